@@ -88,7 +88,7 @@ def history_verb(
     with Ledger(declared, place, who) as ledger:
         if add is not None:
             _add(ledger, add, now)
-        lost = not verify and ledger.is_lost()
+        lost = not verify and ledger.warn_if_lost()
         all_series = watch(ledger.entries(), ledger.acknowledgements())
         if acknowledge is not None:
             _acknowledge(ledger, _named(all_series, acknowledge, declared), why, since, now)

@@ -156,7 +156,14 @@ def status(title: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def delay_signals() -> Iterator[None]:
-    """Let a short write and the records of it be completed before a signal is a KeyboardInterrupt."""
+    """Let a short write and the records of it be completed before a signal is a KeyboardInterrupt.
+
+    Unlike the blocker of `interruptible`, which drops a signal during a stop, this one raises it afterwards. Outside
+    the main thread nothing changes.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
     came: list[int] = []
     before = {one: signal.signal(one, lambda number, _: came.append(number)) for one in SIGNALS}
     try:

@@ -130,8 +130,8 @@ class Ledger(HistoryStore):
         unknown, new = unknown_writes(writes_to(self.cell, verdict.entries), self.audited())
         return Verification(self.place, verdict, broken, tuple(unknown), new != unknown)
 
-    def is_lost(self) -> bool:
-        """Whether the index is empty, though the audit log has calibrations or writes of this cell; with a warning."""
+    def warn_if_lost(self) -> bool:
+        """Warn, and return true, if the index is empty though the audit log has entries of this cell."""
         audited = () if self.entries() else read(self.place.audit)
         entered = any(entered_calibration(one, self.cell.name) for one in audited)
         if lost := entered or bool(writes_to(self.cell, audited, everywhere=True)):

@@ -27,7 +27,8 @@ LEAST_WEIGHT = 1e-3
 """Share of the known payload's torque in a joint's, where it is largest. In a recording it is 0.1 and more."""
 LARGEST_TOTAL_PERCENT = 50.0
 LARGEST_AXIS_PERCENT = 100.0
-"""Of ‖ρ‖/‖Y‖ of a fit. A robot with every effect undeclared stays below 15 and 40; a model of nothing leaves 100."""
+"""Largest relative errors of a fit. A robot with every effect undeclared stays below 15 in total and 40 on an axis; a
+model that explains nothing leaves 100."""
 LARGEST_UNKNOWN_PERCENT = 25.0  #: The same, on an axis whose gain is smaller than its own σ
 
 
@@ -172,8 +173,8 @@ def estimate_with(method: Method, system: System, fixed_gains: FloatArray | None
     Raises:
         DataUnfit: ``tls`` with fixed gains: it has nothing to correct then.
     """
-    if Method(method) is Method.TLS:
+    if method is Method.TLS:
         if fixed_gains is not None:
             raise DataUnfit(", ".join(system.runs), "tls needs free gains; with fixed gains choose ls, wls or ml")
         return tls(system)
-    return {Method.LS: ls, Method.WLS: wls, Method.ML: ml}[Method(method)](system, fixed_gains)
+    return {Method.LS: ls, Method.WLS: wls, Method.ML: ml}[method](system, fixed_gains)

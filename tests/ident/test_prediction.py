@@ -122,7 +122,7 @@ def test_a_motion_that_no_one_recorded_needs_the_same_current(identified: Eviden
     calibration, data = _of(after), after.datasets[1]
     asked = planned(data.motion(), data.rate_hz, data.payload)
     expected = predict_current(calibration, after.model, data)
-    assert_allclose(predict_current(calibration, after.model, asked), expected, rtol=1e-6, atol=1e-12)
+    assert_allclose(predict_current(calibration, after.model, asked), expected, rtol=0.0, atol=1e-12)
 
 
 def test_an_effect_of_the_load_is_predicted_with_the_final_load(identified: Evidence) -> None:

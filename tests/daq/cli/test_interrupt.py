@@ -5,12 +5,13 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from daq.cli.record import _interrupted
-from daq.cli.terminal import GRACE_S, SIGNALS, interruptible
+from daq.cli.terminal import GRACE_S, SIGNALS, delay_signals, interruptible
 from daq.errors import ExitCode
 from drivers.errors import DriveFault
 
@@ -27,6 +28,21 @@ def test_signals_that_were_ignored_from_birth_are_heard_and_others_left_alone() 
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, deaf)
+
+
+def test_a_signal_during_a_write_counts_after_it_and_another_thread_may_write_too() -> None:
+    done = []
+    with pytest.raises(KeyboardInterrupt), delay_signals():
+        signal.raise_signal(signal.SIGTERM)
+        done.append("written")
+    with ThreadPoolExecutor() as pool, delay_signals():
+        pool.submit(_write_undisturbed, done).result()
+    assert done == ["written", "elsewhere"]
+
+
+def _write_undisturbed(done: list[str]) -> None:
+    with delay_signals():
+        done.append("elsewhere")
 
 
 @pytest.mark.parametrize("number", SIGNALS)

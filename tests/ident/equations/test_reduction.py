@@ -47,7 +47,7 @@ def test_the_triangles_are_those_of_the_rows(noisy: Evidence, whole: System) -> 
 
 @pytest.fixture(scope="module")
 def small_estimate(small_truth: Truth, small_runs: tuple[Run, ...]) -> Estimate:
-    """Of one run of the arm of three axes without load and one with it, in pieces of the usual length."""
+    """Estimate from a run of the three-axis arm without load and one with it, in pieces of the usual length."""
     return ml(_system(reduce_runs(small_truth.model, small_runs[:2], SMALL)))
 
 
