@@ -99,6 +99,8 @@ def test_an_interrupt_while_the_command_is_imported_is_no_traceback(module: str)
     script = f"""
 import signal, sys
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background inherits that it is ignored
+
 def interrupt(event, given):
     if event == "import" and given[0] == {module!r}:
         signal.raise_signal(signal.SIGINT)
