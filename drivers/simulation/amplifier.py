@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.simulation.dynamics import compiled
 from drivers.simulation.effects import Lag, build_effect
+from drivers.simulation.noise import ColouredNoise, random_streams
 from drivers.simulation.plant import Plant, reduction
 from drivers.simulation.spec import CellSpec, FloatArray
 
@@ -297,16 +298,12 @@ class AmplifierSet:
         built = (build_effect(effect, n) for effect in spec.effects)
         self._lags = tuple(effect for effect in built if isinstance(effect, Lag))
         self._lagged_a = np.zeros(n)
-        # A random stream for each axis: its noise does not depend on the other axes.
-        self._random = [np.random.default_rng(np.random.SeedSequence(spec.seed, spawn_key=(i,))) for i in range(n)]
-        sigma = np.array([axis.current_noise_a for axis in spec.axes])
-        tau = np.array([axis.noise_correlation_s for axis in spec.axes])
-        with np.errstate(divide="ignore"):
-            self._memory = np.where(tau > 0.0, np.exp(-period_s / np.where(tau > 0.0, tau, 1.0)), 0.0)
-        self._drive_a = sigma * np.sqrt(1.0 - self._memory**2)
-        self._noise_a = sigma * [stream.standard_normal() for stream in self._random]
-        self._block = np.zeros((0, n))
-        self._used = 0
+        self._noise = ColouredNoise(
+            random_streams(spec.seed, n),
+            np.array([axis.current_noise_a for axis in spec.axes]),
+            np.array([axis.noise_correlation_s for axis in spec.axes]),
+            period_s,
+        )
         self._rated_a = np.array([axis.rated_current_a for axis in spec.axes])
         self.readings = self._read()  #: renewed once a SYNC
 
@@ -321,13 +318,8 @@ class AmplifierSet:
     def report(self) -> None:
         """Renew the reported currents and the readings, once a SYNC."""
         self.actual_a[:] = self.loops["current_a"]
-        if self._used == len(self._block):
-            self._block = np.stack([stream.standard_normal(1024) for stream in self._random], axis=1)
-            self._used = 0
-        # First-order autoregression of stationary variance σ².
-        self._noise_a = self._memory * self._noise_a + self._drive_a * self._block[self._used]
-        self._used += 1
-        np.add(self._lagged_a if self._lags else self.loops["current_a"], self._noise_a, out=self.reported_a)
+        current_a = self._lagged_a if self._lags else self.loops["current_a"]
+        np.add(current_a, self._noise.advance(), out=self.reported_a)
         self.readings = self._read()
 
     def _read(self) -> Readings:

@@ -52,6 +52,17 @@ def load_friction(moment: Moment, axis: int, coefficient: float) -> None:
     moment.bound_nm[axis] += coefficient * abs(moment.load_torque_nm[axis])
 
 
+def efficiency(moment: Moment, axis: int, efficiency: float) -> None:
+    """A gear that gives on a part of the power: τ_g/η where the motor drives the load, η τ_g where the load drives it.
+
+    τ_g is the torque of the links and of the joint's friction. The loss can only dissipate: it joins the bound.
+    """
+    velocity = moment.velocity_rad_s[axis]
+    rubbing = moment.bound_nm[axis] + moment.viscous_nm_s_rad[axis] * abs(velocity)
+    along = moment.load_torque_nm[axis] * math.copysign(1.0, velocity) + rubbing
+    moment.bound_nm[axis] += along * (1.0 / efficiency - 1.0) if along > 0.0 else -along * (1.0 - efficiency)
+
+
 def nonlinear_viscous(moment: Moment, axis: int, torque_at_1_rad_s_nm: float, exponent: float) -> None:
     """Friction c·|v|^η against the motion, v in rad/s, beside the linear one: lubricants, seals, churning.
 
@@ -194,6 +205,7 @@ class Lag:
 UNDECLARED_EFFECTS: dict[str, Callable[..., None] | type[Presliding | Coupling | Elasticity | Lag]] = {
     "stribeck": stribeck,
     "load-friction": load_friction,
+    "efficiency": efficiency,
     "nonlinear-viscous": nonlinear_viscous,
     "asymmetric-viscous": asymmetric_viscous,
     "spring": spring,

@@ -10,9 +10,12 @@ from numpy.typing import NDArray
 
 from drivers.simulation.dynamics import TOLERANCE_RAD_S, Mechanics, advance
 from drivers.simulation.effects import Coupling, Effect, Elasticity, Lag, Moment, build_effect
+from drivers.simulation.noise import ColouredNoise, random_streams
 from drivers.simulation.spec import Body, CellSpec, FloatArray, FrictionUnsolved, SpecInvalid
 
 BRAKE_FACTOR = 2.0  #: Holding torque of a brake over the peak torque of its motor
+
+DISTURBANCE = 1  #: Kind of the random streams of the torque disturbance; those of the current noise have none
 
 
 def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag]) -> tuple[Mechanics, tuple[Elasticity, ...]]:
@@ -100,6 +103,7 @@ class Plant:
         position_rad, velocity_rad_s: of the coordinates, shape (N,).
         load_torque_nm: torque of the links on the joints in the last step, shape (n,).
         motor_rad: angle of each rotor [rad], shape (n,); zero at joint position zero.
+        disturbance_nm: random torque on each motor in the last step, in joint units, shape (n,).
         time_s: since power-on.
     """
 
@@ -153,6 +157,8 @@ class Plant:
             motor_torque_nm=np.zeros(n),
         )
         self._impulse = np.zeros(m)
+        self.disturbance_nm = np.zeros(n)
+        self._disturbance = _disturbance(spec, self._mechanics.step_s)
         self.set_brakes(np.ones(n, dtype=np.bool_))
 
     def set_brakes(self, closed: NDArray[np.bool_]) -> None:
@@ -202,6 +208,9 @@ class Plant:
             moment.current_a[...] = current_a
             for act in self._acting:
                 act(moment)
+        if self._disturbance is not None:
+            self.disturbance_nm = self._disturbance.advance()
+            moment.motor_torque_nm += self.disturbance_nm
         residual = advance(
             self._constants,
             np.ascontiguousarray(pin.crba(self._model, self._data, position)),
@@ -223,6 +232,16 @@ class Plant:
                 "orders of magnitude"
             )
         self.time_s += self._mechanics.step_s
+
+
+def _disturbance(spec: CellSpec, step_s: float) -> ColouredNoise | None:
+    """Return the random torque on each motor in joint units [Nm], None for a cell without any."""
+    rated_nm = np.array([abs(axis.gain_nm_per_a) * axis.rated_current_a for axis in spec.axes])
+    sigma_nm = 0.01 * np.array([axis.torque_disturbance_percent for axis in spec.axes]) * rated_nm
+    if not sigma_nm.any():
+        return None
+    correlation_s = np.array([axis.disturbance_correlation_s for axis in spec.axes])
+    return ColouredNoise(random_streams(spec.seed, len(spec.axes), DISTURBANCE), sigma_nm, correlation_s, step_s)
 
 
 def link_model(urdf: str, gravity_m_s2: tuple[float, float, float], payload: Body | None) -> pin.Model:

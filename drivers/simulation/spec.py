@@ -70,6 +70,11 @@ class AxisSpec:
     toggle_bit: ToggleBit | None = None  #: bit of statusword 6041h that is inverted with every SYNC, or None
     #: Gain entered in 2003h (:01 in mNm/A, :02 in Nm/A as REAL32); the loops do not use it.
     entered_gain_nm_per_a: float = 0.0
+    #: Root mean square of a random torque on the motor, in percent of its rated torque |gain| · rated current; inside
+    #: the control loops, so that it moves the arm and returns, late, in the current.
+    torque_disturbance_percent: Annotated[float, Interval(ge=0, le=10)] = 0.0
+    #: Correlation time of that torque (first-order).
+    disturbance_correlation_s: Annotated[float, Interval(ge=0.002, le=0.05)] = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +100,7 @@ class CellSpec:
     effects: tuple[UndeclaredEffect, ...]  #: effects beyond the declared model
     sync_period_us: int  #: time by which one SYNC advances the plant
     substeps: int  #: control and integration steps in one SYNC period
-    seed: int  #: seed of the current noise
+    seed: int  #: seed of the current noise and the torque disturbance
     faults: tuple[FaultSpec, ...] = ()  #: injected faults
 
 

@@ -38,6 +38,7 @@ def test_an_unknown_payload_is_refused(checkout: Path) -> None:
         ("axis: J3", "axis: elbow", SchemaMismatch, r"effects\[0\].axis"),
         ("start_deg: [0.0, ", "start_deg: [", ConfigurationInconsistent, "5 angles"),
         ("serial: 1001", "serail: 1001", SchemaMismatch, "serial"),
+        ("serial: 1001", "serial: 1001, torque_disturbance_percent: 11", SchemaMismatch, "torque_disturbance_percent"),
         ("gain_nm_per_a: 33.9", "gain_nm_per_a: 0.0", ConfigurationInconsistent, "not zero"),
     ],
 )

@@ -79,6 +79,21 @@ def test_load_friction_is_proportional_to_the_size_of_the_load(load_nm: float) -
     np.testing.assert_allclose(extra, only(2, -0.12 * abs(load_nm) * np.sign(SPEED[2])), atol=1e-6)
 
 
+@pytest.mark.parametrize("load_nm", [-40.0, -3.0, 0.0, 25.0])
+def test_a_gear_passes_a_part_of_the_power_whichever_side_drives(load_nm: float) -> None:
+    """Power into the gear times η is the power out of it, friction of the joint included."""
+    axis, eta = clean_cell().axes[2], 0.8
+    friction = np.sign(SPEED[2]) * axis.coulomb_nm + axis.viscous_nm_s_rad * SPEED[2]
+    out = load_nm + friction
+    lost = -extra_torque_nm(UndeclaredEffect("efficiency", 2, {"efficiency": eta}), load_nm=load_nm)
+    into = out + lost[2]
+    power_in, power_out = into * SPEED[2], out * SPEED[2]
+    assert (power_out if power_in > 0.0 else power_in) == pytest.approx(
+        eta * (power_in if power_in > 0.0 else power_out), abs=1e-6
+    )
+    np.testing.assert_allclose(lost, only(2, lost[2]), atol=1e-6)
+
+
 def test_load_friction_knows_the_payload() -> None:
     torque = {}
     for payload in (None, "disc"):
@@ -212,6 +227,7 @@ def test_bounds_of_dry_friction_never_become_negative(speed: float, load: float,
     for name, parameters in (
         ("stribeck", {"rise_nm": 2.0, "speed_rad_s": 0.1}),
         ("load-friction", {"coefficient": 0.2}),
+        ("efficiency", {"efficiency": 0.7}),
         ("nonlinear-viscous", {"torque_at_1_rad_s_nm": 1.0, "exponent": 0.5}),
         ("position-friction", {"amplitude_nm": 4.0, "phase_rad": 0.0}),
         ("warm-up", {"cold_fraction": 1.0, "time_constant_s": 10.0}),
@@ -239,7 +255,7 @@ def test_unknown_names_and_parameters_are_refused_with_what_exists() -> None:
         build_effect(UndeclaredEffect("coupling", 3, {"other_axis": 4, "coulomb_nm": 0.4, "viscous_nm_s_rad": 0.3}), 6)
     with pytest.raises(SpecInvalid, match="unknown parameter bristle"):
         build_effect(UndeclaredEffect("presliding", 0, {"torque_nm": 1.0, "distance_rad": 0.1, "bristle": 1.0}), 6)
-    assert len(UNDECLARED_EFFECTS) == 14
+    assert len(UNDECLARED_EFFECTS) == 15
 
 
 def test_a_drive_too_stiff_for_the_step_is_refused() -> None:
