@@ -65,10 +65,15 @@ def _robot(model: CellModel, urdf: str) -> tuple[tuple[Joint, ...], list[Fault]]
     try:
         joints = robot_from_urdf(urdf, model.robot.gravity_m_s2).joints
     except ModelError as error:
-        return (), [*faults, Fault(("robot", "urdf"), str(error), "a URDF of an arm")]
+        expected = "a URDF of an arm; `hold: {JOINT: POSITION}` fixes a joint that is no axis"
+        return (), [*faults, Fault(("robot", "urdf"), str(error), expected)]
     if len(joints) != len(model.axes):
-        names = ", ".join(joint.name for joint in joints)
-        expected = f"one for each moving joint of the URDF ({names})"
+        names = [joint.name for joint in joints]
+        expected = f"one for each moving joint of the URDF ({', '.join(names)})"
+        if len(joints) > len(model.axes):
+            others = [name for name in names if name not in {axis.name for axis in model.axes}]
+            held = ", ".join(f"{name}: 0.0" for name in others[len(model.axes) - len(joints) :])
+            expected += f"; joints that are no axes are held at a position [deg; m if prismatic]: `hold: {{{held}}}`"
         faults.append(Fault(("axes",), f"{len(model.axes)} axes", expected))
     return joints, faults
 

@@ -1,7 +1,8 @@
-"""An import description: the layout of the CSV files of another controller (configs/imports/tx40.yaml)."""
+"""An import description: the layout of the files of another controller (configs/imports/tx40.yaml)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -14,6 +15,8 @@ from daq.errors import ConfigurationInconsistent
 
 Column = Annotated[str, Field(min_length=1)] | Annotated[int, Field(ge=1)]
 """Name in the header, or number counted from 1."""
+Rate = Annotated[float, Field(ge=1.0, le=1e6)]
+Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
 SomeColumns = Annotated[tuple[Column, ...], Field(min_length=1)]
 
 
@@ -39,16 +42,22 @@ class TimeUnit(Enum):
     MILLISECOND = "ms"
     MICROSECOND = "us"
     NANOSECOND = "ns"
+    ISO_8601 = "iso8601"  #: Date and time with a zone: 2026-03-01T08:00:00.004+01:00
+
+    @property
+    def digits(self) -> int:
+        """Decimal digits below a second: 3 for milliseconds."""
+        return {"s": 0, "ms": 3, "us": 6, "ns": 9, "iso8601": 0}[self.value]
 
     @property
     def seconds(self) -> float:
         """The unit in seconds."""
-        return {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[self.value]
+        return {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "iso8601": 1.0}[self.value]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Table:
-    """Layout of the files."""
+class CsvLayout:
+    """Layout of CSV files."""
 
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] = ","  #: between fields; " " means any white space
     decimal: Annotated[str, Field(pattern=r"^[.,]$")] = "."  #: point or comma
@@ -56,7 +65,7 @@ class Table:
     header: bool = True  #: whether a line of names precedes the numbers
 
     @model_validator(mode="after")
-    def _check_delimiter(self) -> Table:
+    def _check_delimiter(self) -> CsvLayout:
         if self.delimiter == self.decimal:
             raise ValueError("a delimiter that is not the decimal sign")
         return self
@@ -79,16 +88,47 @@ class CurrentColumns:
     file: FileName
     columns: SomeColumns
     unit: Annotated[str, Field(min_length=1)]
-    factor: Annotated[float, Field(ge=-1e9, le=1e9)] = 1.0
+    #: One for all axes, a list in their order, or a mapping from their names.
+    factor: Factor | Annotated[tuple[Factor, ...], Field(min_length=1)] | dict[Name, Factor] = 1.0
+
+    def factors(self, axes: Sequence[str]) -> tuple[float, ...] | None:
+        """Return the factor of each axis; None if other axes have one."""
+        if isinstance(self.factor, float):
+            return (self.factor,) * len(axes)
+        if isinstance(self.factor, dict):
+            return tuple(self.factor[axis] for axis in axes) if self.factor.keys() == set(axes) else None
+        return self.factor if len(self.factor) == len(axes) else None
+
+
+class VelocityUnit(Enum):
+    """Unit of the velocity columns."""
+
+    RAD = "rad/s"
+    DEG = "deg/s"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VelocityColumns:
+    """Velocity columns, one for each axis: a check of the positions and the time; not imported."""
+
+    file: FileName
+    columns: SomeColumns
+    unit: VelocityUnit
+    side: Side
+    #: Largest difference between the way by the velocities and by the positions, as a share of the latter.
+    tolerance: Annotated[float, Field(gt=0.0, le=1.0)] = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TimeColumn:
-    """The time column, instead of a rate."""
+    """The time column, instead of a rate: a stamp is the time of its sample."""
 
     file: FileName
     column: Column
     unit: TimeUnit
+    rate_hz: Rate | None = None  #: rate to resample to [Hz]; that of the stamps by default
+    #: Longest step that is interpolated, in usual steps; a longer one is a gap, and refused.
+    largest_gap_periods: Annotated[float, Field(ge=1.5, le=100.0)] = 3.0
 
 
 class ImportDescription(StrictModel):
@@ -96,14 +136,26 @@ class ImportDescription(StrictModel):
 
     name: Name  #: name of the recording
     cell: FileName  #: cell file, relative to this one
-    table: Table = Table()  #: layout of the files
+    table: CsvLayout = CsvLayout()  #: layout of CSV files
     position: PositionColumns  #: column of the position
     current: CurrentColumns  #: column of the current
-    rate_hz: Annotated[float, Field(ge=1.0, le=1e6)] | None = None  #: sampling rate [Hz]; either this or `time`
+    velocity: VelocityColumns | None = None  #: columns of the velocity, for a check alone
+    rate_hz: Rate | None = None  #: sampling rate [Hz]; either this or `time`
     time: TimeColumn | None = None  #: the time column, instead of a rate
+    topic: str | None = None  #: topic of the joint states in a ROS 2 bag; needed if it has several
     payload: Name | None = None  #: mounted payload, as named in the cell; None without load
     mounting: Name | None = None  #: its mounting, as named in the cell; None without load
     operator: str = ""  #: person who recorded it
+
+    def files(self) -> dict[str, tuple[Column, ...]]:
+        """Return the files, each with its columns of numbers; the time column is not among them."""
+        columns: dict[str, dict[Column, None]] = {}
+        sections = (self.position, self.current, *(() if self.velocity is None else (self.velocity,)))
+        for section in sections:
+            columns.setdefault(section.file, {}).update(dict.fromkeys(section.columns))
+        if self.time is not None:
+            columns.setdefault(self.time.file, {})
+        return {file: tuple(found) for file, found in columns.items()}
 
 
 def load_import(path: Path) -> ImportDescription:
@@ -122,12 +174,17 @@ def load_import(path: Path) -> ImportDescription:
     if wanted.position.unit is PositionUnit.COUNTS and wanted.position.side is Side.JOINT:
         expected = "motor; counts are of the motor encoder"
         faults.append(Fault(("position", "side"), "joint, with encoder counts", expected))
-    if wanted.current.factor == 0.0:
+    factor = wanted.current.factor
+    if 0.0 in ((factor,) if isinstance(factor, float) else factor.values() if isinstance(factor, dict) else factor):
         faults.append(Fault(("current", "factor"), "0", "the unit of the gain for each unit in the file"))
-    if len(wanted.position.columns) != len(wanted.current.columns):
-        found = f"{len(wanted.current.columns)} columns"
-        faults.append(Fault(("current", "columns"), found, f"{len(wanted.position.columns)}, as many as of position"))
-    named = [c for c in (*wanted.position.columns, *wanted.current.columns) if isinstance(c, str)]
+    axes = len(wanted.position.columns)
+    for name, section in (("current", wanted.current), ("velocity", wanted.velocity)):
+        # One name may be a whole matrix or field (daq.log.readers.with_columns); then the import counts.
+        if section is not None and len(section.columns) != axes and 1 not in {axes, len(section.columns)}:
+            found = f"{len(section.columns)} columns"
+            faults.append(Fault((name, "columns"), found, f"{axes}, as many as of position"))
+    timed = () if wanted.time is None else (wanted.time.column,)
+    named = [c for columns in (*wanted.files().values(), timed) for c in columns if isinstance(c, str)]
     if named and not wanted.table.header:
         faults.append(Fault(("table", "header"), f"false, and column {named[0]!r} by name", "column numbers from 1"))
     if faults:

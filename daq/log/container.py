@@ -18,6 +18,7 @@ from typing import BinaryIO, TypeVar
 
 import numpy as np
 import zstandard
+from lz4.frame import LZ4FrameDecompressor
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -214,7 +215,7 @@ class RecordFile:
         """Decompress a chunk.
 
         Raises:
-            LogForeign: another compression than zstd.
+            LogForeign: another compression than zstd or lz4.
             LogCorrupt: too large, broken, or of another checksum.
         """
         size = chunk.uncompressed_size
@@ -223,11 +224,11 @@ class RecordFile:
         self._allowance -= size
         if self._allowance < 0:
             raise self.corrupt(offset, f"chunks that unfold to {LARGEST_RATIO} times the file", "a recording")
-        if chunk.compression not in {"zstd", ""}:
+        if chunk.compression not in {"zstd", "lz4", ""}:
             raise LogForeign(
                 str(self.path),
                 found=f"chunks in {chunk.compression!r}",
-                expected="zstd",
+                expected="zstd or lz4",
                 remedy="convert the file with a tool for MCAP",
             )
         data = chunk.data
@@ -239,6 +240,11 @@ class RecordFile:
                 data = self._zstd.decompress(data, max_output_size=size)
             except zstandard.ZstdError as error:
                 raise self.corrupt(offset, f"a broken chunk ({error})", "zstd") from error
+        elif chunk.compression == "lz4":
+            try:
+                data = LZ4FrameDecompressor().decompress(data, max_length=size)
+            except (RuntimeError, EOFError) as error:
+                raise self.corrupt(offset, f"a broken chunk ({error})", "lz4") from error
         if len(data) != size:
             raise self.corrupt(offset, f"a chunk of {len(data)} bytes", f"{size}, as declared")
         self._check_crc(offset, "chunk", chunk.uncompressed_crc, zlib.crc32(data))

@@ -168,10 +168,10 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
         move=moves(log.events, samples.time_ns),
         digest=log.digest,
         valid=valid,
-        started_s=float(samples.time_ns[0]) * 1e-9,
+        started_s=float(samples.time_ns[0]) * 1e-9 if run.has_clock else None,
         partial=log.partial or accepted,
         recording=Recording(
-            # An import knows no time and writes 0.
+            # An import without the time of day writes 0.
             recorded_s=run.started_wall_ns * 1e-9 if run.started_wall_ns else None,
             entered_kg=run.entered_kg,
             serials=tuple(serial if type(serial := drive.get("serial")) is int else None for drive in drives),

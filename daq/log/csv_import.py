@@ -1,4 +1,4 @@
-"""Convert CSV files of other controllers to logs.
+"""Convert files of other controllers to logs.
 
 A log holds int32. If the files hold angles, the count of each axis is the smallest power of two with which the largest
 value still fits. The rounding error, half a count, is then at most 4.7e-10 of that value, and a power of two scales
@@ -9,10 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import math
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil, log2, pi
 from pathlib import Path
 
@@ -20,11 +17,13 @@ import numpy as np
 
 from daq.config.cell import Cell
 from daq.config.cell_file import bundle, load_cell
-from daq.config.import_description import ImportDescription, PositionUnit, Side, Table, load_import
+from daq.config.import_description import ImportDescription, PositionUnit, Side, VelocityUnit, load_import
 from daq.errors import ConfigurationInconsistent, PositionImplausible, TableUnfit
-from daq.files import open_regular
-from daq.log.conversion import check_limits, scaling
-from daq.log.metadata import AxisReadback, Readback, RunInfo, RunStatistics
+from daq.log.conversion import check_limits, scaling, unwrapped
+from daq.log.metadata import AxisReadback, Readback, RunInfo, RunStatistics, Timing
+from daq.log.readers import reader_of, with_columns
+from daq.log.resampling import Clock, clock_of
+from daq.log.table import Table
 from daq.log.writer import NOTHING_KEPT, LogContent, LogWriter
 from drivers.stream.sample import Sample
 from ident.arrays import FloatArray, IntArray
@@ -41,12 +40,22 @@ SPEED_PERCENTILE = 99.9
 """Percentile of a run's speeds that is compared with the limit: a few outliers do not mean a wrong rate."""
 SLOW_SHARE = 0.1
 """Share of the velocity limits; if no joint is ever faster, the real rate may be ten times the declared one."""
-TIME_TOLERANCE = 0.5  #: Largest deviation of a time stamp, as a share of the period
+VELOCITY_WINDOW_S = 0.1  #: Time over which the ways by velocities and by positions are compared
+STILL = 1e-3  #: Difference of speed that is no contradiction, as a share of the velocity limit
+UNIX_NS = range(10**18, 3 * 10**18)  #: Stamps from 2001 to 2065 are since 1970; any others since some start
+LATEST_NS = 9 * 10**18  #: The latest stamp that a log holds, roughly
 
 
-def import_csv(
-    description: Path, data: Path, out: Path, *, software: str, cell_path: Path | None = None
-) -> RunStatistics:
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """Result of an import."""
+
+    statistics: RunStatistics  #: of the log
+    timing: Timing | None  #: what the time stamps showed; None without a time column
+    remarks: tuple[str, ...]  #: oddities of the files that were mended
+
+
+def import_csv(description: Path, data: Path, out: Path, *, software: str, cell_path: Path | None = None) -> Imported:
     """Convert the files that a description names to a log. The same input gives the same bytes: no clock is read.
 
     Args:
@@ -64,23 +73,23 @@ def import_csv(
     wanted = load_import(description)
     path = cell_path or description.parent / wanted.cell
     cell = load_cell(path)
+    wanted = with_columns(wanted, data, cell.axis_names)
     _check_cell(wanted, cell, description)
-    timed = () if wanted.time is None else (wanted.time.file,)
-    names = dict.fromkeys((wanted.position.file, wanted.current.file, *timed))
-    files = {name: read_table(data / name, wanted.table) for name in names}
-    position = numbers(files[wanted.position.file], wanted.position.columns)
-    current = numbers(files[wanted.current.file], wanted.current.columns)
-    if len({len(file.rows) for file in files.values()}) > 1:
-        raise TableUnfit(
-            ", ".join(str(file.path) for file in files.values()),
-            found=" and ".join(f"{len(file.rows)} rows in {name}" for name, file in files.items()),
-            expected="as many in each",
-            remedy="one of them ends early, or they are of different runs; export them again",
-        )
-    rate_hz = _rate_hz(wanted, files)
-    counts, count_rad = _counts(wanted, cell, position, files[wanted.position.file])
+    files = _read_tables(wanted, data)
+    table = files[wanted.position.file]
+    position = table.take(wanted.position.columns)
+    current = files[wanted.current.file].take(wanted.current.columns)
     _check_current(current, wanted, files[wanted.current.file])
-    raw, unit = quantise(current * wanted.current.factor)
+    if wanted.position.unit is PositionUnit.COUNTS:
+        _check_counts(position, wanted, table)
+    clock = _clock(wanted, files)
+    rate_hz = wanted.rate_hz if clock is None else clock.timing.rate_hz
+    assert rate_hz is not None  # load_import requires one of the two
+    if clock is not None:
+        position, current = position[clock.row], current[clock.row]
+    counts, count_rad = _counts(wanted, cell, position, clock)
+    factors = wanted.current.factors(cell.axis_names)
+    raw, unit = quantise((current if clock is None else clock.currents(current)) * np.array(factors))
     readback = Readback(
         tuple(
             AxisReadback(axis.name, float(unit[i]), None if count_rad is None else float(count_rad[i]))
@@ -89,19 +98,22 @@ def import_csv(
     )
     scale = scaling(cell, readback)
     joint_rad = scale.joint_position(counts)
-    check_limits(str(data / wanted.position.file), joint_rad, cell)
-    _check_motion(str(data / wanted.position.file), joint_rad, cell)
-    _check_speed(str(data / wanted.position.file), joint_rad, rate_hz, cell)
-    digests = {name: hashlib.sha256("\n".join(file.rows).encode()).hexdigest() for name, file in files.items()}
+    check_limits(str(table.path), joint_rad, cell)
+    _check_motion(str(table.path), joint_rad, cell)
+    _check_speed(str(table.path), joint_rad, rate_hz, cell)
+    _check_velocity(wanted, cell, files, clock, joint_rad, rate_hz)
+    digests = {name: file.digest for name, file in files.items()}
+    started_ns, started_wall_ns, timing = _start(wanted, files, clock)
     run = RunInfo(
         run_id=f"import-{hashlib.sha256(repr(sorted(digests.items())).encode()).hexdigest()[:16]}",
         rate_hz=rate_hz,
         payload=_payload(wanted, cell),
         operator=wanted.operator,
         software=software,
-        started_wall_ns=0,
-        started_monotonic_ns=0,
+        started_wall_ns=started_wall_ns,
+        started_monotonic_ns=started_wall_ns,
         origin=f"imported as {wanted.name} from " + ", ".join(f"{name} ({d[:12]})" for name, d in digests.items()),
+        timing=timing,
     )
     content = LogContent(run, bundle(path), readback, cell.axis_names)
     opened = False
@@ -109,7 +121,7 @@ def import_csv(
         # A crash of an import loses no sample, so no clock is needed to flush in time.
         with LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0, remedy=NOTHING_KEPT) as log:
             opened = True
-            time_ns = np.rint(np.arange(len(counts)) * (1e9 / rate_hz)).astype(np.int64).tolist()
+            time_ns = (started_ns + np.rint(np.arange(len(counts)) * (1e9 / rate_hz)).astype(np.int64)).tolist()
             silent = (0,) * len(cell.axes)
             for cycle, row in enumerate(zip(time_ns, counts.tolist(), raw.tolist(), strict=True)):
                 log.write(Sample(cycle, row[0], tuple(row[1]), tuple(row[2]), silent))
@@ -118,7 +130,53 @@ def import_csv(
         if opened:
             log.part.unlink(missing_ok=True)
         raise
-    return log.statistics
+    return Imported(log.statistics, timing, tuple(remark for file in files.values() for remark in file.remarks))
+
+
+def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
+    """Read every file of the description with the reader of its kind."""
+    tables = {}
+    for name, columns in wanted.files().items():
+        time = wanted.time if wanted.time is not None and wanted.time.file == name else None
+        tables[name] = reader_of(data / name)(data / name, wanted, columns, time)
+    if len({len(file.values) for file in tables.values()}) > 1:
+        raise TableUnfit(
+            ", ".join(str(file.path) for file in tables.values()),
+            found=" and ".join(f"{len(file.values)} rows in {name}" for name, file in tables.items()),
+            expected="as many in each",
+            remedy="one of them ends early, or they are of different runs; export them again",
+        )
+    return tables
+
+
+def _clock(wanted: ImportDescription, files: dict[str, Table]) -> Clock | None:
+    """Return the clock of the time column, None without one."""
+    if wanted.time is None:
+        return None
+    return clock_of(files[wanted.time.file], wanted.time, np.hstack([file.values for file in files.values()]))
+
+
+def _start(wanted: ImportDescription, files: dict[str, Table], clock: Clock | None) -> tuple[int, int, Timing | None]:
+    """Return the first stamp of the log and the time of day [ns; 0 where unknown], and the timing with the former.
+
+    Raises:
+        TableUnfit: the first stamp is later than a log can hold.
+    """
+    if wanted.time is None or clock is None:
+        return 0, 0, None
+    file = files[wanted.time.file]
+    assert file.stamps is not None  # clock_of has used them
+    first_ns = file.stamps.first_ns
+    if first_ns >= LATEST_NS:
+        raise TableUnfit(
+            file.place(0, wanted.time.column),
+            found=f"a stamp of {first_ns * 1e-9:.4g} s",
+            expected="seconds since 1970, or since some start",
+            remedy="correct `unit` of `time` in the import description: is it ms, us or ns?",
+        )
+    if first_ns < 0:
+        return 0, 0, clock.timing
+    return first_ns, first_ns if first_ns in UNIX_NS else 0, replace(clock.timing, started_s=first_ns * 1e-9)
 
 
 def quantise(values: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -137,55 +195,41 @@ def quantise(values: FloatArray) -> tuple[IntArray, FloatArray]:
     return np.rint(values / quantum).astype(np.int64), quantum
 
 
+def _check_counts(position: FloatArray, wanted: ImportDescription, file: Table) -> None:
+    """Refuse counts that are no whole numbers of 32 bits."""
+    wrong = np.argwhere((position != np.rint(position)) | (np.abs(position) > LARGEST_RAW))
+    if wrong.size:
+        row, column = wrong[0].tolist()
+        raise TableUnfit(
+            file.place(row, wanted.position.columns[column]),
+            found=f"{position[row, column]!r}",
+            expected="a whole number of encoder counts of at most 31 bits",
+            remedy="correct `unit` in the import description",
+        )
+
+
 def _counts(
-    wanted: ImportDescription, cell: Cell, position: FloatArray, file: TableFile
+    wanted: ImportDescription, cell: Cell, position: FloatArray, clock: Clock | None
 ) -> tuple[IntArray, FloatArray | None]:
-    """Return motor counts and the motor angle of a count [rad], None if the counts are the encoder's."""
+    """Return motor counts and the motor angle of a count [rad], None if the counts are the encoder's.
+
+    Between two samples the encoder's count is not a whole number: resampled counts are stored as angles, much finer,
+    so that they are not rounded a second time.
+    """
+    resampled = clock is not None and clock.timing.resampled
     if wanted.position.unit is PositionUnit.COUNTS:
-        fractional = np.argwhere(position != np.rint(position))
-        if fractional.size or np.abs(position).max() > LARGEST_RAW:
-            row, column = fractional[0] if fractional.size else np.argwhere(np.abs(position) > LARGEST_RAW)[0]
-            raise TableUnfit(
-                f"{file.path}:{file.first_line + row}, column {wanted.position.columns[column]}",
-                found=f"{position[row, column]!r}",
-                expected="a whole number of encoder counts of at most 31 bits",
-                remedy="correct `unit` in the import description",
-            )
-        return position.astype(np.int64), None
-    angle_rad = position
-    if wanted.position.unit is PositionUnit.DEG:
+        if not resampled:
+            return position.astype(np.int64), None
+        turn = np.array([axis.counts_per_revolution for axis in cell.axes], dtype=np.float64)
+        position = unwrapped(position.astype(np.int32)) * (2.0 * pi / turn)
+    elif wanted.position.unit is PositionUnit.DEG:
         # On the joint side a prismatic axis is in mm; on the motor side everything is an angle.
         units = [axis.unit.si if wanted.position.side is Side.JOINT else pi / 180.0 for axis in cell.axes]
-        angle_rad = position * np.array(units)
+        position = position * np.array(units)
     if wanted.position.side is Side.JOINT:
-        offset_rad = np.array([axis.zero_offset_rad for axis in cell.axes])
-        angle_rad = (angle_rad - offset_rad) @ cell.ratio.T
-    return quantise(angle_rad)
-
-
-def _rate_hz(wanted: ImportDescription, files: dict[str, TableFile]) -> float:
-    """Return the rate of the description, or that of the time column.
-
-    Raises:
-        TableUnfit: a time stamp deviates by more than half a period.
-    """
-    if wanted.time is None:
-        assert wanted.rate_hz is not None  # load_import requires one of the two
-        return wanted.rate_hz
-    file = files[wanted.time.file]
-    time_s = numbers(file, (wanted.time.column,))[:, 0] * wanted.time.unit.seconds
-    time_s = time_s - time_s[0]
-    period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
-    wrong = np.abs(np.diff(time_s) - period_s) > TIME_TOLERANCE * period_s
-    if period_s <= 0.0 or wrong.any():
-        row = int(np.argmax(wrong))
-        raise TableUnfit(
-            f"{file.path}:{file.first_line + row + 1}, column {wanted.time.column}",
-            found=f"{time_s[min(row + 1, len(time_s) - 1)] - time_s[row]:.6g} s after the sample before",
-            expected=f"{period_s:.6g} s, the same between all samples",
-            remedy="samples are missing or duplicated: cut the recording there; or give rate_hz if stamps are coarse",
-        )
-    return float((len(time_s) - 1) / time_s[-1])
+        # Zero is that of the controller; `zero_offset_deg` leads from there to the URDF's.
+        position = position @ cell.ratio.T
+    return quantise(position if clock is None else clock.positions(position))
 
 
 def _payload(wanted: ImportDescription, cell: Cell) -> Payload | None:
@@ -205,13 +249,14 @@ def _payload(wanted: ImportDescription, cell: Cell) -> Payload | None:
 
 def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> None:
     n = len(cell.axes)
-    if len(wanted.position.columns) != n:
-        raise ConfigurationInconsistent(
-            f"{description}: position.columns",
-            found=f"{len(wanted.position.columns)} columns",
-            expected=f"{n}, one for each axis of cell {cell.name!r}",
-            remedy="correct the description, or choose the cell with --cell",
-        )
+    for key, section in (("position", wanted.position), ("current", wanted.current), ("velocity", wanted.velocity)):
+        if section is not None and len(section.columns) != n:
+            raise ConfigurationInconsistent(
+                f"{description}: {key}.columns",
+                found=f"{len(section.columns)} columns",
+                expected=f"{n}, one for each axis of cell {cell.name!r}",
+                remedy="correct the description, or choose the cell with --cell",
+            )
     for axis in cell.axes:
         if axis.gain_unit not in {f"Nm/{wanted.current.unit}", f"N/{wanted.current.unit}"}:
             raise ConfigurationInconsistent(
@@ -220,6 +265,13 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
                 expected=f"current in {axis.gain_unit.partition('/')[2]!r}",
                 remedy="state that unit, and `factor` to convert the numbers of the file to it",
             )
+    if wanted.current.factors(cell.axis_names) is None:
+        raise ConfigurationInconsistent(
+            f"{description}: current.factor",
+            found=str(wanted.current.factor),
+            expected=f"one for each of {', '.join(cell.axis_names)}",
+            remedy="write a number for all axes, a list in their order, or a mapping from their names",
+        )
     if wanted.position.unit is PositionUnit.COUNTS and any(a.counts_per_revolution is None for a in cell.axes):
         raise ConfigurationInconsistent(
             f"{description}: position.unit",
@@ -230,7 +282,45 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
     _payload(wanted, cell)
 
 
-def _check_current(current: FloatArray, wanted: ImportDescription, file: TableFile) -> None:
+def _check_velocity(
+    wanted: ImportDescription,
+    cell: Cell,
+    files: dict[str, Table],
+    clock: Clock | None,
+    joint_rad: FloatArray,
+    rate_hz: float,
+) -> None:
+    """Compare velocity columns with the positions, by the way moved in VELOCITY_WINDOW_S: it needs no derivative."""
+    if (velocity := wanted.velocity) is None:
+        return
+    stated = files[velocity.file].take(velocity.columns)
+    if clock is not None:
+        stated = clock.currents(stated[clock.row])
+    if velocity.unit is VelocityUnit.DEG:
+        units = [axis.unit.si if velocity.side is Side.JOINT else pi / 180.0 for axis in cell.axes]
+        stated = stated * np.array(units)
+    if velocity.side is Side.MOTOR:
+        stated = stated @ np.linalg.inv(cell.ratio).T
+    step = min(max(1, round(VELOCITY_WINDOW_S * rate_hz)), len(stated) - 1)
+    summed = np.cumsum(0.5 * (stated[1:] + stated[:-1]) / rate_hz, axis=0)
+    summed = np.vstack((np.zeros_like(stated[:1]), summed))
+    expected, moved = (values[step:] - values[:-step] for values in (summed, joint_rad))
+    still = np.array([STILL * axis.limits.velocity for axis in cell.axes]) * step / rate_hz
+    error, size = (np.sqrt(np.mean(values**2, axis=0)) for values in (expected - moved, moved))
+    for index in np.flatnonzero(error > velocity.tolerance * size + still).tolist():
+        way, stated_way = moved[:, index], expected[:, index]
+        ratio = float(way @ stated_way) / max(float(stated_way @ stated_way), 1e-300)
+        raise TableUnfit(
+            f"{files[velocity.file].path}, column {velocity.columns[index]}, axis {cell.axes[index].name}",
+            found=f"positions that move {ratio:.3g} times as fast as this velocity says, and differ from it by "
+            f"{100.0 * float(error[index]) / max(float(size[index]), 1e-300):.3g} %",
+            expected=f"velocities that agree with the positions to {100.0 * velocity.tolerance:g} %",
+            remedy="check `unit` and `side` of both, the order of their columns, and the rate or the unit of the time; "
+            "or leave `velocity` out",
+        )
+
+
+def _check_current(current: FloatArray, wanted: ImportDescription, file: Table) -> None:
     """Refuse outliers: one absurd number would make the count of its column so coarse that the others become zero."""
     size = np.abs(current)
     usual = np.percentile(size, 99.0, axis=0)
@@ -245,7 +335,7 @@ def _check_current(current: FloatArray, wanted: ImportDescription, file: TableFi
             )
         if size[row, index] > LARGEST_OUTLIER * max(usual[index], 1e-200):
             raise TableUnfit(
-                f"{file.path}:{file.first_line + row}, column {column}",
+                file.place(row, column),
                 found=f"{current[row, index]:.6g}, while 99 % of the column are within {usual[index]:.3g}",
                 expected="a current",
                 remedy="samples are never invented: cut the recording there, or export it again",
@@ -289,153 +379,3 @@ def _check_motion(name: str, joint_rad: FloatArray, cell: Cell) -> None:
             expected=f"at least {100.0 * SMALLEST_MOTION:g} % on one joint",
             remedy="most likely radians were taken for degrees, or joint for motor side; correct the description",
         )
-
-
-@dataclass(frozen=True, slots=True)
-class TableFile:
-    """A CSV file as lines."""
-
-    path: Path  #: path of the file
-    table: Table  #: its layout
-    names: tuple[str, ...]  #: column names from the header; empty without one
-    rows: tuple[str, ...]  #: lines of numbers
-    first_line: int  #: line number of the first row, from 1
-
-    def fields(self, row: str) -> list[str]:
-        """Split a line into fields without quotes and white space."""
-        parts = row.split() if self.table.delimiter == " " else row.split(self.table.delimiter)
-        return [part.strip().strip('"').strip() for part in parts]
-
-
-def read_table(path: Path, table: Table) -> TableFile:
-    """Read a file as lines, all of the same number of fields.
-
-    Raises:
-        TableUnfit: the file cannot be read, has no rows, ends early, or a line has another number of fields.
-    """
-    try:
-        with open_regular(path) as stream:
-            text = stream.read().decode("utf-8-sig")
-    except OSError as error:
-        raise TableUnfit(
-            str(path),
-            found=(error.strerror or type(error).__name__).lower(),
-            expected="a CSV file",
-            remedy="check --data and the file name in the import description",
-        ) from error
-    except UnicodeDecodeError as error:
-        raise TableUnfit(
-            str(path), found=f"byte {error.start} is no UTF-8", expected="text", remedy="is this a CSV file?"
-        ) from error
-    lines = text.splitlines()
-    if len(lines) > 1 and not text.endswith(("\n", "\r")):
-        # The last number may lack digits without any other sign.
-        raise TableUnfit(
-            f"{path}:{len(lines)}",
-            found=f"a last line {lines[-1][-40:]!r} without an end of line",
-            expected="an end of line, as after all others",
-            remedy="the file ends early: export or copy it again; if the exporter never writes the last one, add it",
-        )
-    while lines and not lines[-1].strip():
-        lines.pop()
-    start = table.skip_rows + (1 if table.header else 0)
-    rows = tuple(lines[start:])
-    if not rows:
-        raise TableUnfit(
-            str(path),
-            found=f"{len(lines)} lines, of which {min(start, len(lines))} before the numbers",
-            expected="a line of numbers for each sample",
-            remedy="was the export interrupted?",
-        )
-    bare = TableFile(path, table, (), rows, start + 1)
-    names = tuple(bare.fields(lines[table.skip_rows])) if table.header else ()
-    _check_shape(bare, len(names))
-    return TableFile(path, table, names, rows, start + 1)
-
-
-def numbers(file: TableFile, columns: Sequence[str | int]) -> FloatArray:
-    """Read columns as numbers, shape (k, len(columns)).
-
-    Raises:
-        TableUnfit: a column is missing, or a field is not a finite number.
-    """
-    indices = [_index(file, column) for column in columns]
-    table = file.table
-    rows = [row.replace(",", ".") for row in file.rows] if table.decimal == "," else file.rows
-    try:
-        values = np.loadtxt(
-            rows,
-            delimiter=None if table.delimiter == " " else table.delimiter,
-            usecols=indices,
-            ndmin=2,
-            comments=None,
-            quotechar='"',
-        )
-    except ValueError as error:
-        raise _not_numeric(file, indices) from error
-    if not np.isfinite(values).all():
-        raise _not_numeric(file, indices)
-    return np.asarray(values, dtype=np.float64)
-
-
-def _check_shape(file: TableFile, named: int) -> None:
-    counts = np.array([len(file.fields(row)) for row in file.rows])
-    usual = named or Counter(counts.tolist()).most_common(1)[0][0]
-    wrong = np.flatnonzero(counts != usual)
-    last = len(file.rows) - 1
-    if wrong.size and (wrong[0] != last or counts[last] > usual or last == 0):
-        first = int(wrong[0])
-        raise TableUnfit(
-            f"{file.path}:{file.first_line + first}",
-            found=f"{counts[first]} columns",
-            expected=f"{usual}, as in {'the header' if named else 'most lines'}",
-            remedy="check the delimiter in the import description, and the export",
-        )
-    if wrong.size or not file.fields(file.rows[last])[-1]:
-        raise TableUnfit(
-            f"{file.path}:{file.first_line + last}",
-            found=f"a last line {file.rows[last][-40:]!r} of {counts[last]} fields",
-            expected=f"{usual} complete fields",
-            remedy="the file ends early; export or copy it again",
-        )
-
-
-def _index(file: TableFile, column: str | int) -> int:
-    width = len(file.fields(file.rows[0]))
-    if isinstance(column, int):
-        if column <= width:
-            return column - 1
-        raise TableUnfit(
-            str(file.path), found=f"{width} columns", expected=f"a column {column}", remedy="columns count from 1"
-        )
-    if file.names.count(column) == 1:
-        return file.names.index(column)
-    raise TableUnfit(
-        str(file.path),
-        found=f"columns {', '.join(file.names)}",
-        expected=f"one column {column!r}",
-        remedy="correct `columns` in the import description",
-    )
-
-
-def _not_numeric(file: TableFile, indices: list[int]) -> TableUnfit:
-    """Make the error for the first field that is not a finite number."""
-    for number, row in enumerate(file.rows):
-        fields = file.fields(row)
-        for index in indices:
-            text = fields[index].replace(",", ".") if file.table.decimal == "," else fields[index]
-            try:
-                finite = math.isfinite(float(text))
-            except ValueError:
-                finite = False
-            if not finite:
-                label = file.names[index] if file.names else str(index + 1)
-                return TableUnfit(
-                    f"{file.path}:{file.first_line + number}, column {label}",
-                    found=repr(fields[index]),
-                    expected="a finite number",
-                    remedy="samples are never invented: cut the recording there, or export it again",
-                )
-    return TableUnfit(
-        str(file.path), found="fields that are no numbers", expected="numbers", remedy="check the decimal sign"
-    )

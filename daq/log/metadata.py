@@ -18,9 +18,13 @@ T = TypeVar("T")
 
 RUN, STATISTICS, READBACK = "drivegain.run", "drivegain.statistics", "readback.json"
 """Names of two metadata records and an attachment."""
+RECORDED = "recorded"  #: Origin of a log that is no import; `salvage` adds to it
 LARGEST_COUNT = 2**64  #: Largest number of cycles, which are uint64 in the log
 VERSION = "1"  #: Version of the log contract; a reader refuses any other
 SEAL = "crc32"  #: Entry with the checksum of the others. Outside chunks, a log without its end has no other checksum.
+
+
+_Count = Annotated[int, Field(ge=0, le=LARGEST_COUNT)]
 
 
 class Role(Enum):
@@ -28,6 +32,23 @@ class Role(Enum):
 
     UNLOADED = "unloaded"
     LOADED = "loaded"
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Time stamps of an imported recording, and the uniform clock that its log has (`daq.log.resampling`)."""
+
+    rows: _Count  #: rows of the file
+    rate_hz: FiniteFloat  #: rate of the log [Hz]
+    usual_step_s: FiniteFloat  #: median step between stamps [s]
+    longest_step_s: FiniteFloat  #: longest step [s]
+    jitter_s: FiniteFloat  #: standard deviation of the steps, missing samples apart [s]
+    drift_s: FiniteFloat  #: largest distance of a stamp from a uniform clock that starts with the first one [s]
+    missing: _Count  #: samples that are missing between the first and the last; interpolated
+    resampled: bool  #: whether the samples were moved to a uniform clock
+    duplicates: _Count = 0  #: rows left out because they repeat the one before
+    close: _Count = 0  #: samples left out because they are too close to the one before to tell a speed
+    started_s: FiniteFloat | None = None  #: first stamp by the file's clock [s]; None before zero, as of a trigger's
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +62,17 @@ class RunInfo:
     software: str  #: name and version of the recorder
     started_wall_ns: int  #: Unix time of the start [ns]
     started_monotonic_ns: int  #: the monotonic clock at the same moment [ns]; the difference reveals a clock jump
-    origin: str = "recorded"  #: "recorded", or the sources of an import
+    origin: str = RECORDED  #: RECORDED, or the sources of an import
     speed: float = 1.0  #: speed of the moves as a share of the plan's; 1 except for a first run
     #: Mass of the payload as weighed for this recording [kg]; None if it was not entered.
     entered_kg: float | None = None
     controller_sha256: str | None = None  #: digest of the controller's file at the start; None without one
+    timing: Timing | None = None  #: time stamps of an import; None without stamps, and for a recording
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether the samples have the time at which they were taken, not only their order."""
+        return self.origin.startswith(RECORDED) or (self.timing is not None and self.timing.started_s is not None)
 
     @property
     def role(self) -> Role:
@@ -56,9 +83,6 @@ class RunInfo:
     def wall_minus_monotonic_ns(self) -> int:
         """Offset between the stamps of the samples and the monotonic clock of the recording computer [ns]."""
         return self.started_wall_ns - self.started_monotonic_ns
-
-
-_Count = Annotated[int, Field(ge=0, le=LARGEST_COUNT)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +120,12 @@ def run_record(info: RunInfo) -> dict[str, str]:
         "speed": repr(info.speed),
         "payload_entered_kg": "" if info.entered_kg is None else repr(info.entered_kg),
         "controller_sha256": info.controller_sha256 or "",
+        "timing": "" if info.timing is None else json.dumps(asdict(info.timing)),
     }
 
 
 def run_from_record(record: Mapping[str, str]) -> RunInfo:
-    """Decode `run_record`; logs of earlier versions lack speed, second weighing and controller.
+    """Decode `run_record`; logs of earlier versions lack speed, second weighing, controller and timing.
 
     Raises:
         KeyError: an entry is missing.
@@ -138,6 +163,7 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
         speed=speed,
         entered_kg=float(entered) if entered else None,
         controller_sha256=record.get("controller_sha256") or None,
+        timing=_validated(Timing, timing) if (timing := record.get("timing")) else None,
     )
 
 

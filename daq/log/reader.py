@@ -13,6 +13,7 @@ from mcap.records import Attachment, Chunk, Header, McapRecord, Metadata
 from numpy.typing import NDArray
 
 from daq.errors import LogIncomplete, LogMissing, LogUnreadable
+from daq.log.bag_table import foreign_recording
 from daq.log.container import UNFINISHED, ChunkContents, RecordFile
 from daq.log.message import ENCAPSULATION_WORD, SAMPLES_TOPIC
 from daq.log.metadata import (
@@ -94,7 +95,13 @@ class LogReader:
 
     def __iter__(self) -> Iterator[SampleBlock]:
         """Yield blocks of samples; events are collected meanwhile."""
-        yield from self._blocks(self._file)
+        try:
+            yield from self._blocks(self._file)
+        except LogUnreadable as error:
+            foreign = foreign_recording(self.path)
+            if foreign is None:
+                raise
+            raise foreign from error
 
     def until_damage(self) -> Iterator[SampleBlock]:
         """Yield the blocks before the damage of a log without a valid end; `damage` is then its description.
@@ -107,7 +114,7 @@ class LogReader:
         except LogMissing:
             raise
         except LogUnreadable as damage:
-            self.damage = damage
+            self.damage = foreign_recording(self.path) or damage
 
     @property
     def events(self) -> list[CellEvent]:
@@ -182,7 +189,8 @@ class LogReader:
             run = run_from_record(self._metadata[RUN])
             readback = readback_from_bytes(self._attachments[READBACK])
         except (KeyError, ValueError, RecursionError) as error:
-            raise self._incomplete(error, f"metadata {RUN!r} and attachment {READBACK!r}") from error
+            incomplete = self._incomplete(error, f"metadata {RUN!r} and attachment {READBACK!r}")
+            raise foreign_recording(self.path) or incomplete from error
         return LogHead(run, readback, self._attachments)
 
     @property

@@ -7,6 +7,7 @@ import os
 import shutil
 from math import pi
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,10 @@ from daq.config.yaml_file import parse_yaml
 from daq.errors import ConfigurationInconsistent, OutputFailed, TableUnfit, UsageError
 from daq.log.conversion import load_run
 from daq.log.csv_import import import_csv, quantise
+from daq.log.reader import read_log
+from daq.report.log import describe_log
 
+FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 NAMES = [f"q{i}" for i in range(1, 7)] + [f"i{i}" for i in range(1, 7)]
 
 
@@ -44,7 +48,7 @@ class Bench:
         self.describe()
         return self
 
-    def write_csv(self, values: np.ndarray[tuple[int, ...], np.dtype[np.float64]], delimiter: str = ",") -> None:
+    def write_csv(self, values: FloatArray, delimiter: str = ",") -> None:
         """The recording, positions before currents."""
         lines = [delimiter.join(NAMES), *(delimiter.join(map(repr, row)) for row in values.tolist())]
         (self.data / "run.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -114,7 +118,7 @@ def test_motor_radians_counts_and_joint_degrees_are_the_same_run(bench: Bench) -
         np.testing.assert_allclose(load_run(bench.out)[0].position_rad, np.radians(bench.joint_deg), atol=3e-6)
 
 
-def load_run_of(bench: Bench) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def load_run_of(bench: Bench) -> FloatArray:
     """R of the bench's cell."""
     tree = parse_yaml((bench.folder / "configs/cells/demo.yaml").read_bytes(), "cell").tree
     return np.array(tree["drive_train"]["ratio"], dtype=np.float64)
@@ -147,7 +151,7 @@ def test_the_same_files_give_the_same_log(bench: Bench) -> None:
 
 
 @given(arrays(np.float64, (5, 2), elements=st.floats(-1e12, 1e12)))
-def test_nothing_is_lost_by_counting(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> None:
+def test_nothing_is_lost_by_counting(values: FloatArray) -> None:
     raw, quantum = quantise(values)
     largest = np.abs(values).max(axis=0)
     assert np.abs(raw).max() <= 2**31 - 1
@@ -337,7 +341,7 @@ def test_rates_beyond_reason(bench: Bench, capsys: pytest.CaptureFixture[str], c
     _refused(bench, capsys, 6, "rate_hz")
 
 
-def _with_time(bench: Bench, time_s: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> None:
+def _with_time(bench: Bench, time_s: np.ndarray[tuple[Any, ...], np.dtype[np.floating[Any]]]) -> None:
     lines = (bench.data / "run.csv").read_text(encoding="utf-8").splitlines()
     timed = ["t," + lines[0], *(f"{t!r},{line}" for t, line in zip(time_s.tolist(), lines[1:], strict=True))]
     (bench.data / "run.csv").write_text("\n".join(timed) + "\n", encoding="utf-8")
@@ -350,12 +354,196 @@ def test_the_rate_of_a_time_column(bench: Bench) -> None:
     assert load_run(bench.out)[0].rate_hz == pytest.approx(250.0)
 
 
-@pytest.mark.parametrize(("index", "shift"), [(100, 4.0), (100, -4.0), (299, 3.0)])
+@pytest.mark.parametrize(("index", "shift"), [(100, 12.0), (100, -4.0), (100, -5.0), (299, 9.0)])
 def test_a_jump_in_the_time_column(bench: Bench, index: int, shift: float) -> None:
     _with_time(bench, 4.0 * np.arange(300) + shift * (np.arange(300) >= index))
     with pytest.raises(TableUnfit, match=rf"run\.csv:{index + 2}, column t"):
         import_csv(bench.description, bench.data, bench.out, software="x")
     assert bench.left == []
+
+
+UNEVEN_MS = np.concatenate(([0], np.cumsum(np.random.default_rng(3).choice([3, 5], 299)))).astype(np.float64)
+
+
+def test_a_uniform_time_column_gives_the_samples_of_a_rate(bench: Bench) -> None:
+    assert bench.run() == 0
+    expected = read_log(bench.out).samples
+    bench.out.unlink()
+    _with_time(bench, np.arange(300.0))
+    assert bench.run() == 0
+    found = read_log(bench.out).samples
+    for name in ("time_ns", "position_counts", "current_raw"):
+        assert np.array_equal(getattr(found, name), getattr(expected, name))
+
+
+def test_jittered_stamps_are_the_sample_times(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.joint_deg = 20.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))
+    bench.current_a = np.cos(UNEVEN_MS[:, None] / 280.0 + np.arange(6))
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    _with_time(bench, UNEVEN_MS)
+    assert main(["import", str(bench.description), "--data", str(bench.data), "--out", str(bench.out), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["timing"]["resampled"] is True
+    assert document["timing"]["longest_step_s"] == pytest.approx(0.005)
+    assert describe_log(bench.out)["timing"] == document["timing"]
+    run = load_run(bench.out)[0]
+    at_ms = 1e3 * run.time_s[:, None]
+    assert np.abs(np.degrees(run.position_rad) - 20.0 * np.sin(at_ms / 160.0 + np.arange(6))).max() < 1e-3
+    np.testing.assert_allclose(run.current_a, np.cos(at_ms / 280.0 + np.arange(6)), atol=(5.0 / 280.0) ** 2 / 8)
+
+
+def test_resampled_counts_go_on_over_a_wrap_and_are_finer_than_a_count(bench: Bench) -> None:
+    """An encoder of 30 bits on the first motor wraps after two turns; those of the others have 10 bits."""
+    cell = bench.folder / "configs/cells/demo.yaml"
+    text = cell.read_text(encoding="utf-8").replace("revolution: 65536", f"revolution: {2**30}", 1)
+    cell.write_text(text.replace("revolution: 65536", "revolution: 1024"), encoding="utf-8")
+    turn = np.array([2**30, *[1024] * 5])
+    ratio = load_run_of(bench)
+    joint_rad = np.radians(30.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6)))
+    counts = np.rint(joint_rad @ ratio.T / (2 * pi) * turn).astype(np.int64).astype(np.int32).astype(np.float64)
+    assert np.abs(np.diff(counts[:, 0])).max() > 2**31
+    bench.write_csv(np.hstack((counts, bench.current_a)))
+    _with_time(bench, UNEVEN_MS)
+    counted = {"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
+    bench.describe(rate_hz=None, position=counted, time={"file": "run.csv", "column": "t", "unit": "ms"})
+    assert bench.run() == 0
+    run = load_run(bench.out)[0]
+    expected = np.radians(30.0 * np.sin(1e3 * run.time_s[:, None] / 160.0 + np.arange(6)))
+    error = ((run.position_rad - expected) @ ratio.T / (2 * pi) * turn)[:, 1:]
+    assert np.abs(error).max() < 1.0
+    assert np.sqrt(np.mean(error**2)) < 0.35  # once rounded; a second time would make 0.41 of 0.29
+    assert np.abs(run.position_rad[:, 0] - expected[:, 0]).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("first", "unit", "started_s", "recorded"),
+    [(0.0, "ms", 0.0, False), (512_300.0, "ms", 512.3, False), (1_772_348_400_000.0, "ms", 1_772_348_400.0, True)],
+)
+def test_the_first_stamp_is_when_the_run_began(
+    bench: Bench, first: float, unit: str, started_s: float, recorded: bool
+) -> None:
+    _with_time(bench, first + 4.0 * np.arange(300))
+    assert bench.run() == 0
+    run = load_run(bench.out)[0]
+    assert run.started_s == pytest.approx(started_s, abs=1e-6)
+    assert run.recording is not None
+    assert (run.recording.recorded_s is not None) is recorded
+
+
+def test_without_stamps_or_before_a_trigger_nothing_is_known_of_the_start(bench: Bench) -> None:
+    assert bench.run() == 0
+    assert load_run(bench.out)[0].started_s is None
+    bench.out.unlink()
+    _with_time(bench, 4.0 * np.arange(300) - 100.0)
+    assert bench.run() == 0
+    assert load_run(bench.out)[0].started_s is None
+
+
+def test_a_date_in_a_file_is_when_the_run_began(bench: Bench) -> None:
+    _with_time(bench, np.arange(300.0))
+    path = bench.data / "run.csv"
+    head, *rows = path.read_text(encoding="utf-8").splitlines()
+    dated = [f"2026-03-01T08:00:{index // 100:02d}.{index % 100:02d}+01:00," for index in range(300)]
+    text = "\n".join([head, *(date + row.partition(",")[2] for date, row in zip(dated, rows, strict=True))])
+    path.write_text(text + "\n", encoding="utf-8")
+    bench.describe(rate_hz=None, time={"file": "run.csv", "column": "t", "unit": "iso8601"})
+    assert bench.run() == 0
+    run = load_run(bench.out)[0]
+    assert run.rate_hz == pytest.approx(100.0)
+    assert run.started_s == 1_772_348_400.0
+
+
+def test_a_unit_that_makes_a_stamp_absurd(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    _with_time(bench, 1_772_348_400_000_000.0 + 4.0 * np.arange(300))
+    _refused(bench, capsys, 4, "run.csv:2, column t", "correct `unit` of `time`")
+
+
+def test_a_first_row_that_is_there_twice(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    _with_time(bench, 4.0 * np.arange(300))
+    rows = (bench.data / "run.csv").read_text(encoding="utf-8").splitlines()
+    bench.spoil_csv(rows[1], f"{rows[1]}\n{rows[1]}")
+    assert bench.run() == 0
+    assert "1 duplicated and dropped" in capsys.readouterr().out
+    np.testing.assert_allclose(load_run(bench.out)[0].position_rad, np.radians(bench.joint_deg), atol=2e-9)
+
+
+def test_zero_offsets_count_on_the_joint_side_too(bench: Bench) -> None:
+    cell = bench.folder / "configs/cells/demo.yaml"
+    text = cell.read_text(encoding="utf-8")
+    cell.write_text(text.replace("zero_offset_deg: 0.0", "zero_offset_deg: 30.0", 1), encoding="utf-8")
+    assert bench.run() == 0
+    expected = np.radians(bench.joint_deg + np.array([30.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(load_run(bench.out)[0].position_rad, expected, atol=2e-9)
+
+
+@pytest.mark.parametrize("mapping", [False, True])
+def test_a_factor_for_each_axis(bench: Bench, mapping: bool) -> None:
+    factors = [0.5, 1, -2.0, 0.1, 3, 1.0]
+    named = dict(reversed([*zip((f"J{i}" for i in range(1, 7)), factors, strict=True)]))
+    factor = named if mapping else factors
+    bench.describe(current={"file": "run.csv", "columns": NAMES[6:], "unit": "A", "factor": factor})
+    assert bench.run() == 0
+    np.testing.assert_allclose(load_run(bench.out)[0].current_a, bench.current_a * factors, atol=3e-9)
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [
+        ([1.0, 2.0], ("current.factor", "(1.0, 2.0)", "one for each of J1, J2")),
+        ({"J1": 1.0, "J9": 1.0}, ("current.factor", "'J9': 1.0", "a mapping from their names")),
+        ([1.0, 2.0, 3.0, 0.0, 1.0, 1.0], ("current.factor", "0")),
+        ({"J1": 0.0}, ("current.factor", "0")),
+    ],
+)
+def test_factors_of_other_axes(
+    bench: Bench, capsys: pytest.CaptureFixture[str], factor: object, said: tuple[str, ...]
+) -> None:
+    bench.describe(current={"file": "run.csv", "columns": NAMES[6:], "unit": "A", "factor": factor})
+    _refused(bench, capsys, 6, *said)
+
+
+SPEEDS = [f"v{i}" for i in range(1, 7)]
+
+
+def _with_velocity(bench: Bench, velocity_deg_s: FloatArray, **changes: object) -> None:
+    header = ",".join((*NAMES, *SPEEDS))
+    values = np.hstack((bench.joint_deg, bench.current_a, velocity_deg_s))
+    np.savetxt(bench.data / "run.csv", values, delimiter=",", header=header, comments="")
+    bench.describe(
+        velocity={"file": "run.csv", "columns": SPEEDS, "unit": "deg/s", "side": "joint", **changes},
+    )
+
+
+def _velocity_deg_s() -> FloatArray:
+    return 20.0 / 0.040 * np.cos(np.arange(300)[:, None] / 40.0 + np.arange(6))
+
+
+@pytest.mark.parametrize("side", ["joint", "motor"])
+@pytest.mark.parametrize("unit", ["deg/s", "rad/s"])
+def test_velocities_that_agree_change_nothing(bench: Bench, side: str, unit: str) -> None:
+    assert bench.run() == 0
+    expected = read_log(bench.out).samples.position_counts
+    bench.out.unlink()
+    velocity = _velocity_deg_s() + np.random.default_rng(0).normal(scale=20.0, size=(300, 6))
+    velocity = velocity if unit == "deg/s" else np.radians(velocity)
+    _with_velocity(bench, velocity if side == "joint" else velocity @ load_run_of(bench).T, side=side, unit=unit)
+    assert bench.run() == 0
+    assert np.array_equal(read_log(bench.out).samples.position_counts, expected)
+
+
+@pytest.mark.parametrize(
+    ("factors", "said"),
+    [
+        ((1, 1, -1, 1, 1, 1), ("column v3, axis J3", "move -1 times as fast", "agree with the positions to 20 %")),
+        ((1, 1, 1, 1, pi / 180, 1), ("axis J5", "move 57.3 times as fast")),
+        ((0, 1, 1, 1, 1, 1), ("axis J1", "differ from it by 100 %")),
+    ],
+)
+def test_velocities_that_disagree_name_the_axis(
+    bench: Bench, capsys: pytest.CaptureFixture[str], factors: tuple[float, ...], said: tuple[str, ...]
+) -> None:
+    _with_velocity(bench, _velocity_deg_s() * factors)
+    _refused(bench, capsys, 4, *said)
 
 
 def test_counts_need_an_encoder(bench: Bench) -> None:

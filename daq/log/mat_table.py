@@ -1,0 +1,270 @@
+"""Read MATLAB files of format 5 (`save -v6`, `save -v7`) as tables.
+
+A column is named as the variable, or `struct.field`; a matrix adds the number of its column, counted from 1: `q.1`,
+`run.q.1`. The longer side of a matrix is time.
+
+The file may be truncated, damaged or malicious: only the named variables are unpacked, every length is compared with
+the bytes that are there, nothing is followed deeper than the fields of a struct, and no object is ever built.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daq.config.import_description import Column, ImportDescription, TimeColumn, TimeUnit
+from daq.errors import TableUnfit
+from daq.files import read_regular
+from daq.log.table import Stamps, Table, digest_of, require_finite, stamps_of_ns, stamps_of_numbers
+
+MAGIC = b"MATLAB 5.0 MAT-file"
+LARGEST_BYTES = 2**31 - 1  #: Largest file and variable; the format has no larger ones
+LARGEST_RATIO = 200  #: Largest ratio of an unpacked variable to its packed bytes, beyond SMALL_BYTES
+SMALL_BYTES = 64 * 2**20
+_HEADER_BYTES = 128
+_PEEK_BYTES = 4096  #: Class, dimensions and name of a variable are in its first bytes
+
+# Types of elements and classes of arrays, by their numbers in the format.
+_MATRIX, _COMPRESSED = 14, 15
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_STRUCT, _OPAQUE, _FLOATS, _INTEGERS = 2, 17, (6, 7), range(8, 16)
+_KINDS = {
+    1: "a cell array", 3: "an object", 4: "text", 5: "a sparse matrix", 16: "a function",
+    17: "an object (a table, timetable, timeseries, datetime or duration)",
+}  # fmt: skip
+_COMPLEX = 0x0800
+
+
+def read_mat(path: Path, _wanted: ImportDescription, columns: tuple[Column, ...], time: TimeColumn | None) -> Table:
+    """Read columns of a MATLAB file.
+
+    Raises:
+        TableUnfit: the file cannot be read, is of another format, a variable is missing or holds no real numbers, or
+            the columns are of different lengths.
+    """
+    if time is not None and time.unit is TimeUnit.ISO_8601:
+        raise TableUnfit(
+            str(path),
+            found=f"time column {time.column!r} in {time.unit.value}",
+            expected="numbers in s, ms, us or ns",
+            remedy="in MATLAB, posixtime(t) makes seconds of a datetime",
+        )
+    file = _MatFile(path, _content(path))
+    names = columns if time is None else (*columns, time.column)
+    found = [file.column(name) for name in names]
+    if len({len(numbers) for numbers in found}) > 1:
+        raise TableUnfit(
+            str(path),
+            found=", ".join(f"{len(numbers)} values in {name}" for name, numbers in zip(names, found, strict=True)),
+            expected="as many in each",
+            remedy="are they of one run? the longer side of a matrix is taken for time",
+        )
+    values = require_finite(Table(path, names, np.column_stack([one.astype(np.float64) for one in found]), "")).values
+    values, clock = values[:, : len(columns)], None if time is None else _stamps(found[-1], time)
+    return Table(path, columns, values, digest_of(values, clock), clock)
+
+
+def _stamps(values: NDArray[Any], time: TimeColumn) -> Stamps:
+    factor = round(time.unit.seconds * 1e9)
+    if values.dtype.kind in "iu" and np.abs(values.astype(np.float64)).max() * factor < 2.0**62:
+        return stamps_of_ns((values.astype(np.int64) * factor).tolist())
+    return stamps_of_numbers(values.astype(np.float64), time.unit)
+
+
+def _content(path: Path) -> memoryview:
+    """Read a file of format 5.
+
+    Raises:
+        TableUnfit: it cannot be read, or is of another format.
+    """
+    try:
+        content = read_regular(path, LARGEST_BYTES)
+    except OSError as error:
+        raise TableUnfit(
+            str(path),
+            found=(error.strerror or type(error).__name__).lower(),
+            expected="a MATLAB file (.mat) of at most 2 GB",
+            remedy="check --data and the file name in the import description",
+        ) from error
+    if content.startswith(MAGIC) and content[126:128] in (b"IM", b"MI"):
+        return memoryview(content)
+    newer = b"\x89HDF\r\n" in content[: 512 + 8]
+    raise TableUnfit(
+        str(path),
+        found="a MATLAB file of format 7.3 (HDF5)" if newer else f"first bytes {content[:20]!r}",
+        expected="a MATLAB file of format 5, as `save -v7` writes it",
+        remedy="in MATLAB: save('run.mat', 'q', 'i', 't', '-v7') with the names of your variables",
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Array:
+    """An array whose numbers are not yet read."""
+
+    kind: int  #: class
+    shape: tuple[int, ...]  #: dimensions
+    imaginary: bool  #: complex numbers
+    body: memoryview  #: elements behind the name
+
+    def __str__(self) -> str:
+        size = "×".join(map(str, self.shape))
+        return _KINDS.get(self.kind, f"{size} struct" if self.kind == _STRUCT else size + " complex" * self.imaginary)
+
+
+class _MatFile:
+    """The variables of a file, unpacked when they are asked for."""
+
+    def __init__(self, path: Path, content: memoryview) -> None:
+        self._path = path
+        self._order = "<" if bytes(content[126:128]) == b"IM" else ">"
+        self._read: dict[str, NDArray[Any]] = {}
+        try:
+            self._variables = dict(self._found(content[_HEADER_BYTES:]))
+        except (ValueError, struct.error, zlib.error) as error:
+            raise self._broken(error) from error
+
+    def _found(self, data: memoryview) -> Iterator[tuple[str, tuple[_Array, memoryview | None]]]:
+        """Name, array and packed bytes of each variable; an array that is packed lacks its body yet."""
+        at = 0
+        while at < len(data):
+            kind, body, at = self._element(data, at)
+            if kind == _COMPRESSED:
+                start = memoryview(zlib.decompressobj().decompress(body, _PEEK_BYTES))[8:]
+                name, array = self._head(start)
+                yield name, (array, body)
+            elif kind == _MATRIX:
+                name, array = self._head(body)
+                yield name, (array, None)
+            else:
+                raise ValueError(f"an element of type {kind}")
+
+    def column(self, column: Column) -> NDArray[Any]:
+        """Return a column as numbers, shape (k,).
+
+        Raises:
+            TableUnfit: it is not there, or holds no real numbers.
+        """
+        parts = str(column).split(".")
+        number = int(parts.pop()) if len(parts) > 1 and parts[-1].isascii() and parts[-1].isdigit() else None
+        name = ".".join(parts)
+        if name not in self._read:
+            try:
+                self._read[name] = self._numbers(name, parts)
+            except (ValueError, struct.error, zlib.error, MemoryError) as error:
+                raise self._broken(error) from error
+        values = self._read[name]
+        width = values.shape[1]
+        if number is None and width == 1:
+            number = 1
+        if number is None or not 1 <= number <= width:
+            known = f"{name}.1" if width == 1 else f"{name}.1 to {name}.{width}"
+            raise self._unfit(f"column {column}, and {name} has {width} columns", f"one of {known}")
+        return values[:, number - 1]
+
+    def _numbers(self, name: str, parts: list[str]) -> NDArray[Any]:
+        """Read the array of a variable or field, shape (k, columns)."""
+        known = {variable: array for variable, (array, _) in self._variables.items() if variable}
+        if parts[0] not in known:
+            raise self._unfit(f"no variable {parts[0]!r}", "one of " + _listed(known))
+        array = self._whole(parts[0])
+        if array.kind == _STRUCT and len(parts) == 2 and prod(array.shape) == 1:
+            fields = dict(self._fields(array))
+            if parts[1] not in fields:
+                raise self._unfit(f"no field {name!r}", f"one of {_listed(fields, parts[0] + '.')}")
+            array = fields[parts[1]]
+        elif array.kind == _STRUCT or len(parts) > 1:
+            found = f"{name}, where {parts[0]} is {array}"
+            raise self._unfit(found, "VARIABLE, or STRUCT.FIELD of one struct, and .NUMBER for a column of a matrix")
+        if array.kind not in (*_FLOATS, *_INTEGERS) or array.imaginary:
+            raise self._unfit(f"{name}, {array}", "real numbers")
+        sides = [side for side in array.shape if side != 1]
+        if not sides or len(sides) > 2 or 0 in sides:
+            raise self._unfit(f"{name} of size {array}", "a column for each axis, a row for each sample")
+        kind, data, _ = self._element(array.body, 0)
+        values = np.frombuffer(data, dtype=self._order + _TYPES.get(kind, "V1"))
+        if values.dtype.kind == "V" or len(values) != prod(sides):
+            raise ValueError(f"{len(values)} numbers for {array}")
+        table = values.reshape(sides[0], -1, order="F")
+        table = table if table.shape[0] >= table.shape[1] else table.T
+        exact = (
+            array.kind in _INTEGERS and table.dtype.kind in "iu" and (table.dtype != np.uint64 or table.max() < 2**63)
+        )
+        return table.astype(np.int64 if exact else np.float64)
+
+    def _whole(self, name: str) -> _Array:
+        """Unpack a variable."""
+        array, packed = self._variables[name]
+        if packed is None:
+            return array
+        unpack = zlib.decompressobj()
+        (size,) = struct.unpack(self._order + "4xI", unpack.decompress(packed, 8))
+        if size > min(LARGEST_BYTES, SMALL_BYTES + LARGEST_RATIO * len(packed)):
+            raise ValueError(f"{len(packed)} bytes that unfold to {size}")
+        body = unpack.decompress(unpack.unconsumed_tail, size)
+        if len(body) < size:
+            raise ValueError(f"{len(body)} bytes of {size} in {name}")
+        return self._head(memoryview(body))[1]
+
+    def _fields(self, array: _Array) -> Iterator[tuple[str, _Array]]:
+        """Name and array of each field of one struct."""
+        _, length, at = self._element(array.body, 0)
+        _, names, at = self._element(array.body, at)
+        (width,) = struct.unpack(self._order + "i", length)
+        if width < 1:
+            raise ValueError(f"names of {width} bytes")
+        for start in range(0, len(names), width):
+            _, body, at = self._element(array.body, at)
+            yield _text(names[start : start + width]), self._head(body)[1]
+
+    def _head(self, body: memoryview) -> tuple[str, _Array]:
+        """Read name, class and dimensions of a matrix."""
+        if not body:  # a field that was never set
+            return "", _Array(_FLOATS[0], (0, 0), imaginary=False, body=body)
+        _, flags, at = self._element(body, 0)
+        (word,) = struct.unpack_from(self._order + "I", flags)
+        kind, shape = word & 0xFF, ()
+        if kind != _OPAQUE:
+            _, sides, at = self._element(body, at)
+            shape = struct.unpack(f"{self._order}{len(sides) // 4}i", sides)
+        _, name, at = self._element(body, at)
+        return _text(name), _Array(kind, shape, bool(word & _COMPLEX), body[at:])
+
+    def _element(self, data: memoryview, at: int) -> tuple[int, memoryview, int]:
+        """Return type and content of the element at an offset, and the offset of the next one."""
+        kind, size = struct.unpack_from(self._order + "II", data, at)
+        start, following = at + 8, at + 8 + size + (0 if kind == _COMPRESSED else -size % 8)
+        if kind >> 16:  # a small element: its size is in the upper half, its content in the second word
+            kind, size, start, following = kind & 0xFFFF, kind >> 16, at + 4, at + 8
+        if start + size > len(data):
+            raise ValueError(f"{len(data) - start} bytes of an element of {size}")
+        return kind, data[start : start + size], following
+
+    def _unfit(self, found: str, expected: str) -> TableUnfit:
+        remedy = "correct `columns` in the import description, or save plain matrices: save('run.mat', 'q', 'i', '-v7')"
+        return TableUnfit(str(self._path), found=found, expected=expected, remedy=remedy)
+
+    def _broken(self, error: Exception) -> TableUnfit:
+        return TableUnfit(
+            str(self._path),
+            found=f"a damaged MATLAB file ({error})",
+            expected="whole variables",
+            remedy="the file ends early or was changed: save or copy it again",
+        )
+
+
+def _text(data: memoryview) -> str:
+    return bytes(data).split(b"\0")[0].decode("latin-1")
+
+
+def _listed(arrays: dict[str, _Array], before: str = "") -> str:
+    """Name up to twelve arrays with their sizes."""
+    names = [f"{before}{name} ({array})" for name, array in arrays.items()]
+    return ", ".join(names[:12] + [f"{len(names) - 12} more"] * (len(names) > 12)) or "none"

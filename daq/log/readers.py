@@ -1,0 +1,69 @@
+"""Choose the reader of a foreign recording by its content: CSV, MATLAB or a ROS 2 bag."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from daq.config.import_description import ImportDescription
+from daq.errors import TableUnfit
+from daq.files import open_regular
+from daq.log.bag_table import FIELDS, read_bag
+from daq.log.container import MAGIC
+from daq.log.csv_table import read_csv
+from daq.log.mat_table import read_mat
+from daq.log.table import Reader
+
+_HEADS: dict[bytes, Reader] = {MAGIC: read_bag, b"MATLAB ": read_mat, b"\x89HDF\r\n": read_mat}
+_SUFFIXES: dict[str, Reader] = {".mcap": read_bag, ".mat": read_mat}
+_UNREADABLE = {
+    b"SQLite format 3\0": ("a ROS 2 bag in SQLite (.db3)", "convert it: `ros2 bag convert` with storage_id mcap"),
+    b"#ROSBAG V": ("a ROS 1 bag", "convert it to a ROS 2 bag in MCAP: `rosbags-convert`"),
+}
+
+
+def reader_of(path: Path) -> Reader:
+    """Return the reader of a file, or of a folder with the parts of a bag; the name decides if the content does not.
+
+    Raises:
+        TableUnfit: the content is of a format that is not read.
+    """
+    if path.is_dir():
+        return read_bag
+    head = b""
+    with suppress(OSError), open_regular(path) as stream:  # the reader reports it
+        head = stream.read(16)
+    for start, (found, remedy) in _UNREADABLE.items():
+        if head.startswith(start):
+            raise TableUnfit(
+                str(path), found=found, expected="CSV, a MATLAB file or a ROS 2 bag in MCAP", remedy=remedy
+            )
+    by_content = next((reader for start, reader in _HEADS.items() if head.startswith(start)), None)
+    return by_content or _SUFFIXES.get(path.suffix.lower(), read_csv)
+
+
+def with_columns(wanted: ImportDescription, data: Path, axis_names: Sequence[str]) -> ImportDescription:
+    """Return a description whose columns are those of its readers, where it has a shorter form.
+
+    The columns of a bag may be joints; the section says which field is meant. A single column may be a whole field
+    (`position`: its joints are called as the axes) or a whole matrix of a MATLAB file (`q`: a column for each axis).
+
+    Raises:
+        TableUnfit: a file is of a format that is not read.
+    """
+    changed = {}
+    for key, field in (("position", "position"), ("current", "effort"), ("velocity", "velocity")):
+        section = getattr(wanted, key)
+        reader = None if section is None else reader_of(data / section.file)
+        if reader is read_bag:
+            names = [str(column) for column in section.columns]
+            if len(names) == 1 and names[0] in FIELDS:
+                names = [f"{names[0]}.{axis}" for axis in axis_names]
+            columns = [name if name.partition(".")[0] in FIELDS else f"{field}.{name}" for name in names]
+            changed[key] = replace(section, columns=tuple(columns))
+        elif reader is read_mat and len(section.columns) == 1 < len(axis_names):
+            columns = [f"{section.columns[0]}.{number + 1}" for number in range(len(axis_names))]
+            changed[key] = replace(section, columns=tuple(columns))
+    return wanted.model_copy(update=changed)

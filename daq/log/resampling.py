@@ -1,0 +1,183 @@
+"""Sample times: judge the stamps of a recording, and resample it to a uniform clock.
+
+Everything after a log assumes evenly spaced samples, as central differences do. A stamp is the time of its sample:
+positions at the ticks of a uniform clock come from a cubic spline through the samples, currents from straight lines
+between them. Where the stamps show a uniform clock, the samples stay as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from daq.config.import_description import TimeColumn
+from daq.errors import TableUnfit
+from daq.log.metadata import Timing
+from daq.log.table import Table
+from ident.arrays import BoolArray, FloatArray, IntArray
+
+EVEN = 1e-3  #: Largest distance of a stamp from a uniform clock that leaves the samples as they are [periods]
+COARSE = 1.5  #: Spread of the rounded stamps of a uniform clock [units of their last digit]: 1, and what the fit adds
+NEAR = 0.25  #: Steps this near to whole numbers of the usual one mean that samples are missing, not late [usual steps]
+CLOSEST = 0.1  #: Shortest step between two samples [usual steps]; a spline through closer ones amplifies their noise
+SLOWEST, QUICKEST = 0.5, 2.0
+"""Rates that may be stated, in multiples of the data's: far below, noise folds into the band of the motion."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clock:
+    """Sample times of the rows of a recording that are used, and the ticks that they are resampled to."""
+
+    row: IntArray  #: rows of the file that are used, shape (k,)
+    time_s: FloatArray  #: their stamps since the first one [s], increasing, shape (k,)
+    tick_s: FloatArray  #: ticks of the uniform clock [s], shape (m,)
+    timing: Timing  #: what the stamps showed
+
+    def positions(self, values: FloatArray) -> FloatArray:
+        """Return positions at the ticks, shape (m, n), by a cubic spline through those of the rows, shape (k, n)."""
+        if not self.timing.resampled:
+            return values
+        from scipy.interpolate import CubicSpline  # noqa: PLC0415 - half of the time of an import without a spline
+
+        return np.asarray(CubicSpline(self.time_s, values)(self.tick_s), dtype=np.float64)
+
+    def currents(self, values: FloatArray) -> FloatArray:
+        """Return currents at the ticks, shape (m, n), by straight lines between those of the rows, shape (k, n)."""
+        if not self.timing.resampled:
+            return values
+        return np.column_stack([np.interp(self.tick_s, self.time_s, column) for column in values.T])
+
+
+def clock_of(table: Table, wanted: TimeColumn, numbers: FloatArray) -> Clock:
+    """Return the clock of a recording.
+
+    Rows that repeat the one before, stamp and all, are left out; so are samples CLOSEST to the one before.
+
+    Args:
+        table: the file with the stamps.
+        wanted: the time column; its rate is that of the ticks, if it has one.
+        numbers: everything that is imported, shape (k, c).
+
+    Raises:
+        TableUnfit: a stamp is earlier than the one before, or repeats it with other numbers; a step is longer than
+            `largest_gap_periods`; or the stated rate is far from that of the stamps.
+    """
+    assert table.stamps is not None  # its reader was asked for them
+    row = np.flatnonzero(_distinct(table, wanted, numbers))
+    time_s = table.stamps.time_s[row]
+    duplicates = len(numbers) - len(row)
+    step_s = np.diff(time_s, prepend=-np.inf)
+    far = step_s >= CLOSEST * np.median(step_s)
+    row, time_s = row[far], time_s[far]
+    if len(row) < 3:
+        raise TableUnfit(
+            str(table.path),
+            found=f"{len(row)} different time stamps in {len(numbers)} rows",
+            expected="one for each sample",
+            remedy="correct `column` and `unit` of `time` in the import description, or give rate_hz instead",
+        )
+    timing = replace(check_stamps(time_s), rows=len(numbers), duplicates=duplicates, close=int(np.count_nonzero(~far)))
+    _check_gaps(table, wanted, row, time_s, timing)
+    if wanted.rate_hz is not None:
+        timing = _at_rate(table, wanted, wanted.rate_hz, time_s, timing)
+    tick_s = np.arange(int(time_s[-1] * timing.rate_hz + EVEN) + 1) / timing.rate_hz
+    return Clock(row, time_s, np.minimum(tick_s, time_s[-1]), timing)
+
+
+def check_stamps(time_s: FloatArray) -> Timing:
+    """Judge time stamps.
+
+    Args:
+        time_s: stamps since the first one [s], increasing, shape (k,) with k > 1.
+
+    Returns:
+        the timing. Its rate is that of the usual step where every step is nearly a whole number of them, else the mean
+        rate.
+    """
+    step_s = np.diff(time_s)
+    usual_s = float(np.median(step_s))
+    periods = np.rint(step_s / usual_s)
+    if not np.all((periods >= 1.0) & (np.abs(step_s / usual_s - periods) < NEAR)):
+        periods = np.ones_like(step_s)
+    rate_hz = float(periods.sum() / time_s[-1])
+    missing = round(float(periods.sum())) - len(step_s)
+    clock_s = np.concatenate(([0.0], np.cumsum(periods))) / rate_hz
+    return Timing(
+        rows=len(time_s),
+        rate_hz=rate_hz,
+        usual_step_s=usual_s,
+        longest_step_s=float(step_s.max()),
+        jitter_s=float(np.std(step_s - periods / rate_hz)),
+        drift_s=float(np.abs(time_s - clock_s).max()),
+        missing=missing,
+        resampled=missing > 0 or not _is_uniform(time_s),
+    )
+
+
+def _is_uniform(time_s: FloatArray) -> bool:
+    """Whether stamps show a uniform clock: exactly, or rounded to a decimal digit.
+
+    Rounding makes steps of two kinds, one unit of the digit apart, and moves every stamp by less than one unit.
+    """
+    index = np.arange(len(time_s)) - 0.5 * (len(time_s) - 1)
+    period_s = float(index @ time_s / (index @ index))
+    spread_s = float(np.ptp(time_s - period_s * index))
+    if spread_s <= 2.0 * EVEN * period_s:
+        return True
+    for digit_s in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
+        digits = time_s / digit_s
+        if np.all(np.abs(digits - np.rint(digits)) < 1e-3):
+            return bool(np.ptp(np.diff(np.rint(digits))) <= 1.0 and spread_s <= COARSE * digit_s)
+    return False
+
+
+def _at_rate(table: Table, wanted: TimeColumn, rate_hz: float, time_s: FloatArray, timing: Timing) -> Timing:
+    """Return the timing with a stated rate; samples stay as they are if it agrees to half a period over the file."""
+    if not SLOWEST <= rate_hz / timing.rate_hz <= QUICKEST:
+        raise TableUnfit(
+            f"{table.path}, column {wanted.column}",
+            found=f"stamps at {timing.rate_hz:.6g} Hz",
+            expected=f"a rate near the stated {rate_hz:g} Hz: at least half and at most twice as large",
+            remedy="correct `rate_hz` or `unit` of `time` in the import description",
+        )
+    ahead = float(time_s[-1]) * abs(rate_hz - timing.rate_hz)  # periods at the last stamp
+    drift_s = max(timing.drift_s, ahead / rate_hz)
+    return replace(timing, rate_hz=rate_hz, drift_s=drift_s, resampled=timing.resampled or ahead >= 0.5)
+
+
+def _distinct(table: Table, wanted: TimeColumn, numbers: FloatArray) -> BoolArray:
+    """Return which rows are not the row before once more, shape (k,)."""
+    assert table.stamps is not None
+    step_s = np.diff(table.stamps.time_s)
+    repeated = (step_s == 0.0) & np.all(numbers[1:] == numbers[:-1], axis=1)
+    if (wrong := (step_s <= 0.0) & ~repeated).any():
+        row = int(np.argmax(wrong)) + 1
+        back_s = -float(step_s[row - 1])
+        raise TableUnfit(
+            table.place(row, wanted.column),
+            found=f"a stamp {back_s:.6g} s before that of the row above"
+            if back_s
+            else "the stamp of the row above, with other numbers",
+            expected="stamps that increase",
+            remedy="were two recordings joined? cut them apart"
+            if back_s
+            else "delete the row that is wrong; if the stamps are coarse, give rate_hz instead of time",
+        )
+    return np.concatenate(([True], ~repeated))
+
+
+def _check_gaps(table: Table, wanted: TimeColumn, row: IntArray, time_s: FloatArray, timing: Timing) -> None:
+    """Refuse gaps: nothing is known of the motion in them."""
+    step_s = np.diff(time_s)
+    gaps = np.flatnonzero(step_s > wanted.largest_gap_periods * timing.usual_step_s * (1.0 + EVEN))
+    if gaps.size:
+        first = int(gaps[0])
+        raise TableUnfit(
+            table.place(int(row[first + 1]), wanted.column),
+            found=f"{step_s[first]:.6g} s after the sample before"
+            + (f", and {len(gaps) - 1} more gaps" if len(gaps) > 1 else ""),
+            expected=f"at most {wanted.largest_gap_periods:g} times the usual {timing.usual_step_s:.6g} s",
+            remedy="samples are missing: import the parts before and after it as two recordings, or allow the gap with "
+            "`largest_gap_periods` of `time`; if these are times of arrival, give rate_hz instead of time",
+        )

@@ -1,0 +1,298 @@
+"""ROS 2 bags: the joint states that an independent writer put in, or an error that says what is there."""
+
+from __future__ import annotations
+
+import json
+import random
+import struct
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from mcap_ros2.writer import Writer as Ros2Writer
+
+from daq.cli import main
+from daq.config.import_description import ImportDescription, TimeColumn, TimeUnit
+from daq.errors import DataError, LogForeign, LogTruncated, TableUnfit
+from daq.log.bag_table import STAMP, joint_state_from_cdr, read_bag
+from daq.log.conversion import load_run
+from daq.log.message import DEFINITIONS, JOINTS_SCHEMA
+from daq.log.reader import read_log
+from daq.log.table import Table
+
+JOINTS = tuple(f"J{number}" for number in range(1, 7))
+START_NS = 1_700_000_000_123_456_789
+STEP_NS = 4_000_000
+ROWS = 200
+POSITION = 0.35 * np.sin(np.arange(ROWS)[:, None] / 9.0 + np.arange(6))
+EFFORT = np.cos(np.arange(ROWS)[:, None] / 7.0 + np.arange(6))
+TIME = TimeColumn(file="run.mcap", column=STAMP, unit=TimeUnit.NANOSECOND)
+COLUMNS = tuple(f"{field}.{joint}" for field in ("position", "effort") for joint in JOINTS)
+
+
+def message(row: int, joints: Sequence[int] = range(6), **changes: Any) -> dict[str, Any]:
+    """A joint state of some joints in a row of the recording, with some fields replaced."""
+    seconds, nanoseconds = divmod(START_NS + row * STEP_NS, 10**9)
+    return {
+        "header": {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": "base"},
+        "name": [JOINTS[joint] for joint in joints],
+        "position": [float(POSITION[row, joint]) for joint in joints],
+        "velocity": [],
+        "effort": [float(EFFORT[row, joint]) for joint in joints],
+        **changes,
+    }
+
+
+def write_bag(path: Path, messages: Iterable[tuple[str, dict[str, Any]]], **options: Any) -> Path:
+    """A bag with these joint states, by topic, each recorded half a millisecond after the one before."""
+    with path.open("wb") as stream, Ros2Writer(stream, **options) as writer:
+        schema = writer.register_msgdef(JOINTS_SCHEMA, DEFINITIONS[JOINTS_SCHEMA])
+        for number, (topic, content) in enumerate(messages):
+            writer.write_message(topic, schema, content, log_time=START_NS + 500_000 * number)
+    return path
+
+
+def describe(topic: str | None = None) -> ImportDescription:
+    """A description; the reader needs its topic alone."""
+    return ImportDescription.model_construct(topic=topic)
+
+
+def read(path: Path, columns: tuple[str, ...] = COLUMNS, topic: str | None = None) -> Table:
+    """Columns with their stamps."""
+    return read_bag(path, describe(topic), columns, TIME)
+
+
+def whole() -> list[tuple[str, dict[str, Any]]]:
+    """The recording, all joints in each message."""
+    return [("/joint_states", message(row)) for row in range(ROWS)]
+
+
+def assert_whole(table: Table) -> None:
+    """The table is the recording, to the last bit."""
+    np.testing.assert_array_equal(table.values, np.hstack((POSITION, EFFORT)))
+    assert table.stamps is not None
+    assert table.stamps.first_ns == START_NS
+    np.testing.assert_allclose(table.stamps.time_s, np.arange(ROWS) * 4e-3, atol=1e-12)
+
+
+@pytest.mark.parametrize("compression", CompressionType)
+def test_a_bag_is_read_as_it_was_written(compression: CompressionType, tmp_path: Path) -> None:
+    assert_whole(read(write_bag(tmp_path / "run.mcap", whole(), compression=compression, chunk_size=4000)))
+
+
+def _repack(source: Path, target: Path, **options: Any) -> Path:
+    """The messages of a bag, written once more by the general writer with its own options."""
+    with source.open("rb") as read_from, target.open("wb") as stream:
+        writer = Writer(stream, **options)
+        writer.start("ros2")
+        channels: dict[int, int] = {}
+        for schema, channel, content in make_reader(read_from).iter_messages():
+            assert schema is not None
+            if channel.id not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, "cdr", number)
+            writer.add_message(channels[channel.id], content.log_time, content.data, content.publish_time)
+        writer.finish()
+    return target
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"use_chunking": False}, {"enable_crcs": False}, {"enable_data_crcs": True}],
+    ids=lambda options: next(iter(options)),
+)
+def test_chunks_and_checksums_are_optional(options: dict[str, Any], tmp_path: Path) -> None:
+    plain = write_bag(tmp_path / "plain.mcap", whole())
+    assert_whole(read(_repack(plain, tmp_path / "run.mcap", **options)))
+
+
+def test_several_publishers_make_one_row_a_stamp(tmp_path: Path) -> None:
+    """The wrist comes from another driver than the arm, a gripper on the same topic is nobody's axis, and the bag began
+    and ended between two messages of one stamp."""
+    parts = [
+        ("/joint_states", part)
+        for row in range(ROWS)
+        for part in (message(row, (2, 0, 1)), message(row, (), name=["finger"]), message(row, (5, 3, 4)))
+    ]
+    table = read(write_bag(tmp_path / "run.mcap", parts))
+    assert_whole(table)
+    assert table.remarks == ()
+    cut = read(write_bag(tmp_path / "cut.mcap", parts[1:-1]))
+    np.testing.assert_array_equal(cut.values, np.hstack((POSITION, EFFORT))[1:-1])
+    assert cut.remarks == ("2 stamps at the ends of the bag lack joints and are left out",)
+    with pytest.raises(TableUnfit, match=r"found no position.J4, .* at 1700000000.163456.*; expected all joints in"):
+        read(write_bag(tmp_path / "gap.mcap", [*parts[:32], *parts[33:]]))
+
+
+def test_the_same_message_twice_is_two_rows(tmp_path: Path) -> None:
+    """The resampling decides what duplicates mean."""
+    bag = write_bag(tmp_path / "run.mcap", [whole()[0], *whole()])
+    assert len(read(bag).values) == ROWS + 1
+
+
+def test_joints_that_are_never_stamped_together_are_refused(tmp_path: Path) -> None:
+    parts = [("/joint_states", message(row, (0, 1, 2) if row % 2 else (3, 4, 5))) for row in range(ROWS)]
+    with pytest.raises(TableUnfit, match=r"found no position.J1, position.J2.*same stamp.*record a topic that has all"):
+        read(write_bag(tmp_path / "run.mcap", parts))
+
+
+def test_without_stamps_the_time_of_recording_is_used(tmp_path: Path) -> None:
+    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
+    table = read(write_bag(tmp_path / "run.mcap", [(topic, {**one, "header": header}) for topic, one in whole()]))
+    assert table.stamps is not None
+    np.testing.assert_allclose(table.stamps.time_s, np.arange(ROWS) * 5e-4, atol=1e-12)
+    assert table.remarks == ("200 messages have no stamp; the time of their recording is used",)
+
+
+def test_a_folder_is_one_bag_of_several_files(tmp_path: Path) -> None:
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    for number in range(11):
+        write_bag(folder / f"bag_{number}.mcap", whole()[number * 20 : (number + 1) * 20])
+    assert_whole(read(folder))
+
+
+def test_a_topic_is_chosen(tmp_path: Path) -> None:
+    others = [("/desired", {**one, "position": [9.0] * 6}) for _, one in whole()]
+    bag = write_bag(tmp_path / "run.mcap", [*others, *whole()])
+    with pytest.raises(TableUnfit, match=r"found joint states on 2 topics, /desired, /joint_states; .*`topic: NAME`"):
+        read(bag)
+    assert_whole(read(bag, topic="/joint_states"))
+    with pytest.raises(TableUnfit, match="found topics /desired, /joint_states; expected /arm of type sensor_msgs"):
+        read(bag, topic="/arm")
+
+
+@pytest.mark.parametrize(
+    ("columns", "changes", "error"),
+    [
+        (("position.J7",), {}, "found joints J1, J2, J3, J4, J5, J6; expected those of position.J7"),
+        (("torque.J1",), {}, "found column 'torque.J1'; expected position.JOINT, velocity.JOINT or effort.JOINT"),
+        (("velocity.J1",), {}, "6 names and 0 values of velocity"),
+        (("effort.J1",), {"effort": [1.0, float("nan")] + [0.0] * 4}, None),
+        (("effort.J2",), {"effort": [1.0, float("nan")] + [0.0] * 4}, "row 1, column effort.J2: found nan"),
+    ],
+)
+def test_what_a_bag_lacks_is_named(
+    columns: tuple[str, ...], changes: dict[str, Any], error: str | None, tmp_path: Path
+) -> None:
+    bag = write_bag(tmp_path / "run.mcap", [("/joint_states", message(0, **changes))])
+    if error is None:
+        assert read(bag, columns).values.tolist() == [[1.0]]
+        return
+    with pytest.raises(TableUnfit, match=error):
+        read(bag, columns)
+
+
+def test_a_bag_is_imported_with_its_joints_as_axes(checkout: Path, tmp_path: Path) -> None:
+    write_bag(tmp_path / "run.mcap", whole())
+    description = tmp_path / "run.yaml"
+    document = {
+        "name": "run",
+        "cell": str(checkout / "configs/cells/demo.yaml"),
+        "position": {"file": "run.mcap", "columns": ["position"], "unit": "rad", "side": "joint"},
+        "current": {"file": "run.mcap", "columns": ["effort"], "unit": "A"},
+        "time": {"file": "run.mcap", "column": STAMP, "unit": "ns"},
+    }
+    description.write_text(json.dumps(document))
+    out = tmp_path / "log.mcap"
+    assert main(["import", str(description), "--data", str(tmp_path), "--out", str(out)]) == 0
+    run, _ = load_run(out)
+    assert run.rate_hz == pytest.approx(250.0)
+    np.testing.assert_allclose(run.position_rad, POSITION, atol=1e-8)
+    np.testing.assert_allclose(run.current_a, EFFORT, atol=1e-8)
+    document["position"] = {"file": "run.mcap", "columns": list(JOINTS), "unit": "rad", "side": "joint"}
+    document["current"] = {"file": "run.mcap", "columns": list(JOINTS), "unit": "A"}
+    description.write_text(json.dumps(document))
+    again = tmp_path / "again.mcap"
+    assert main(["import", str(description), "--data", str(tmp_path), "--out", str(again)]) == 0
+    assert again.read_bytes() == out.read_bytes()
+    time = {"file": "run.mcap", "column": "stamp", "unit": "s"}
+    description.write_text(json.dumps({**document, "time": time}))
+    assert main(["import", str(description), "--data", str(tmp_path), "--out", str(tmp_path / "x.mcap")]) == 4
+
+
+def test_a_healthy_bag_is_called_a_bag(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    bag = write_bag(tmp_path / "run.mcap", whole())
+    sums = _repack(bag, tmp_path / "sums.mcap", enable_data_crcs=True)
+    for words in (["info", bag], ["info", sums], ["salvage", bag, "--out", tmp_path / "saved.mcap"]):
+        assert main([str(word) for word in words]) == 4
+        said = " ".join(capfd.readouterr().err.split())
+        assert "joint states of J1, J2, J3, J4, J5, J6 on /joint_states" in said
+        assert "damaged" not in said
+        assert "drivegain import" in said
+        assert "the joints as `columns`" in said
+    with pytest.raises(LogForeign, match=r"with /chatter; .*reads bags with sensor_msgs/msg/JointState"):
+        read_log(_of_text(tmp_path / "text.mcap"))
+    with pytest.raises(TableUnfit, match="found topics /chatter; expected a topic of type sensor_msgs/msg/JointState"):
+        read(tmp_path / "text.mcap")
+
+
+def _of_text(path: Path) -> Path:
+    with path.open("wb") as stream, Ros2Writer(stream) as writer:
+        schema = writer.register_msgdef("std_msgs/msg/String", "string data")
+        writer.write_message("/chatter", schema, {"data": "hello"})
+    return path
+
+
+def test_a_bag_of_a_killed_recorder_is_called_unfinished(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "run.mcap", whole(), chunk_size=4000)
+    bag.write_bytes(bag.read_bytes()[:-2000])
+    with pytest.raises(LogTruncated, match=r"expected a finished bag; .*mcap recover"):
+        read(bag)
+    with pytest.raises(LogForeign, match="joint states of J1"):
+        read_log(bag)
+
+
+@settings(deadline=None, max_examples=60, derandomize=True)
+@given(seed=st.integers(0, 10**6), hurt=st.sampled_from(("flip", "cut", "junk")))
+def test_a_damaged_bag_is_refused_or_the_same(seed: int, hurt: str, bag_bytes: bytes, tmp_path_factory: Any) -> None:
+    """With the checksums of ROS 2 (chunks only), damage between them may remove a chunk, never change a number."""
+    rng = random.Random(seed)
+    data, at = bytearray(bag_bytes), rng.randrange(len(bag_bytes))
+    if hurt == "flip":
+        data[at] ^= 1 << rng.randrange(8)
+    elif hurt == "cut":
+        del data[at:]
+    else:
+        data[at : at + 40] = rng.randbytes(40)
+    path = tmp_path_factory.getbasetemp() / "hurt.mcap"
+    path.write_bytes(data)
+    try:
+        table = read(path)
+    except DataError as error:
+        assert str(path) in str(error)
+    else:
+        expected = {row.tobytes() for row in np.hstack((POSITION, EFFORT))}
+        assert {row.tobytes() for row in table.values} <= expected
+
+
+@pytest.fixture(scope="module")
+def bag_bytes(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A bag of some chunks."""
+    return write_bag(tmp_path_factory.mktemp("bag") / "run.mcap", whole()[:60], chunk_size=4000).read_bytes()
+
+
+@settings(deadline=None, max_examples=200, derandomize=True)
+@given(st.binary(max_size=200), st.integers(0, 1))
+def test_any_bytes_are_a_joint_state_or_refused(data: bytes, order: int) -> None:
+    try:
+        state = joint_state_from_cdr(bytes((0, order, 0, 0)) + data)
+    except ValueError:
+        return
+    assert max(len(state.names), len(state.position), len(state.effort)) <= len(data)
+
+
+def test_a_message_of_the_other_byte_order_is_read() -> None:
+    names = b"".join(struct.pack(">I", 3) + name.encode() + b"\0" + b"\0" for name in ("J1", "J2"))
+    big = (
+        b"\0\0\0\0" + struct.pack(">iII", 5, 6, 1) + b"\0\0\0\0" + struct.pack(">I", 2) + names
+        + struct.pack(">I2d", 2, 1.5, -2.5) + struct.pack(">II", 0, 0)
+    )  # fmt: skip
+    state = joint_state_from_cdr(big)
+    assert (state.stamp_ns, state.names, state.position, state.effort) == (5_000_000_006, ("J1", "J2"), (1.5, -2.5), ())

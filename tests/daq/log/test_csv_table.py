@@ -1,0 +1,170 @@
+"""CSV files as exporters write them: the same table from each, or an error that says what to do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daq.config.import_description import (
+    CsvLayout,
+    CurrentColumns,
+    ImportDescription,
+    PositionColumns,
+    PositionUnit,
+    Side,
+    TimeColumn,
+    TimeUnit,
+)
+from daq.errors import TableUnfit
+from daq.log.csv_table import read_csv
+from daq.log.table import Table
+
+ROWS = ("0.125,1.50", "0.250,1.25", "0.375,1.00", "0.500,0.75")
+VALUES = np.array([[float(field) for field in row.split(",")] for row in ROWS])
+
+
+def _read(
+    tmp_path: Path, data: bytes, columns: tuple[str | int, ...], time: TimeUnit | None = None, **layout: object
+) -> Table:
+    path = tmp_path / "run.csv"
+    path.write_bytes(data)
+    wanted = ImportDescription(
+        name="run",
+        cell="cell.yaml",
+        table=CsvLayout(**layout),  # type: ignore[arg-type]
+        position=PositionColumns(file="run.csv", columns=columns[:1], unit=PositionUnit.RAD, side=Side.JOINT),
+        current=CurrentColumns(file="run.csv", columns=columns[1:], unit="A"),
+    )
+    return read_csv(path, wanted, columns, None if time is None else TimeColumn(file="run.csv", column=1, unit=time))
+
+
+def _text(*rows: str, header: str = "Winkel [°],Strom [µA]") -> str:
+    return "\n".join((header, *rows)) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("encoding", "bom", "remark"),
+    [
+        ("utf-8", b"", ""),
+        ("utf-8-sig", b"", ""),
+        ("cp1252", b"", "Windows-1252"),
+        ("utf-16-le", b"\xff\xfe", "UTF-16"),
+        ("utf-16-be", b"\xfe\xff", "UTF-16"),
+    ],
+)
+def test_encodings(tmp_path: Path, encoding: str, bom: bytes, remark: str) -> None:
+    table = _read(tmp_path, bom + _text(*ROWS).encode(encoding), ("Winkel [°]", "Strom [µA]"))
+    assert np.array_equal(table.values, VALUES)
+    assert [remark in text and text.startswith("run.csv: ") for text in table.remarks] == [True] * bool(remark)
+
+
+@pytest.mark.parametrize(
+    ("data", "found"),
+    [
+        (_text(*ROWS, header="a,b").encode("utf-16-le"), "byte 1 is NUL"),
+        (b"\xff\xfe" + _text(*ROWS).encode("utf-16-le")[:-1], "no UTF-16"),
+        (b"a,b\n\x81\x8d,1\n", "byte 4 is no UTF-8"),
+    ],
+)
+def test_what_is_no_text(tmp_path: Path, data: bytes, found: str) -> None:
+    with pytest.raises(TableUnfit, match=found) as caught:
+        _read(tmp_path, data, (1, 2))
+    assert "save it as UTF-8" in caught.value.remedy
+
+
+def test_a_decimal_comma_has_to_be_declared(tmp_path: Path) -> None:
+    data = _text(*(row.replace(",", ";").replace(".", ",") for row in ROWS), header="q;i").encode()
+    assert np.array_equal(_read(tmp_path, data, ("q", "i"), delimiter=";", decimal=",").values, VALUES)
+    with pytest.raises(TableUnfit, match=r"run\.csv:2, column q") as caught:
+        _read(tmp_path, data, ("q", "i"), delimiter=";")
+    assert 'write `decimal: ","`' in caught.value.remedy
+
+
+def test_a_file_without_a_header(tmp_path: Path) -> None:
+    data = ("\n".join(ROWS) + "\n").encode()
+    assert np.array_equal(_read(tmp_path, data, (1, 2), header=False).values, VALUES)
+    with pytest.raises(TableUnfit, match=r"run\.csv:1: found a header of numbers, 0\.125, 1\.50") as caught:
+        _read(tmp_path, data, (1, 2))
+    assert "write `header: false`" in caught.value.remedy
+
+
+def test_a_header_that_is_not_declared(tmp_path: Path) -> None:
+    with pytest.raises(TableUnfit, match=r"run\.csv:1, column 1") as caught:
+        _read(tmp_path, _text(*ROWS).encode(), (1, 2), header=False)
+    assert "write `header: true`" in caught.value.remedy
+
+
+def test_columns_may_be_called_by_numbers(tmp_path: Path) -> None:
+    assert np.array_equal(_read(tmp_path, _text(*ROWS, header="0,1").encode(), ("0", "1")).values, VALUES)
+
+
+@pytest.mark.parametrize("last", ["0.625,0.50", "0.625,0.5000"])
+def test_a_last_line_without_its_end_is_taken_when_it_is_complete(tmp_path: Path, last: str) -> None:
+    table = _read(tmp_path, _text(*ROWS, last).encode()[:-1], (1, 2))
+    assert table.values[-1].tolist() == [0.625, 0.5]
+    assert "no end of line" in table.remarks[0]
+
+
+@pytest.mark.parametrize("last", ["0.625,0.5", "0.625,", "0.625", "0.62", "0.625,-", "0.625,20.50"])
+def test_a_last_line_that_may_lack_digits_is_refused(tmp_path: Path, last: str) -> None:
+    with pytest.raises(TableUnfit, match=r"run\.csv:6") as caught:
+        _read(tmp_path, _text(*ROWS, last).encode()[:-1], (1, 2))
+    assert "the file ends early" in caught.value.remedy
+
+
+def test_a_text_in_the_last_column_lacks_no_digits(tmp_path: Path) -> None:
+    data = _text(*(f"{row},ok" for row in ROWS), header="q,i,state").encode()[:-1]
+    assert np.array_equal(_read(tmp_path, data, ("q", "i")).values, VALUES)
+
+
+def test_lines_may_end_with_a_delimiter(tmp_path: Path) -> None:
+    data = _text(*(f"{row}," for row in ROWS), header="q,i,").encode()
+    assert np.array_equal(_read(tmp_path, data, ("q", "i")).values, VALUES)
+
+
+START_NS = 1_772_348_400_123_456_789  #: 2026-03-01T07:00:00.123456789Z
+STEP_NS = 12_000_001
+
+
+def _stamped(tmp_path: Path, unit: TimeUnit, stamps: list[str]) -> Table:
+    return _read(tmp_path, _text(*(f"{stamp},1,2" for stamp in stamps), header="t,q,i").encode(), ("q", "i"), unit)
+
+
+@pytest.mark.parametrize("unit", [TimeUnit.SECOND, TimeUnit.MILLISECOND, TimeUnit.MICROSECOND, TimeUnit.NANOSECOND])
+def test_stamps_since_1970_are_exact_in_every_unit(tmp_path: Path, unit: TimeUnit) -> None:
+    digits = 9 - unit.digits
+    whole = [START_NS + STEP_NS * index for index in range(4)]
+    texts = [f"{ns // 10**digits}.{ns % 10**digits:0{digits}d}" if digits else str(ns) for ns in whole]
+    stamps = _stamped(tmp_path, unit, texts).stamps
+    assert stamps is not None
+    assert stamps.first_ns == START_NS
+    assert stamps.time_s.tolist() == [STEP_NS * index * 1e-9 for index in range(4)]
+
+
+def test_dates_with_a_zone(tmp_path: Path) -> None:
+    texts = [
+        "2026-03-01T07:00:00.123456789Z",
+        "2026-03-01T08:00:00.135+01:00",
+        "2026-03-01 06:00:01-0100",
+        "2026-03-01T07:00:01.5Z",
+    ]
+    stamps = _stamped(tmp_path, TimeUnit.ISO_8601, texts).stamps
+    assert stamps is not None
+    assert stamps.first_ns == START_NS
+    assert stamps.time_s == pytest.approx([0.0, 0.011543211, 0.876543211, 1.376543211], abs=1e-12)
+
+
+@pytest.mark.parametrize("text", ["2026-03-01T07:00:00.1", "2026-13-01T07:00:00Z", "7:00", "1772348400.1"])
+def test_a_date_without_a_zone_is_refused(tmp_path: Path, text: str) -> None:
+    with pytest.raises(TableUnfit, match=r"run\.csv:2, column 1") as caught:
+        _stamped(tmp_path, TimeUnit.ISO_8601, [text] * 3)
+    assert "add the zone" in caught.value.remedy
+
+
+def test_stamps_since_some_start_are_those_of_the_file(tmp_path: Path) -> None:
+    stamps = _stamped(tmp_path, TimeUnit.MILLISECOND, ["512300", "512310", "512322"]).stamps
+    assert stamps is not None
+    assert stamps.first_ns == 512_300_000_000
+    assert stamps.time_s == pytest.approx([0.0, 0.010, 0.022], abs=1e-9)

@@ -1,0 +1,156 @@
+"""Time stamps: uniform ones leave the samples alone, uneven ones are taken for what they are, gaps are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from daq.config.import_description import TimeColumn, TimeUnit
+from daq.errors import TableUnfit
+from daq.log.resampling import Clock, check_stamps, clock_of
+from daq.log.table import Stamps, Table
+from ident.arrays import FloatArray
+
+AnyFloats = np.ndarray[tuple[Any, ...], np.dtype[np.floating[Any]]]
+
+WANTED = TimeColumn(file="run.csv", column="t", unit=TimeUnit.SECOND)
+
+
+def _clock(time_s: AnyFloats, wanted: TimeColumn = WANTED, numbers: FloatArray | None = None) -> Clock:
+    """The clock of these stamps; every row has numbers of its own unless they are given."""
+    numbers = np.arange(float(len(time_s)))[:, None] if numbers is None else numbers
+    return clock_of(
+        Table(Path("run.csv"), (), numbers, "", Stamps(np.asarray(time_s, dtype=np.float64), 0), 2), wanted, numbers
+    )
+
+
+def _steps(rng: np.random.Generator, count: int, steps_ms: tuple[int, ...] = (10, 12)) -> FloatArray:
+    """Stamps with random steps [s]."""
+    return np.concatenate(([0.0], np.cumsum(rng.choice(steps_ms, count)))) * 1e-3
+
+
+@example(0.029366597839968218, 4, True, 0.0)
+@given(st.floats(0.2e-3, 0.1), st.integers(2, 7), st.booleans(), st.floats(0.0, 1.0))
+def test_a_uniform_clock_is_one_with_rounded_stamps_too(period_s: float, digits: int, down: bool, phase: float) -> None:
+    """Stamps of 2.5 ms in whole ms are 0, 2, 5, 7, 10: rounded, not uneven."""
+    digit_s = 10.0**-digits
+    if digit_s > 0.5 * period_s:
+        return
+    exact = (np.arange(500) + phase) * period_s / digit_s + 1e-6  # what is whole stays so
+    time_s = (np.floor(exact) if down else np.rint(exact)) * digit_s
+    timing = check_stamps(time_s - time_s[0])
+    assert not timing.resampled
+    assert timing.missing == 0
+    assert timing.rate_hz * period_s == pytest.approx(1.0, abs=2.0 * digit_s / (499 * period_s))
+
+
+def test_stamps_that_are_uniform_leave_the_samples_alone() -> None:
+    time_s = np.arange(100) * 0.004
+    clock, values = _clock(time_s), np.random.default_rng(0).normal(size=(100, 2))
+    assert clock.positions(values) is values
+    assert clock.currents(values) is values
+    assert clock.timing.rate_hz == 99 / time_s[-1]
+    assert clock.timing.drift_s < 1e-12
+    assert clock.row.tolist() == list(range(100))
+
+
+def test_steps_of_10_and_12_ms() -> None:
+    time_s = _steps(np.random.default_rng(1), 4000)
+    clock = _clock(time_s)
+    timing = clock.timing
+    assert timing.resampled
+    assert timing.rate_hz == pytest.approx(4000 / time_s[-1])
+    assert timing.longest_step_s == pytest.approx(0.012)
+    assert timing.jitter_s == pytest.approx(1e-3, rel=0.02)
+    assert timing.drift_s > 10e-3
+    assert (timing.missing, timing.duplicates, timing.close) == (0, 0, 0)
+    assert len(clock.tick_s) == 4001
+    assert np.diff(clock.tick_s) == pytest.approx(1.0 / timing.rate_hz)
+
+    def motion(at_s: FloatArray) -> FloatArray:
+        return np.column_stack([np.sin(4.0 * at_s), np.cos(7.0 * at_s)])
+
+    error = np.abs(clock.positions(motion(time_s)) - motion(clock.tick_s)).max()
+    assert error < 2e-6  # (ω h)⁴ / 384 of the quicker one, and a little at the ends
+    assert np.abs(motion(time_s) - motion(clock.tick_s)).max() > 100 * error
+    assert np.abs(clock.currents(motion(time_s)) - motion(clock.tick_s)).max() <= (7.0 * 0.012) ** 2 / 8
+
+
+def test_missing_samples_are_interpolated_and_the_others_stay() -> None:
+    index = np.delete(np.arange(300), [57, 120, 121])
+    clock = _clock(index * 1e-3)
+    assert clock.timing.missing == 3
+    assert clock.timing.rate_hz == pytest.approx(1000.0)
+    values = np.sin(index / 30.0)[:, None]
+    for resampled in (clock.positions(values), clock.currents(values)):
+        assert len(resampled) == 300
+        assert resampled[index] == pytest.approx(values, abs=1e-12)
+        assert resampled[:, 0] == pytest.approx(np.sin(np.arange(300) / 30.0), abs=1e-3)
+
+
+@pytest.mark.parametrize("row", [1, 40, 99])
+def test_a_row_that_is_there_twice_counts_once(row: int) -> None:
+    rows = np.insert(np.arange(99), row, row - 1)
+    clock = _clock(rows * 0.01, numbers=np.sin(rows)[:, None])
+    assert clock.timing.duplicates == 1
+    assert not clock.timing.resampled
+    assert np.sin(rows)[clock.row].tolist() == np.sin(np.arange(99)).tolist()
+
+
+def test_a_stamp_that_is_there_twice_with_other_numbers_is_refused() -> None:
+    with pytest.raises(TableUnfit, match=r"run.csv:42, column t: found the stamp of the row above, with other numbers"):
+        _clock(np.insert(np.arange(99), 40, 39) * 0.01)
+
+
+def test_stamps_that_go_back_are_refused() -> None:
+    with pytest.raises(TableUnfit, match=r"run.csv:52, column t: found a stamp 0.49 s before") as caught:
+        _clock(np.concatenate((np.arange(50), np.arange(50))) * 0.01)
+    assert "two recordings" in caught.value.remedy
+
+
+def test_samples_that_come_at_once_are_not_used_for_a_speed() -> None:
+    time_s = np.sort(np.append(np.arange(200) * 0.01, 0.5001))
+    clock = _clock(time_s)
+    assert clock.timing.close == 1
+    assert 51 not in clock.row
+    assert not clock.timing.resampled
+
+
+@pytest.mark.parametrize(("periods", "allowed"), [(3, 3.0), (4, 3.0), (20, 3.0), (20, 25.0)])
+def test_gaps(periods: int, allowed: float) -> None:
+    time_s = np.concatenate((np.arange(100), 99 + periods + np.arange(100))) * 0.01
+    wanted = replace(WANTED, largest_gap_periods=allowed)
+    if periods <= allowed:
+        assert _clock(time_s, wanted).timing.missing == periods - 1
+        return
+    with pytest.raises(TableUnfit, match=rf"run.csv:102, column t: found {periods * 0.01:g} s after") as caught:
+        _clock(time_s, wanted)
+    assert caught.value.expected == "at most 3 times the usual 0.01 s"
+    assert "`largest_gap_periods`" in caught.value.remedy
+
+
+@pytest.mark.parametrize(("rate_hz", "resampled"), [(100.0, False), (100.001, False), (100.5, True), (125.0, True)])
+def test_a_stated_rate(rate_hz: float, resampled: bool) -> None:
+    clock = _clock(np.arange(1001) * 0.01, replace(WANTED, rate_hz=rate_hz))
+    assert clock.timing.rate_hz == rate_hz
+    assert clock.timing.resampled is resampled
+    if resampled:
+        assert np.diff(clock.tick_s) == pytest.approx(1.0 / rate_hz)
+        assert 10.0 - 1.0 / rate_hz < clock.tick_s[-1] <= 10.0
+
+
+@pytest.mark.parametrize("rate_hz", [49.0, 201.0, 1000.0])
+def test_a_stated_rate_far_from_that_of_the_stamps_is_refused(rate_hz: float) -> None:
+    with pytest.raises(TableUnfit, match="found stamps at 100 Hz"):
+        _clock(np.arange(1001) * 0.01, replace(WANTED, rate_hz=rate_hz))
+
+
+def test_a_column_that_is_no_time_is_refused() -> None:
+    with pytest.raises(TableUnfit, match="1 different time stamps in 50 rows"):
+        _clock(np.zeros(50), numbers=np.zeros((50, 1)))
