@@ -147,7 +147,7 @@ class Cell:
     """A cell as declared, in SI units."""
 
     name: str
-    urdf: str  #: text of the URDF
+    urdf: str  #: text of the URDF, its held joints fixed
     gravity_m_s2: tuple[float, float, float]  #: in the base frame
     ratio: FloatArray  #: drive train R with q_motor = R q_joint (paper eq. 24), shape (n, n); rad/m, prismatic joints
     buses: tuple[Bus, ...]  #: buses of the amplifiers, usually one; empty in a cell that only imports recordings

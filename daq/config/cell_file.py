@@ -14,6 +14,7 @@ from daq.config.cell_schema import AxisModel, CellModel, ConditioningModel, Payl
 from daq.config.checks import check
 from daq.config.clearance import clearance_of
 from daq.config.drive import drive_from_text
+from daq.config.hold import held_urdf
 from daq.config.yaml_file import parse_yaml, read_bytes, read_model
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationMissing
@@ -69,6 +70,7 @@ def cell_from_bundle(
         for drive in model.drives
         for member in (f"{DRIVES}{drive}.yaml",)
     }
+    urdf = held_urdf(document, model, urdf)
     check(document, model, urdf, profiles)
     controller = None if model.controller is None else model.controller.file
     used = (CELL, URDF, *(f"{DRIVES}{drive}.yaml" for drive in model.drives))

@@ -197,6 +197,9 @@ class CellModel(StrictModel):
     name: Name
     robot: RobotModel
     drive_train: DriveTrainModel
+    hold: Annotated[
+        dict[str, float], Field(description="Positions of joints that are no axes [deg; m if prismatic].")
+    ] = Field(default_factory=dict)
     bus: Buses | None = None
     sync: Sync | None = None
     axes: Annotated[tuple[AxisModel, ...], Field(min_length=1, max_length=32)]

@@ -60,10 +60,12 @@ class DriveTrain:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One standard parameter."""
+    """One parameter, with the values that physics allows it: a spring may have either sign, a compliance not."""
 
     name: str
     unit: str
+    least: float = -np.inf
+    largest: float = np.inf
 
 
 @dataclass(frozen=True, slots=True)

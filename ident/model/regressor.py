@@ -23,14 +23,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident.arrays import FloatArray
+from ident.arrays import BoolArray, FloatArray
 from ident.model.robot import JointKind, Robot, skew
 
 BLOCK_SAMPLES = 1024  #: Samples computed at once: their screws and products stay in a core's own cache
 
 
 def fill_rigid(
-    robot: Robot, position: FloatArray, velocity: FloatArray, acceleration: FloatArray, out: FloatArray
+    robot: Robot,
+    position: FloatArray,
+    velocity: FloatArray,
+    acceleration: FloatArray,
+    out: FloatArray,
+    wanted: BoolArray | None = None,
 ) -> None:
     """Write the columns of the rigid links into an array of the caller, who may use it again for the next piece.
 
@@ -40,8 +45,11 @@ def fill_rigid(
         out: torque per unit of each parameter (LINK_PARAMETERS) [Nm or N], shape (n, n, 10, k): joint, link,
             parameter, sample; a view into a wider layout will do. Only links that the joint moves are written, so that
             the rest may be zeroed once and for all.
+        wanted: parameters of each link that are written, shape (n, 10); all when None.
     """
     links = _links(robot)
+    wanted = np.ones((len(links), 10), dtype=np.bool_) if wanted is None else wanted
+    inertias, moments = ([_spans(own) for own in part] for part in (wanted[:, :6], wanted[:, 6:]))
     samples = position.shape[1]
     size = min(samples, BLOCK_SAMPLES)
     work = _work(robot, links, size)
@@ -52,11 +60,19 @@ def fill_rigid(
         for index, link in enumerate(links):
             _move(link, work, index, position[index, block], velocity[index, block], acceleration[index, block])
             screws = work.screws[index]
-            _fill_wrench(work.inertia, work.moments, screws[:, 0], screws[:, 1])
-            for place, mover in enumerate(link.movers, start=2):
-                screw, row = screws[:, place], out[mover, index, :, block]
-                np.einsum("dk,dck->ck", screw[:3], work.inertia, out=row[:6])
-                np.einsum("dk,dck->ck", screw, work.moments, out=row[6:])
+            _fill_wrench(work.inertia, work.moments, screws[0], screws[1])
+            for screw, mover in zip(screws[2:], link.movers, strict=True):
+                row = out[mover, index, :, block]
+                for part in inertias[index]:
+                    np.einsum("dk,dck->ck", screw[:3], work.inertia[:, part], out=row[:6][part])
+                for part in moments[index]:
+                    np.einsum("dk,dck->ck", screw, work.moments[:, part], out=row[6:][part])
+
+
+def _spans(wanted: BoolArray) -> list[slice]:
+    """Stretches of what is wanted."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], wanted, [0])))).tolist()
+    return [slice(first, last) for first, last in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def rigid_torque(
@@ -69,21 +85,53 @@ def rigid_torque(
         block = slice(first, first + BLOCK_SAMPLES)
         states = list(zip(position[:, block], velocity[:, block], acceleration[:, block], strict=True))
         work = _work(robot, links, len(states[0][0]), movers=False)
-        factors = [_move(link, work, index, *states[index]) for index, link in enumerate(links)]
+        for index, link in enumerate(links):
+            _move(link, work, index, *states[index])
         wrenches = np.zeros((len(links) + 1, 6, len(states[0][0])))  # the last one is what the base bears
         for own, screws, inertia in zip(wrenches, work.screws, inertias, strict=False):
-            v, (momentum, own[:]) = screws[:, 0], inertia @ np.swapaxes(screws, 0, 1)
-            own[:3] += _cross(v[:3], momentum[:3]) + _cross(v[3:], momentum[3:])
-            own[3:] += _cross(v[:3], momentum[3:])
-        for link, own, given, row in reversed(list(zip(links, wrenches, factors, out, strict=False))):
-            row[block] = link.own @ own
-            wrenches[link.parent] += link.transforms.T @ np.concatenate((own, *(factor * own for factor in given)))
+            v, (momentum, own[:]) = screws[0], inertia @ screws
+            _add_cross(own[:3], v[:3], momentum[:3])
+            _add_cross(own[:3], v[3:], momentum[3:])
+            _add_cross(own[3:], v[:3], momentum[3:])
+        for index, link in reversed(list(enumerate(links))):
+            out[index, block] = link.own @ wrenches[index]
+            wrenches[link.parent] += _borne(link, wrenches[index], states[index][0])
     return out
 
 
-def _cross(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Cross products of vectors of shape (3, k)."""
-    return first[[1, 2, 0]] * second[[2, 0, 1]] - first[[2, 0, 1]] * second[[1, 2, 0]]
+def mass_matrix(robot: Robot, position: FloatArray, parameters: FloatArray) -> FloatArray:
+    """Torque of the rigid links at joint i per unit of acceleration of joint j, Σ S_iᵀ M S_j over the links, (n, n, k).
+
+    Args:
+        robot: n joints.
+        position: of the joints, shape (n, k).
+        parameters: of the links (LINK_PARAMETERS), shape (n, 10).
+    """
+    links, (count, samples) = _links(robot), position.shape
+    inertias, out = [_inertia(own) for own in parameters], np.zeros((count, count, samples))
+    for first in range(0, samples, BLOCK_SAMPLES):
+        here = position[:, first : first + BLOCK_SAMPLES]
+        work, still = _work(robot, links, here.shape[1]), np.zeros(here.shape[1])
+        for index, (link, inertia) in enumerate(zip(links, inertias, strict=True)):
+            _move(link, work, index, here[index], still, still)
+            screws = work.screws[index][2:]
+            part = out[:, :, first : first + BLOCK_SAMPLES]
+            part[np.ix_(link.movers, link.movers)] += np.einsum("idk,jdk->ijk", screws, inertia @ screws)
+    return out
+
+
+def _add_cross(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
+    """Add the cross products of vectors of shape (3, k)."""
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[i] += a[j] * b[k] - a[k] * b[j]
+
+
+def _cos_sin(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Cosine and sine to the last digit of one, by the half-angle: numpy has a vector tangent, four times as fast."""
+    tangent = np.tan(0.5 * angle)
+    square = tangent * tangent
+    share = 1.0 / (1.0 + square)
+    return (1.0 - square) * share, 2.0 * tangent * share
 
 
 def _inertia(parameters: FloatArray) -> FloatArray:
@@ -94,20 +142,21 @@ def _inertia(parameters: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class _Link:
-    """Constants of a link: X_f below each other, shape (6 f, 6), S, and C with V × S = C V."""
+    """Constants of a link. Its joint turns or slides along z of a frame of its own: there cos q and sin q, or q, touch
+    two components in three, and most robots' links have that frame already."""
 
     parent: int
     movers: tuple[int, ...]
     revolute: bool
-    transforms: FloatArray
-    own: FloatArray
-    cross: FloatArray
+    fixed: FloatArray  #: from the parent's frame to the joint's at q = 0, shape (6, 6)
+    back: FloatArray | None  #: from the joint's frame to the link's; None where they are the same
+    own: FloatArray  #: S in the link's frame, shape (6,)
 
 
 @dataclass(frozen=True, slots=True)
 class _Work:
-    """Arrays that every block uses again: V, A and the movers' screws of each link (the base is the last), X_f times
-    the parent's (flat, room for the longest), and Y."""
+    """Arrays that every block uses again: V, A and the movers' screws of each link, shape (2 + movers, 6, k) (the base
+    is the last), room for products, and Y."""
 
     screws: tuple[FloatArray, ...]
     products: FloatArray
@@ -118,59 +167,74 @@ class _Work:
 def _links(robot: Robot) -> tuple[_Link, ...]:
     links: list[_Link] = []
     for index, joint in enumerate(robot.joints):
-        revolute = joint.kind is JointKind.REVOLUTE
-        fixed, turned = _blocks(joint.rotation.T, -joint.rotation.T @ skew(joint.translation_m)), skew(joint.axis)
-        if revolute:
-            # exp(−skew θ) = e eᵀ + cos θ (1 − e eᵀ) − sin θ skew (Rodrigues).
-            outer = np.outer(joint.axis, joint.axis)
-            parts = [_blocks(turn) @ fixed for turn in (outer, np.eye(3) - outer, -turned)]
-        else:
-            # Slid along the axis e, u + w × (p + R e q): the second term is all that changes.
-            parts = [fixed, _blocks(np.zeros((3, 3)), -turned @ joint.rotation.T)]
+        revolute, axis = joint.kind is JointKind.REVOLUTE, joint.axis
+        first = np.eye(3)[np.argmin(np.abs(axis))]
+        first = (first - axis * (axis @ first)) / np.sqrt(1.0 - (axis @ first) ** 2)
+        turn = np.array((first, skew(axis) @ first, axis))
         own = np.zeros(6)
-        own[slice(0, 3) if revolute else slice(3, 6)] = joint.axis
+        own[slice(0, 3) if revolute else slice(3, 6)] = axis
         links.append(
             _Link(
                 parent=joint.parent,
                 movers=(*(links[joint.parent].movers if joint.parent >= 0 else ()), index),
                 revolute=revolute,
-                transforms=np.concatenate(parts),
+                fixed=_blocks(turn @ joint.rotation.T, -turn @ joint.rotation.T @ skew(joint.translation_m)),
+                back=None if (turn == np.eye(3)).all() else _blocks(turn.T),
                 own=own,
-                cross=_blocks(-skew(own[:3]), -skew(own[3:])),
             )
         )
     return tuple(links)
 
 
 def _work(robot: Robot, links: tuple[_Link, ...], samples: int, *, movers: bool = True) -> _Work:
-    base = np.zeros((6, 2, samples))
-    base[3:, 1] = -robot.gravity_m_s2[:, None]
-    screws = [np.empty((6, 2 + movers * len(link.movers), samples)) for link in links]
+    base = np.zeros((2, 6, samples))
+    base[1, 3:] = -robot.gravity_m_s2[:, None]
+    screws = [np.empty((2 + movers * len(link.movers), 6, samples)) for link in links]
     for link, array in zip(links, screws, strict=True):
-        array[:, 2:] = link.own[:, None, None]  # the last one stays
-    products = np.empty(18 * (1 + robot.joint_count) * samples)
+        array[2:] = link.own[:, None]  # the last one stays
+    products = np.empty((1 + robot.joint_count, 2, 2, samples))
     return _Work((*screws, base), products, np.zeros((3, 6, samples)), np.zeros((6, 4, samples)))
 
 
 def _move(
     link: _Link, work: _Work, index: int, position: FloatArray, velocity: FloatArray, acceleration: FloatArray
-) -> tuple[FloatArray, ...]:
-    """Carry the parent's screws to a link; return the f(q) of its X_f, from the second one on."""
-    before, here = work.screws[link.parent], work.screws[index]
-    factors = (np.cos(position), np.sin(position)) if link.revolute else (position,)
-    flat = before.reshape(6, -1)
-    parts = work.products[: len(link.transforms) * flat.shape[1]].reshape(-1, *before.shape)
-    np.matmul(link.transforms, flat, out=parts.reshape(-1, flat.shape[1]))
-    carried = parts[0]
-    for number, factor in enumerate(factors, start=1):
-        parts[number] *= factor
-        carried += parts[number]
-    here[:, : before.shape[1]] = carried
-    v, a = here[:, 0], here[:, 1]
+) -> None:
+    """Carry the parent's screws to a link, through the frame of its joint."""
+    before = work.screws[link.parent]
+    here = work.screws[index][: len(before)]
+    np.matmul(link.fixed, before, out=here)
+    parts = here.reshape(len(here), 2, 3, -1)  # angular and linear
+    v, a = parts[:2]
     # S × S is nothing: V may be that before S q̇ is added.
-    a += np.outer(link.own, acceleration) + (link.cross @ v) * velocity
-    v += np.outer(link.own, velocity)
-    return factors
+    if link.revolute:
+        cosine, sine = _cos_sin(position)
+        turned = np.multiply(parts[:, :, 1::-1], sine, out=work.products[: len(here)])
+        parts[:, :, :2] *= cosine
+        parts[:, :, 0] += turned[:, :, 0]
+        parts[:, :, 1] -= turned[:, :, 1]
+        a[:, 0] += v[:, 1] * velocity
+        a[:, 1] -= v[:, 0] * velocity
+    else:
+        parts[:, 1, 0] += position * parts[:, 0, 1]
+        parts[:, 1, 1] -= position * parts[:, 0, 0]
+        a[1, 0] += v[0, 1] * velocity
+        a[1, 1] -= v[0, 0] * velocity
+    kind = 0 if link.revolute else 1
+    v[kind, 2] += velocity
+    a[kind, 2] += acceleration
+    if link.back is not None:
+        here[:] = link.back @ here
+
+
+def _borne(link: _Link, wrench: FloatArray, position: FloatArray) -> FloatArray:
+    """What a link's wrench is at its parent, shape (6, k): the transpose of `_move`."""
+    n, f = (wrench if link.back is None else link.back.T @ wrench).reshape(2, 3, -1)
+    if link.revolute:
+        c, s = _cos_sin(position)
+        n, f = (np.stack((c * x - s * y, s * x + c * y, z)) for x, y, z in (n, f))
+    else:
+        n = np.stack((n[0] - position * f[1], n[1] + position * f[0], n[2]))
+    return link.fixed.T @ np.concatenate((n, f))
 
 
 def _blocks(diagonal: FloatArray, lower: FloatArray | None = None) -> FloatArray:

@@ -7,10 +7,11 @@ joints' names, fixed joints merged into the moving joint before them.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
-from math import cos, inf, isfinite, sin, sqrt
-from xml.etree.ElementTree import Element, ParseError, fromstring
+from math import atan2, cos, inf, isfinite, sin, sqrt
+from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 
 import numpy as np
 
@@ -76,6 +77,56 @@ def robot_from_urdf(urdf: str, gravity_m_s2: tuple[float, float, float] = (0.0, 
     return Robot(read_urdf(urdf).joints, np.asarray(gravity_m_s2, dtype=np.float64))
 
 
+def hold_joints(urdf: str, position_rad: Mapping[str, float]) -> str:
+    """Return a URDF in which joints that are no axes of the arm (a gripper's, a mobile base's) are fixed.
+
+    Args:
+        urdf: text of the URDF.
+        position_rad: position of each held joint [rad; m for a prismatic joint], by name. A joint that mimics a held
+            one follows it. Joints of type floating and planar can only be held at 0.
+
+    Raises:
+        ModelError: the text is no URDF, a name is no movable joint, or a joint cannot be held there.
+    """
+    robot = _root(urdf)
+    movable = {_name(joint): joint for joint in robot.findall("joint") if joint.get("type") != "fixed"}
+    followed = {}
+    for name, joint in movable.items():
+        mimic = joint.find("mimic")
+        leader = None if mimic is None else position_rad.get(mimic.get("joint", ""))
+        if mimic is not None and leader is not None:
+            factor, offset = (_finite(mimic.get(*one)) for one in (("multiplier", "1"), ("offset", "0")))
+            if factor is None or offset is None:
+                raise ModelError(f"<mimic> of {name!r} in the URDF has a multiplier or offset that is no number")
+            followed[name] = factor * leader + offset
+    for name, position in {**followed, **position_rad}.items():
+        if name not in movable:
+            raise ModelError(f"no movable joint {name!r} in the URDF; expected one of {', '.join(movable)}")
+        _fix(movable[name], position)
+    return tostring(robot, encoding="unicode")
+
+
+def _fix(element: Element, position: float) -> None:
+    """Make a joint a fixed one whose origin is its pose at a position."""
+    name, kind = _name(element), element.get("type")
+    rotation, translation = _origin(element, name)
+    if kind not in ("floating", "planar"):
+        joint = _joint(element, _Frame(-1, rotation, translation))
+        placed = poses(Robot((joint,), np.zeros(3)), np.array([[position]]))
+        rotation, translation = placed.rotation[1, 0], placed.origin_m[1, 0]
+    elif position != 0.0:
+        raise ModelError(f"joint {name!r} is of type {kind!r} and held at {position:g}; expected 0")
+    roll = atan2(rotation[2, 1], rotation[2, 2])
+    s, c = sin(roll), cos(roll)  # with this roll the other two are exact for every pitch, 90° included
+    pitch = atan2(-rotation[2, 0], s * rotation[2, 1] + c * rotation[2, 2])
+    yaw = atan2(s * rotation[0, 2] - c * rotation[0, 1], c * rotation[1, 1] - s * rotation[1, 2])
+    for child in [child for child in element if child.tag not in ("parent", "child")]:
+        element.remove(child)
+    element.set("type", "fixed")
+    spelled = {"xyz": translation.tolist(), "rpy": [roll, pitch, yaw]}
+    element.append(Element("origin", {key: " ".join(map(repr, three)) for key, three in spelled.items()}))
+
+
 def read_urdf(urdf: str) -> UrdfRobot:
     """Read joints, bodies and effort limits of a URDF.
 
@@ -118,8 +169,8 @@ class _Frame:
     translation_m: FloatArray
 
 
-def _tree(urdf: str) -> tuple[dict[str, Element], dict[str, list[Element]], str]:
-    """Return the links, the joints behind each (last name first, to be popped), and the link without a parent."""
+def _root(urdf: str) -> Element:
+    """Return <robot>, without a namespace."""
     try:
         robot = fromstring(urdf)
     except (ParseError, TypeError) as error:
@@ -133,6 +184,12 @@ def _tree(urdf: str) -> tuple[dict[str, Element], dict[str, list[Element]], str]
         raise ModelError(f"the URDF is of version {robot.get('version')}; expected 1.0 or 1.1")
     for element in robot.iter():
         element.tag = element.tag.removeprefix(space) if isinstance(element.tag, str) else ""
+    return robot
+
+
+def _tree(urdf: str) -> tuple[dict[str, Element], dict[str, list[Element]], str]:
+    """Return the links, the joints behind each (last name first, to be popped), and the link without a parent."""
+    robot = _root(urdf)
     links = {_name(link): link for link in robot.findall("link")}
     joints = {_name(joint): joint for joint in robot.findall("joint")}
     for kind, named in (("link", links), ("joint", joints)):

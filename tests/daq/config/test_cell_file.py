@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from daq.config.bus import bus_address, bus_parts, cell_address, drive_axes
-from daq.config.cell import PacingMode
+from daq.config.cell import PacingMode, model_of
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.config.drive import drive_from_text
 from daq.environment import shipped_configurations
@@ -18,6 +18,7 @@ from daq.errors import ConfigurationError, ConfigurationInconsistent, Configurat
 from drivers.canopen.bus import BusAddress
 from drivers.profiles.profile import Amplitude, ObjectEntry, TapPoint
 from drivers.stream.split_bus import SplitAddress
+from ident.model.robot import read_urdf
 from tests.two_buses import LEFT, RIGHT, on_two_buses
 
 
@@ -282,3 +283,59 @@ def test_a_history_that_would_replace_another_file_is_refused(configurations: Pa
         stream.write(f"\nhistory: {{store: {store}}}\n")
     with pytest.raises(ConfigurationInconsistent, match="a file of the history's own"):
         load_cell(cell)
+
+
+GRIPPER = """
+  <link name="left"><inertial><mass value="0.3"/></inertial></link>
+  <link name="right"/>
+  <joint name="swivel" type="revolute"><origin xyz="0 0 0.1"/><parent link="link6"/><child link="left"/>
+    <axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
+  <joint name="slide" type="prismatic"><parent link="left"/><child link="right"/>
+    <axis xyz="0 1 0"/><limit lower="0" upper="0.05" velocity="1" effort="1"/></joint>
+</robot>"""
+
+
+@pytest.fixture
+def with_gripper(configurations: Path) -> Path:
+    """The cell of the TX-40 with a gripper of two joints in its URDF, not yet held."""
+    _spoil(configurations / "robots/tx40.urdf", "</robot>", GRIPPER)
+    return configurations / "cells/tx40.yaml"
+
+
+def test_joints_that_are_no_axes_are_held(with_gripper: Path) -> None:
+    bare = model_of(load_cell(shipped_configurations() / "cells/tx40.yaml")).robot
+    cell = load_cell(_spoil(with_gripper, "\naxes:", "\nhold: {swivel: 30, slide: 0.02}\naxes:"))
+    robot = model_of(cell).robot
+    assert [joint.name for joint in robot.joints] == [joint.name for joint in bare.joints]
+    flange, carrying = read_urdf((shipped_configurations() / "robots/tx40.urdf").read_text()), read_urdf(cell.urdf)
+    assert carrying.bodies[-1].mass_kg == pytest.approx(flange.bodies[-1].mass_kg + 0.3)
+    assert '<origin xyz="0.0 0.0 0.1" rpy="0.0 0.5235987755982988 0.0" />' in cell.urdf
+    assert '<origin xyz="0.0 0.02 0.0"' in cell.urdf
+    logged = cell_from_bundle(bundle(with_gripper))
+    assert logged.urdf == cell.urdf
+    assert logged.recording_digest == cell.recording_digest
+
+
+@pytest.mark.parametrize(
+    ("hold", "message"),
+    [
+        ("", r"axes: found 6 axes; expected .*J6, swivel, slide.*hold: \{swivel: 0.0, slide: 0.0\}"),
+        ("hold: {swivel: 0}", r"axes: found 6 axes; .*hold: \{slide: 0.0\}"),
+        ("hold: {swivel: 0, slide: 0, thumb: 0}", "hold: found no movable joint 'thumb'.*J6, swivel, slide"),
+        ("hold: {swivel: 0, slide: 0, J6: 0}", "hold.J6: found a joint that is also one of `axes`"),
+        ("hold: {swivel: 90, slide: 0}", "hold.swivel: found 90 deg; expected -57.3 to 57.3 deg"),
+        ("hold: {swivel: 0, slide: 20}", "hold.slide: found 20 m; expected 0 to 0.05 m"),
+    ],
+)
+def test_a_joint_is_an_axis_or_held(with_gripper: Path, hold: str, message: str) -> None:
+    with pytest.raises(ConfigurationInconsistent, match=message):
+        load_cell(_spoil(with_gripper, "\naxes:", f"\n{hold}\naxes:"))
+
+
+def test_a_base_that_floats_is_held_to_be_an_arm(configurations: Path) -> None:
+    world = '<link name="w"/><joint name="f" type="floating"><parent link="w"/><child link="base"/></joint></robot>'
+    _spoil(configurations / "robots/tx40.urdf", "</robot>", world)
+    cell = configurations / "cells/tx40.yaml"
+    with pytest.raises(ConfigurationInconsistent, match=r"'f' is of type 'floating'.*`hold: \{JOINT: POSITION\}`"):
+        load_cell(cell)
+    assert model_of(load_cell(_spoil(cell, "\naxes:", "\nhold: {f: 0.0}\naxes:"))).robot.joint_count == 6

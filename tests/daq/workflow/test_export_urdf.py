@@ -324,3 +324,19 @@ def test_a_damaged_file_is_refused_or_gives_the_bodies(cut: int, rubbish: str) -
 def test_hostile_and_foreign_files_are_refused(content: bytes, says: str) -> None:
     with pytest.raises(SchemaMismatch, match=re.escape(says)):
         update_urdf(content, "x.urdf", UPDATES, "me")
+
+
+def test_held_joints_are_fixed_in_the_exported_urdf(tx40: tuple[Path, Path, FloatArray], tmp_path: Path) -> None:
+    cell, calibration, _ = tx40
+    finger = '<link name="f"/><joint name="finger" type="revolute"><parent link="link6"/><child link="f"/><limit '
+    urdf = load_cell(cell).urdf.replace("</robot>", finger + 'effort="1" velocity="1"/></joint></robot>')
+    (tmp_path / "robot.urdf").write_text(urdf)
+    text = (
+        cell.read_text().replace("../robots/tx40.urdf", "robot.urdf").replace("axes:", "hold: {finger: 20}\naxes:", 1)
+    )
+    (tmp_path / "cell.yaml").write_text(text)
+    out = tmp_path / "out.urdf"
+    assert _export(calibration, "--cell", tmp_path / "cell.yaml", "--out", out) == 0
+    exported = pin.buildModelFromXML(out.read_text())
+    assert list(exported.names)[1:] == [f"J{number}" for number in range(1, 7)]
+    assert exported.existFrame("finger")

@@ -8,7 +8,7 @@ import pytest
 
 from ident.arrays import FloatArray
 from ident.model import regressor
-from ident.model.regressor import fill_rigid
+from ident.model.regressor import fill_rigid, mass_matrix
 from ident.model.robot import Robot, robot_from_urdf
 from tests.bench.torque_fit import moved_links
 from tests.ident.arms import ARMS, GRAVITIES, Arm
@@ -104,3 +104,26 @@ def test_in_a_tree_a_joint_moves_its_own_branch_alone() -> None:
 def test_no_samples_are_no_rows() -> None:
     robot = robot_from_urdf(ARMS[0].urdf)
     assert rigid_regressor(robot, *np.zeros((3, robot.joint_count, 0))).shape == (6, 60, 0)
+
+
+@pytest.mark.parametrize("arm", ARMS, ids=lambda arm: arm.name)
+def test_the_mass_matrix_is_that_of_the_composite_bodies(arm: Arm) -> None:
+    model = pin.buildModelFromXML(arm.urdf)
+    data = model.createData()
+    q = np.random.default_rng(9).uniform(-3, 3, (model.nv, 12))
+    found = mass_matrix(robot_from_urdf(arm.urdf), q, _pinocchio_parameters(model).reshape(-1, 10))
+    for k in range(12):
+        upper = np.triu(pin.crba(model, data, q[:, k]))
+        assert found[:, :, k] == pytest.approx(upper + np.triu(upper, 1).T, rel=1e-10, abs=1e-10)
+
+
+def test_writes_the_wanted_parameters_alone() -> None:
+    robot = robot_from_urdf(ARMS[0].urdf)
+    rng = np.random.default_rng(10)
+    q, v, a = rng.uniform(-2, 2, (3, robot.joint_count, 5))
+    whole, part = (np.full((robot.joint_count, robot.joint_count, 10, 5), np.nan) for _ in range(2))
+    wanted = rng.random((robot.joint_count, 10)) < 0.5
+    fill_rigid(robot, q, v, a, whole)
+    fill_rigid(robot, q, v, a, part, wanted)
+    assert np.array_equal(part[:, wanted], whole[:, wanted], equal_nan=True)
+    assert np.isnan(part[:, ~wanted]).all()

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ident.errors import ModelError
-from ident.model.robot import JointKind, read_urdf, robot_from_urdf
+from ident.model.robot import JointKind, UrdfRobot, hold_joints, read_urdf, robot_from_urdf
 from tests.ident.arms import CONFIGS, GANTRY, SEVEN_AXES, THREE_AXES
 
 FloatArray = NDArray[np.float64]
@@ -28,8 +28,10 @@ TWO_LINKS = (
 
 
 def _assert_read_as_pinocchio_reads(urdf: str) -> None:
-    model = pin.buildModelFromXML(urdf)
-    found = read_urdf(urdf)
+    _assert_same(read_urdf(urdf), pin.buildModelFromXML(urdf), 1e-14)
+
+
+def _assert_same(found: UrdfRobot, model: pin.Model, tolerance: float) -> None:
     assert [joint.name for joint in found.joints] == list(model.names)[1:]
     assert found.effort_limit.tolist() == list(model.upperEffortLimit)
     for number, (joint, body) in enumerate(zip(found.joints, found.bodies, strict=True), start=1):
@@ -70,6 +72,79 @@ def test_robots_of_others_are_read_as_pinocchio_reads_them(name: str, shared_dat
 @settings(deadline=None, max_examples=150, derandomize=True)
 @given(seed=st.integers(0, 1_000_000), count=st.integers(2, 14))
 def test_any_tree_is_read_as_pinocchio_reads_it(seed: int, count: int) -> None:
+    _assert_read_as_pinocchio_reads(_any_tree(seed, count))
+
+
+@settings(deadline=None, max_examples=60, derandomize=True)
+@given(seed=st.integers(0, 1_000_000), count=st.integers(3, 10))
+def test_held_joints_are_those_that_pinocchio_locks(seed: int, count: int) -> None:
+    """Any joints but one, at any position; the bodies behind them are carried by the joint before them."""
+    urdf = _any_tree(seed, count)
+    model, rng = pin.buildModelFromXML(urdf), np.random.default_rng(seed)
+    position = rng.choice([0.0, np.pi / 2, -0.7, 2.5], model.nv)
+    held = [int(number) for number in rng.permutation(np.arange(1, model.njoints))[: rng.integers(0, model.nv)]]
+    locked = pin.buildReducedModel(model, held, pin.integrate(model, pin.neutral(model), position))
+    found = hold_joints(urdf, {model.names[number]: position[model.joints[number].idx_v] for number in held})
+    _assert_same(read_urdf(found), locked, 1e-12)
+
+
+def _with_gripper(finger: str, thumb: str) -> str:
+    """The two links with a gripper on the second; the arguments are type and content of its joints."""
+    return TWO_LINKS.replace(
+        "</robot>",
+        f'<link name="f"><inertial>{BODY}</inertial></link><link name="t"><inertial>{BODY}</inertial></link>'
+        f'<joint name="finger" {finger}<parent link="b"/><child link="f"/></joint>'
+        f'<joint name="thumb" {thumb}<parent link="b"/><child link="t"/></joint></robot>',
+    )
+
+
+TURNING = 'type="revolute"><origin xyz="0.1 0 0"/><axis xyz="0 0 2"/>' + LIMIT
+SLIDING = 'type="prismatic"><origin xyz="0.1 0 0"/><axis xyz="0 0 2"/>' + LIMIT
+FOLLOWING = '<mimic joint="finger" multiplier="-2" offset="0.1"/>'
+
+
+@settings(deadline=None, max_examples=25, derandomize=True)
+@given(angle=st.floats(-7.0, 7.0))
+def test_a_held_gripper_is_the_one_whose_joints_are_fixed_by_hand(angle: float) -> None:
+    held = hold_joints(_with_gripper(TURNING, SLIDING + FOLLOWING), {"finger": angle})
+    _assert_same_robot(
+        held,
+        _with_gripper(
+            f'type="fixed"><origin xyz="0.1 0 0" rpy="0 0 {angle}"/>',
+            f'type="fixed"><origin xyz="0.1 0 {0.1 - 2.0 * angle}"/>',
+        ),
+    )
+    _assert_same_robot(held, hold_joints(_with_gripper(TURNING, SLIDING), {"finger": angle, "thumb": 0.1 - 2 * angle}))
+
+
+def _assert_same_robot(urdf: str, other: str) -> None:
+    (found,), (expected,) = read_urdf(urdf).bodies, read_urdf(other).bodies
+    assert found.mass_kg == expected.mass_kg == 6.0
+    assert _far(found.centre_m, expected.centre_m) < 1e-13
+    assert _far(found.inertia_kg_m2, expected.inertia_kg_m2) < 1e-11
+
+
+@pytest.mark.parametrize(
+    ("urdf", "held", "message"),
+    [
+        (_with_gripper(TURNING, SLIDING), {"wrist": 0.0}, "no movable joint 'wrist'.*one of j, finger, thumb"),
+        (_with_gripper(TURNING, 'type="fixed">'), {"thumb": 0.0}, "no movable joint 'thumb'.*one of j, finger"),
+        (_with_gripper('type="floating">', SLIDING), {"finger": 0.1}, "'finger' is of type 'floating' and held at 0.1"),
+        (_with_gripper(TURNING, SLIDING + FOLLOWING.replace("-2", "x")), {"finger": 0.1}, "'thumb'.*no number"),
+    ],
+)
+def test_what_cannot_be_held_is_refused(urdf: str, held: dict[str, float], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        hold_joints(urdf, held)
+
+
+def test_a_floating_base_is_held_where_it_is() -> None:
+    base = _with_gripper('type="floating"><origin xyz="1 2 3"/>', 'type="planar">')
+    held = hold_joints(base, {"finger": 0.0, "thumb": 0.0})
+    _assert_same_robot(held, _with_gripper('type="fixed"><origin xyz="1 2 3"/>', 'type="fixed">'))
+
+
+def _any_tree(seed: int, count: int) -> str:
     """Random trees: branches, fixed joints, all kinds of joint, bodies anywhere or nowhere, names in any order."""
     rng = np.random.default_rng(seed)
     names = [f"{letter}{number}" for number, letter in enumerate(rng.choice(list("zyABé_"), count))]
@@ -88,7 +163,7 @@ def test_any_tree_is_read_as_pinocchio_reads_it(seed: int, count: int) -> None:
             f'<link name="l{number}"><visual/>{_inertial(rng)}</link>',
         ]
     rng.shuffle(elements)
-    _assert_read_as_pinocchio_reads(f'<?xml version="1.0"?><!-- a tree --><robot name="r">{"".join(elements)}</robot>')
+    return f'<?xml version="1.0"?><!-- a tree --><robot name="r">{"".join(elements)}</robot>'
 
 
 def _three(numbers: FloatArray) -> str:
