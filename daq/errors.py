@@ -5,7 +5,7 @@ DaqError
 ├── CalibrationRefused    exit 3    ControllerUnfit, ControllerChanged, SignatureInvalid, AuditUnusable
 ├── DataError             exit 4    CalibrationMissing, CalibrationUnreadable, TableUnfit, HistoryUnreadable,
 │   │                               LogsDiffer, LogRepeated, RunInvalid, CyclesLost, ClockImplausible,
-│   │                               CurrentSaturated, PositionImplausible
+│   │                               CurrentSaturated, PositionImplausible, EffectsRefuted
 │   └── LogUnreadable               LogMissing, LogForeign, LogTruncated, LogCorrupt, LogIncomplete
 ├── ConfigurationError    exit 6    ConfigurationMissing, YamlInvalid, SchemaMismatch, ConfigurationInconsistent
 ├── JobHeld               exit 14   NotReleased (exit 11), BusTaken (exit 12), TimeBoundReached (exit 13)
@@ -124,7 +124,7 @@ class LogIncomplete(LogUnreadable):
 
 
 class TableUnfit(DataError):
-    """A CSV file of another controller cannot be imported."""
+    """A file of another controller cannot be imported."""
 
 
 class HistoryUnreadable(DataError):
@@ -157,6 +157,10 @@ class CurrentSaturated(DataError):
 
 class PositionImplausible(DataError):
     """Positions are far outside the joint limits: degrees for radians, or a wrong drive train."""
+
+
+class EffectsRefuted(DataError):
+    """The effects found raise the error of held-out runs by more than its noise."""
 
 
 class ConfigurationError(DaqError):

@@ -4,15 +4,23 @@ IdentificationError
 ├── ModelError            the URDF or drive train does not describe this robot
 ├── DataUnfit             the recording cannot be used: NaN, too short, too slow, wrong shape
 ├── ModelContradicted     the declared model explains less of the data than it leaves
-│   └── RolesExchanged    loaded and unloaded runs are mistaken for each other
+│   ├── RolesExchanged    loaded and unloaded runs are mistaken for each other
+│   ├── ChannelsExchanged the currents of some axes are each other's
+│   ├── CurrentReversed   a current counts against the sign of its fixed gain
+│   ├── UnitsMistaken     all gains, or the payload's weight, are off by a factor such as 1000
+│   └── PayloadDiffers    a run carries another payload than it says
 ├── TooFewMoves           uncertainty and left-out moves need more of them
 ├── RankDeficient         the data do not distinguish some unknowns
 ├── PayloadUnseen         runs declared loaded do not differ from the others by the weight of the payload
 ├── NotConverged          the iteration did not reach its optimum
 └── EffectRefused         an effect was asked for that does not exist or does not fit the axis
+
+What leaves usable numbers is no error but a `Diagnosis`.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 
 class IdentificationError(Exception):
@@ -42,10 +50,30 @@ class ModelContradicted(IdentificationError):
 
     def __init__(self, subject: str, *, found: str, expected: str, remedy: str) -> None:
         super().__init__(f"{subject}: found {found}; expected {expected}; {remedy}")
+        self.subject = subject
+        self.found = found
+        self.expected = expected
+        self.remedy = remedy
 
 
 class RolesExchanged(ModelContradicted):
     """Loaded and unloaded runs are mistaken for each other."""
+
+
+class ChannelsExchanged(ModelContradicted):
+    """The currents of some axes are each other's."""
+
+
+class CurrentReversed(ModelContradicted):
+    """A current counts against the sign of its fixed gain."""
+
+
+class UnitsMistaken(ModelContradicted):
+    """All gains, or the payload's weight, are off by a factor such as 1000."""
+
+
+class PayloadDiffers(ModelContradicted):
+    """A run carries another payload than it says."""
 
 
 class TooFewMoves(IdentificationError):
@@ -99,3 +127,23 @@ class NotConverged(IdentificationError):
 
 class EffectRefused(IdentificationError):
     """An effect was asked for that does not exist or does not fit the axis."""
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """Something wrong with a recording or fit that leaves usable numbers, and where to look."""
+
+    #: One of axis-error, axis-idle, channels-exchanged, current-off-scale, current-reversed, estimators-disagree,
+    #: gain-off-nameplate, ill-conditioned, payload-differs, torque-above-limit.
+    name: str
+    runs: tuple[str, ...]  #: those it points at
+    axes: tuple[str, ...]  #: likewise
+    found: str
+    expected: str
+    remedy: str
+
+    @property
+    def text(self) -> str:
+        """The diagnosis in one line."""
+        subject = ", ".join((*self.runs, *self.axes)) or "the fit"
+        return f"{subject}: found {self.found}; expected {self.expected}; {self.remedy} ({self.name})"

@@ -133,11 +133,11 @@ class Decimator:
             padded = np.zeros((len(flat), length))
             padded[:, : min(length, shape[-1])] = flat[:, :length]
             flat = padded
-        weighted = flat.reshape(-1, factor) @ taps.reshape(blocks, factor).T
-        weighted = weighted.reshape(len(flat), count + blocks - 1, blocks)
+        # Taps first: the sums below then run along memory.
+        weighted = (taps.reshape(blocks, factor) @ flat.reshape(-1, factor).T).reshape(blocks, len(flat), -1)
         out = np.zeros((len(flat), count))
-        for block in range(blocks):
-            out += weighted[:, block : block + count, block]
+        for block, share in enumerate(weighted):
+            out += share[:, block : block + count]
         return out.reshape(*shape[:-1], count)
 
 

@@ -42,6 +42,8 @@ class Dataset:
     payload: Payload | None  #: what was mounted, None without load
     #: When the run began, on a clock that the runs of one session share; None without a clock.
     started_s: float | None = None
+    #: Motion that the drives were asked for, all k samples; None where it is not known (`ident.data.demand`).
+    demanded: Motion | None = None
 
     def motion(self, part: slice = slice(None)) -> Motion:
         """Motion of the joints over some of the samples."""

@@ -34,6 +34,7 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
     (position.Spring(),),
     (friction.PositionFriction(),),
     tuple(electrical.Cogging(order) for order in ORDERS),
+    (transmission.Ripple(0.5),),  # and what the periodogram proposes (ident.discovery.ripple)
     (electrical.Saturation(),),
     (electrical.Lag(),),
     (electrical.TimeSkew(),),
@@ -43,6 +44,7 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
     tuple(friction.Presliding(distance_rad) for distance_rad in (0.005, 0.01, 0.02, 0.04, 0.08, 0.16)),
     tuple(transmission.Backlash(share) for share in (0.02, 0.05, 0.15, 0.4)),
     (transmission.Elasticity(),),
+    tuple(transmission.Efficiency(friction_share) for friction_share in (0.5, 1.0)),
     tuple(friction.Coupling(other, sense) for other in PAIRED for sense in (1, -1)),
     tuple(transmission.InertialCoupling(other) for other in PAIRED),
     tuple(position.Hinge(start_rad, sense) for start_rad in np.linspace(-2.5, 2.5, 11).tolist() for sense in (1, -1)),

@@ -94,7 +94,7 @@ class Effect(ABC):
     @property
     @abstractmethod
     def coefficients(self) -> tuple[Column, ...]:
-        """Name and unit of each linear parameter."""
+        """Name, unit and possible values of each linear parameter."""
 
     @property
     def side(self) -> Side:
@@ -109,6 +109,11 @@ class Effect(ABC):
     @abstractmethod
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Torque per unit coefficient [Nm], (p, k); (2, p, k) of two joints, (n, p, k) of all joints or motors."""
+
+    def fits_in(self, runs: Sequence[Signals]) -> bool:
+        """Whether the data are long enough for its settings: no time constant is longer than what was recorded."""
+        del runs
+        return True
 
     @property
     def settings(self) -> dict[str, float]:
@@ -166,6 +171,9 @@ def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axe
         )
 
 
+ADDED = frozenset({"half_gap_rad", "resonant_rad_nm", "damping_ratio"})
+"""Settings that calibrations of an earlier version do not have; they mean 0, and names of columns leave a 0 out."""
+
 ALL_AXES = "all axes"  #: Where an effect is that acts on every motor alike
 
 
@@ -189,10 +197,11 @@ class PlacedEffect:
     def columns(self) -> tuple[Column, ...]:
         """Linear parameters named after effect, axis and settings, because an axis may have cogging of two orders."""
         name, number = self.effect.name, self.axis + 1
-        settings = ", ".join(f"{key} {value:.6g}" for key, value in self.effect.settings.items())
+        given = {key: value for key, value in self.effect.settings.items() if value or key not in ADDED}
+        settings = ", ".join(f"{key} {value:.6g}" for key, value in given.items())
         suffix = f" ({settings})" if settings else ""
         return tuple(
-            Column(f"{name} {column.name} {number}{suffix}", column.unit) for column in self.effect.coefficients
+            replace(column, name=f"{name} {column.name} {number}{suffix}") for column in self.effect.coefficients
         )
 
 

@@ -25,7 +25,7 @@ class Saturation(Effect):
     side = Side.MOTOR
     declares = Property.ODD_IN_CURRENT
     abscissa = Abscissa.CURRENT
-    coefficients = (Column("coefficient", "1/A²"),)
+    coefficients = (Column("coefficient", "1/A²", least=0.0),)
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""

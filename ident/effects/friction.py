@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -24,7 +25,7 @@ class Stribeck(Effect):
     name = "stribeck"
     declares = Property.ODD_IN_VELOCITY
     abscissa = Abscissa.VELOCITY
-    coefficients = (Column("amplitude", "Nm"),)
+    coefficients = (Column("amplitude", "Nm", least=0.0),)
 
     speed_rad_s: Annotated[float, Range(1e-4, 1e2)]  #: η, between standstill and a tenth of full speed
 
@@ -51,7 +52,7 @@ class NonlinearViscous(Effect):
     @property
     def coefficients(self) -> tuple[Column, ...]:
         """Linear parameter, with a unit that depends on the exponent."""
-        return (Column("coefficient", f"Nm/(rad/s)^{self.exponent:.3g}"),)
+        return (Column("coefficient", f"Nm/(rad/s)^{self.exponent:.3g}", least=0.0),)
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
@@ -94,7 +95,7 @@ class LoadFriction(Effect):
     @property
     def coefficients(self) -> tuple[Column, ...]:
         """Linear parameter, with a unit that depends on the exponent."""
-        return (Column("coefficient", "(rad/s)^-1" if self.speed_exponent else "Nm/Nm"),)
+        return (Column("coefficient", "(rad/s)^-1" if self.speed_exponent else "Nm/Nm", least=0.0),)
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
@@ -134,7 +135,7 @@ class Presliding(Effect):
     name = "presliding"
     declares = Property.ODD_IN_VELOCITY
     abscissa = Abscissa.DISTANCE
-    coefficients = (Column("amplitude", "Nm"),)
+    coefficients = (Column("amplitude", "Nm", least=0.0),)
 
     distance_rad: Annotated[float, Range(1e-6, 1e2)]  #: η, over which 63 % of a change of z happens
 
@@ -164,11 +165,18 @@ class WarmUp(Effect):
     name = "warm-up"
     declares = Property.ODD_IN_VELOCITY
     abscissa = Abscissa.TIME
-    coefficients = (Column("dry", "Nm"), Column("viscous", "Nm/(rad/s)"))
+    coefficients = (Column("dry", "Nm", least=0.0), Column("viscous", "Nm/(rad/s)", least=0.0))
 
     time_constant_s: Annotated[float, Range(1e-2, 1e6)]  #: η, from half a run to many
     #: 1 where t counts from the first run of the session, 0 where from the beginning of each run, as after a power-on.
     whole_session: Switch
+
+    def fits_in(self, runs: Sequence[Signals]) -> bool:
+        """Whether the friction fades while it is watched: over the session, or over the longest run."""
+        if self.whole_session:
+            began_s, ended_s = (choose(run.session_s[end] for run in runs) for choose, end in ((min, 0), (max, -1)))
+            return bool(self.time_constant_s <= ended_s - began_s)
+        return bool(self.time_constant_s <= max(run.time_s[-1] for run in runs))
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k)."""
@@ -188,7 +196,7 @@ class Coupling(Effect):
     side = Side.TWO_JOINTS
     declares = Property.ODD_IN_VELOCITY
     abscissa = Abscissa.OTHER_VELOCITY
-    coefficients = (Column("dry", "Nm"), Column("viscous", "Nm/(rad/s)"))
+    coefficients = (Column("dry", "Nm", least=0.0), Column("viscous", "Nm/(rad/s)", least=0.0))
 
     other_axis: AxisNumber  #: number of joint j, from 1; joint i is the one with the lower number
     sense: Sense  #: 1 for the sum of the speeds, −1 for their difference

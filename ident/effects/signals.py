@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from itertools import pairwise
 
 import numpy as np
 
@@ -14,9 +15,10 @@ from ident.equations.rows import Observation
 from ident.estimators.estimate import Estimate
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
-from ident.model.robot import Motion
+from ident.model.regressor import mass_matrix
 
 STICKING_RAD_S = 0.005  #: Below this speed the noise of the filtered encoder decides the sign
+UNIX_S = 1e9  #: Times from here on, September 2001, are since 1970; earlier ones since some start
 POSTURE_SAMPLES = 20  #: Samples between two postures in which the mass matrix is computed
 
 
@@ -138,22 +140,32 @@ def declared_signals(
 
 
 def session_began_s(datasets: Sequence[Dataset]) -> float | None:
-    """Return the start of the earliest run, None if one of them has no clock."""
-    starts_s = [data.started_s for data in datasets if data.started_s is not None]
-    return min(starts_s) if starts_s and len(starts_s) == len(datasets) else None
+    """Return the start of the earliest run, None if one of them has no clock, or if they have no common one.
+
+    Clocks that start with a run, or with a controller, show it: by them two runs of the robot overlap, or one is since
+    1970 and another is not.
+    """
+    spans_s = sorted(
+        (data.started_s, data.time_s[-1] - data.time_s[0]) for data in datasets if data.started_s is not None
+    )
+    if not spans_s or len(spans_s) < len(datasets):
+        return None
+    first_s, last_s = spans_s[0][0], spans_s[-1][0]
+    overlap = any(start_s + length_s > next_s for (start_s, length_s), (next_s, _) in pairwise(spans_s))
+    # By the time of day, runs of a simulated cell may overlap: it moves faster than time.
+    common = not overlap if last_s < UNIX_S else first_s >= UNIX_S
+    return first_s if common else None
 
 
 def _inertia_of_joints(model: Model, data: Dataset, standard: FloatArray) -> FloatArray:
     """Mass matrix of links and payload, shape (n, n, k), interpolated between postures because it changes slowly."""
     samples, count = data.position_rad.shape
     postures = np.linspace(0, samples - 1, max(2, samples // POSTURE_SAMPLES)).round().astype(np.int64)
-    position = data.position_rad[postures]
-    units = np.repeat(np.eye(count + 1, count, -1), len(postures), axis=0)  # none, then of each joint
-    moved = Motion(np.tile(position, (count + 1, 1)), np.zeros_like(units), units)
-    torque, mass = model.torques(moved, standard)[0].reshape(count, count + 1, -1), np.empty((count, count, samples))
+    links = standard[: 14 * count].reshape(count, 14)[:, : len(LINK_PARAMETERS)]
+    coarse = mass_matrix(model.robot, np.ascontiguousarray(data.position_rad[postures].T), links)
+    mass = np.empty((count, count, samples))
     for row, joint in zip(*np.tril_indices(count), strict=True):
-        coarse = torque[row, joint + 1] - torque[row, 0]
-        mass[row, joint] = mass[joint, row] = np.interp(np.arange(samples), postures, coarse)
+        mass[row, joint] = mass[joint, row] = np.interp(np.arange(samples), postures, coarse[row, joint])
     return mass
 
 

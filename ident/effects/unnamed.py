@@ -115,3 +115,8 @@ def cubic_basis(x: FloatArray, lower: float, upper: float) -> FloatArray:
     for offset, part in enumerate(parts):
         basis[interval + offset, np.arange(len(x))] = part / 6.0
     return basis
+
+
+def is_unnamed(effect: Effect) -> bool:
+    """Whether it is a smooth or periodic term, which fits anything and names no cause."""
+    return isinstance(effect, Smooth | Periodic)

@@ -50,44 +50,42 @@ class Linearisation:
             torque_nm: per unit of each column.
             to_motor: T (DriveTrain.to_motor).
         """
-        columns = np.zeros((len(self.motor), torque_nm.shape[1]))
-        felt = [bool(np.any(torque)) for torque in torque_nm]
-        for motor, row in enumerate(to_motor):
-            rows = np.flatnonzero(self.motor == motor)
-            for joint in np.flatnonzero(row):
-                if felt[joint]:
-                    weight = row[joint] * self.gamma[motor] / self.noise[motor]
-                    columns[rows] += weight * torque_nm[joint][:, self.source[rows]].T
-        return columns
+        columns = np.zeros((torque_nm.shape[1], len(self.motor)))
+        for joint in np.flatnonzero(torque_nm.any(axis=(1, 2))):
+            for motor in np.flatnonzero(to_motor[:, joint]):
+                rows = np.flatnonzero(self.motor == motor)
+                weight = to_motor[motor, joint] * self.gamma[motor] / self.noise[motor]
+                columns[:, rows] += weight * torque_nm[joint][:, self.source[rows]]
+        return columns.T
 
 
 def linearise(
     observation: Observation, gains: FloatArray, parameters: FloatArray, noise: FloatArray, *, gains_fixed: bool
 ) -> Linearisation:
     """Linearise around given gains [Nm/A], parameters and current noise [A] of each motor."""
-    count = len(gains)
-    parts, motors, clusters, sources = [], [], [], []
-    for motor, columns in enumerate(observation.motor_columns()):
-        used = np.flatnonzero(observation.motor_use[motor])
-        parts.append((*motor_jacobian(columns[:, used].T, motor, gains, parameters, noise), columns[0, used]))
-        motors.append(np.full(len(used), motor))
-        clusters.append(observation.move[used])
-        sources.append(used)
-    jacobian, residual, current = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    motor_of = np.concatenate(motors)
-    free = np.arange(count if gains_fixed else 0, jacobian.shape[1])
-    norms = np.linalg.norm(jacobian, axis=0)
+    count, width = len(gains), len(gains) + len(parameters)
+    used = [np.flatnonzero(use) for use in observation.motor_use]
+    ends = np.cumsum([len(rows) for rows in used])
+    jacobian, residual, current = np.empty((ends[-1], width)), np.empty(ends[-1]), np.empty(ends[-1])
+    for motor, (columns, rows, end) in enumerate(zip(observation.motor_columns(), used, ends, strict=True)):
+        here = slice(end - len(rows), end)
+        jacobian[here], residual[here] = motor_jacobian(columns[:, rows].T, motor, gains, parameters, noise)
+        current[here] = columns[0, rows] / noise[motor]
+    source, free = np.concatenate(used), slice(count if gains_fixed else 0, width)
+    norms = np.sqrt(np.einsum("rf,rf->f", jacobian, jacobian))
     unit = np.concatenate((gains, np.divide(1.0, norms[count:], where=norms[count:] > 0, out=np.ones(len(parameters)))))
+    jacobian = jacobian[:, free]
+    jacobian *= unit[free]
     return Linearisation(
-        jacobian=jacobian[:, free] * unit[free],
+        jacobian=jacobian,
         residual=residual,
-        current=current / noise[motor_of],
-        motor=motor_of,
-        cluster=np.unique(np.concatenate(clusters), return_inverse=True)[1].astype(np.int64),
-        source=np.concatenate(sources),
+        current=current,
+        motor=np.repeat(np.arange(count), [len(rows) for rows in used]),
+        cluster=np.unique(observation.move[source], return_inverse=True)[1].astype(np.int64),
+        source=source,
         gamma=1.0 / gains,
         noise=noise,
-        free=free,
+        free=np.arange(width)[free],
         scale=unit[free],
     )
 
@@ -134,7 +132,13 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def jackknife_covariance(
-    system: System, gains: FloatArray, parameters: FloatArray, noise: FloatArray, *, gains_fixed: bool
+    system: System,
+    gains: FloatArray,
+    parameters: FloatArray,
+    noise: FloatArray,
+    *,
+    gains_fixed: bool,
+    recorded: System | None = None,
 ) -> FloatArray:
     """Covariance of (gains, parameters) from leaving out one move at a time, zero for fixed gains.
 
@@ -146,6 +150,7 @@ def jackknife_covariance(
         gains, parameters: the estimate, gains in Nm/A, shapes (n,) and (p,).
         noise: σ_i of each motor's current [A], shape (n,).
         gains_fixed: the gains were given.
+        recorded: equations whose residuals count, where those of ``system`` are projected on instruments.
 
     Returns:
         shape (n + p, n + p).
@@ -158,9 +163,11 @@ def jackknife_covariance(
         raise TooFewMoves(clusters, MIN_MOVES_TO_LEAVE_OUT)
     free = slice(count if gains_fixed else 0, size)
     grams, scores = np.zeros((clusters, size, size)), np.zeros((clusters, size))
-    for index, cluster in enumerate(system.clusters):
-        for motor, rows in enumerate(cluster):
+    for index, (cluster, own) in enumerate(zip(system.clusters, (recorded or system).clusters, strict=True)):
+        for motor, (rows, measured) in enumerate(zip(cluster, own, strict=True)):
             jacobian, residual = motor_jacobian(rows, motor, gains, parameters, noise)
+            if measured is not rows:
+                residual = motor_jacobian(measured, motor, gains, parameters, noise)[1]
             grams[index] += jacobian.T @ jacobian
             scores[index] += jacobian.T @ residual
     shifts = left_out_shifts(grams[:, free, free], scores[:, free])
@@ -171,15 +178,44 @@ def jackknife_covariance(
 
 
 @dataclass(frozen=True, slots=True)
+class MotorRows:
+    """Rows of one motor in a problem cut into folds: they follow each other, sorted by fold and cluster."""
+
+    rows: slice  #: among those of the problem
+    starts: IntArray  #: first row of each block, counted from the motor's first, shape (blocks,)
+    fold: IntArray  #: of each block, ascending, shape (blocks,)
+    cluster: IntArray  #: of each block, shape (blocks,)
+    seen: IntArray  #: unknowns that the motor's equation holds, shape (s,)
+    jacobian: FloatArray  #: J of these, columns first, shape (s, rows)
+
+    def sums(self, first: FloatArray, second: FloatArray) -> FloatArray:
+        """Products A_b B_bᵀ of two sets of columns over the rows of each block, shape (blocks, a, b).
+
+        Args:
+            first, second: columns first, shapes (a, rows) and (b, rows).
+        """
+        out = np.empty((len(self.starts), len(first), len(second)))
+        for product, start, stop in zip(out, self.starts, (*self.starts[1:], first.shape[1]), strict=True):
+            np.matmul(first[:, start:stop], second[:, start:stop].T, out=product)
+        return out
+
+    def by_fold(self, products: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Folds that the motor has rows in, and the products of each block summed over each of them."""
+        folds, first = np.unique(self.fold, return_index=True)
+        return folds, np.add.reduceat(products, first, axis=0)
+
+
+@dataclass(frozen=True, slots=True)
 class Folds:
     """A linearised problem cut into folds of whole moves, with everything that cross-validation reuses.
 
     A block holds the rows of one motor in one cluster; folds, clusters and motors are sums over blocks.
     """
 
-    problem: Linearisation  #: the linearisation, its rows sorted by fold, cluster and motor
+    problem: Linearisation  #: the linearisation, its rows sorted by motor, fold and cluster
     moves: int  #: number of whole moves distributed over the folds; a cluster may be only a piece of one
     blocks: tuple[tuple[slice, int, int, int], ...]  #: rows, fold, cluster and motor of each block
+    motors: tuple[MotorRows, ...]  #: the same by motor, those without rows left out
     full_factor: tuple[FloatArray, bool]  #: Cholesky factor of JᵀJ, with scipy's flag
     factors: tuple[tuple[FloatArray, bool], ...]  #: the same without each fold
     scores: FloatArray  #: Jᵀe without each fold, shape (folds, f)
@@ -221,7 +257,7 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
     count = min(count, moves)
     fold_of = move_of % count
     motors, width = len(problem.gamma), problem.jacobian.shape[1]
-    order = np.lexsort((problem.motor, problem.cluster, fold_of[problem.cluster]))
+    order = np.lexsort((problem.cluster, fold_of[problem.cluster], problem.motor))
     of_rows = ("jacobian", "residual", "current", "motor", "cluster", "source")
     problem = replace(problem, **{name: getattr(problem, name)[order] for name in of_rows})
     change = (np.diff(problem.cluster, prepend=-1) != 0) | (np.diff(problem.motor, prepend=-1) != 0)
@@ -232,38 +268,48 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
     cluster_hessian = np.zeros((problem.cluster_count, width, width))
     cluster_score = np.zeros((problem.cluster_count, width))
     part_hessian, motor_score = np.zeros((count, motors, width, width)), np.zeros((motors, width))
-    for rows, k, m, i in blocks:
-        inside = problem.jacobian[rows]
-        gram, score = inside.T @ inside, inside.T @ problem.residual[rows]
-        cluster_hessian[m] += gram
-        cluster_score[m] += score
-        part_hessian[k, i] += gram
-        motor_score[i] += score
+    by_motor = []
+    for i in np.unique(motor):
+        here = motor == i
+        whole = slice(int(starts[here][0]), int(np.searchsorted(problem.motor, i, side="right")))
+        seen = np.flatnonzero(problem.jacobian[whole].any(axis=0))
+        inside = np.ascontiguousarray(problem.jacobian[whole, seen].T)
+        own = MotorRows(whole, starts[here] - whole.start, fold_of[cluster[here]], cluster[here], seen, inside)
+        by_motor.append(own)
+        grams, scores = own.sums(inside, inside), own.sums(inside, problem.residual[None, whole])[:, :, 0]
+        cluster_hessian[np.ix_(own.cluster, seen, seen)] += grams
+        cluster_score[np.ix_(own.cluster, seen)] += scores
+        folds, parts = own.by_fold(grams)
+        part_hessian[:, i][np.ix_(folds, seen, seen)] = parts
+        motor_score[i, seen] = scores.sum(axis=0)
     by_fold = part_hessian.sum(axis=1)
     hessian, score = by_fold.sum(axis=0), motor_score.sum(axis=0)
     # Two effects may be nearly equal: regularise the direction in which they differ.
     hessian[np.diag_indices_from(hessian)] *= 1.0 + 1e-10
-    factors, scores = [], []
+    factors, scores_without = [], []
     for k in range(count):
         rest = hessian - by_fold[k]
         # A direction that only this fold sees must not explode: it stays where the whole data put it.
         rest[np.diag_indices_from(rest)] += 1e-10 * np.diag(hessian)
         factors.append(linalg.cho_factor(rest, lower=True))
-        scores.append(score - cluster_score[fold_of == k].sum(axis=0))
-    steps = [linalg.cho_solve(factor, part) for factor, part in zip(factors, scores, strict=True)]
-    residual = np.empty_like(problem.residual)
+        scores_without.append(score - cluster_score[fold_of == k].sum(axis=0))
+    steps = [linalg.cho_solve(factor, part) for factor, part in zip(factors, scores_without, strict=True)]
+    residual = problem.residual.copy()
     part_score = np.zeros((count, motors, width))
-    for rows, k, _, i in blocks:
-        inside = problem.jacobian[rows]
-        residual[rows] = problem.residual[rows] - inside @ steps[k]
-        part_score[k, i] += inside.T @ residual[rows]
+    for own in by_motor:
+        left = residual[own.rows]
+        for first, last, k in zip(own.starts, (*own.starts[1:], len(left)), own.fold, strict=True):
+            left[first:last] -= steps[k][own.seen] @ own.jacobian[:, first:last]
+        folds, parts = own.by_fold(own.sums(own.jacobian, left[None])[:, :, 0])
+        part_score[:, problem.motor[own.rows.start]][np.ix_(folds, own.seen)] = parts
     return Folds(
         problem=problem,
         moves=moves,
         blocks=blocks,
+        motors=tuple(by_motor),
         full_factor=linalg.cho_factor(hessian, lower=True),
         factors=tuple(factors),
-        scores=np.stack(scores),
+        scores=np.stack(scores_without),
         cluster_hessian=cluster_hessian,
         cluster_score=cluster_score,
         part_hessian=part_hessian,

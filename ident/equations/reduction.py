@@ -15,6 +15,7 @@ import numpy as np
 from ident.arrays import FloatArray, IntArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
+from ident.data.demand import with_demand
 from ident.data.run import Run
 from ident.equations.rows import CHUNK_ROWS, Rows, rows_of
 from ident.equations.system import System, Triangles, qr_update, triangle
@@ -29,11 +30,12 @@ MAX_CLUSTERS = 256
 
 @dataclass(frozen=True, slots=True)
 class Cluster:
-    """The motor rows of one move, or of several that follow each other in runs of one mounting."""
+    """The motor rows of one move, or of several that follow each other in one run."""
 
     mounting: int  #: index into the payloads, −1 without load
+    run: int  #: index into the runs
     #: For each motor i the rows, or where they are many their triangle, of [v_i | (T W_st)_i], the columns that the
-    #: motor's equation can hold (``Layout.motor``).
+    #: motor's equation can hold (``Layout.motor``); with instruments [v_i | (T W_st)_i | (T Z_st)_i].
     factors: tuple[FloatArray, ...]
 
 
@@ -58,6 +60,7 @@ class Reduction:
     joint_rows: IntArray  #: equations of each joint, shape (n,)
     motor_rows: IntArray  #: equations of each motor, shape (n,)
     clusters: tuple[Cluster, ...]  #: in the order of the runs
+    instrumented: bool = False  #: the clusters hold instruments, made of the demanded motion
 
     def base(self) -> BaseParameters:
         """The base parameters that these rows show.
@@ -114,13 +117,21 @@ class Reduction:
                 spread = _widened(factors[joint], plan.joint[joint], count + standard)
                 parts.append(np.concatenate((spread[:, :count], -chosen(spread[:, count:], index - 1)), axis=1))
             joints.append(triangle(parts, count + width))
+
+        def part(cluster: Cluster, number: int) -> list[FloatArray]:
+            """The columns of each motor's equation in one of the parts of a cluster's rows: W_st, Z_st."""
+            return [
+                chosen(
+                    _widened(rows[:, 1 + number * len(c) : 1 + (number + 1) * len(c)], c, standard), cluster.mounting
+                )
+                for rows, c in zip(cluster.factors, plan.motor, strict=True)
+            ]
+
         clusters = tuple(
-            tuple(
-                np.concatenate((factor[:, :1], chosen(_widened(factor[:, 1:], held, standard), c.mounting)), 1)
-                for factor, held in zip(c.factors, plan.motor, strict=True)
-            )
+            tuple(np.concatenate((rows[:, :1], own), 1) for rows, own in zip(c.factors, part(c, 0), strict=True))
             for c in self.clusters
         )
+        instruments = tuple(tuple(part(c, 1)) for c in self.clusters) if self.instrumented else ()
         motors = tuple(triangle((cluster[motor] for cluster in clusters), 1 + width) for motor in range(count))
         named = zip(base.names, base.independent, strict=True)
         return System(
@@ -133,6 +144,8 @@ class Reduction:
             joints=Triangles(tuple(joints), self.joint_rows),
             motors=Triangles(motors, self.motor_rows),
             clusters=clusters,
+            cluster_runs=tuple((cluster.run, cluster.mounting) for cluster in self.clusters),
+            instruments=instruments,
         )
 
 
@@ -153,6 +166,7 @@ def reduce_runs(
     conditioning: Conditioning,
     *,
     payloads: Sequence[Payload] = (),
+    instruments: bool = False,
     chunk_rows: int = CHUNK_ROWS,
 ) -> Reduction:
     """Reduce runs one after the other; no more than one of them is held.
@@ -162,6 +176,7 @@ def reduce_runs(
         runs: read while they are reduced; a mounting that several share has one set of unknowns.
         conditioning: the filters.
         payloads: known beforehand; others are added as runs bring them.
+        instruments: keep those of the demanded motion beside the rows; a run of which none is known is its own.
         chunk_rows: rows built at once; the result does not depend on it.
 
     Raises:
@@ -174,10 +189,14 @@ def reduce_runs(
     joint_rows, motor_rows = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
     names: list[str] = []
     clusters: list[Cluster] = []
+    known = False
     for run in runs:
         mounting = mounting_index(run.payload, seen_payloads, run.name)
         joints += [[np.zeros((c, c)) for c in width] for _ in range(len(seen_payloads) + 1 - len(joints))]
         data = differentiate(run, model.drive_train, conditioning)
+        if instruments:
+            data = with_demand(data, model.drive_train, conditioning)
+            known |= data.demanded is not None
         moves: dict[int, list[list[FloatArray]]] = {}
         for rows in rows_of(model, data, conditioning, chunk_rows):
             for joint, used in enumerate(rows.use):
@@ -188,10 +207,10 @@ def reduce_runs(
                 joints[mounting + 1][joint] = qr_update(joints[mounting + 1][joint], columns)
             joint_rows += rows.use.sum(axis=1)
             motor_rows += rows.motor_use.sum(axis=1)
-            for move, parts in _motor_rows(model, rows, plan).items():
+            for move, parts in _motor_rows(model, rows, plan, instruments=instruments).items():
                 moves.setdefault(move, []).append(parts)
         for pieces in moves.values():
-            clusters.append(_cluster(mounting, pieces))
+            clusters.append(_cluster(mounting, len(names), pieces))
             if len(clusters) > 2 * MAX_CLUSTERS:
                 clusters = _joined(clusters)
         names.append(run.name)
@@ -206,6 +225,7 @@ def reduce_runs(
         joint_rows=joint_rows,
         motor_rows=motor_rows,
         clusters=tuple(clusters),
+        instrumented=known,
     )
 
 
@@ -230,14 +250,15 @@ def mounting_index(payload: Payload | None, payloads: list[Payload], run: str) -
     return len(payloads) - 1
 
 
-def _motor_rows(model: Model, rows: Rows, plan: Layout) -> dict[int, list[FloatArray]]:
-    """Rows [v_i | (T W_st)_i] of each motor, parted by move."""
+def _motor_rows(model: Model, rows: Rows, plan: Layout, *, instruments: bool) -> dict[int, list[FloatArray]]:
+    """Rows [v_i | (T W_st)_i] of each motor, with instruments [v_i | (T W_st)_i | (T Z_st)_i], parted by move."""
     to_motor = model.drive_train.to_motor
     by_motor = []
     for motor, held in enumerate(plan.motor):
         joints = np.flatnonzero(to_motor[motor])
-        mixed = sum(to_motor[motor, joint] * rows.standard[joint][held] for joint in joints)
-        by_motor.append(np.concatenate((rows.current[motor][None], np.asarray(mixed))))
+        parts_of = (rows.standard, rows.instrument) if instruments else (rows.standard,)
+        mixed = [sum(to_motor[motor, joint] * part[joint][held] for joint in joints) for part in parts_of]
+        by_motor.append(np.concatenate((rows.current[motor][None], *map(np.asarray, mixed))))
     parts: dict[int, list[FloatArray]] = {}
     for move in np.unique(rows.move):
         here = rows.motor_use & (rows.move == move)
@@ -246,18 +267,18 @@ def _motor_rows(model: Model, rows: Rows, plan: Layout) -> dict[int, list[FloatA
     return parts
 
 
-def _cluster(mounting: int, pieces: list[list[FloatArray]]) -> Cluster:
-    return Cluster(mounting, tuple(triangle(parts, parts[0].shape[1]) for parts in zip(*pieces, strict=True)))
+def _cluster(mounting: int, run: int, pieces: list[list[FloatArray]]) -> Cluster:
+    return Cluster(mounting, run, tuple(triangle(parts, parts[0].shape[1]) for parts in zip(*pieces, strict=True)))
 
 
 def _joined(clusters: list[Cluster]) -> list[Cluster]:
-    """Neighbours of one mounting joined in pairs."""
+    """Neighbours of one run joined in pairs."""
     joined: list[Cluster] = []
     index = 0
     while index < len(clusters):
         pair = clusters[index : index + 2]
-        if len(pair) == 2 and pair[0].mounting == pair[1].mounting:
-            joined.append(_cluster(pair[0].mounting, [list(cluster.factors) for cluster in pair]))
+        if len(pair) == 2 and pair[0].run == pair[1].run:
+            joined.append(_cluster(pair[0].mounting, pair[0].run, [list(cluster.factors) for cluster in pair]))
             index += 2
         else:
             joined.append(pair[0])

@@ -6,16 +6,17 @@ An estimate needs their triangles alone (ident/equations/reduction.py); these ar
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.conditioning import Conditioning, Decimator, decimator
 from ident.data.dataset import Dataset
-from ident.equations.system import Equations, System, Triangles, triangle
+from ident.equations.system import Equations, System, Triangles, triangle_of
 from ident.errors import DataUnfit
 from ident.model.model import Column, DriveTrain, Model
+from ident.model.robot import Motion
 
 CHUNK_ROWS = 256  #: Decimated rows built at once: the regressor of their samples stays in the cache's reach
 
@@ -76,6 +77,7 @@ class Rows:
 
     current: FloatArray  #: current references of the motors [A], shape (n, r)
     standard: FloatArray  #: torque at each joint per unit of each standard parameter, shape (n, c, r)
+    instrument: FloatArray  #: the same for the demanded motion; the same array where none is known
     use: BoolArray  #: rows of each joint that count: moving and valid, shape (n, r)
     motor_use: BoolArray  #: rows of each motor that count: all joints it turns with, and itself, moving, shape (n, r)
     time_s: FloatArray  #: of each row, since the start of the run, shape (r,)
@@ -101,6 +103,9 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
     centres = filter_.centres(len(data.time_s))
     time_s, move = data.time_s[centres] - data.time_s[0], data.move[centres]
     first, support = 0, model.support
+    asked = None
+    if data.demanded is not None:  # slow enough for the rate of rows: an instrument need not be exact
+        asked = Motion(*(filter_(getattr(data.demanded, field.name).T).T for field in fields(Motion)))
     for part in chunks(filter_, len(data.time_s), chunk_rows):
         regressor = model.regressor(data.motion(part))
         standard = np.zeros((*support.shape, filter_.rows(regressor.shape[2])))
@@ -110,6 +115,7 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
         yield Rows(
             current=filter_(data.current_a[part].T),
             standard=standard,
+            instrument=standard if asked is None else model.regressor(_part(asked, piece)),
             use=use[:, piece],
             motor_use=motor_use[:, piece],
             time_s=time_s[piece],
@@ -117,7 +123,11 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
         )
 
 
-OF_ROWS = ("current", "regressor", "flange", "use", "motor_use", "time_s", "run", "move", "mounting")
+def _part(motion: Motion, rows: slice) -> Motion:
+    return Motion(motion.position_rad[rows], motion.velocity_rad_s[rows], motion.acceleration_rad_s2[rows])
+
+
+OF_ROWS = ("current", "regressor", "effects", "flange", "use", "motor_use", "time_s", "run", "move", "mounting")
 """Fields of an observation that have a row last."""
 
 
@@ -126,7 +136,8 @@ class Observation(Equations):
     """Rows of several runs, before any scaling; arrays are joint-first and time-last."""
 
     current: FloatArray  #: decimated current references of the motors [A], shape (n, r)
-    regressor: FloatArray  #: W, torque at each joint per unit of each column, shape (n, b, r)
+    regressor: FloatArray  #: torque at each joint per unit of each base parameter: W without effects, shape (n, b, r)
+    effects: FloatArray  #: the same of each effect, the other columns of W, shape (n, e, r)
     flange: FloatArray  #: the last link's ten columns; a payload's are these where it was mounted, shape (n, 10, r)
     use: BoolArray  #: rows of each joint that count: moving and valid, shape (n, r)
     motor_use: BoolArray  #: rows of each motor that count: all joints it turns with, and itself, moving, shape (n, r)
@@ -135,10 +146,12 @@ class Observation(Equations):
     move: IntArray  #: number of each row's move, unique over all runs, shape (r,)
     mounting: IntArray  #: index into payloads, −1 without load, shape (r,)
     conditioning: Conditioning  #: the filters these rows went through
+    #: The same rows with the columns of the demanded motion, instruments of `iv`; None where no run's is known.
+    instruments: Observation | None = None
 
     def linear(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
         """[W | W_uL] of some rows, shape (n, p, rows)."""
-        parts = [self.regressor[:, :, rows]]
+        parts = [self.regressor[:, :, rows], self.effects[:, :, rows]]
         for index, indices in enumerate(self.payload_columns):
             parts.append(self.flange[:, list(indices)][:, :, rows] * (self.mounting[rows] == index))
         return np.concatenate(parts, axis=1)
@@ -151,44 +164,64 @@ class Observation(Equations):
             weights[index] = payload.known_parameters
         return np.asarray(np.einsum("jpr,rp->jr", self.flange[:, :, rows], weights[self.mounting[rows]]))
 
-    def motor_columns(self) -> list[FloatArray]:
-        """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor, columns first, shape (p + 2, r)."""
-        to_motor, linear = self.drive_train.to_motor, self.linear()
-        mixed = (to_motor @ linear.reshape(len(to_motor), -1)).reshape(linear.shape)
-        return [
-            np.concatenate((current[None], columns, rest[None]))
-            for current, columns, rest in zip(self.current, mixed, to_motor @ self.known(), strict=True)
-        ]
+    def motor_columns(self) -> Iterator[FloatArray]:
+        """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor in turn, columns first, shape (p + 2, r)."""
+        linear, known = self.linear(), self.known()
+        for current, row in zip(self.current, self.drive_train.to_motor, strict=True):
+            columns = np.zeros((linear.shape[1] + 2, linear.shape[2]))
+            columns[0] = current
+            for joint in np.flatnonzero(row):
+                columns[1:-1] += row[joint] * linear[joint]
+                columns[-1] += row[joint] * known[joint]
+            yield columns
 
     def torque(self, gains: FloatArray, rows: BoolArray | slice = slice(None)) -> FloatArray:
         """Y = V g: joint torque from the measured current references (eq. 4 through R) [Nm], shape (n, rows)."""
         return self.drive_train.direction.T @ (gains[:, None] * self.current[:, rows])
 
-    def only(self, rows: BoolArray | IntArray) -> Observation:
-        """Keep some of the rows, in the order of their indices."""
-        return replace(self, **{name: getattr(self, name)[..., rows] for name in OF_ROWS})
+    def only(self, rows: BoolArray | IntArray | slice) -> Observation:
+        """Keep some of the rows, in the order of their indices; those of a slice are views."""
+        kept = {name: getattr(self, name)[..., rows] for name in OF_ROWS}
+        return replace(self, **kept, instruments=None if self.instruments is None else self.instruments.only(rows))
 
-    def extended(self, columns: tuple[Column, ...], torque: FloatArray) -> Observation:
-        """Add columns to W, torque of shape (n, extra, r) [Nm per unit]."""
-        return replace(self, columns=self.columns + columns, regressor=np.concatenate((self.regressor, torque), axis=1))
+    def extended(
+        self, columns: tuple[Column, ...], torque: FloatArray, demanded_torque: FloatArray | None = None
+    ) -> Observation:
+        """Add columns to W, torque of shape (n, extra, r) [Nm per unit], and those of the demanded motion."""
+        instruments = self.instruments
+        if instruments is not None:
+            instruments = instruments.extended(columns, torque if demanded_torque is None else demanded_torque)
+        return replace(
+            self,
+            columns=self.columns + columns,
+            effects=np.concatenate((self.effects, torque), axis=1),
+            instruments=instruments,
+        )
+
+    def _by_move(self, first_column: int = 0) -> tuple[tuple[FloatArray, ...], ...]:
+        """The motors' rows that count, parted by move, with their columns from one on."""
+        by_move, parts = np.argsort(self.move, kind="stable"), []
+        moves = np.unique(self.move[self.motor_use.any(axis=0)])
+        for columns, used in zip(self.motor_columns(), self.motor_use, strict=True):
+            order = by_move[used[by_move]]
+            pieces = np.split(columns[first_column:, order], np.searchsorted(self.move[order], moves[1:]), axis=1)
+            parts.append([piece.T for piece in pieces])
+        return tuple(zip(*parts, strict=True))
 
     def system(self) -> System:
         """Reduce the rows to triangles."""
         linear, known = self.linear(), self.known()
-        direction, width = self.drive_train.direction, linear.shape[1]
+        direction = self.drive_train.direction
         joints = []
         for joint, used in enumerate(self.use):
             current = direction[:, joint, None] * self.current[:, used]
-            rows = np.concatenate((current, -linear[joint][:, used], -known[joint, used][None]))
-            joints.append(triangle((rows.T,), len(rows)))
-        motors, clusters = [], []
-        motor_columns = self.motor_columns()
-        for columns, used in zip(motor_columns, self.motor_use, strict=True):
-            motors.append(triangle((columns[:, used].T,), width + 2))
-        for move in np.unique(self.move):
-            here = self.motor_use & (self.move == move)
-            if here.any():
-                clusters.append(tuple(columns[:, used].T for columns, used in zip(motor_columns, here, strict=True)))
+            joints.append(triangle_of(np.concatenate((current, -linear[joint][:, used], -known[joint, used][None]))))
+        del linear  # a copy of all rows; the motors' is another
+        clusters, runs = self._by_move(), []
+        motors = [triangle_of(np.concatenate(rows).T) for rows in zip(*clusters, strict=True)]
+        for move in np.unique(self.move[self.motor_use.any(axis=0)]):
+            first = int(np.argmax(self.move == move))
+            runs.append((int(self.run[first]), int(self.mounting[first])))
         return System(
             drive_train=self.drive_train,
             base=self.base,
@@ -198,11 +231,13 @@ class Observation(Equations):
             runs=self.runs,
             joints=Triangles(tuple(joints), self.use.sum(axis=1)),
             motors=Triangles(tuple(motors), self.motor_use.sum(axis=1)),
-            clusters=tuple(clusters),
+            clusters=clusters,
+            cluster_runs=tuple(runs),
+            instruments=() if self.instruments is None else self.instruments._by_move(first_column=1),
         )
 
 
-def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditioning, like: System) -> Observation:
+def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditioning, like: Equations) -> Observation:
     """Build the rows of several runs.
 
     Args:
@@ -228,11 +263,12 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
             run.append(np.full(len(rows.move), index, dtype=np.int64))
             mounting.append(np.full(len(rows.move), mounted, dtype=np.int64))
         first_move = last
-    return Observation(
+    found = Observation(
         drive_train=model.drive_train,
         columns=like.columns[: len(base)],
         base=like.base,
         regressor=np.concatenate([regressor for _, regressor, _ in parts], axis=2),
+        effects=np.zeros((model.robot.joint_count, 0, sum(map(len, run)))),
         flange=np.concatenate([flange for _, _, flange in parts], axis=2),
         run=np.concatenate(run),
         move=np.concatenate(move),
@@ -241,5 +277,13 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
         payload_columns=like.payload_columns,
         runs=tuple(data.name for data in datasets),
         conditioning=conditioning,
+        instruments=None,
         **{name: np.concatenate([getattr(rows, name) for rows, _, _ in parts], axis=-1) for name in shared},
     )
+    if all(data.demanded is None for data in datasets):
+        return found
+    regressor, flange = (
+        np.concatenate([rows.instrument[:, columns] for rows, _, _ in parts], axis=2)
+        for columns in (base, model.flange)
+    )
+    return replace(found, instruments=replace(found, regressor=regressor, flange=flange))

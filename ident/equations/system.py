@@ -70,6 +70,14 @@ def triangle(parts: Iterable[FloatArray], columns: int) -> FloatArray:
     return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64) if len(rows) > columns else rows
 
 
+def triangle_of(columns: FloatArray) -> FloatArray:
+    """R of rows that are given column by column, shape (c, k) → (≤c, c); columns that are zero take no part."""
+    held = np.flatnonzero(columns.any(axis=1))
+    out = np.zeros((len(held), len(columns)))
+    out[:, held] = qr_update(None, columns[held])
+    return out
+
+
 def solve(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Least squares with unit-norm columns inside: solution and (MᵀM)⁻¹.
 
@@ -151,6 +159,11 @@ class System(Equations):
     motors: Triangles
     #: For each cluster the rows or the triangle of each motor's rows.
     clusters: tuple[tuple[FloatArray, ...], ...]
+    #: Of each cluster the index of its run, and that of its payload, −1 without load.
+    cluster_runs: tuple[tuple[int, int], ...] = ()
+    #: Beside the rows of each cluster those of its instruments, [(T [Z | Z_uL])_i | (T Z_kL χ_kL)_i] of the demanded
+    #: motion; empty where none is known.
+    instruments: tuple[tuple[FloatArray, ...], ...] = ()
 
     @property
     def knows_payload(self) -> bool:
@@ -181,7 +194,29 @@ class System(Equations):
             joints=folded(self.joints, self.joint_count),
             motors=folded(self.motors, 1),
             clusters=tuple(tuple(held(rows, 1) for rows in cluster) for cluster in self.clusters),
+            instruments=tuple(tuple(held(rows, 0) for rows in cluster) for cluster in self.instruments),
         )
+
+    def on_instruments(self) -> System:
+        """Replace each motor's columns by their projection on its instruments: the first of two stages.
+
+        What is left of a column depends on the demanded motion alone; a disturbance that moved the arm is gone from it.
+        """
+        projected = []
+        for motor in range(self.joint_count):
+            instruments = np.concatenate([cluster[motor] for cluster in self.instruments])
+            seen = np.flatnonzero(np.any(instruments, axis=0))
+            columns = np.concatenate([cluster[motor][:, 1:] for cluster in self.clusters])
+            both = triangle((np.concatenate((instruments[:, seen], columns), axis=1),), len(seen) + columns.shape[1])
+            stage, _ = solve(both[: len(seen), : len(seen)], both[: len(seen), len(seen) :])
+            projected.append(
+                [
+                    np.concatenate((rows[motor][:, :1], known[motor][:, seen] @ stage), axis=1)
+                    for rows, known in zip(self.clusters, self.instruments, strict=True)
+                ]
+            )
+        factors = tuple(triangle(rows, rows[0].shape[1]) for rows in projected)
+        return replace(self, motors=Triangles(factors, self.motors.rows), clusters=tuple(zip(*projected, strict=True)))
 
 
 def require_rows(system: System) -> None:

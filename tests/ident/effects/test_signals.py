@@ -104,6 +104,25 @@ def test_the_session_clock_counts_from_the_first_run(small_truth: Truth, data: D
         assert np.all(np.diff(run.session_s) > 0)
 
 
+@pytest.mark.parametrize(
+    ("starts_s", "began_s"),
+    [
+        ((512.3, 0.0, 60.0), 0.0),
+        ((0.0, 0.0), None),
+        ((0.0, 500.0, 500.5), None),
+        ((0.0, 1.7e9), None),
+        ((1.7e9 + 0.5, 1.7e9), 1.7e9),
+        ((0.0,), 0.0),
+    ],
+)
+def test_runs_that_overlap_have_no_common_clock(
+    data: Dataset, starts_s: tuple[float, ...], began_s: float | None
+) -> None:
+    """Stamps from each file's own start say nothing of the session; by the time of day a simulated cell may overlap."""
+    assert data.time_s[-1] - data.time_s[0] > 0.9
+    assert session_began_s([replace(data, started_s=started_s) for started_s in starts_s]) == began_s
+
+
 def test_without_a_clock_the_session_is_the_run(small_truth: Truth, data: Dataset) -> None:
     runs = [replace(data, started_s=1000.0), replace(data, started_s=None)]
     assert session_began_s(runs) is None

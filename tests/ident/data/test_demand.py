@@ -1,0 +1,94 @@
+"""The demanded motion, rebuilt from recorded moves."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ident.data.conditioning import Conditioning
+from ident.data.dataset import Dataset, differentiate
+from ident.data.demand import as_demanded, demanded_positions, with_demand
+from ident.data.run import Run
+from ident.model.model import DriveTrain
+
+FloatArray = NDArray[np.float64]
+RATE_HZ = 250.0
+CONDITIONING = Conditioning(standstill_rad_s=(0.03, 0.03))
+STRAIGHT, COUPLED = DriveTrain(np.diag([40.0, 30.0])), DriveTrain(np.array([[40.0, 0.0], [30.0, 30.0]]))
+
+
+def trapezoid(stops: FloatArray, rng: np.random.Generator, speed: float, acceleration: float) -> FloatArray:
+    """Positions of one motor that goes from stop to stop at trapezoidal speed, with rests of 0.2 s or more."""
+    parts = [np.repeat(stops[0], round(0.3 * RATE_HZ))]
+    for start, end in pairwise(stops):
+        way = abs(end - start)
+        ramp = min(speed / acceleration, np.sqrt(way / acceleration))
+        duration = way / (acceleration * ramp) + ramp
+        time = np.arange(round(duration * RATE_HZ) + 1) / RATE_HZ
+        velocity = acceleration * np.minimum(np.minimum(time, duration - time).clip(0.0), ramp)
+        done = np.cumsum(velocity)
+        parts.append(start + (end - start) * done / done[-1])
+        parts.append(np.repeat(end, round(rng.uniform(0.2, 0.6) * RATE_HZ)))
+    return np.concatenate(parts)
+
+
+def dataset(position: FloatArray, train: DriveTrain = STRAIGHT) -> Dataset:
+    run = Run("run", np.arange(len(position)) / RATE_HZ, position, np.zeros_like(position))
+    return differentiate(run, train, CONDITIONING)
+
+
+def two_motors(seed: int) -> FloatArray:
+    rng = np.random.default_rng(seed)
+    motors = [trapezoid(rng.uniform(-2.0, 2.0, 7), rng, speed, 6.0) for speed in (2.0, 1.4)]
+    longest = max(map(len, motors))
+    return np.stack([np.pad(motor, (0, longest - len(motor)), mode="edge") for motor in motors], axis=1)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_moves_are_found_beneath_a_disturbance(seed: int) -> None:
+    asked = two_motors(seed)
+    rng = np.random.default_rng(seed + 1)
+    wave = 0.002 * np.sin(2.0 * np.pi * rng.uniform(5.0, 15.0) * np.arange(len(asked)) / RATE_HZ)[:, None]
+    found = demanded_positions(dataset(np.asarray(asked + wave, dtype=np.float64)), STRAIGHT)
+    assert found is not None
+    speed = np.diff(asked[1:-1], axis=0)
+    assert np.all(np.sum((np.diff(found, axis=0) - speed) ** 2, axis=0) < 0.01 * np.sum(speed**2, axis=0))
+    # Three numbers a move follow next to nothing of what the disturbance adds to the acceleration.
+    added, left = np.diff(wave[1:-1], n=2, axis=0), np.diff(found - asked[1:-1], n=2, axis=0)
+    assert np.all(np.abs(np.sum(added * left, axis=0)) < 0.06 * np.sum(added**2))
+
+
+def test_coupled_motors_make_the_trapezoids() -> None:
+    """Joint 2 is the difference of two motors that start and stop at different times: no trapezoid of its own."""
+    motors = two_motors(3)
+    joints = np.asarray(np.linalg.solve(COUPLED.direction, motors.T).T, dtype=np.float64)
+    found = demanded_positions(dataset(joints, COUPLED), COUPLED)
+    assert found is not None
+    assert np.max(np.abs(found - joints[1:-1])) < 0.01
+
+
+def test_continuous_motion_has_no_moves() -> None:
+    time = np.arange(2000)[:, None] / RATE_HZ
+    motion = np.sin(2.0 * time + np.array([0.0, 1.0])) + 0.5 * np.cos(3.3 * time) + 0.3 * np.sin(5.1 * time)
+    data = dataset(motion)
+    assert demanded_positions(data, STRAIGHT) is None
+    assert with_demand(data, STRAIGHT, CONDITIONING) is data
+    assert as_demanded(data) is data
+
+
+def test_an_axis_that_rests_is_demanded_to_rest() -> None:
+    motion = two_motors(1)
+    motion[:, 1] = 0.7
+    found = demanded_positions(dataset(motion), STRAIGHT)
+    assert found is not None
+    assert found[:, 1] == pytest.approx(0.7)
+
+
+def test_derivatives_are_those_of_the_demanded_positions() -> None:
+    asked = as_demanded(with_demand(dataset(two_motors(2)), STRAIGHT, CONDITIONING))
+    speed = np.gradient(asked.position_rad, 1.0 / RATE_HZ, axis=0)
+    assert np.max(np.abs(speed - asked.velocity_rad_s)) < 1e-9
+    assert np.max(np.abs(asked.velocity_rad_s)) == pytest.approx(2.0, rel=0.05)
