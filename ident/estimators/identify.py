@@ -8,15 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident.arrays import FloatArray, as_array, require_kind
+from ident.arrays import BoolArray, FloatArray, as_array, require_kind
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.equations.reduction import reduce_runs
 from ident.equations.system import System, require_distinct
 from ident.errors import DataUnfit, IdentificationError, ModelContradicted, ModelError, PayloadUnseen, RolesExchanged
+from ident.estimators.diagnosis import idle_joints, joint_torques, require_signs, require_weight
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import ls, tls, wls
-from ident.estimators.maximum_likelihood import ml
+from ident.estimators.maximum_likelihood import iv, ml
 from ident.estimators.method import Method
 from ident.model.bodies import Payload
 from ident.model.model import Model
@@ -75,6 +76,7 @@ def identify(
     Raises:
         ModelError: an argument is of another type, there is no such method, or no gain for each motor.
         RolesExchanged, ModelContradicted: see `require_plausible`. A reversed current only reverses its gain's sign.
+        UnitsMistaken, CurrentReversed: with fixed gains.
         DataUnfit, RankDeficient, TooFewMoves, PayloadUnseen, NotConverged: see reduction and estimators.
     """
     require_kind("model", model, Model, "write Model(robot, drive_train)")
@@ -84,7 +86,7 @@ def identify(
         fixed_gains = as_array("fixed_gains", fixed_gains, (model.robot.joint_count,), "one per motor")
         if not fixed_gains.all():
             raise ModelError(f"fixed_gains is {fixed_gains.tolist()}; expected no zero: such a motor moves nothing")
-    reduction = reduce_runs(model, each_run(runs), conditioning)
+    reduction = reduce_runs(model, each_run(runs), conditioning, instruments=method is Method.IV)
     if not reduction.runs:
         raise DataUnfit("", "no run was given; expected one without load and one with a weighed payload")
     system = reduction.system(reduction.base(), reduction.payload_columns())
@@ -95,9 +97,14 @@ def identify(
         # The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and do not see that moves
         # contradict each other; ml's do, where it has an estimate.
         with suppress(IdentificationError):
-            jackknifed = estimate if method is Method.ML else ml(system)
+            jackknifed = estimate if method.is_of_currents else ml(system)
         require_seen_payload(jackknifed, system)
-    require_plausible(jackknifed, estimate.relative_error(system), [joint.name for joint in model.robot.joints])
+    axes = [joint.name for joint in model.robot.joints]
+    if fixed_gains is not None:
+        require_weight(system, estimate)
+        require_signs(system, estimate, axes)
+    idle = idle_joints(model, *joint_torques(system, estimate))
+    require_plausible(jackknifed, estimate.relative_error(system), axes, idle)
     rest = reduce_runs(model, each_run(holdout, system.payloads), conditioning, payloads=system.payloads)
     unseen = rest.system(system.base, system.payload_columns) if rest.runs else None
     return Identification(model, conditioning, system, unseen, estimate)
@@ -120,11 +127,19 @@ def require_seen_payload(estimate: Estimate, system: System) -> None:
         raise PayloadUnseen(tuple(float(100.0 * value) for value in relative), system.runs)
 
 
-def require_plausible(estimate: Estimate, error: RelativeError, axes: Sequence[str]) -> None:
+def require_plausible(
+    estimate: Estimate, error: RelativeError, axes: Sequence[str], idle: BoolArray | None = None
+) -> None:
     """Refuse a fit whose model contradicts its data: no number of it can be believed, however small its σ.
 
     The payload's weight sets the sign of all gains. Taken from the wrong runs it reverses them, and all torques with
     them: the residual stays the same, but the dry friction of every joint then drives the robot.
+
+    Args:
+        estimate: with σ of its gains.
+        error: of the fit.
+        axes: name of each axis.
+        idle: of `idle_joints`: a relative error of nothing is nothing, where the gain is known; none when None.
 
     Raises:
         ModelContradicted: the relative error is above one of the LARGEST_..._PERCENT.
@@ -132,6 +147,8 @@ def require_plausible(estimate: Estimate, error: RelativeError, axes: Sequence[s
     """
     unknown = estimate.gains_std > np.abs(estimate.gains)
     excess = np.array(error.axes) / np.where(unknown, LARGEST_UNKNOWN_PERCENT, LARGEST_AXIS_PERCENT)
+    if idle is not None:
+        excess[idle & ~unknown] = 0.0
     worst = int(np.nanargmax(excess))
     if error.total > LARGEST_TOTAL_PERCENT or excess[worst] > 1.0:
         raise ModelContradicted(
@@ -177,4 +194,4 @@ def estimate_with(method: Method, system: System, fixed_gains: FloatArray | None
         if fixed_gains is not None:
             raise DataUnfit(", ".join(system.runs), "tls needs free gains; with fixed gains choose ls, wls or ml")
         return tls(system)
-    return {Method.LS: ls, Method.WLS: wls, Method.ML: ml}[method](system, fixed_gains)
+    return {Method.LS: ls, Method.WLS: wls, Method.ML: ml, Method.IV: iv}[method](system, fixed_gains)

@@ -18,7 +18,7 @@ from scipy import linalg
 from ident.arrays import FloatArray
 from ident.equations.linearisation import jackknife_covariance
 from ident.equations.system import System, Triangles, require_known_payload, require_rows, solve
-from ident.errors import NotConverged, RankDeficient
+from ident.errors import DataUnfit, NotConverged, RankDeficient
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import Scaling, tls, wls
 from ident.estimators.method import Method
@@ -41,6 +41,35 @@ def ml(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
         TooFewMoves: for the covariance.
         NotConverged: the cost still falls, or cannot fall, after MAX_ITERATIONS.
     """
+    return _maximum_likelihood(system, system, Method.ML, fixed_gains)
+
+
+def iv(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
+    """Two-stage least squares: `ml` with the columns projected on those of the demanded motion.
+
+    Where a torque disturbs the arm inside its position loop, recorded motion and error share a cause, and `ml` is
+    biased. The demanded motion knows nothing of the disturbance: Σ_i (T L̂_i)ᵀ e_i γ_i/σ_i² = 0 and v̂_iᵀ e_i = 0 with L̂
+    and v̂ of that motion hold in the mean however strong it is (Söderström & Stoica, System Identification, ch. 8; for
+    robots Janot, Vandanjon & Gautier 2014). σ is the jackknife of these conditions.
+
+    Arguments and errors are those of `ml`.
+
+    Raises:
+        DataUnfit: no run of the system has instruments.
+    """
+    if fixed_gains is None:
+        require_known_payload(system)
+    if not system.instruments:
+        raise DataUnfit(
+            ", ".join(system.runs),
+            "the demanded motion is not known: the joints do not move from rest to rest at trapezoidal speed; "
+            "choose the method ml, or record point-to-point moves",
+        )
+    return _maximum_likelihood(system.on_instruments(), system, Method.IV, fixed_gains)
+
+
+def _maximum_likelihood(system: System, recorded: System, method: Method, fixed_gains: FloatArray | None) -> Estimate:
+    """Estimate from one system; σ from the residuals of the recorded one."""
     require_rows(system)
     triangles = system.motors
     if fixed_gains is None:
@@ -49,24 +78,20 @@ def ml(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
     else:
         gamma, iterations = 1.0 / fixed_gains, 0
     free = len(system.unknowns) + (0 if fixed_gains is not None else system.joint_count)
-    noise = noise_of(triangles, gamma, _parameters(triangles, gamma, np.ones(len(gamma))), free)
-    for _ in range(30):  # σ and χ for these γ: a fixed point of a few rounds
-        parameters = _parameters(triangles, gamma, noise)
-        updated = noise_of(triangles, gamma, parameters, free)
-        if np.allclose(updated, noise, rtol=1e-10):
-            break
-        noise = updated
+    parameters, noise = settled(triangles, gamma, free)
     full = np.concatenate((1.0 / gamma, parameters, [1.0]))
     weighted = system.joints.weighted_system(full, free, gains=fixed_gains is None)
-    covariance = jackknife_covariance(system, 1.0 / gamma, parameters, noise, gains_fixed=fixed_gains is not None)
+    covariance = jackknife_covariance(
+        system, 1.0 / gamma, parameters, noise, gains_fixed=fixed_gains is not None, recorded=recorded
+    )
     return Estimate(
-        method=Method.ML,
+        method=method,
         gains=1.0 / gamma,
         gains_fixed=fixed_gains is not None,
         unknowns=system.unknowns,
         parameters=parameters,
         covariance=covariance,
-        axis_noise=noise,
+        axis_noise=noise if method is Method.ML else noise_of(recorded.motors, gamma, parameters, free),
         singular_values=weighted,
         condition=float(weighted[0] / weighted[-1]),
         rows=int(triangles.rows.sum()),
@@ -91,9 +116,25 @@ def _residuals(triangles: Triangles, gamma: FloatArray, parameters: FloatArray) 
     return [factor @ vector for factor, vector in zip(triangles.factors, vectors, strict=True)]
 
 
+def settled(triangles: Triangles, gamma: FloatArray, free: int) -> tuple[FloatArray, FloatArray]:
+    """χ and σ of each motor's current [A] for given γ, shapes (p,) and (n,): a fixed point of a few rounds."""
+    noise = noise_of(triangles, gamma, _parameters(triangles, gamma, np.ones(len(gamma))), free)
+    for _ in range(30):
+        parameters = _parameters(triangles, gamma, noise)
+        updated = noise_of(triangles, gamma, parameters, free)
+        if np.allclose(updated, noise, rtol=1e-10):
+            break
+        noise = updated
+    return parameters, noise
+
+
 def noise_of(triangles: Triangles, gamma: FloatArray, parameters: FloatArray, free: int) -> FloatArray:
-    """σ of each motor's current [A] around an estimate, shape (n,); ``free`` parameters are shared among the motors."""
+    """σ of each motor's current [A] around an estimate, shape (n,); ``free`` parameters are shared among the motors.
+
+    It is 1 for a motor without rows, which has no residual.
+    """
     size = np.array([float(e @ e) for e in _residuals(triangles, gamma, parameters)])
+    size[triangles.rows == 0] = 1.0
     return np.asarray(np.sqrt(size / np.maximum(triangles.rows - free / len(gamma), 1.0)))
 
 

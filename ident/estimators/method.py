@@ -14,6 +14,12 @@ class Method(Enum):
     WLS = "wls"
     TLS = "tls"
     ML = "ml"
+    IV = "iv"
+
+    @property
+    def is_of_currents(self) -> bool:
+        """Whether it fits the motors' currents, so that the search for effects can build on it."""
+        return self in (Method.ML, Method.IV)
 
     @classmethod
     def _missing_(cls, value: object) -> Method:

@@ -1,0 +1,193 @@
+"""Each mistake of a recording is named, by run or axis, and it alone; none is named in clean recordings."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ident.data.run import Run
+from ident.errors import CurrentReversed, ModelContradicted, PayloadDiffers, UnitsMistaken
+from ident.estimators.diagnosis import (
+    UNIT_RATIO,
+    axis_error_diagnoses,
+    exchanged_channels,
+    idle_joints,
+    require_units,
+    scale_diagnoses,
+)
+from ident.estimators.estimate import RelativeError
+from ident.estimators.identify import identify, require_plausible
+from ident.estimators.method import Method
+from ident.estimators.payload_diagnosis import payload_differences
+from tests.ident.mistaken import AXES, BODY, SMALL, diagnosed, small_recordings, turned, with_currents
+from tests.ident.recordings import MOUNTED, FloatArray, Truth, record
+
+
+@pytest.fixture(scope="module")
+def clean(small_truth: Truth) -> list[Run]:
+    return small_recordings(small_truth, 0)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_nothing_is_named_in_clean_recordings(small_truth: Truth, seed: int) -> None:
+    runs = small_recordings(small_truth, seed, count=3, noise_a=(0.02, 0.1, 0.15)[seed % 3])
+    limit = np.full(3, 99.0)
+    assert diagnosed(small_truth, runs[:2], runs[2:], effort_limit=limit) == ()
+    assert diagnosed(small_truth, runs[1:], runs[:1], fixed=True, method=Method.WLS, effort_limit=limit) == ()
+    assert exchanged_channels(small_truth.model, runs[:2], SMALL, AXES) is None
+
+
+def test_a_payload_turned_in_one_run_of_three(small_truth: Truth) -> None:
+    runs = small_recordings(small_truth, 0, count=6, bodies={3: turned(np.pi)})
+    (found,) = diagnosed(small_truth, runs)
+    assert (found.name, found.runs, found.axes) == ("payload-differs", ("r3",), ())
+    assert "not turned?" in found.text
+
+
+def test_of_two_loaded_runs_neither_can_be_blamed_alone(small_truth: Truth) -> None:
+    runs = small_recordings(small_truth, 1, bodies={1: turned(np.pi)})
+    (found,) = diagnosed(small_truth, runs, fixed=True)
+    assert (found.name, found.runs) == ("payload-differs", ("r1", "r3"))
+
+
+def test_a_payload_turned_in_the_held_out_run(small_truth: Truth) -> None:
+    runs = small_recordings(small_truth, 2, bodies={3: turned(np.pi)})
+    (found,) = diagnosed(small_truth, runs[:2], runs[2:])
+    assert (found.name, found.runs) == ("payload-differs", ("r3",))
+
+
+@pytest.mark.parametrize("left_on", [False, True])
+def test_a_payload_left_off_or_on_in_one_run_leaves_no_numbers(small_truth: Truth, left_on: bool) -> None:
+    run, body = (2, BODY) if left_on else (3, 0.0 * BODY)
+    runs = small_recordings(small_truth, 0, count=6, bodies={run: body})
+    with pytest.raises(PayloadDiffers, match=rf"run r{run}: .*was it mounted in this run"):
+        diagnosed(small_truth, runs, fixed=True)
+
+
+def test_the_only_loaded_run_without_its_payload(small_truth: Truth) -> None:
+    """Fixed gains that are off by 10 to 20 % say nothing of a payload; a weight of nearly nothing does."""
+    runs = small_recordings(small_truth, 0, count=2)
+    off = np.array([1.2, 0.85, 1.1])
+    assert diagnosed(small_truth, with_currents(runs, off), fixed=True) == ()
+    forgotten = [runs[0], small_recordings(small_truth, 0, count=2, bodies={1: 0.0 * BODY})[1]]
+    (found,) = diagnosed(small_truth, forgotten, fixed=True)
+    assert (found.name, found.runs) == ("payload-differs", ("r1",))
+
+
+def test_the_difference_is_estimated_as_planted(small_truth: Truth) -> None:
+    """Twice the mass, at the same centre."""
+    heavier = BODY * np.r_[np.ones(6), np.full(4, 2.0)]
+    runs = small_recordings(small_truth, 4, bodies={3: heavier}, noise_a=0.02)
+    known = identify(small_truth.model, runs[:2], SMALL, holdout=runs[3:], fixed_gains=small_truth.gains)
+    assert known.holdout is not None
+    (found,) = payload_differences(known.holdout, known.estimate.gains, known.estimate.parameters)
+    seen = [6, 8, 9]  # my lies along the last axis, which is horizontal
+    assert found.difference[seen] == pytest.approx(BODY[seen], rel=0.1)
+    assert found.probability < 1e-6
+
+
+@pytest.mark.parametrize("order", [*map(list, itertools.permutations(range(3)))][1:], ids=str)
+def test_exchanged_currents_are_named(small_truth: Truth, clean: list[Run], order: list[int]) -> None:
+    found = exchanged_channels(small_truth.model, with_currents(clean[:2], 1.0, order), SMALL, AXES)
+    assert found is not None
+    assert found.axes == tuple(name for name, place in zip(AXES, order, strict=True) if AXES[place] != name)
+
+
+def test_a_reversed_current_only_turns_a_free_gain(small_truth: Truth, clean: list[Run]) -> None:
+    (found,) = diagnosed(small_truth, with_currents(clean, np.array([1.0, -1.0, 1.0])))
+    assert (found.name, found.axes) == ("current-reversed", ("J2",))
+
+
+@pytest.mark.parametrize("signs", [s for s in itertools.product((1.0, -1.0), repeat=3) if 0 < s.count(-1.0) < 3])
+def test_a_reversed_current_with_fixed_gains(small_truth: Truth, clean: list[Run], signs: tuple[float, ...]) -> None:
+    names = [joint.name for joint, sign in zip(small_truth.model.robot.joints, signs, strict=True) if sign < 0.0]
+    with pytest.raises(CurrentReversed, match=f"axis {', '.join(names)}: "):
+        diagnosed(small_truth, with_currents(clean[:1], np.array(signs)), fixed=True, method=Method.WLS)
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+@pytest.mark.parametrize(("current", "mass"), [(1000.0, 1.0), (1.0, 1000.0)], ids=["mA", "grams"])
+def test_a_unit_is_named(small_truth: Truth, clean: list[Run], current: float, mass: float, fixed: bool) -> None:
+    heavy = replace(MOUNTED, known={"m": mass * MOUNTED.known["m"]})
+    runs = [replace(run, payload=run.payload and heavy) for run in with_currents(clean[:2], current)]
+    subject = "the weight of the payload" if fixed else "all drive gains"
+    with pytest.raises(UnitsMistaken, match=f"{subject}.*{'mA' if fixed or current > 1.0 else 'g and read as kg'}"):
+        diagnosed(small_truth, runs, fixed=fixed)
+
+
+@given(st.lists(st.floats(0.001, 1000.0), min_size=2, max_size=5))
+def test_all_gains_must_be_off_alike(ratio: list[float]) -> None:
+    gains = np.array(ratio) * (-1.0) ** np.arange(len(ratio))
+    if min(ratio) > UNIT_RATIO or max(ratio) < 1.0 / UNIT_RATIO:
+        with pytest.raises(UnitsMistaken):
+            require_units(gains, np.ones(len(ratio)))
+    else:
+        require_units(gains, np.ones(len(ratio)))
+
+
+def test_one_gain_off_its_nameplate(small_truth: Truth, clean: list[Run]) -> None:
+    (found,) = diagnosed(small_truth, with_currents(clean, np.array([1.0, 1.0, 5.0])))
+    assert (found.name, found.axes) == ("gain-off-nameplate", ("J3",))
+
+
+def test_torques_above_the_limits_of_the_urdf(small_truth: Truth, clean: list[Run]) -> None:
+    """Without a payload nothing else speaks of mA."""
+    runs, limit = with_currents(clean[:1], 1000.0), np.array([99.0, np.inf, 99.0])
+    (found,) = diagnosed(small_truth, runs, fixed=True, effort_limit=limit)
+    assert found.name == "torque-above-limit"
+    assert diagnosed(small_truth, runs, fixed=True, effort_limit=np.full(3, np.inf)) == ()
+
+
+def test_an_error_on_one_axis(small_truth: Truth, clean: list[Run]) -> None:
+    rng = np.random.default_rng(0)
+    noise = [rng.standard_normal(run.current_a.shape) * np.array([0.0, 0.0, 1.0]) for run in clean]
+    noisy = [replace(run, current_a=run.current_a + one) for run, one in zip(clean, noise, strict=True)]
+    (found,) = diagnosed(small_truth, noisy[:2], fixed=True)
+    assert (found.name, found.runs, found.axes) == ("axis-error", (), ("J3",))
+
+
+def test_a_tiny_torque_is_no_error(small_truth: Truth) -> None:
+    size, left = np.array([30.0, 20.0, 0.01]), np.array([1.0, 1.0, 0.09])
+    idle = idle_joints(small_truth.model, size, left)
+    (found,) = axis_error_diagnoses(size, left, idle, AXES, ())
+    assert (found.name, found.axes) == ("axis-idle", ("J3",))
+    estimate = identify(
+        small_truth.model, small_recordings(small_truth, 5, count=1), SMALL, fixed_gains=small_truth.gains
+    ).estimate
+    error = RelativeError((3.3, 5.0, 900.0), 4.0)
+    require_plausible(estimate, error, AXES, idle)
+    with pytest.raises(ModelContradicted, match="900 % on axis J3"):
+        require_plausible(estimate, error, AXES)
+
+
+def test_axes_that_never_move_apart_leave_no_parameters(small_truth: Truth) -> None:
+    def tied(q: FloatArray) -> FloatArray:
+        return np.column_stack((q[:, 0], q[:, 1], 0.5 * q[:, 1] + 1e-6 * q[:, 2]))
+
+    run = record(small_truth, "tied", np.random.default_rng(0), seconds=16.0, noise_a=0.05, rate_hz=200.0, bend=tied)
+    (found,) = diagnosed(small_truth, [run], fixed=True, method=Method.WLS)
+    assert found.name == "ill-conditioned"
+
+
+def test_another_estimator_far_from_ml(small_truth: Truth, clean: list[Run]) -> None:
+    """IDIM-WLS takes the noise in the currents for smaller gains."""
+    found = diagnosed(small_truth, clean, method=Method.WLS)
+    assert {one.name for one in found} == {"estimators-disagree"}
+    assert "J3" in {one.axes[0] for one in found}
+    assert "by wls" in found[0].found
+
+
+@given(scale=st.floats(0.01, 0.33) | st.floats(0.34, 2.9) | st.floats(3.1, 100.0), sign=st.sampled_from([1.0, -1.0]))
+def test_the_scale_of_a_current_beside_a_calibration(scale: float, sign: float) -> None:
+    predicted = np.random.default_rng(0).standard_normal((2, 200))
+    measured = predicted * np.array([[1.0], [sign * scale]])
+    names = {
+        one.name for one in scale_diagnoses(measured, predicted, np.ones((2, 200), dtype=bool), ("a", "b"), ("r",))
+    }
+    assert ("current-reversed" in names) == (sign < 0.0)
+    assert ("current-off-scale" in names) == (not 0.334 <= scale <= 3.0)
