@@ -36,6 +36,7 @@ import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
 
 from ident.arrays import FloatArray, IntArray
+from ident.discovery.gates import PairedChange, compare_by_move
 from ident.discovery.loop import Evidence, Step, with_effects
 from ident.discovery.noise_floor import NoiseFloor, noise_floors
 from ident.effects.effect import PlacedEffect
@@ -43,7 +44,7 @@ from ident.equations.linearisation import Folds, cut_into_folds, left_out_shifts
 from ident.equations.rows import Observation
 from ident.errors import IdentificationError
 from ident.estimators.estimate import Estimate, RelativeError, of_squares
-from ident.estimators.maximum_likelihood import ml
+from ident.estimators.identify import estimate_with
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,10 +65,27 @@ class CurrentError:
 
 def error_on(observation: Observation, estimate: Estimate) -> CurrentError:
     """Error of an estimate on rows, those of its fit or others with the same columns."""
-    use, measured = observation.motor_use, observation.current
-    predicted = observation.drive_train.to_motor @ estimate.predicted_torque(observation)
-    residual = measured - predicted / estimate.gains[:, None]
+    use, measured, residual = observation.motor_use, observation.current, _residual(observation, estimate)
     return CurrentError(np.sum(measured**2, axis=1, where=use), np.sum(residual**2, axis=1, where=use))
+
+
+def holdout_change(before: Evidence, after: Evidence) -> PairedChange | None:
+    """Compare the squared errors of two models on held-out rows by move, currents weighted by the gains before [Nm²].
+
+    None without held-out runs.
+    """
+    if before.holdout is None or after.holdout is None:
+        return None
+    rows = before.holdout
+    first, second = (np.square(_residual(one.holdout or rows, one.estimate)) for one in (before, after))
+    weights = np.square(before.estimate.gains)[:, None] * rows.motor_use
+    return compare_by_move(np.sum(weights * (second - first), axis=0), rows.move)
+
+
+def _residual(observation: Observation, estimate: Estimate) -> FloatArray:
+    """e of each motor and row [A], shape (n, r)."""
+    predicted = observation.drive_train.to_motor @ estimate.predicted_torque(observation)
+    return np.asarray(observation.current - predicted / estimate.gains[:, None])
 
 
 def error_left_out(folds: Folds) -> CurrentError:
@@ -128,7 +146,7 @@ def _error_without(evidence: Evidence, left_out: int) -> CurrentError:
         training=training,
         holdout=held,
         effects=(),
-        estimate=ml(training.system(), fixed),
+        estimate=estimate_with(evidence.estimate.method, training.system(), fixed),
     )
     if not evidence.effects:
         return error_on(held, bare.estimate)
@@ -211,6 +229,7 @@ class Account:
     holdout_floor: RelativeError | None  #: the same on held-out rows, None without any
     turns: tuple[BeforeAfter | None, ...]  #: change by each turn of the loop, None where it added nothing
     total: BeforeAfter  #: change from the declared model to the last one
+    holdout_change: PairedChange | None  #: of the squared error on held-out rows, None without any
 
 
 def account(
@@ -252,6 +271,7 @@ def account(
         holdout_floor=None if start.holdout is None else floor_on(start.holdout, floors).relative(weights_nm_a),
         turns=tuple(turns),
         total=before_after(first, last),
+        holdout_change=holdout_change(start, steps[-1].after),
     )
 
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from scipy import linalg
 
-from ident.arrays import FloatArray, IntArray
+from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.dataset import Dataset
 from ident.discovery.noise_floor import noise_floors
-from ident.effects.effect import Effect, at_joints, effect_torque, is_placeable
+from ident.effects.effect import Effect, at_joints, is_placeable
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.linearisation import Folds, cut_into_folds, linearise
 from ident.equations.rows import Observation, decimate_rows
@@ -25,6 +25,7 @@ from ident.model.model import Model
 
 ColumnCache = dict[tuple[Effect, int], FloatArray]
 
+BATCH_COLUMNS = 48  #: Columns tested together: enough for fast products, few enough to keep memory small
 MOVES_WANTED = 60
 SHORTEST_PIECE_S = 0.25
 REDUNDANT_SHARE = 1e-6  #: Share of a column that must be left when all declared directions are projected out of it
@@ -44,7 +45,7 @@ class SearchProblem:
     folds: Folds  #: the problem around the estimate, in folds of moves
     #: Noise of each motor's current in a row that no model of motion explains; None where not known.
     floors_a: tuple[float | None, ...]
-    #: Columns of motion and time alone, which stay the same from turn to turn.
+    #: Columns of motion and time alone, which stay the same from turn to turn, before they are placed at joints.
     cache: ColumnCache = field(default_factory=dict)
 
     @property
@@ -66,31 +67,36 @@ class SearchProblem:
             for effect in family
             if is_placeable(effect, axis, self.model.robot)
         ]
-        if not placed:
-            return ()
-        trials = self.trials([torque(effect, axis) for _, effect in placed])
+        trials = self.trials(torque(effect, axis) for _, effect in placed)
         members: dict[int, list[tuple[Effect, Trial]]] = {}
         for (number, effect), trial in zip(placed, trials, strict=True):
             if trial is not None:
                 members.setdefault(number, []).append((effect, trial))
         return tuple(FamilyTrials(axis, tuple(found)) for found in members.values())
 
-    def trials(self, torques: Sequence[FloatArray]) -> tuple[Trial | None, ...]:
+    def trials(self, torques: Iterable[FloatArray]) -> tuple[Trial | None, ...]:
         """Test candidates given by their joint torques (n, p, r); None where the model contains them already."""
-        ends = np.cumsum([torque.shape[1] for torque in torques])
-        candidates = [slice(int(end) - torque.shape[1], int(end)) for end, torque in zip(ends, torques, strict=True)]
-        whole = np.concatenate(torques, axis=1)
-        columns = self.folds.problem.whitened(whole, self.model.drive_train.to_motor)
-        return score_candidates(self.folds, columns, candidates)
+        problem, to_motor = self.folds.problem, self.model.drive_train.to_motor
+        trials: list[Trial | None] = []
+        parts: list[FloatArray] = []
+        for torque in torques:
+            parts.append(problem.whitened(torque, to_motor))
+            if sum(part.shape[1] for part in parts) >= BATCH_COLUMNS:
+                trials += _scored(self.folds, parts)
+                parts = []
+        return (*trials, *_scored(self.folds, parts))
 
     def torque(self, effect: Effect, axis: int) -> FloatArray:
         """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (n, p, r)."""
-        if (effect, axis) in self.cache:
-            return self.cache[effect, axis]
-        made = effect_torque(effect, axis, self.runs, self.datasets, self.observation.conditioning, self.model)
-        if effect.abscissa.is_kinematic:
-            self.cache[effect, axis] = made
-        return made
+        columns = self.cache.get((effect, axis))
+        if columns is None:
+            conditioning = self.observation.conditioning
+            pairs = zip(self.datasets, self.runs, strict=True)
+            parts = [decimate_rows(data, conditioning, effect.columns(run, axis)) for data, run in pairs]
+            columns = np.concatenate(parts, axis=-1)
+            if effect.abscissa.is_kinematic:
+                self.cache[effect, axis] = columns
+        return at_joints(effect, axis, columns, self.model.drive_train)
 
     def _torque_at_rows(self, effect: Effect, axis: int) -> FloatArray:
         if effect.abscissa in FAST:
@@ -188,11 +194,20 @@ def _pieces(observation: Observation) -> tuple[IntArray, IntArray]:
     return pieces, move[used[at]]
 
 
+def _scored(folds: Folds, parts: Sequence[FloatArray]) -> tuple[Trial | None, ...]:
+    """Test the candidates of one batch, each with whitened columns of shape (rows, p)."""
+    if not parts:
+        return ()
+    ends = np.cumsum([part.shape[1] for part in parts]).tolist()
+    candidates = [slice(end - part.shape[1], end) for end, part in zip(ends, parts, strict=True)]
+    return score_candidates(folds, np.concatenate(parts, axis=1), candidates)
+
+
 def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[slice]) -> tuple[Trial | None, ...]:
     """Project columns off all declared directions, gains included, and measure what they explain.
 
     Everything is computed from products that are summed block by block, so that no candidate needs a pass over the rows
-    of its own.
+    of its own; candidates with the same number of columns p are computed together.
 
     Args:
         folds: the problem in folds.
@@ -204,97 +219,113 @@ def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[sli
     """
     made = _products(folds, columns)
     motor_jacobian, fold_jacobian = made.part_jacobian.sum(axis=0), made.part_jacobian.sum(axis=1)
-    motor_gram, gram_sum = made.part_gram.sum(axis=0), made.cluster_gram.sum(axis=0)
+    motor_gram, squares = made.part_gram.sum(axis=0), np.diag(made.part_gram.sum(axis=(0, 1)))
     whole_jacobian = motor_jacobian.sum(axis=0)
     # Φ⊥ = Φ − J H⁻¹ JᵀΦ, of each move and of each motor.
-    along = linalg.cho_solve(folds.full_factor, whole_jacobian)
-    all_pushed, motor_pushed = folds.cluster_hessian @ along, folds.part_hessian.sum(axis=0) @ along
-    cluster_score = made.cluster_score - folds.cluster_score @ along
-    motor_score = made.part_score.sum(axis=0) - folds.motor_score @ along
+    along = linalg.cho_solve(folds.full_factor, whole_jacobian.T).T
+    all_pushed, motor_pushed = along @ folds.cluster_hessian, along @ folds.part_hessian.sum(axis=0)
+    cluster_score = made.cluster_score - folds.cluster_score @ along.T
+    motor_score = made.part_score.sum(axis=0) - folds.motor_score @ along.T
     # The same with J and Φ of the other folds, for each fold k: Φ − J w_k.
     coupling = whole_jacobian - fold_jacobian
-    steps = np.stack([linalg.cho_solve(*pair) for pair in zip(folds.factors, coupling, strict=True)])
-    pushed = folds.part_hessian @ steps[:, None]
-    drive = made.part_score.sum(axis=(0, 1)) - made.part_score.sum(axis=1) - (folds.scores[:, None] @ steps)[:, 0]
-    shown = made.part_held - folds.part_score @ steps
-    before, squares = folds.square_sum(folds.residual), np.diag(gram_sum)
-    trials: list[Trial | None] = []
-    for chosen in candidates:
-        w, step = along[:, chosen], steps[:, :, chosen]
-        cluster_gram = _projected_gram(
-            made.cluster_gram[:, chosen, chosen], made.cluster_jacobian[:, :, chosen], w[None], all_pushed[:, :, chosen]
-        )
-        gram = cluster_gram.sum(axis=0)
-        root = np.sqrt(np.maximum(np.diag(gram), 0.0))
-        left = np.all(np.diag(gram) > REDUNDANT_SHARE * squares[chosen])
-        if not left or np.linalg.cond(gram / np.outer(root, root)) > 1e10:
-            trials.append(None)
-            continue
-        score = cluster_score[:, chosen].sum(axis=0)
-        coefficients = np.linalg.solve(gram, score)
-        own = motor_gram[:, chosen, chosen], motor_jacobian[:, :, chosen], w[None], motor_pushed[:, :, chosen]
-        explained = np.einsum("p,npq,q->n", coefficients, _projected_gram(*own), coefficients)
+    steps = np.stack([linalg.cho_solve(factor, c.T).T for factor, c in zip(folds.factors, coupling, strict=True)])
+    pushed = steps[:, None] @ folds.part_hessian
+    drive = (
+        made.part_score.sum(axis=(0, 1)) - made.part_score.sum(axis=1) - np.einsum("kqf,kf->kq", steps, folds.scores)
+    )
+    shown = made.part_held - np.einsum("kqf,knf->knq", steps, folds.part_score)
+    before = folds.square_sum(folds.residual)
+    trials: list[Trial | None] = [None] * len(candidates)
+    starts, stops = np.array([(chosen.start, chosen.stop) for chosen in candidates]).T
+    for width in np.unique(stops - starts):
+        numbers = np.flatnonzero(stops - starts == width)
+        at = starts[numbers, None] + np.arange(width)  # shape (c, p)
+        pair = at[:, :, None], at[:, None, :]
+        gram = _projected_gram(made.cluster_gram[:, *pair], made.cluster_jacobian[:, at], along[at], all_pushed[:, at])
+        kept = _is_new(gram.sum(axis=0), squares[at])
+        numbers, at, gram = numbers[kept], at[kept], gram[:, kept]
+        pair = at[:, :, None], at[:, None, :]
+        score = cluster_score[:, at].sum(axis=0)
+        fitted = np.linalg.solve(gram.sum(axis=0), score[..., None])[..., 0]
+        own = _projected_gram(motor_gram[:, *pair], motor_jacobian[:, at], along[at], motor_pushed[:, at])
+        fallen = 2.0 * np.einsum("ncp,cp->cn", motor_score[:, at], fitted)
+        fallen -= np.einsum("cp,ncpq,cq->cn", fitted, own, fitted)
+        scatter = cluster_score[:, at] - (gram @ fitted[..., None])[..., 0]
         # Without fold k; what the other folds do not show at all is left as it is: in its own unit, the shortest of
         # all solutions.
-        unit = np.sqrt(squares[chosen])
-        part_gram = made.part_gram[:, :, chosen, chosen]
-        rest = motor_gram[:, chosen, chosen].sum(axis=0) - part_gram.sum(axis=1)
-        schur = rest - np.swapaxes(coupling[:, :, chosen], 1, 2) @ step
-        inverse = np.linalg.pinv(schur / np.outer(unit, unit), rcond=UNSEEN)
-        fitted = (inverse @ (drive[:, chosen] / unit)[:, :, None])[:, :, 0] / unit
+        unit, step = np.sqrt(squares[at]), steps[:, at]
+        part_gram = made.part_gram[:, :, *pair]
+        rest = motor_gram[:, *pair].sum(axis=0) - part_gram.sum(axis=1)
+        schur = rest - coupling[:, at] @ np.swapaxes(step, -1, -2)
+        inverse = np.linalg.pinv(schur / (unit[:, :, None] * unit[:, None, :]), rcond=UNSEEN)
+        without = (inverse @ (drive[:, at] / unit)[..., None])[..., 0] / unit
         # r − (Φ − J w_k) fitted, squared motor by motor.
-        inside = _projected_gram(part_gram, made.part_jacobian[:, :, :, chosen], step[:, None], pushed[:, :, :, chosen])
-        rose = np.einsum("kp,knpq,kq->kn", fitted, inside, fitted)
-        trials.append(
-            Trial(
-                coefficients=coefficients,
-                fallen=2.0 * motor_score[:, chosen] @ coefficients - explained,
-                training_fall=np.sum(drive[:, chosen] * fitted, axis=1),
-                held_out=before - 2.0 * np.einsum("knp,kp->kn", shown[:, :, chosen], fitted) + rose,
-                score=score,
-                scatter=cluster_score[:, chosen] - cluster_gram @ coefficients,
-                gram=cluster_gram,
+        inside = _projected_gram(part_gram, made.part_jacobian[:, :, at], step[:, None], pushed[:, :, at])
+        held_out = before[:, :, None] - 2.0 * np.einsum("kncp,kcp->knc", shown[:, :, at], without)
+        held_out += np.einsum("kcp,kncpq,kcq->knc", without, inside, without)
+        training = np.sum(drive[:, at] * without, axis=-1)
+        for place, number in enumerate(numbers):
+            trials[number] = Trial(
+                coefficients=fitted[place],
+                fallen=fallen[place],
+                training_fall=training[:, place],
+                held_out=held_out[:, :, place],
+                score=score[place],
+                scatter=scatter[:, place],
+                gram=gram[:, place],
             )
-        )
     return tuple(trials)
 
 
+def _is_new(gram: FloatArray, squares: FloatArray) -> BoolArray:
+    """Which candidates the declared model lacks, by Φ⊥ᵀΦ⊥, shape (c, p, p), and ‖φ‖² of their columns, shape (c, p)."""
+    size = np.diagonal(gram, axis1=1, axis2=2)
+    new = np.asarray(np.all(size > REDUNDANT_SHARE * squares, axis=1))
+    root = np.sqrt(size[new])
+    new[new] = np.linalg.cond(gram[new] / (root[:, :, None] * root[:, None, :])) <= 1e10
+    return new
+
+
 def _projected_gram(gram: FloatArray, jacobian: FloatArray, along: FloatArray, pushed: FloatArray) -> FloatArray:
-    """(Φ − J w)ᵀ(Φ − J w) of each part, shape (…, p, p), with ``pushed`` = JᵀJ w."""
-    crossed = np.swapaxes(jacobian, -1, -2) @ along
-    return np.asarray(gram - crossed - np.swapaxes(crossed, -1, -2) + np.swapaxes(along, -1, -2) @ pushed)
+    """(Φ − J w)ᵀ(Φ − J w) of each part, shape (…, p, p), from ΦᵀΦ, ΦᵀJ, wᵀ and wᵀJᵀJ, the last three (…, p, f)."""
+    crossed = jacobian @ np.swapaxes(along, -1, -2)
+    return np.asarray(gram - crossed - np.swapaxes(crossed, -1, -2) + pushed @ np.swapaxes(along, -1, -2))
 
 
 @dataclass(frozen=True, slots=True)
 class _Products:
-    """Products of candidate columns Φ (many candidates side by side) with the problem, shape (…, q) for q columns."""
+    """Products of q candidate columns Φ (many candidates side by side) with the problem."""
 
-    cluster_jacobian: FloatArray  #: JᵀΦ of each cluster
-    cluster_gram: FloatArray  #: ΦᵀΦ of each cluster
-    cluster_score: FloatArray  #: Φᵀe of each cluster
-    part_jacobian: FloatArray  #: JᵀΦ of each fold and motor
-    part_gram: FloatArray  #: ΦᵀΦ of each fold and motor
-    part_score: FloatArray  #: Φᵀe of each fold and motor
-    part_held: FloatArray  #: Φᵀr of each fold and motor
+    cluster_jacobian: FloatArray  #: ΦᵀJ of each cluster, shape (clusters, q, f)
+    cluster_gram: FloatArray  #: ΦᵀΦ of each cluster, shape (clusters, q, q)
+    cluster_score: FloatArray  #: Φᵀe of each cluster, shape (clusters, q)
+    part_jacobian: FloatArray  #: ΦᵀJ of each fold and motor, shape (folds, n, q, f)
+    part_gram: FloatArray  #: ΦᵀΦ of each fold and motor, shape (folds, n, q, q)
+    part_score: FloatArray  #: Φᵀe of each fold and motor, shape (folds, n, q)
+    part_held: FloatArray  #: Φᵀr of each fold and motor, shape (folds, n, q)
 
 
 def _products(folds: Folds, columns: FloatArray) -> _Products:
     problem, n = folds.problem, len(folds.problem.gamma)
     f, q = problem.jacobian.shape[1], columns.shape[1]
     clusters, count = problem.cluster_count, folds.count
-    shapes = [(*parts, *shape) for parts in ((clusters,), (count, n)) for shape in ((f, q), (q, q), (q,))]
+    shapes = [(*parts, *shape) for parts in ((clusters,), (count, n)) for shape in ((q, f), (q, q), (q,))]
     made = _Products(*map(np.zeros, (*shapes, shapes[-1])))
-    felt = [bool(np.any(columns[problem.motor == motor])) for motor in range(n)]
-    for rows, k, m, i in folds.blocks:
-        if not felt[i]:
-            continue
-        inside = columns[rows]
-        jacobian, gram, score = problem.jacobian[rows].T @ inside, inside.T @ inside, problem.residual[rows] @ inside
-        made.cluster_jacobian[m] += jacobian
-        made.cluster_gram[m] += gram
-        made.cluster_score[m] += score
-        made.part_jacobian[k, i] += jacobian
-        made.part_gram[k, i] += gram
-        made.part_score[k, i] += score
-        made.part_held[k, i] += folds.residual[rows] @ inside
+    for own in folds.motors:
+        # Most candidates act on one motor: only columns that this one feels, and unknowns that it holds, take part.
+        inside, motor = columns[own.rows].T, problem.motor[own.rows.start]
+        felt = np.flatnonzero(inside.any(axis=1))
+        inside = inside[felt]
+        products = own.sums(inside, np.concatenate((own.jacobian, inside)))
+        scores = own.sums(inside, np.stack((problem.residual[own.rows], folds.residual[own.rows])))
+        jacobian, gram = np.split(products, [len(own.seen)], axis=2)
+        made.cluster_jacobian[np.ix_(own.cluster, felt, own.seen)] += jacobian
+        made.cluster_gram[np.ix_(own.cluster, felt, felt)] += gram
+        made.cluster_score[np.ix_(own.cluster, felt)] += scores[:, :, 0]
+        (present, products), (_, scores) = own.by_fold(products), own.by_fold(scores)
+        jacobian, gram = np.split(products, [len(own.seen)], axis=2)
+        made.part_jacobian[:, motor][np.ix_(present, felt, own.seen)] = jacobian
+        made.part_gram[:, motor][np.ix_(present, felt, felt)] = gram
+        made.part_score[:, motor][np.ix_(present, felt)] = scores[:, :, 0]
+        made.part_held[:, motor][np.ix_(present, felt)] = scores[:, :, 1]
     return made

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,8 +13,20 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
+from ident.data.demand import as_demanded, with_demand
 from ident.data.run import Run
-from ident.discovery.candidates import ColumnCache, prepare_search
+from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, prepare_search, score_candidates
+from ident.discovery.gates import (
+    RunsLeftOut,
+    gain_shifts,
+    impossible,
+    in_noise,
+    moved_gains,
+    whitened_columns,
+    without_effects_of,
+)
+from ident.discovery.resonance import propose_resonances
+from ident.discovery.ripple import propose_orders
 from ident.discovery.search import (
     MIN_MOVES_FOR_STRUCTURE,
     EffectKey,
@@ -30,8 +42,10 @@ from ident.discovery.search import (
     refine_setting,
 )
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import Effect, PlacedEffect, effect_torque, joints_of
+from ident.effects.effect import Effect, PlacedEffect, effect_torque
 from ident.effects.signals import fitted_signals, session_began_s
+from ident.effects.transmission import Ripple
+from ident.effects.unnamed import is_unnamed
 from ident.equations.rows import Observation, observe
 from ident.errors import NotConverged, RankDeficient
 from ident.estimators.estimate import Estimate, RelativeError
@@ -40,6 +54,7 @@ from ident.model.model import Model
 
 UNFITTED = (NotConverged, RankDeficient, np.linalg.LinAlgError)
 MAX_EFFECTS = 12  #: More effects than this on one robot mean that the declared model is wrong
+PIECES_PER_EFFECT = 3  #: Fewer pieces of moves than this for each effect cannot show that all of them are there
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +89,23 @@ class Evidence:
 
 
 @dataclass(frozen=True, slots=True)
+class SetAside:
+    """A finding that passed the search, but did not join the model."""
+
+    finding: Finding
+    words: str = ""  #: why it did not, `{rival}` in the place of the rival's name
+    rival: PlacedEffect | None = None  #: an effect that is kept instead
+    moved: tuple[tuple[int, float], ...] = ()  #: gains that it would move: index, and by how many σ
+
+    def reason(self, axes: Sequence[str]) -> str:
+        """Why it did not join, in words, with the names of the axes."""
+        if self.moved:
+            gains = ", ".join(f"the gain of {axes[motor]} by {size:.1f} σ" for motor, size in self.moved)
+            return f"it has no name, and would move {gains}"
+        return self.words if self.rival is None else self.words.replace("{rival}", self.rival.name_among(axes))
+
+
+@dataclass(frozen=True, slots=True)
 class Step:
     """One turn of the loop: the findings, and the model after it."""
 
@@ -84,6 +116,7 @@ class Step:
     limits_nm: FloatArray  #: torque (root mean square) that a detectable effect has at each motor, shape (n,)
     accepted: Finding | None  #: the finding, or the structure without a name, that joined the model; None ends the loop
     after: Evidence  #: the model with it
+    set_aside: tuple[SetAside, ...] = ()  #: what would have joined the model, but for a gate of the joint fit
     ended: str = ""  #: reason why the search ended here although the residual may call for more; else empty
 
 
@@ -98,19 +131,26 @@ def find_effects(
 
     Each turn of the loop:
 
-    1. linearises the problem around the estimate and deals whole moves to folds (`prepare_search`);
-    2. tests every family of the dictionary on every axis: its columns, made from the motion and the predicted load and
-       current, are projected off all declared directions, and the fall of the squared residual is measured in-sample
-       and on held-out moves (`rank_effects`);
-    3. passes a candidate only through all gates: larger than noise makes anywhere in the search, better on most folds,
-       and large enough to matter (`Gates`);
-    4. chooses the best on held-out moves, the simplest among equals (`choose_effect`);
-    5. tests terms without a name, splines and motor harmonics, on the same axis, or on all axes if no named effect
-       passed; one that explains much more replaces the named effect (`find_structure`, `is_inadequate`);
-    6. refines its setting (`refine_setting`), adds it, and refits gains, parameters and effects together;
-    7. drops earlier effects on the same joints that no longer pass the gates.
+    1. proposes settings (`propose_orders`, `propose_resonances`) and tests every family on every axis: its columns,
+       made from the motion and the predicted load and current, are projected off all declared directions, and the fall
+       of the squared residual is measured in-sample and on held-out moves (`rank_effects`);
+    2. passes a candidate only through all gates: larger than noise makes anywhere in the search, better on most folds,
+       large enough to matter, and physically possible (`Gates`, `impossible`);
+    3. chooses the best on held-out moves, the simplest among equals (`choose_effect`), if it does not raise the error
+       on runs left out (`RunsLeftOut`);
+    4. tests terms without a name, splines and motor harmonics, on the same axis, or on all axes if no named effect
+       passed; one that explains much more replaces the named effect (`find_structure`, `is_inadequate`), but not if it
+       moves a gain by more than its σ;
+    5. refines its setting (`refine_setting`), adds it, and refits gains, parameters and effects together;
+    6. linearises the problem around the joint fit and deals whole moves to folds (`prepare_search`); every effect in
+       the model must still pass, beside all the others, or it leaves (`without_effects_of`). A term without a name may
+       not make a named effect leave: then it does not join.
 
-    It ends when nothing passes, or after MAX_EFFECTS. Held-out runs take no part in it.
+    What a gate of the joint fit refuses is in `Step.set_aside`, and the next best is tried. The ambiguity of an
+    accepted effect holds what could not be distinguished from it, passed before, and does not pass beside it.
+
+    It ends when nothing passes, at one effect for PIECES_PER_EFFECT pieces, or after MAX_EFFECTS turns. Held-out runs
+    take no part in it.
 
     Args:
         start: identified by ``ml``, from `gather`.
@@ -122,47 +162,211 @@ def find_effects(
     Returns:
         the turns taken; the last one has accepted nothing, unless MAX_EFFECTS was reached.
     """
-    gates = gates or Gates()
+    gates, cache = gates or Gates(), ColumnCache()
+    model = _linearised(start, cache)
     steps: list[Step] = []
-    current = start
-    cache: ColumnCache = {}
-    refused: dict[EffectKey, str] = {}
+    seen = {_keys(start)}
     for _ in range(MAX_EFFECTS):
-        known = len(current.effects)
-        progress("searching for a missing effect" + (f" beside the {known} found" if known else ""))
-        search_problem = prepare_search(current.model, start.trained, current.training, current.estimate, cache)
-        findings = rank_effects(search_problem, rng, gates, families)
-        taken = frozenset((*refused, *(effect_key(placed.effect, placed.axis) for placed in current.effects)))
-        accepted = choose_effect(findings, taken)
-        axes = range(search_problem.axes) if accepted is None else (accepted.axis,)
-        if accepted is None:
-            progress("searching for structure that no named effect explains")
-        structures = find_structure(search_problem, axes, rng, gates)
-        best = choose_effect(structures, taken)
-        if accepted is None or (best is not None and is_inadequate(accepted, best)):
-            accepted = best
-        limits_nm = detection_limits_nm(search_problem, gates)
-        if accepted is None:
-            moves, reasons = search_problem.folds.moves, [*refused.values()]
-            if moves < MIN_MOVES_FOR_STRUCTURE:
-                reasons.append(f"structure without a name needs {MIN_MOVES_FOR_STRUCTURE} moves, found {moves}")
-            steps.append(Step(findings, structures, limits_nm, None, current, "; ".join(reasons)))
+        step, joined = _turn(model, rng, gates, families, seen, progress)
+        if steps:
+            steps[-1] = _settled(steps[-1], model.search_problem, (*step.findings, *step.structures), rng, gates)
+        steps.append(step)
+        if joined is None:
             break
-        key = effect_key(accepted.effect, accepted.axis)
-        accepted = replace(accepted, effect=refine_setting(search_problem, accepted.effect, accepted.axis, families))
-        progress(f"adding {accepted.effect.name} on axis {accepted.axis + 1}")
-        try:
-            joined = with_effects(current, (*current.effects, PlacedEffect(accepted.effect, accepted.axis)))
-        except UNFITTED as error:
-            # The linearised problem distinguished the effect from the model, the whole one does not.
-            refused[key] = f"{accepted.effect.name} on axis {accepted.axis + 1} cannot be added: {error}"
-            progress(refused[key])
-            continue
-        current = _without_redundant(joined, rng, gates)
-        steps.append(Step(findings, structures, limits_nm, accepted, current))
-    if not steps:
-        steps.append(Step(findings, structures, limits_nm, None, current, "; ".join(refused.values())))
+        model = joined
+        seen.add(_keys(model.evidence))
+    else:
+        steps[-1] = _settled(steps[-1], model.search_problem, (), rng, gates)
     return tuple(steps)
+
+
+@dataclass(frozen=True, slots=True)
+class _Model:
+    """A joint fit, and the problem linearised around it."""
+
+    evidence: Evidence
+    search_problem: SearchProblem
+
+
+def _linearised(evidence: Evidence, cache: ColumnCache) -> _Model:
+    problem = prepare_search(evidence.model, evidence.trained, evidence.training, evidence.estimate, cache)
+    return _Model(evidence, problem)
+
+
+def _keys(evidence: Evidence) -> frozenset[EffectKey]:
+    return frozenset(effect_key(placed.effect, placed.axis) for placed in evidence.effects)
+
+
+def _turn(
+    model: _Model,
+    rng: np.random.Generator,
+    gates: Gates,
+    families: tuple[tuple[Effect, ...], ...],
+    seen: set[frozenset[EffectKey]],
+    progress: Callable[[str], None],
+) -> tuple[Step, _Model | None]:
+    """Take one turn: the step, and the model with what was accepted; None where nothing was."""
+    evidence, problem = model.evidence, model.search_problem
+    known, moves = len(evidence.effects), problem.folds.moves
+    most = problem.folds.problem.cluster_count // PIECES_PER_EFFECT
+    progress("searching for a missing effect" + (f" beside the {known} found" if known else ""))
+    proposed = _proposals(problem, evidence.effects, rng, gates, families)
+    findings, structures = rank_effects(problem, rng, gates, families, proposed), tuple[Finding, ...]()
+    limits_nm, runs = detection_limits_nm(problem, gates), RunsLeftOut.of(problem)
+    taken, searched, aside = set(_keys(evidence)), range(0), list[SetAside]()
+    reasons = []
+    while True:
+        named = choose_effect(findings, taken)
+        if named is not None and (why := runs.refusal(whitened_columns(problem, named.effect, named.axis))):
+            findings = _refused(findings, named, why)
+            continue
+        axes = range(problem.axes) if named is None else range(named.axis, named.axis + 1)
+        if axes != searched:
+            if named is None:
+                progress("searching for structure that no named effect explains")
+            structures, searched = find_structure(problem, axes, rng, gates), axes
+        accepted = term = choose_effect(structures, taken)
+        if term is not None and (why := runs.refusal(whitened_columns(problem, term.effect, term.axis))):
+            structures = _refused(structures, term, why)
+            continue
+        if named is not None and (term is None or not is_inadequate(named, term)):
+            accepted = named
+        if accepted is None or known >= most:
+            break
+        near = (*proposed.get(accepted.axis, ()), *families)
+        effect = refine_setting(problem, accepted.effect, accepted.axis, near)
+        accepted = replace(accepted, effect=effect)
+        progress(f"adding {effect.name} on axis {accepted.axis + 1}")
+        joined = _join(model, accepted, rng, gates, seen)
+        if isinstance(joined, _Model):
+            if named is not None and is_unnamed(effect):
+                rival = PlacedEffect(effect, accepted.axis)
+                aside.append(SetAside(named, "{rival} explains clearly more of the same residual", rival))
+            return Step(findings, structures, limits_nm, accepted, joined.evidence, tuple(aside)), joined
+        reason = joined.reason([f"axis {number}" for number in range(1, problem.axes + 1)])
+        progress(f"{effect.name} on axis {accepted.axis + 1} does not join the model: {reason}")
+        aside.append(joined)
+        # The variables of an axis go together: if its best term may not join, no other one stands in for it.
+        others = structures if is_unnamed(effect) else ()
+        taken |= {effect_key(one.effect, one.axis) for one in (accepted, *others) if one.axis == accepted.axis}
+    if accepted is not None:
+        reasons.append(f"{moves} moves allow no more than {most} effects")
+    elif moves < MIN_MOVES_FOR_STRUCTURE:
+        reasons.append(f"structure without a name needs {MIN_MOVES_FOR_STRUCTURE} moves, found {moves}")
+    return Step(findings, structures, limits_nm, None, evidence, tuple(aside), "; ".join(reasons)), None
+
+
+def _proposals(
+    search_problem: SearchProblem,
+    effects: tuple[PlacedEffect, ...],
+    rng: np.random.Generator,
+    gates: Gates,
+    families: tuple[tuple[Effect, ...], ...],
+) -> dict[int, tuple[tuple[Effect, ...], ...]]:
+    """Families with settings that only the data suggest, by axis, of those that the dictionary holds."""
+    kinds = {type(family[0]) for family in families}
+    ripples = propose_orders(search_problem, effects, rng, gates) if Ripple in kinds else {}
+    resonances = propose_resonances(search_problem, gates, kinds)
+    return {axis: (*ripples.get(axis, ()), *resonances.get(axis, ())) for axis in {*ripples, *resonances}}
+
+
+def _refused(findings: Sequence[Finding], refused: Finding, why: str) -> tuple[Finding, ...]:
+    new = replace(refused, passed=False, refusals=(*refused.refusals, why))
+    return tuple(new if finding is refused else finding for finding in findings)
+
+
+def _join(
+    model: _Model, accepted: Finding, rng: np.random.Generator, gates: Gates, seen: set[frozenset[EffectKey]]
+) -> _Model | SetAside:
+    """Refit with a finding in the model and drop what no longer passes; or say why it may not join."""
+    evidence, problem = model.evidence, model.search_problem
+    last, gains_std = PlacedEffect(accepted.effect, accepted.axis), evidence.estimate.gains_std
+    if is_unnamed(last.effect):  # before the refit, which takes longer
+        torque = whitened_columns(problem, last.effect, last.axis) @ accepted.coefficients
+        if moved := moved_gains(gain_shifts(problem.folds, torque), gains_std):
+            return SetAside(accepted, moved=moved)
+    try:
+        joined = _linearised(with_effects(evidence, (*evidence.effects, last)), problem.cache)
+    except UNFITTED as error:
+        # The linearised problem distinguished the effect from the model, the whole one does not.
+        return SetAside(accepted, f"it cannot be fitted: {error}")
+    terms = [placed for placed in joined.evidence.effects if is_unnamed(placed.effect)]
+    if last in terms:
+        together = without_effects_of(joined.search_problem, joined.evidence.estimate, terms)
+        if moved := moved_gains(together.gain_shifts, gains_std):
+            return SetAside(accepted, moved=moved)
+    pruned = _pruned(joined, accepted, rng, gates)
+    if isinstance(pruned, _Model) and _keys(pruned.evidence) in seen:
+        return SetAside(accepted, "it would only exchange places with an effect that it replaces")
+    return pruned
+
+
+def _pruned(model: _Model, accepted: Finding, rng: np.random.Generator, gates: Gates) -> _Model | SetAside:
+    """Drop effects that no longer pass beside the last one; or say why the last one may not stay."""
+    last = model.evidence.effects[-1]
+    needed: set[PlacedEffect] = set()
+    while True:
+        evidence = model.evidence
+        judged = [(placed, *_beside_others(model, placed, rng, gates)) for placed in evidence.effects]
+        failing = [one for one in judged if one[2] and one[0] not in needed]
+        if not failing:
+            return model
+        named = next((placed for placed, _, _ in failing if not is_unnamed(placed.effect)), None)
+        if is_unnamed(last.effect) and named is not None:
+            return SetAside(accepted, "{rival} would no longer pass beside it", named)
+        worst, _, why = min(failing, key=lambda one: one[1])
+        if worst == last:
+            return SetAside(accepted, f"in the joint fit it no longer passes: {why}")
+        try:
+            rest = with_effects(evidence, tuple(placed for placed in evidence.effects if placed != worst))
+            model = _linearised(rest, model.search_problem.cache)
+        except UNFITTED:
+            needed.add(worst)  # the data cannot be fitted without it
+
+
+def _beside_others(model: _Model, placed: PlacedEffect, rng: np.random.Generator, gates: Gates) -> tuple[float, str]:
+    """Judge an effect of a joint fit beside all others: fall of ‖e‖² on held-out moves, and why it does not pass."""
+    estimate = model.evidence.estimate
+    reduced = without_effects_of(model.search_problem, estimate, (placed,))
+    problem, columns = reduced.search_problem, reduced.columns
+    (trial,) = score_candidates(problem.folds, columns, (slice(0, columns.shape[1]),))
+    if trial is None:
+        return 0.0, "the model contains it already"
+    (finding,) = rank_families(problem, (FamilyTrials(placed.axis, ((placed.effect, trial),)),), rng, gates)
+    names = {column.name for column in placed.columns}
+    own = np.array([index for index, column in enumerate(estimate.unknowns) if column.name in names])
+    values, place = estimate.parameters[own], len(estimate.gains) + own
+    joint = in_noise(values, estimate.covariance[np.ix_(place, place)])
+    physics = impossible(placed.effect.coefficients, values, estimate.parameters_std[own])
+    reasons = (*finding.refusals, joint, physics, RunsLeftOut.of(problem).refusal(columns))
+    return finding.held_out_fall, "; ".join(dict.fromkeys(reason for reason in reasons if reason))
+
+
+def _settled(
+    step: Step, problem: SearchProblem, tested: Sequence[Finding], rng: np.random.Generator, gates: Gates
+) -> Step:
+    """Keep of an accepted effect's ambiguity what passed before and does not pass beside it.
+
+    Args:
+        step: with what was accepted.
+        problem: linearised with it in the model.
+        tested: on that problem; rivals that are not among them are tested here.
+        rng: of the bootstrap.
+        gates: limits.
+    """
+    if step.accepted is None:
+        return step
+    own = effect_key(step.accepted.effect, step.accepted.axis)
+    passed = {(one.effect, one.axis) for one in (*step.findings, *step.structures) if one.passed}
+    rivals = {
+        effect_key(one.effect, one.axis): one for one in step.accepted.ambiguity if (one.effect, one.axis) in passed
+    }
+    now = {effect_key(one.effect, one.axis): one.passed for one in tested}
+    missing = [one for key, one in rivals.items() if key not in now]
+    again = [trial for one in missing for trial in problem.test(((one.effect,),), one.axis)]
+    now |= {effect_key(one.effect, one.axis): one.passed for one in rank_families(problem, again, rng, gates)}
+    left = tuple(one for key, one in rivals.items() if key != own and not now.get(key, False))
+    return replace(step, accepted=replace(step.accepted, ambiguity=left))
 
 
 def gather(found: Identification, runs: Iterable[Run], holdout: Iterable[Run] = ()) -> Evidence:
@@ -170,6 +374,8 @@ def gather(found: Identification, runs: Iterable[Run], holdout: Iterable[Run] = 
     model, conditioning = found.model, found.conditioning
     trained = tuple(differentiate(run, model.drive_train, conditioning) for run in runs)
     unseen = tuple(differentiate(run, model.drive_train, conditioning) for run in holdout)
+    if found.system.instruments:
+        trained = tuple(with_demand(data, model.drive_train, conditioning) for data in trained)
     rows = observe(model, (*trained, *unseen), conditioning, found.system)
     training, rest = _split_holdout(rows, len(unseen))
     return Evidence(model, conditioning, (*trained, *unseen), len(unseen), rows, training, rest, (), found.estimate)
@@ -185,17 +391,28 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...]) -> Evidenc
     fixed = before.estimate.gains if before.estimate.gains_fixed else None
     passes = 1 if all(placed.effect.abscissa.is_kinematic for placed in effects) else 2
     for _ in range(passes):
-        runs = [
-            fitted_signals(before.model, data, current.training, current.estimate, began_s) for data in before.datasets
-        ]
         rows = before.rows_without_effects
-        for placed in effects:
-            torque = effect_torque(placed.effect, placed.axis, runs, before.datasets, rows.conditioning, before.model)
-            rows = rows.extended(placed.columns, torque)
+        if effects:
+            torque, demanded = _torques(effects, current, before.datasets, began_s), None
+            if rows.instruments is not None:
+                demanded = _torques(effects, current, tuple(map(as_demanded, before.datasets)), began_s)
+            rows = rows.extended(tuple(column for placed in effects for column in placed.columns), torque, demanded)
         training, rest = _split_holdout(rows, before.held_out)
         estimate = estimate_with(before.estimate.method, training.system(), fixed)
         current = replace(before, training=training, holdout=rest, effects=effects, estimate=estimate)
     return current
+
+
+def _torques(
+    effects: Sequence[PlacedEffect], around: Evidence, datasets: Sequence[Dataset], began_s: float | None
+) -> FloatArray:
+    """Columns of effects on the rows of runs, load and current predicted by an estimate, shape (n, p, r)."""
+    parts = []
+    for data in datasets:  # one after the other: signals at full rate are the largest arrays of a search
+        run = fitted_signals(around.model, data, around.training, around.estimate, began_s)
+        given = (run,), (data,), around.conditioning, around.model
+        parts.append(np.concatenate([effect_torque(placed.effect, placed.axis, *given) for placed in effects], axis=1))
+    return np.concatenate(parts, axis=2)
 
 
 def without_effects(evidence: Evidence, estimate: Estimate) -> Evidence:
@@ -210,22 +427,3 @@ def _split_holdout(observation: Observation, held_out: int) -> tuple[Observation
         return observation, None
     rows = observation.run >= len(observation.runs) - held_out
     return observation.only(~rows), observation.only(rows)
-
-
-def _without_redundant(current: Evidence, rng: np.random.Generator, gates: Gates) -> Evidence:
-    """Drop effects that the last one made redundant: earlier ones on its joints must pass the gates again."""
-    *earlier, last = current.effects
-    train = current.model.drive_train
-    touched = joints_of(last.effect, last.axis, train)
-    for placed in earlier:
-        if not touched & joints_of(placed.effect, placed.axis, train):
-            continue
-        try:
-            rest = with_effects(current, tuple(other for other in current.effects if other != placed))
-        except UNFITTED:
-            continue  # the data cannot be fitted without it
-        search_problem = prepare_search(rest.model, rest.trained, rest.training, rest.estimate)
-        findings = rank_families(search_problem, search_problem.test(((placed.effect,),), placed.axis), rng, gates)
-        if not findings or not findings[0].passed:
-            current = rest
-    return current

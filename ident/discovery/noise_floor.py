@@ -21,12 +21,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
 
 from ident.arrays import FloatArray
-from ident.data.conditioning import Conditioning, Decimator
+from ident.data.conditioning import Conditioning, decimator
 from ident.data.dataset import Dataset
 from ident.equations.rows import row_filter
 
@@ -68,7 +69,7 @@ def _floor(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) 
         for start, stop in zip(edges[::2], edges[1::2], strict=True):
             current = data.current_a[start:stop, motor]
             if filter_.rows(len(current)) > _TREND and np.ptp(current) > 0.0:
-                dwells.append(_variance(filter_, current))
+                dwells.append(_variance(filter_(current), data.rate_hz, conditioning.decimation_cutoff_hz))
     if len(dwells) < MIN_DWELLS:
         return None
     variance, freedom = np.array(dwells).T
@@ -81,19 +82,22 @@ def _floor(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) 
     return NoiseFloor(float(np.sqrt(middle)), len(dwells), float(freedom.sum()))
 
 
-def _variance(filter_: Decimator, current: FloatArray) -> tuple[float, float]:
-    """Variance s_d² [A²] and freedom ν of one dwell."""
-    seen = filter_(current)
-    trend, _ = np.linalg.qr(np.vander(np.arange(len(seen), dtype=np.float64), _TREND))
-    rest = np.eye(len(seen)) - trend @ trend.T
-    spread = rest @ _correlation(filter_, len(seen)) @ rest
-    expected = float(np.trace(spread))
-    return float(np.sum((rest @ seen) ** 2)) / expected, expected**2 / float(np.sum(spread**2))
+def _variance(seen: FloatArray, rate_hz: float, cutoff_hz: float) -> tuple[float, float]:
+    """Variance s_d² [A²] and freedom ν of one dwell, by its rows."""
+    trend, expected, freedom = _detrending(rate_hz, cutoff_hz, len(seen))
+    return float(np.sum((seen - trend @ (trend.T @ seen)) ** 2)) / expected, freedom
 
 
-def _correlation(filter_: Decimator, rows: int) -> FloatArray:
-    """Correlation P of rows of white noise, shape (rows, rows)."""
-    taps = filter_.taps
+@lru_cache(maxsize=1024)
+def _detrending(rate_hz: float, cutoff_hz: float, rows: int) -> tuple[FloatArray, float, float]:
+    """Orthonormal parabolas over so many rows, shape (rows, 3), tr(MP) and ν: every dwell of this length has them."""
+    filter_ = decimator(rate_hz, cutoff_hz)
+    trend, _ = np.linalg.qr(np.vander(np.arange(rows, dtype=np.float64), _TREND))
+    rest = np.eye(rows) - trend @ trend.T
     lags = filter_.factor * np.arange(rows)
+    taps = filter_.taps
     of_lag = np.array([float(taps[lag:] @ taps[: len(taps) - lag]) if lag < len(taps) else 0.0 for lag in lags])
-    return np.asarray(of_lag[np.abs(np.subtract.outer(np.arange(rows), np.arange(rows)))] / of_lag[0])
+    correlation = of_lag[np.abs(np.subtract.outer(np.arange(rows), np.arange(rows)))] / of_lag[0]
+    spread = rest @ correlation @ rest
+    expected = float(np.trace(spread))
+    return trend, expected, expected**2 / float(np.sum(spread**2))

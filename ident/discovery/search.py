@@ -6,7 +6,11 @@ The lag-one correlation of a residual is about 0.67, so textbook tests are wrong
    of each move a random sign (wild bootstrap, Cameron et al. 2008), or in 95 % if the candidate is strong (`Gates`);
 2. it lowers the error on at least three quarters of the folds of held-out moves;
 3. it explains at least 3 % of the squared residual of the motor that it affects most;
-4. that motor's error on held-out moves falls by at least 2 %.
+4. that motor's error on held-out moves falls by at least 2 %;
+5. its coefficients are possible: none is outside what physics allows by more than 2 σ, and no time constant is longer
+   than the data.
+
+The loop asks those that may join for more: see `ident.discovery.gates`.
 
 Candidates are ranked by held-out moves, and the setting of a family (its exponent, its speed) is chosen anew inside
 each fold, by the other folds alone: the score of a family has not seen what it is scored on.
@@ -18,7 +22,7 @@ that would have been.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,12 +30,13 @@ import scipy  # loads scipy.special when it is first used: a fit needs none of i
 
 from ident.arrays import BoolArray, FloatArray
 from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial
+from ident.discovery.gates import impossible
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import FOLDED, INTERVALS, Periodic, Smooth
 
-EffectKey = tuple[str, int, tuple[int, ...]]
+EffectKey = tuple[str, int, tuple[float, ...]]
 
 AS_GOOD = 0.99  #: Share of the best one's fall on held-out moves that counts as equal
 CLEARLY = 0.95
@@ -83,6 +88,7 @@ class Finding:
     ambiguity: tuple[PlacedEffect, ...] = ()
     #: Of the motor's squared residual beyond its noise floor; None where the floor is not known.
     share_of_excess: float | None = None
+    refusals: tuple[str, ...] = ()  #: gates that it did not pass, in words
 
 
 def rank_effects(
@@ -90,9 +96,20 @@ def rank_effects(
     rng: np.random.Generator,
     gates: Gates | None = None,
     families: tuple[tuple[Effect, ...], ...] = EFFECTS,
+    proposed: Mapping[int, tuple[tuple[Effect, ...], ...]] | None = None,
 ) -> tuple[Finding, ...]:
-    """Test all families on all axes and return them ranked, the best on held-out moves first."""
-    tested = [found for axis in range(search_problem.axes) for found in search_problem.test(families, axis)]
+    """Test all families on all axes and rank them, the best on held-out moves first.
+
+    What is proposed for an axis takes the place of the families of the same name there.
+    """
+    fitting = (tuple(effect for effect in family if effect.fits_in(search_problem.runs)) for family in families)
+    families = tuple(family for family in fitting if family)
+    tested: list[FamilyTrials] = []
+    for axis in range(search_problem.axes):
+        own = (proposed or {}).get(axis, ())
+        names = {family[0].name for family in own}
+        shared = (family for family in families if family[0].name not in names)
+        tested += search_problem.test((*shared, *own), axis)
     return rank_families(search_problem, tested, rng, gates or Gates())
 
 
@@ -119,7 +136,7 @@ def rank_families(
     )
 
 
-def choose_effect(findings: Sequence[Finding], taken: frozenset[EffectKey] = frozenset()) -> Finding | None:
+def choose_effect(findings: Sequence[Finding], taken: Collection[EffectKey] = ()) -> Finding | None:
     """Choose the best that passed; of those as good on the same axis, the one with the fewest parameters.
 
     So a hinge that starts outside the joint's range is reported as a spring. Places that are taken, in the model or
@@ -138,8 +155,9 @@ def choose_effect(findings: Sequence[Finding], taken: frozenset[EffectKey] = fro
 
 
 def effect_key(effect: Effect, axis: int) -> EffectKey:
-    """Identify an effect on an axis by its family and integer settings: two orders of a ripple are two effects."""
-    return effect.name, axis, tuple(value for value in effect.settings.values() if isinstance(value, int))
+    """Identify an effect on an axis by its family, integer settings and order: two orders of a ripple are two."""
+    whole = (value for name, value in effect.settings.items() if isinstance(value, int) or name == "order")
+    return effect.name, axis, tuple(whole)
 
 
 def _better(one: FloatArray, other: FloatArray) -> BoolArray:
@@ -180,11 +198,14 @@ def _judge(
     probabilities: Iterator[float],
     gates: Gates,
 ) -> Finding:
-    problem, members = search_problem.folds.problem, family.members
-    probability = [next(probabilities) for _ in members]
-    best = int(np.argmax([float(trial.fallen.sum()) for _, trial in members]))
-    effect, trial = members[best]
-    after = family.nested()
+    problem = search_problem.folds.problem
+    probability = [next(probabilities) for _ in family.members]
+    # A setting that needs impossible coefficients is chosen only where every setting of the family does.
+    ruled_out = [impossible(effect.coefficients, trial.coefficients, _sigma(trial)) for effect, trial in family.members]
+    possible = [index for index, why in enumerate(ruled_out) if not why] or range(len(family.members))
+    best = max(possible, key=lambda index: float(family.members[index][1].fallen.sum()))
+    effect, trial = family.members[best]
+    after = replace(family, members=tuple(family.members[index] for index in possible)).nested()
     fall = before.sum(axis=1) - after.sum(axis=1)
     # Another motor may supply a joint's torque (R): the drive in question is the one whose residual falls most.
     motor = int(np.argmax(trial.fallen))
@@ -195,21 +216,22 @@ def _judge(
     error_fall = 1.0 - error_after / error_before
     folds_better = float(np.mean(fall > 0))
     strong = folds_better >= gates.strong_folds and error_fall >= gates.strong_fall
-    passed = (
-        probability[best] <= (gates.strong_false_alarm if strong else gates.false_alarm)
-        and folds_better >= gates.folds_better
-        and explained >= gates.explained
-        and error_fall >= gates.error_fall
+    false_alarm = gates.strong_false_alarm if strong else gates.false_alarm
+    verdicts = (
+        (probability[best] > false_alarm, f"noise makes one as strong with p = {probability[best]:.3f}"),
+        (folds_better < gates.folds_better, f"it is better on {100 * folds_better:.0f} % of the folds only"),
+        (explained < gates.explained, f"it explains {100 * explained:.1f} % of the squared residual only"),
+        (error_fall < gates.error_fall, f"the error on left-out moves changes by {-100 * error_fall:+.1f} % only"),
+        (bool(ruled_out[best]), ruled_out[best]),
     )
-    # σ of the coefficients, G⁻¹XᵀXG⁻¹ over moves (Liang & Zeger, 1986).
-    spread = trial.scatter @ np.linalg.pinv(trial.gram.sum(axis=0))
+    refusals = tuple(words for refused, words in verdicts if refused)
     floor_a = search_problem.floors_a[motor]
     excess = 0.0 if floor_a is None else own - float(np.sum(rows)) * (floor_a / problem.noise[motor]) ** 2
     return Finding(
         effect=effect,
         axis=family.axis,
         coefficients=trial.coefficients,
-        deviations=np.sqrt(np.sum(spread**2, axis=0)),
+        deviations=_sigma(trial),
         probability=float(probability[best]),
         folds_better=folds_better,
         explained=explained,
@@ -217,10 +239,17 @@ def _judge(
         error_after_percent=100.0 * error_after,
         error_fall=error_fall,
         held_out_fall=float(fall.sum()),
-        passed=bool(passed),
+        passed=not refusals,
         share_of_excess=min(float(trial.fallen[motor]) / excess, 1.0) if excess > 0.0 else None,
         fold_errors=after.sum(axis=1),
+        refusals=refusals,
     )
+
+
+def _sigma(trial: Trial) -> FloatArray:
+    """σ of the coefficients, G⁻¹XᵀXG⁻¹ over moves (Liang & Zeger, 1986), shape (p,)."""
+    spread = trial.scatter @ np.linalg.pinv(trial.gram.sum(axis=0))
+    return np.asarray(np.sqrt(np.sum(spread**2, axis=0)))
 
 
 def _max_t(trials: tuple[Trial, ...], rng: np.random.Generator, draws: int) -> FloatArray:

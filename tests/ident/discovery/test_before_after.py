@@ -18,6 +18,7 @@ from ident.discovery.before_after import (
     error_left_out,
     error_on,
     floor_on,
+    holdout_change,
     left_out_runs,
 )
 from ident.discovery.loop import Evidence, Step, gather, with_effects, without_effects
@@ -125,6 +126,24 @@ def test_the_effect_helps_its_axis_alone_wherever_it_is_measured(compared: Accou
         assert second.total < first.total
     assert compared.total.added == (SPRING,)
     assert compared.total.removed == ()
+
+
+def test_held_out_errors_are_compared_by_move(start: Evidence, after: Evidence) -> None:
+    change = holdout_change(start, after)
+    assert change is not None
+    assert start.holdout is not None
+    assert after.holdout is not None
+    before_nm2, after_nm2 = (
+        error_on(rows, estimate).left @ start.estimate.gains**2
+        for rows, estimate in ((start.holdout, start.estimate), (after.holdout, after.estimate))
+    )
+    assert change.rise == pytest.approx(after_nm2 - before_nm2)
+    assert change.moves == len(np.unique(start.holdout.move))
+    assert not change.is_rise
+    without_the_spring = holdout_change(after, start)
+    assert without_the_spring is not None
+    assert without_the_spring.is_rise
+    assert holdout_change(replace(start, holdout=None), after) is None
 
 
 def test_a_turn_that_adds_nothing_has_no_before_and_after(compared: Account) -> None:

@@ -16,7 +16,7 @@ from ident.discovery.search import Gates, rank_effects, rank_families
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect
 from ident.effects.electrical import Cogging
-from ident.effects.friction import Stribeck
+from ident.effects.friction import PositionFriction, Stribeck
 from ident.equations.linearisation import Folds, Linearisation, cut_into_folds, linearise
 from tests.ident.recordings import search_problem_of, with_current
 
@@ -183,7 +183,7 @@ def test_the_bootstrap_keeps_its_size(
     search_problem: SearchProblem, moves: int, columns: int, least: int, most: int
 ) -> None:
     rng = np.random.default_rng(100 * moves + columns)
-    effect = Stribeck(0.1)
+    effect = (Stribeck(0.1), PositionFriction())[columns - 1]
     false = 0
     for _ in range(400):
         trial = replace(_noise_trial(rng, moves, columns), held_out=np.zeros((8, 3)), fallen=np.ones(3))

@@ -118,6 +118,12 @@ def _bristle(t: TrueSignals, distance_rad: float) -> FloatArray:
     return np.asarray(out)
 
 
+def _meshed(t: TrueSignals, efficiency: float) -> FloatArray:
+    """More torque where the motor drives the load, less where the load drives it: what a gear keeps of the power."""
+    through = t.load + t.frictions[t.axis]
+    return np.asarray(np.where(through * t.velocity > 0.0, through / efficiency, through * efficiency) - through)
+
+
 def _pushed(t: TrueSignals, half_gap_rad: float) -> FloatArray:
     """Torque of all joints for the joint behind a gap, which follows its motor from flank to flank."""
     through = t.load + t.frictions[t.axis]
@@ -151,6 +157,7 @@ def _cold(t: TrueSignals, clock_s: FloatArray, constant_s: float) -> FloatArray:
 CASES = (
     Planted("spring", 1, lambda t: 9.0 * t.position, (9.0,)),
     Planted("cogging", 0, lambda t: 4.0 * np.cos(t.motor_angle) + 3.0 * np.sin(t.motor_angle), (4.0, 3.0)),
+    Planted("ripple", 0, lambda t: 4.0 * np.cos(0.5 * t.motor_angle) + 3.0 * np.sin(0.5 * t.motor_angle), (4.0, 3.0)),
     # g v (1 − c v²) = τ with v = τ/g to first order: the current must be larger by c v³.
     Planted("saturation", 1, lambda t: 0.02 * t.motor_torque * (t.motor_torque / GAINS[1]) ** 2, (0.02,)),
     Planted("lag", 0, lambda t: -0.01 * np.gradient(t.motor_torque) * t.rate_hz, (0.01,)),
@@ -167,6 +174,7 @@ SMALL_CASES = (
     Planted("presliding", 1, lambda t: 9.0 * (_bristle(t, 0.08) - np.sign(t.velocity)), (9.0,)),
     Planted("backlash", 1, lambda t: _pushed(t, 0.004), (0.004,)),
     Planted("elasticity", 1, lambda t: -0.0005 * t.pull() * t.accelerated(t.load), (0.0005,)),
+    Planted("efficiency", 1, lambda t: _meshed(t, 0.85), ((1 - 0.85**2) / (1 + 0.85**2),)),
     Planted("coupling", 1, lambda t: _rubbing(t, 2), (2.0, 0.8)),
     Planted("inertial-coupling", 0, lambda t: _inertial(t, 2), (0.25,)),
     Planted("hinge", 1, lambda t: np.where(t.position > 0.5, 12.0 * (t.position - 0.5), 0.0), (12.0,)),

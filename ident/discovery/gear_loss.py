@@ -1,0 +1,117 @@
+"""Which side drives the gear, and what of its efficiency these data can show.
+
+A gear of efficiency η takes τ/η from a motor that drives the load, and ητ where the load drives the motor. With
+c = (1 − η²)/(1 + η²) and the torque τ through the gear,
+
+    τ_motor = (τ + c |τ| sign(q̇)) / √(1 − c²).
+
+The first factor's contrast of the two sides, c, is what `load-friction` and `efficiency` estimate. Where one side gives
+nearly all torque, |τ| sign(q̇) is ±τ: the gain takes up the loss, and the residual stays silent. The second factor
+scales everything, and the gain always carries it: g is the motor's gain times √(1 − c²) if both directions lose the
+same share of the power. No residual can show whether they do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident.discovery.loop import Step
+from ident.effects.effect import Effect
+from ident.effects.friction import LoadFriction
+from ident.effects.transmission import Efficiency
+from ident.equations.rows import Observation
+from ident.estimators.estimate import Estimate
+
+CERTAIN = 2.0  #: Standard deviations of the loss that count against the gain
+SMALL_SHIFT = 0.01  #: Relative error of a gain below which an unseen loss does not matter
+
+
+@dataclass(frozen=True, slots=True)
+class GearLoss:
+    """One axis: which side drives, and the loss with its σ."""
+
+    motoring_rows: float  #: share of the moving rows in which the motor drives the load
+    motoring_torque: float  #: the same share of the squared load torque; NaN for a joint without load
+    loss: float | None  #: c, the contrast of the two sides; None where the search could not test it
+    loss_std: float | None  #: its σ
+
+    @property
+    def lean(self) -> float:
+        """Part of the loss that an estimate without it puts into the gain: 1 where the motor drives throughout."""
+        return 2.0 * self.motoring_torque - 1.0
+
+    @property
+    def hidden_shift(self) -> float | None:
+        """Relative change of the gain by a loss too small to be seen; None where not known."""
+        if self.loss_std is None or not np.isfinite(self.lean):
+            return None
+        return CERTAIN * self.loss_std * abs(self.lean)
+
+    @property
+    def gain_carries_it(self) -> bool:
+        """Whether a loss that these data do not show could matter to the gain."""
+        return self.hidden_shift is None or self.hidden_shift > SMALL_SHIFT
+
+    @property
+    def efficiency(self) -> float | None:
+        """η of a gear that loses the same share of the power in both directions; None for a loss outside 0 to 1."""
+        if self.loss is None or not 0.0 <= self.loss < 1.0:
+            return None
+        return float(np.sqrt((1.0 - self.loss) / (1.0 + self.loss)))
+
+    @property
+    def gain_factor(self) -> float | None:
+        """Gain of the motor of such a gear over the gain found with the loss in the model; None as above."""
+        return None if self.efficiency is None or self.loss is None else float(1.0 / np.sqrt(1.0 - self.loss**2))
+
+
+def gear_losses(step: Step) -> tuple[GearLoss, ...]:
+    """Judge every axis by the last turn of a search, which has tested the loss beside all that is in the model."""
+    after = step.after
+    shares = driving_shares(after.training, after.estimate)
+    return tuple(GearLoss(*share, *_loss(step, axis)) for axis, share in enumerate(shares))
+
+
+def driving_shares(observation: Observation, estimate: Estimate) -> tuple[tuple[float, float], ...]:
+    """Share of each joint's moving rows, and of their squared load torque, in which the motor drives the load.
+
+    The load torque is the model's, for links and payload; the direction of motion is that of the dry friction.
+    """
+    count = observation.joint_count
+    standard = np.array(observation.base.independent)
+    linear = observation.linear()
+    # Payload columns follow those of the effects, which follow the base parameters: of these, bodies are a joint's
+    # first ten.
+    is_load = np.ones(linear.shape[1], dtype=np.bool_)
+    is_load[: len(observation.columns)] = False
+    is_load[: len(standard)] = (standard < 14 * count) & (standard % 14 < 10)
+    load = np.einsum("jpr,p->jr", linear[:, is_load], estimate.parameters[is_load]) + observation.known()
+    shares: list[tuple[float, float]] = []
+    for joint, used in enumerate(observation.use):
+        dry = np.flatnonzero(standard == 14 * joint + 12)
+        if not len(dry) or not used.any():
+            shares.append((float("nan"), float("nan")))
+            continue
+        torque = load[joint, used]
+        drives = torque * linear[joint, dry[0], used] > 0.0
+        size = float(np.sum(torque**2))
+        shares.append((float(np.mean(drives)), float(np.sum(torque[drives] ** 2)) / size if size else float("nan")))
+    return tuple(shares)
+
+
+def _loss(step: Step, axis: int) -> tuple[float | None, float | None]:
+    """Loss and σ: fitted where it is in the model, else as the search tested it."""
+    evidence, first = step.after, len(step.after.rows_without_effects.columns)
+    for placed in evidence.effects:
+        if placed.axis == axis and is_gear_loss(placed.effect):
+            return float(evidence.estimate.parameters[first]), float(evidence.estimate.parameters_std[first])
+        first += len(placed.effect.coefficients)
+    tested = [found for found in step.findings if found.axis == axis and isinstance(found.effect, Efficiency)]
+    return (float(tested[0].coefficients[0]), float(tested[0].deviations[0])) if tested else (None, None)
+
+
+def is_gear_loss(effect: Effect) -> bool:
+    """Whether an effect is the contrast of the two sides, c."""
+    return isinstance(effect, Efficiency) or effect == LoadFriction(0)

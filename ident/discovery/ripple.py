@@ -1,0 +1,173 @@
+"""Propose orders of torque ripple that are no whole numbers: a periodogram of the residual against an axis' angle.
+
+A belt, a strain-wave gear or a cam gives ripple at an order k that no list holds. With a candidate a cos kθ + b sin kθ
+at full rate, filtered into rows by D and whitened by w, its score is
+
+    S(k) = Σ_t (Dᵀ w e)_t exp(−i k θ_t).
+
+So the residual e of the rows is spread over the samples by the adjoint of the decimation, summed in bins of θ, and a
+Fourier transform of the bins gives all orders at once, move by move. With S_m of the moves as vectors of two numbers,
+
+    T(k) = SᵀV⁻¹S,        S = Σ S_m,        V = Σ S_m S_mᵀ,
+
+needs no model of the noise: it is that of moves as a whole. Orders are searched, so an order is proposed only if its T
+exceeds the largest of all orders, angles and axes in 99 % of draws that give every move a random sign
+(`Gates.false_alarm`; V does not change with the signs). A proposed order then has to pass all gates of the search,
+beside all other candidates.
+
+Lines closer than one period over the range of the angle cannot be separated. Orders of less than four periods over it
+are left to gravity, springs, compensators and smooth functions of the position.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident.arrays import FloatArray
+from ident.discovery.candidates import SearchProblem
+from ident.discovery.search import MIN_MOVES_FOR_STRUCTURE, Gates
+from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.electrical import Cogging
+from ident.effects.transmission import Ripple
+from ident.equations.rows import row_filter
+
+LARGEST_ORDER = {0: 12.5, 1: 200.0}  #: Per revolution of the motor (0) and of the joint (1)
+FEWEST_PERIODS = 4.0  #: Over the range of the angle
+BINS_A_PERIOD = 8  #: Of the highest order: rounding an angle to its bin takes 3 % of that line
+STEPS_A_LINE = 2  #: Orders of the periodogram within the width of a line, one period over the range
+FAMILY = (-2.0, -1.0, 0.0, 1.0, 2.0)
+"""Members of a proposed family around its order, in sixths of a line's width: the refinement needs neighbours."""
+LINES_AN_AXIS = 2  #: Most orders proposed at once
+DRAWS = 199  #: Of random signs; the smallest probability is 1/200
+HOPELESS = 0.3  #: Probability that independent orders reach the largest T, above which no draw is made
+
+
+@dataclass(frozen=True, slots=True)
+class Periodogram:
+    """Score of every order on one angle of one axis."""
+
+    axis: int  #: index
+    of_joint: int  #: 1 for the joint's angle, 0 for the motor's
+    range_rev: float  #: of the angle over the runs, in revolutions
+    orders: FloatArray  #: periods a revolution, shape (k,)
+    scores: FloatArray  #: real and imaginary part of S_m, shape (2, moves, k)
+
+    def statistic(self, signs: FloatArray) -> FloatArray:
+        """T of every order with these signs of the moves, shape (draws, moves) → (draws, k)."""
+        cosine, sine = self.scores
+        a, b, c = np.sum(cosine**2, axis=0), np.sum(cosine * sine, axis=0), np.sum(sine**2, axis=0)
+        determinant = a * c - b**2
+        usable = determinant > 1e-9 * (a * c + np.finfo(np.float32).tiny)
+        signs = signs.astype(cosine.dtype)  # halves the work of the two products
+        x, y = signs @ cosine, signs @ sine
+        square = (c * x**2 - 2.0 * b * x * y + a * y**2) / np.where(usable, determinant, 1.0)
+        return np.asarray(np.where(usable, square, 0.0))
+
+
+def propose_orders(
+    search_problem: SearchProblem, effects: Iterable[PlacedEffect], rng: np.random.Generator, gates: Gates
+) -> Mapping[int, tuple[tuple[Effect, ...], ...]]:
+    """Find lines in the residual that noise does not make, as families of ripple for the search, by axis.
+
+    Args:
+        search_problem: the residual.
+        effects: in the model; orders that they have are not proposed again.
+        rng: of the signs.
+        gates: of the search; `false_alarm` is the probability of a false line among all.
+    """
+    if search_problem.folds.moves < MIN_MOVES_FOR_STRUCTURE:
+        return {}
+    tried = (
+        periodogram(search_problem, axis, of_joint)
+        for axis in range(search_problem.axes)
+        for of_joint in _angles(search_problem, axis)
+    )
+    made = [one for one in tried if one is not None]
+    clusters = search_problem.folds.problem.cluster_count
+    observed = [one.statistic(np.ones((1, clusters)))[0] for one in made]
+    if not made or _independent_probability(observed, clusters) > HOPELESS:
+        return {}
+    signs = rng.choice((-1.0, 1.0), size=(DRAWS, clusters))
+    largest = np.max([one.statistic(signs).max(axis=1) for one in made], axis=0)
+    limit = float(np.quantile(largest, 1.0 - gates.false_alarm, method="higher"))
+    known = {(placed.axis, *_line(placed.effect)) for placed in effects if isinstance(placed.effect, Ripple | Cogging)}
+    proposed: dict[int, tuple[tuple[Effect, ...], ...]] = {}
+    for one, statistic in zip(made, observed, strict=True):
+        taken = [order for axis, of_joint, order in known if (axis, of_joint) == (one.axis, one.of_joint)]
+        families = tuple(_family(one, order) for order in _peaks(one, statistic, limit, taken))
+        if families:
+            proposed[one.axis] = (*proposed.get(one.axis, ()), *families)
+    return proposed
+
+
+def periodogram(search_problem: SearchProblem, axis: int, of_joint: int) -> Periodogram | None:
+    """Score all orders of ripple on one angle of an axis; None where it turns too little for a line."""
+    angles = [(run.position_rad if of_joint else run.motor_position_rad)[axis] for run in search_problem.runs]
+    lowest = min(float(angle.min()) for angle in angles)
+    range_rev = (max(float(angle.max()) for angle in angles) - lowest) / (2.0 * np.pi)
+    largest = LARGEST_ORDER[of_joint]
+    if range_rev * largest <= FEWEST_PERIODS:
+        return None
+    width_rev = 1.0 / (BINS_A_PERIOD * largest)
+    bins = int(np.ceil(STEPS_A_LINE * range_rev / width_rev))
+    first, last = int(np.ceil(STEPS_A_LINE * FEWEST_PERIODS)), bins // BINS_A_PERIOD
+    places = [((angle - lowest) / (2.0 * np.pi * width_rev)).astype(np.int64) for angle in angles]
+    problem, observation = search_problem.folds.problem, search_problem.observation
+    torque = search_problem.model.drive_train.to_motor[:, axis] if of_joint else np.eye(search_problem.axes)[axis]
+    weights = torque * problem.gamma / problem.noise
+    filters = [row_filter(data, observation.conditioning) for data in search_problem.datasets]
+    starts = np.searchsorted(observation.run, np.arange(len(angles)))
+    scores = np.zeros((problem.cluster_count, last - first), dtype=np.complex64)
+    for rows, _, cluster, motor in search_problem.folds.blocks:
+        if weights[motor] == 0.0:
+            continue
+        source = problem.source[rows]
+        run = int(observation.run[source[0]])
+        begin, end = int(source.min()), int(source.max())
+        filter_ = filters[run]
+        stuffed = np.zeros((end - begin) * filter_.factor + 1)
+        stuffed[(source - begin) * filter_.factor] = weights[motor] * problem.residual[rows]
+        spread = np.convolve(stuffed, filter_.taps)
+        sample = (begin - int(starts[run])) * filter_.factor
+        place = places[run][sample : sample + len(spread)]
+        binned = np.bincount(place, spread, minlength=bins)
+        scores[cluster] += np.fft.rfft(binned)[first:last]
+    orders = np.arange(first, last) / (bins * width_rev)
+    return Periodogram(axis, of_joint, range_rev, orders, np.stack((scores.real, scores.imag)))
+
+
+def _angles(search_problem: SearchProblem, axis: int) -> tuple[int, ...]:
+    """Angles that show different lines: where the motor turns with its joint alone, the joint's adds nothing."""
+    alone = np.count_nonzero(search_problem.model.drive_train.ratio[axis]) == 1
+    return (0,) if alone else (0, 1)
+
+
+def _independent_probability(observed: Sequence[FloatArray], clusters: int) -> float:
+    """Probability that one of so many independent orders reaches the largest T: T/m has a beta distribution."""
+    count = sum(len(statistic) for statistic in observed) / STEPS_A_LINE
+    largest = min(max(float(statistic.max(initial=0.0)) for statistic in observed) / clusters, 1.0)
+    return float(count * (1.0 - largest) ** (0.5 * (clusters - 2)))
+
+
+def _peaks(one: Periodogram, statistic: FloatArray, limit: float, taken: Sequence[float]) -> list[float]:
+    """Orders of the highest lines above the limit, none within a line's width of another one."""
+    chosen: list[float] = []
+    for index in np.argsort(-statistic):
+        if statistic[index] <= limit or len(chosen) == LINES_AN_AXIS:
+            break
+        order = float(one.orders[index])
+        if all(abs(order - other) * one.range_rev > 1.0 for other in (*chosen, *taken)):
+            chosen.append(order)
+    return chosen
+
+
+def _family(one: Periodogram, order: float) -> tuple[Effect, ...]:
+    width = 1.0 / one.range_rev
+    return tuple(Ripple(float(f"{order + step * width / 6.0:.6g}"), one.of_joint) for step in FAMILY)
+
+
+def _line(effect: Effect) -> tuple[int, float]:
+    return int(effect.settings.get("of_joint", 0)), float(effect.settings["order"])

@@ -1,0 +1,283 @@
+"""Gates beside the score: physics, runs left out, gains, and every effect beside all the others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from ident.data.dataset import Dataset
+from ident.data.run import Run
+from ident.discovery import loop
+from ident.discovery.candidates import SearchProblem, score_candidates
+from ident.discovery.gates import (
+    MIN_RUNS,
+    RunsLeftOut,
+    compare_by_move,
+    gain_shifts,
+    impossible,
+    in_noise,
+    moved_gains,
+    runs_to_leave_out,
+    whitened_columns,
+    without_effects_of,
+)
+from ident.discovery.loop import Evidence, SetAside, find_effects, with_effects
+from ident.discovery.search import Finding, Gates, effect_key, rank_effects
+from ident.effects.dictionary import EFFECTS
+from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.friction import NonlinearViscous, Stribeck, WarmUp
+from ident.effects.position import Spring
+from ident.effects.signals import Abscissa
+from ident.effects.unnamed import Smooth
+from ident.model.model import Column
+from tests.ident.recordings import Truth, acting_on, bent, search_problem_of
+
+FloatArray = NDArray[np.float64]
+GATES = Gates(draws=199)
+EITHER_SIGN = {
+    "asymmetric-viscous",
+    "position-friction",
+    "spring",
+    "hinge",
+    "gravity-compensator",
+    "cogging",
+    "ripple",
+    "inertial-coupling",
+    "lag",
+    "time-skew",
+}
+STICKING = (Stribeck(0.3),)
+numbers = st.floats(-1e3, 1e3)
+
+
+@pytest.fixture(scope="module")
+def search_problem(small: Evidence) -> SearchProblem:
+    return search_problem_of(small)
+
+
+@given(value=numbers, std=st.floats(0.0, 1e3), least=numbers, width=st.floats(0.0, 1e3))
+def test_a_coefficient_is_impossible_two_sigma_outside_its_range(
+    value: float, std: float, least: float, width: float
+) -> None:
+    column = Column("amplitude", "Nm", least, least + width)
+    outside = max(least - value, value - (least + width))
+    named = impossible((column,), np.array([value]), np.array([std]))
+    assert bool(named) == (outside > 2.0 * std) or abs(outside - 2.0 * std) < 1e-9
+    assert not named or "amplitude" in named
+    assert not impossible((Column("stiffness", "Nm/rad"),), np.array([value]), np.array([std]))
+
+
+def test_every_family_declares_its_signs() -> None:
+    """Friction dissipates, a gear gives and a motor weakens; springs, ripples and delays have either sign."""
+    for family in EFFECTS:
+        bound = {column.least == 0.0 for column in family[0].coefficients}
+        assert bound == {family[0].name not in EITHER_SIGN}, family[0].name
+        columns = PlacedEffect(family[0], 0).columns
+        assert [column.least for column in columns] == [column.least for column in family[0].coefficients]
+
+
+def test_a_time_constant_is_no_longer_than_the_data(search_problem: SearchProblem) -> None:
+    runs = search_problem.runs
+    span_s = max(float(run.time_s[-1]) for run in runs)
+    later = [replace(run, session_s=run.time_s + 100.0 * index) for index, run in enumerate(runs)]
+    assert WarmUp(0.99 * span_s, 0).fits_in(runs)
+    assert not WarmUp(1.01 * span_s, 0).fits_in(later)
+    assert WarmUp(300.0, 1).fits_in(later)
+    assert not WarmUp(400.0, 1).fits_in(later)
+    tried = rank_effects(search_problem, np.random.default_rng(0), GATES, ((WarmUp(900.0, 0),), (Spring(),)))
+    assert {finding.effect.name for finding in tried} == {"spring"}
+
+
+def _sticking(small: Evidence, truth: Truth, amplitude_nm: float) -> Evidence:
+    """More friction of joint 2 at low speed, or less."""
+
+    def torque(data: Dataset) -> FloatArray:
+        v = data.velocity_rad_s[:, 1]
+        return acting_on(1, 3, amplitude_nm * np.sign(v) * np.exp(-np.abs(v) / 0.3))
+
+    return bent(small, truth, torque)
+
+
+@pytest.fixture(scope="module")
+def sticking(small: Evidence, small_truth: Truth) -> Evidence:
+    return _sticking(small, small_truth, 6.0)
+
+
+@pytest.fixture(scope="module")
+def slipping(small: Evidence, small_truth: Truth) -> Evidence:
+    return _sticking(small, small_truth, -6.0)
+
+
+def test_physics_alone_refuses_less_friction_at_low_speed(sticking: Evidence, slipping: Evidence) -> None:
+    """In all else the two recordings are mirror images."""
+    for start, possible in ((sticking, True), (slipping, False)):
+        best = rank_effects(search_problem_of(start), np.random.default_rng(0), GATES, (STICKING,))[0]
+        assert (best.axis, best.passed) == (1, possible)
+        assert [("physics allows" in words) for words in best.refusals] == ([] if possible else [True])
+
+
+def test_of_a_family_the_possible_setting_is_taken(slipping: Evidence) -> None:
+    """Less friction at low speed resembles drag that grows with the root of the speed, which is possible."""
+    family = (*STICKING, NonlinearViscous(0.5))
+    best = rank_effects(search_problem_of(slipping), np.random.default_rng(0), GATES, (family,))[0]
+    assert (best.effect, best.axis, best.passed) == (family[1], 1, True)
+
+
+@given(st.lists(st.tuples(numbers, st.integers(0, 6)), min_size=2, max_size=30))
+def test_a_change_is_summed_by_move(rows: list[tuple[float, int]]) -> None:
+    change, move = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+    found = compare_by_move(change, move)
+    by_move = [change[move == number].sum() for number in np.unique(move)]
+    assert found.rise == pytest.approx(change.sum(), abs=1e-6)
+    assert found.moves == len(by_move)
+    expected = np.std(by_move, ddof=1) * np.sqrt(len(by_move)) if len(by_move) > 1 else 0.0
+    assert found.std == pytest.approx(expected, abs=1e-6)
+    assert not (found.is_rise and compare_by_move(-change, move).is_rise)
+    order = np.random.default_rng(len(rows)).permutation(len(rows))
+    assert compare_by_move(change[order], move[order]).rise == pytest.approx(found.rise, abs=1e-6)
+
+
+def test_a_rise_is_more_than_its_noise_once_in_twenty() -> None:
+    rng = np.random.default_rng(4)
+    move = np.repeat(np.arange(12), 5)
+    rises = [compare_by_move(rng.normal(size=60) + rng.normal(size=12)[move], move).is_rise for _ in range(600)]
+    assert 14 <= sum(rises) <= 46  # 30 ± 5.3, three deviations on either side
+    assert compare_by_move(rng.normal(size=60) + 3.0, move).is_rise
+
+
+def test_runs_are_left_out_where_their_payload_is_in_another(small: Evidence) -> None:
+    rows = small.training
+    assert runs_to_leave_out(rows) == (0, 1, 2, 3)
+    assert runs_to_leave_out(rows.only(rows.run != 3)) == (0, 2)  # run 1 is now the only loaded one
+    assert runs_to_leave_out(rows.only(rows.run < MIN_RUNS - 1)) == ()
+
+
+def test_an_error_on_runs_left_out_is_that_of_a_fit_of_the_others(search_problem: SearchProblem) -> None:
+    problem, rng = search_problem.folds.problem, np.random.default_rng(1)
+    columns = rng.normal(size=(len(problem.motor), 2)) + 0.3 * problem.residual[:, None]
+    run = search_problem.observation.run[problem.source]
+    both = np.concatenate((problem.jacobian, columns), axis=1)
+    rise = 0.0
+    for left_out in range(4):
+        own = run == left_out
+        for matrix, sign in ((both, 1.0), (problem.jacobian, -1.0)):
+            fitted = np.linalg.lstsq(matrix[~own], problem.residual[~own], rcond=None)[0]
+            rise += sign * float(np.sum((problem.residual[own] - matrix[own] @ fitted) ** 2))
+    assert RunsLeftOut.of(search_problem).change(columns).rise == pytest.approx(rise, rel=1e-4)
+
+
+def _levels(small: Evidence, truth: Truth, levels: tuple[float, ...]) -> SearchProblem:
+    """Dry friction of joint 2 that has another level in each run."""
+    names = [data.name for data in small.datasets]
+    start = bent(
+        small,
+        truth,
+        lambda data: acting_on(1, 3, levels[names.index(data.name)] * np.sign(data.velocity_rad_s[:, 1])),
+    )
+    return search_problem_of(start)
+
+
+def _powers_of_the_run(problem: SearchProblem, powers: int) -> FloatArray:
+    """Friction of joint 2 as a polynomial of the run's number, whitened, shape (rows, powers)."""
+    linear = problem.folds.problem
+    run = problem.observation.run[linear.source].astype(np.float64)
+    rubbing = whitened_columns(problem, Stribeck(100.0), 1)  # sign(q̇), as good as
+    return np.asarray(rubbing * run[:, None] ** np.arange(1, powers + 1))
+
+
+@pytest.mark.parametrize(("levels", "powers"), [((4.0, -4.0, 4.0, -4.0), 3), ((0.0, 3.0, 6.0, 9.0), 1)])
+def test_what_only_moves_of_the_same_run_predict_is_refused(
+    small: Evidence, small_truth: Truth, levels: tuple[float, ...], powers: int
+) -> None:
+    """Three powers follow any four levels on moves left out; a run left out shows that they are no law."""
+    problem = _levels(small, small_truth, levels)
+    columns = _powers_of_the_run(problem, powers)
+    (trial,) = score_candidates(problem.folds, columns, (slice(0, powers),))
+    assert trial is not None
+    assert trial.held_out.sum() < 0.9 * problem.folds.square_sum(problem.folds.residual).sum()
+    assert bool(RunsLeftOut.of(problem).refusal(columns)) == (powers == 3)
+
+
+def test_without_an_effect_the_joint_fit_is_the_declared_one_to_first_order(sticking: Evidence) -> None:
+    placed = PlacedEffect(STICKING[0], 1)
+    joined = with_effects(sticking, (placed,))
+    assert placed.columns[0] in joined.estimate.unknowns  # with its possible values
+    reduced = without_effects_of(search_problem_of(joined), joined.estimate, (placed,))
+    noise = (joined.estimate.axis_noise, sticking.estimate.axis_noise)
+    ends = (reduced.search_problem.folds.problem, search_problem_of(sticking).folds.problem)
+    squares = [np.sum((end.residual * own[end.motor]) ** 2) for end, own in zip(ends, noise, strict=True)]
+    assert squares[0] == pytest.approx(squares[1], rel=0.01)
+    shifts = joined.estimate.gains - sticking.estimate.gains
+    assert reduced.gain_shifts == pytest.approx(shifts, abs=0.5 * float(np.max(sticking.estimate.gains_std)))
+
+
+def test_gains_that_move_by_more_than_sigma_are_named(search_problem: SearchProblem, small: Evidence) -> None:
+    """A torque that is a part of motor 1's own torque is a change of its gain; fixed gains cannot move."""
+    problem, std = search_problem.folds.problem, small.estimate.gains_std
+    share = 3.0 * std[0] / small.estimate.gains[0]
+    shifts = gain_shifts(search_problem.folds, -share * problem.jacobian[:, 0])
+    assert shifts[0] == pytest.approx(3.0 * std[0], rel=1e-6)
+    assert [motor for motor, _ in moved_gains(shifts, std)] == [0]
+    assert moved_gains(shifts, np.zeros(3)) == ()
+
+
+def test_coefficients_in_their_noise_are_no_effect() -> None:
+    covariance = np.diag([1.0, 4.0])
+    assert in_noise(np.array([1.0, 2.0]), covariance)
+    assert not in_noise(np.array([3.0, 0.0]), covariance)
+
+
+def _term_after(sticking: Evidence, order: tuple[Effect, ...]) -> loop._Model | SetAside:
+    """Joint fit of a named effect and a term that can replace it, judged as if the last one had just joined."""
+    joined = with_effects(sticking, tuple(PlacedEffect(effect, 1) for effect in order))
+    finding = Finding(order[-1], 1, np.ones(1), np.ones(1), 0.0, 1.0, 0.1, 5.0, 4.0, 0.2, 9.0, True, np.ones(8))
+    return loop._pruned(loop._linearised(joined, {}), finding, np.random.default_rng(0), GATES)
+
+
+def test_a_term_without_a_name_makes_no_named_effect_leave(sticking: Evidence) -> None:
+    term = Smooth(Abscissa.VELOCITY, 0.03, 6.5, 1)
+    refused = _term_after(sticking, (STICKING[0], term))
+    assert isinstance(refused, SetAside)
+    assert refused.rival == PlacedEffect(STICKING[0], 1)
+    assert refused.reason(("J1", "J2", "J3")) == "stribeck on J2 would no longer pass beside it"
+    kept = _term_after(sticking, (term, STICKING[0]))
+    assert isinstance(kept, loop._Model)
+    assert kept.evidence.effects == (PlacedEffect(STICKING[0], 1),)
+
+
+def test_the_number_of_effects_is_bounded_by_the_moves(sticking: Evidence, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop, "PIECES_PER_EFFECT", 1000)
+    (step,) = find_effects(sticking, np.random.default_rng(0), GATES, (STICKING,))
+    assert step.accepted is None
+    assert step.findings[0].passed
+    assert "moves allow no more than 0 effects" in step.ended
+
+
+def test_rivals_are_those_that_stop_passing_beside_it(small: Evidence, small_truth: Truth) -> None:
+    """A hump over the joint's angle, which hinges and harmonics follow equally well."""
+
+    def torque(data: Dataset) -> FloatArray:
+        q = data.position_rad[:, 1]
+        return acting_on(1, 3, 6.0 * np.sin(3.0 * q) * np.exp(-(q**2)))
+
+    families = tuple(family for family in EFFECTS if family[0].name in {"hinge", "gravity-compensator", "stribeck"})
+    start = bent(small, small_truth, torque)
+    first, second = find_effects(start, np.random.default_rng(0), GATES, families)[:2]
+    assert first.accepted is not None
+    assert first.accepted.ambiguity
+    passed = [{effect_key(one.effect, one.axis) for one in step.findings if one.passed} for step in (first, second)]
+    for rival in first.accepted.ambiguity:
+        assert effect_key(rival.effect, rival.axis) in passed[0] - passed[1]
+
+
+def test_two_runs_are_judged_on_moves_alone(small: Evidence, small_runs: tuple[Run, ...]) -> None:
+    rows = small.training.run < MIN_RUNS - 1
+    short = replace(small, training=small.training.only(rows), datasets=small.datasets[: MIN_RUNS - 1])
+    runs = RunsLeftOut.of(search_problem_of(short))
+    assert runs.runs == ()
+    assert runs.refusal(np.ones((1, 1))) == ""

@@ -1,0 +1,151 @@
+"""Flexible gears and gears with a gap whose resonance lies in the band: one effect explains it, and none joins."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from ident.data.dataset import Dataset
+from ident.discovery.loop import Evidence, find_effects
+from ident.discovery.resonance import propose_resonances
+from ident.discovery.search import Gates
+from ident.effects.dictionary import EFFECTS
+from ident.effects.signals import fitted_signals
+from ident.effects.transmission import Backlash, Elasticity, spring_torque, twist_acceleration
+from tests.ident.recordings import Truth, bent, search_problem_of, training_error
+
+FloatArray = NDArray[np.float64]
+GATES = Gates(draws=199)
+AXIS, COMPLIANCE, RATIO = 1, 8.0e-4, 0.2  # a resonance a few times as fast as the moves
+NEAR = frozenset({"elasticity", "lag", "backlash", "presliding", "load-friction"})
+
+
+def _stepped(
+    torque: FloatArray, inertia: FloatArray, rate_hz: float, compliance: float, half_gap: float = 0.0
+) -> FloatArray:
+    """Acceleration of the twist by small explicit steps from the first sample to the last, no windows."""
+    steps = 8
+    twist, rate, out = torque[0] * compliance + half_gap * np.sign(torque[0]), 0.0, np.zeros(len(torque))
+    for k in range(len(torque) - 1):
+        damping = 2.0 * RATIO * np.sqrt(inertia[k] / compliance)
+        for part in range(steps):
+            pulled = torque[k] + (torque[k + 1] - torque[k]) * part / steps
+            if twist > half_gap:
+                force = (twist - half_gap) / compliance + damping * rate
+                force = max(force, 0.0) if half_gap else force
+            elif twist < -half_gap:
+                force = (twist + half_gap) / compliance + damping * rate
+                force = min(force, 0.0) if half_gap else force
+            else:
+                force = 0.0
+            bend = (pulled - force) / inertia[k]
+            if part == 0:
+                out[k] = bend
+            rate += bend / (steps * rate_hz)
+            twist += rate / (steps * rate_hz)
+    out[-1] = out[-2]
+    return out
+
+
+def _on_a_spring(small: Evidence, truth: Truth, compliance: float, half_gap: float) -> Evidence:
+    def torque(data: Dataset) -> FloatArray:
+        run = fitted_signals(small.model, data, small.training, small.estimate)
+        inertia = run.inertia_kg_m2[:, AXIS]
+        through = (run.geared_torque_nm if half_gap else run.load_torque_nm)[AXIS]
+        return np.asarray(-inertia * _stepped(through, inertia[AXIS], run.rate_hz, compliance, half_gap))
+
+    return bent(small, truth, torque)
+
+
+def _found(start: Evidence) -> Evidence:
+    families = tuple(family for family in EFFECTS if family[0].name in NEAR)
+    return find_effects(start, np.random.default_rng(0), GATES, families)[-1].after
+
+
+def test_one_effect_explains_a_resonance_in_the_band_and_none_joins(small: Evidence, small_truth: Truth) -> None:
+    start = _on_a_spring(small, small_truth, COMPLIANCE, 0.0)
+    last = _found(start)
+    ((effect, axis),) = [(placed.effect, placed.axis) for placed in last.effects]
+    assert isinstance(effect, Elasticity)
+    assert axis == AXIS
+    assert effect.resonant_rad_nm == pytest.approx(COMPLIANCE, rel=0.15)
+    found = last.estimate.parameters[len(last.rows_without_effects.columns)]
+    assert found == pytest.approx(COMPLIANCE, rel=0.15)
+    errors = [training_error(evidence).axes[AXIS] for evidence in (start, last, small)]
+    assert errors[0] > 1.1 * errors[2]
+    assert errors[1] < 1.03 * errors[2]
+    assert last.estimate.gains == pytest.approx(small.estimate.gains, rel=0.01)
+
+
+def test_one_effect_explains_a_gap_with_flanks_that_give_and_none_joins(small: Evidence, small_truth: Truth) -> None:
+    start = _on_a_spring(small, small_truth, 2e-4, 4e-3)
+    last = _found(start)
+    ((effect, axis),) = [(placed.effect, placed.axis) for placed in last.effects]
+    assert isinstance(effect, Backlash)
+    assert axis == AXIS
+    assert last.estimate.parameters[len(last.rows_without_effects.columns)] == pytest.approx(4e-3, rel=0.15)
+    errors = [training_error(evidence).axes[AXIS] for evidence in (start, last, small)]
+    # The gap is refined, the compliance of its flanks is one of the three that were proposed.
+    assert errors[1] ** 2 - errors[2] ** 2 < 0.25 * (errors[0] ** 2 - errors[2] ** 2)
+
+
+def test_windows_hold_all_that_a_gap_does() -> None:
+    """The whole time in small steps, of one gap; all gaps at once, in windows around the turns of the torque."""
+    rate_hz = 500.0
+    time = np.arange(2500) / rate_hz
+    torque = 12.0 * np.sin(2.0 * np.pi * 0.7 * time) * np.cos(2.0 * np.pi * 0.16 * time) + 3.0
+    inertia = 0.5 + 0.2 * np.sin(time)
+    gaps, compliances = np.array([4e-4, 2e-3]), np.array([2e-4, 1e-4])
+    made = twist_acceleration(torque, inertia, rate_hz, gaps, compliances, RATIO)
+    for one, gap, compliance in zip(made, gaps, compliances, strict=True):
+        whole = _stepped(torque, inertia, rate_hz, compliance, gap)[100:-100]
+        left = one[100:-100] - whole
+        assert np.sqrt(np.mean(left**2)) < 0.1 * np.sqrt(np.mean(whole**2))
+
+
+def test_no_resonance_is_proposed_where_the_residual_holds_none(small: Evidence) -> None:
+    assert propose_resonances(search_problem_of(small), GATES) == {}
+
+
+@given(
+    rate_hz=st.sampled_from((100.0, 250.0, 1000.0)),
+    share=st.floats(0.02, 0.3),
+    ratio=st.floats(0.05, 1.0),
+    inertia=st.floats(1e-3, 1e2),
+)
+@settings(max_examples=40, deadline=None)
+def test_a_spring_passes_a_wave_as_its_transfer_function_says(
+    rate_hz: float, share: float, ratio: float, inertia: float
+) -> None:
+    """H = ω²/(ω² − w² + 2iζωw), at the resonance exactly, whatever the rate."""
+    resonance = 2.0 * np.pi * share * rate_hz
+    time = np.arange(round(60 + 40.0 / (ratio * share))) / rate_hz
+    passed = spring_torque(
+        np.sin(resonance * time), np.full(len(time), inertia), rate_hz, 1.0 / (inertia * resonance**2), ratio
+    )
+    settled = slice(len(time) // 2, None)
+    expected = np.sin(resonance * time - np.pi / 2.0) / (2.0 * ratio)
+    assert passed[settled] == pytest.approx(expected[settled], abs=0.02 / ratio)
+
+
+def test_a_stiff_gear_or_none_passes_the_torque_as_it_is() -> None:
+    torque = 1.0 - np.cos(np.arange(200.0) / 40.0)  # from rest
+    inertia = np.ones(200)
+    assert np.array_equal(spring_torque(torque, inertia, 1000.0, 0.0, 0.2), torque)
+    assert np.array_equal(spring_torque(torque, -inertia, 1000.0, 1e-4, 0.2), torque)
+    assert spring_torque(torque, inertia, 1000.0, 1e-9, 0.2) == pytest.approx(torque, abs=1e-3)
+
+
+def test_the_first_order_is_the_limit_of_a_stiff_gear(small: Evidence) -> None:
+    problem = search_problem_of(small)
+    run = problem.runs[0]
+    run = replace(run, inertia_kg_m2=np.ones_like(run.inertia_kg_m2))
+    slow = replace(run, load_torque_nm=(1.0 - np.cos(run.time_s)) * np.ones((3, 1)))
+    first = Elasticity().columns(slow, AXIS)[..., 100:-100]
+    assert Elasticity(2e-6, 0.3).columns(slow, AXIS)[..., 100:-100] == pytest.approx(first, abs=0.01)
+    assert not np.allclose(Elasticity(0.1, 0.3).columns(slow, AXIS)[..., 100:-100], first, atol=0.1)

@@ -1,0 +1,90 @@
+"""Ripple of an order that no list holds: found against motor and joint angle, and not found in noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ident.data.dataset import Dataset
+from ident.discovery.loop import Evidence, find_effects
+from ident.discovery.ripple import Periodogram, periodogram, propose_orders
+from ident.discovery.search import Gates
+from ident.effects.dictionary import EFFECTS
+from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.electrical import Cogging
+from ident.effects.transmission import Ripple
+from tests.ident.recordings import Truth, acting_on, bent, search_problem_of
+
+FloatArray = NDArray[np.float64]
+GATES = Gates(draws=199)
+RIPPLES = tuple(family for family in EFFECTS if isinstance(family[0], Ripple | Cogging))
+
+
+def _rippling(small: Evidence, truth: Truth, axis: int, order: float, size_nm: float) -> Evidence:
+    ratio = truth.model.drive_train.ratio[axis, axis]
+
+    def torque(data: Dataset) -> FloatArray:
+        return acting_on(axis, 3, size_nm * np.cos(order * ratio * data.position_rad[:, axis] - 0.8))
+
+    return bent(small, truth, torque)
+
+
+@pytest.mark.parametrize(
+    ("axis", "order"),
+    [(0, 0.37), pytest.param(2, 37.0 / 45.0, id="37-of-the-joint")],
+)
+def test_an_order_between_the_whole_ones_is_named(small: Evidence, small_truth: Truth, axis: int, order: float) -> None:
+    start = _rippling(small, small_truth, axis, order, 4.0)
+    last = find_effects(start, np.random.default_rng(0), GATES, RIPPLES)[-1].after
+    ((placed, effect),) = [(placed.axis, placed.effect) for placed in last.effects]
+    assert isinstance(effect, Ripple)
+    assert placed == axis
+    # A line is one period over the range wide; it is found to a tenth of that.
+    range_rev = np.ptp(np.concatenate([data.position_rad[:, axis] for data in small.datasets])) / (2.0 * np.pi)
+    assert abs(effect.order - order) * 40.0 * range_rev < 0.1
+    found = last.estimate.parameters[len(last.rows_without_effects.columns) :][:2]
+    assert np.hypot(*found) == pytest.approx(4.0, rel=0.1)
+
+
+def test_noise_proposes_no_order(small: Evidence) -> None:
+    """Correlated noise of a size that differs from move to move; 15 draws of one per cent each."""
+    rng, problem = np.random.default_rng(8), search_problem_of(small)
+    folds, alarms = problem.folds, 0
+    for _ in range(15):
+        size = rng.uniform(0.2, 2.0, folds.problem.cluster_count)[folds.problem.cluster]
+        noise = size * np.convolve(rng.normal(size=len(size)), (0.6, 1.0, 0.6), "same")
+        drawn = replace(problem, folds=replace(folds, problem=replace(folds.problem, residual=noise)))
+        alarms += bool(propose_orders(drawn, (), rng, GATES))
+    assert alarms <= 1
+
+
+def test_an_order_in_the_model_or_next_to_one_is_not_proposed_again(small: Evidence, small_truth: Truth) -> None:
+    problem, rng = search_problem_of(_rippling(small, small_truth, 1, 2.6, 4.0)), np.random.default_rng(0)
+    (family,) = propose_orders(problem, (), rng, GATES)[1]
+    nearest: Effect = min(family, key=lambda member: abs(member.settings["order"] - 2.6))
+    assert nearest.settings["order"] == pytest.approx(2.6, abs=0.01)
+    assert propose_orders(problem, (PlacedEffect(nearest, 1),), rng, GATES) == {}
+
+
+def test_the_transform_is_the_sum_over_the_rows_of_each_move(small: Evidence) -> None:
+    problem = search_problem_of(small)
+    made = periodogram(problem, 1, 0)
+    assert made is not None
+    chosen = len(made.orders) // 10
+    columns = problem.torque(Ripple(float(made.orders[chosen])), 1)
+    folds = problem.folds
+    slow = folds.problem.whitened(columns, problem.model.drive_train.to_motor) * folds.problem.residual[:, None]
+    by_move = np.stack([np.bincount(folds.problem.cluster, part) for part in slow.T])
+    # The transform counts its angle from another origin.
+    assert np.hypot(*made.scores[:, :, chosen]) == pytest.approx(np.hypot(*by_move), rel=0.02, abs=0.01 * by_move.max())
+
+
+def test_signs_leave_the_noise_as_it_is() -> None:
+    rng = np.random.default_rng(1)
+    made = Periodogram(0, 0, 3.0, np.arange(5.0), rng.normal(size=(2, 40, 5)))
+    same = made.statistic(np.ones((1, 40)))
+    assert made.statistic(-np.ones((1, 40))) == pytest.approx(same)
+    assert np.mean(made.statistic(rng.choice((-1.0, 1.0), (500, 40)))) == pytest.approx(2.0, rel=0.1)
