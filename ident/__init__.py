@@ -17,8 +17,8 @@ Arrays over time have the shape (n_samples, n_axes) everywhere: in `Run`, `Motio
 first and time last. Units are SI and in the names; a prismatic axis has m for rad and N for Nm.
 
 `find_effects` looks for torques that the declared model lacks, in the rows that `gather` collects. `calibration_of`
-makes the `Calibration` with which `predict_torque` and `predict_current` work. Errors are `IdentificationError` and its
-kinds in `ident.errors`.
+makes the `Calibration` with which `predict_torque`, `predict_current`, `weigh` and `external_torque` work. Errors are
+`IdentificationError` and its kinds in `ident.errors`.
 """
 
 from __future__ import annotations
@@ -29,6 +29,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ident.calibration import Calibration as Calibration
     from ident.calibration import calibration_of as calibration_of
+    from ident.contact import ExternalTorque as ExternalTorque
+    from ident.contact import external_torque as external_torque
+    from ident.contact import prediction_band as prediction_band
     from ident.data.conditioning import Conditioning as Conditioning
     from ident.data.dataset import Dataset as Dataset
     from ident.data.dataset import differentiate as differentiate
@@ -39,6 +42,7 @@ if TYPE_CHECKING:
     from ident.discovery.loop import find_effects as find_effects
     from ident.discovery.loop import gather as gather
     from ident.errors import DataUnfit as DataUnfit
+    from ident.errors import Diagnosis as Diagnosis
     from ident.errors import EffectRefused as EffectRefused
     from ident.errors import IdentificationError as IdentificationError
     from ident.errors import ModelContradicted as ModelContradicted
@@ -48,6 +52,8 @@ if TYPE_CHECKING:
     from ident.errors import RankDeficient as RankDeficient
     from ident.errors import RolesExchanged as RolesExchanged
     from ident.errors import TooFewMoves as TooFewMoves
+    from ident.estimators.diagnosis import diagnose as diagnose
+    from ident.estimators.diagnosis import exchanged_channels as exchanged_channels
     from ident.estimators.estimate import Estimate as Estimate
     from ident.estimators.estimate import RelativeError as RelativeError
     from ident.estimators.identify import Identification as Identification
@@ -62,16 +68,20 @@ if TYPE_CHECKING:
     from ident.prediction import measured_torque as measured_torque
     from ident.prediction import predict_current as predict_current
     from ident.prediction import predict_torque as predict_torque
+    from ident.weighing import WeighedBody as WeighedBody
+    from ident.weighing import weigh as weigh
 
 # Importing the package stays light: a name brings its module along when it is first used.
 _HOMES = {
     "ident.calibration": "Calibration calibration_of",
+    "ident.contact": "ExternalTorque external_torque prediction_band",
     "ident.data.conditioning": "Conditioning",
     "ident.data.dataset": "Dataset differentiate planned",
     "ident.data.run": "Run",
     "ident.discovery.loop": "Evidence Step find_effects gather",
-    "ident.errors": "DataUnfit EffectRefused IdentificationError ModelContradicted ModelError NotConverged "
-    "PayloadUnseen RankDeficient RolesExchanged TooFewMoves",
+    "ident.errors": "DataUnfit Diagnosis EffectRefused IdentificationError ModelContradicted ModelError "
+    "NotConverged PayloadUnseen RankDeficient RolesExchanged TooFewMoves",
+    "ident.estimators.diagnosis": "diagnose exchanged_channels",
     "ident.estimators.estimate": "Estimate RelativeError",
     "ident.estimators.identify": "Identification identify",
     "ident.estimators.method": "Method",
@@ -79,6 +89,7 @@ _HOMES = {
     "ident.model.model": "DriveTrain Model",
     "ident.model.robot": "Motion Robot robot_from_urdf",
     "ident.prediction": "measured_torque predict_current predict_torque",
+    "ident.weighing": "WeighedBody weigh",
 }
 _MODULES = {name: home for home, names in _HOMES.items() for name in names.split()}
 __all__ = list(_MODULES)

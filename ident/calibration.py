@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ident.arrays import FloatArray
 from ident.data.run import Recording
-from ident.errors import ModelError
+from ident.errors import Diagnosis, ModelError
 from ident.estimators.estimate import RelativeError
 
 if TYPE_CHECKING:  # reading a calibration needs no estimator
@@ -111,6 +113,30 @@ class Calibration:
     nameplate_holdout_error_percent: RelativeError | None = None
     #: Digest of the part of the configuration that a recording depends on; None in calibrations of earlier versions.
     recording_configuration_sha256: str | None = None
+    #: Lower triangle L of the covariance L Lᵀ of (gains, parameters), a row each; None in calibrations of earlier
+    #: versions, and of an estimate without σ.
+    covariance_factor: tuple[tuple[float, ...], ...] | None = None
+    diagnoses: tuple[Diagnosis, ...] = ()  #: what was wrong with the recordings or the fit, by run and axis
+
+    @property
+    def covariance(self) -> FloatArray | None:
+        """Covariance of (gains, parameters), shape (n + p, n + p); None where the calibration has none.
+
+        Raises:
+            ModelError: its factor has another shape.
+        """
+        if self.covariance_factor is None:
+            return None
+        size = len(self.gains) + len(self.parameters)
+        if [len(row) for row in self.covariance_factor] != list(range(1, size + 1)):
+            raise ModelError(
+                f"covariance_factor of the calibration of cell {self.cell!r} has {len(self.covariance_factor)} rows; "
+                f"expected {size} of one to {size} entries, for {len(self.gains)} gains and {len(self.parameters)} "
+                "parameters: fit the logs again"
+            )
+        lower = np.zeros((size, size))
+        lower[np.tril_indices(size)] = np.concatenate(self.covariance_factor)
+        return np.asarray(lower @ lower.T)
 
 
 def calibration_of(
@@ -175,7 +201,23 @@ def calibration_of(
         created="",
         software="",
         session_began_s=None if last is None else session_began_s(last.trained),
+        covariance_factor=factor_of(estimate.covariance),
     )
+
+
+def factor_of(covariance: FloatArray) -> tuple[tuple[float, ...], ...] | None:
+    """Rows of L with the covariance L Lᵀ, to six digits; None where σ is not finite.
+
+    Unlike Cholesky's factor, it exists with fewer moves than unknowns too.
+    """
+    if not np.isfinite(covariance).all():
+        return None
+    std = np.sqrt(np.diag(covariance))
+    unit = np.where(std > 0.0, std, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
+    upper = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r"))
+    lower = upper.T * unit[:, None]
+    return tuple(tuple(float(f"{value:.6g}") for value in row[: index + 1]) for index, row in enumerate(lower))
 
 
 def _accepted(

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import EFFECTS, UNNAMED
-from ident.effects.effect import ALL_AXES, PlacedEffect, Side, at_joints, check_settings
+from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, Side, at_joints, check_settings
 from ident.effects.signals import declared_signals, payload_parameters
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload
@@ -107,6 +109,8 @@ def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[P
     if not everywhere and accepted.axis not in axes:
         raise EffectRefused(f"effect {accepted.name!r} acts on axis {accepted.axis!r}; there are {', '.join(axes)}")
     axis = 0 if everywhere else axes.index(accepted.axis)
+    added = {name: 0.0 for name in known.settings if name in ADDED and name not in accepted.settings}
+    accepted = replace(accepted, settings={**accepted.settings, **added})
     if set(accepted.settings) != set(known.settings):
         found, exist = (", ".join(sorted(settings)) or "none" for settings in (accepted.settings, known.settings))
         raise EffectRefused(f"effect {accepted.name!r} is given the settings {found}; it has {exist}")

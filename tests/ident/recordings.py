@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, factor_of
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.discovery.candidates import ColumnCache, SearchProblem, prepare_search
 from ident.discovery.loop import Evidence, gather
+from ident.effects.signals import session_began_s
 from ident.equations.rows import decimate_rows
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.estimators.identify import identify
@@ -115,11 +117,12 @@ def record(
     seconds: float = 20.0,
     noise_a: float = 0.0,
     rate_hz: float = 1000.0,
+    bend: Callable[[FloatArray], FloatArray] = lambda q: q,
 ) -> Run:
-    """One run: the current is what the model needs for the motion, plus noise on the current alone."""
+    """One run: the current is what the model needs for the (bent) motion, plus noise on the current alone."""
     count = len(truth.gains)
     limits = np.array([2.5, 1.8, 2.2, 3.0, 1.8, 3.0, 2.0][:count])
-    q = positions(rng, seconds, rate_hz, limits)
+    q = bend(positions(rng, seconds, rate_hz, limits))
     time = np.arange(len(q)) / rate_hz
     bare = Run(name, time, q, np.zeros_like(q))
     # The recorded positions are band-limited far below this cut-off, so these derivatives are the motion's own.
@@ -173,3 +176,52 @@ def training_error(evidence: Evidence) -> RelativeError:
     """Error on the rows of the fit [%]."""
     estimate, rows = evidence.estimate, evidence.training
     return relative_error(rows.torque(estimate.gains), estimate.predicted_torque(rows), rows.use)
+
+
+def calibrated(evidence: Evidence) -> Calibration:
+    """The calibration that an estimate with its effects amounts to."""
+    estimate = evidence.estimate
+    axes = tuple(f"J{number}" for number in range(1, len(estimate.gains) + 1))
+    parameters = tuple(
+        Parameter(column.name, float(value), float(std), column.unit)
+        for column, value, std in zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
+    )
+    effects = []
+    for placed in evidence.effects:
+        names = {column.name for column in placed.columns}
+        coefficients = tuple(parameter for parameter in parameters if parameter.name in names)
+        setting = {name: float(value) for name, value in placed.effect.settings.items()}
+        effects.append(AcceptedEffect(placed.effect.name, axes[placed.axis], setting, coefficients, 1.0, 1.0))
+    whole = a_calibration(estimate.gains, parameters, estimate.gains_std)
+    return replace(
+        whole,
+        effects=tuple(effects),
+        session_began_s=session_began_s(evidence.trained),
+        covariance_factor=factor_of(estimate.covariance),
+    )
+
+
+def a_calibration(
+    gains: FloatArray, parameters: tuple[Parameter, ...], gains_std: FloatArray | None = None
+) -> Calibration:
+    """A calibration of these gains and parameters, exact unless told otherwise."""
+    std = np.zeros(len(gains)) if gains_std is None else gains_std
+    return Calibration(
+        cell="test",
+        method="ml",
+        gains=tuple(
+            Gain(f"J{number}", float(gain), float(one), "Nm/A", 1.0)
+            for number, (gain, one) in enumerate(zip(gains, std, strict=True), start=1)
+        ),
+        parameters=parameters,
+        effects=(),
+        relative_error_percent=RelativeError((0.0,) * len(gains), 0.0),
+        holdout_error_percent=None,
+        condition=1.0,
+        rows=1,
+        filter={},
+        sources=(),
+        configuration_sha256="",
+        created="",
+        software="",
+    )

@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from numpy.typing import NDArray
 
-from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter
+from ident.calibration import AcceptedEffect, Parameter
 from ident.data.dataset import Dataset, differentiate, planned
 from ident.data.run import Run
 from ident.discovery.loop import Evidence, gather, with_effects
@@ -21,59 +20,20 @@ from ident.effects.effect import PlacedEffect, check_settings
 from ident.effects.electrical import Cogging
 from ident.effects.friction import LoadFriction, Stribeck, WarmUp
 from ident.effects.position import Spring
-from ident.effects.signals import Abscissa, session_began_s
+from ident.effects.signals import Abscissa
+from ident.effects.transmission import Elasticity
 from ident.equations.rows import decimate_rows, row_masks
 from ident.errors import DataUnfit, EffectRefused, ModelError
-from ident.estimators.estimate import RelativeError
 from ident.estimators.identify import identify
 from ident.estimators.method import Method
 from ident.model.bodies import Payload
 from ident.prediction import measured_torque, placed_effect, predict_current, predict_torque, standard_parameters
-from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth
-
-FloatArray = NDArray[np.float64]
-
-AXES = tuple(f"J{number}" for number in range(1, 7))
-
-
-def _calibration(gains: FloatArray, parameters: tuple[Parameter, ...]) -> Calibration:
-    return Calibration(
-        cell="test",
-        method="wls",
-        gains=tuple(Gain(axis, float(gain), 0.0, "Nm/A", 1.0) for axis, gain in zip(AXES, gains, strict=True)),
-        parameters=parameters,
-        effects=(),
-        relative_error_percent=RelativeError((0.0,) * 6, 0.0),
-        holdout_error_percent=None,
-        condition=1.0,
-        rows=1,
-        filter={},
-        sources=(),
-        configuration_sha256="",
-        created="",
-        software="",
-    )
-
-
-def _of(identification: Evidence) -> Calibration:
-    estimate = identification.estimate
-    parameters = tuple(
-        Parameter(column.name, float(value), 0.0, column.unit)
-        for column, value in zip(estimate.unknowns, estimate.parameters, strict=True)
-    )
-    effects = []
-    for placed in identification.effects:
-        names = {column.name for column in placed.columns}
-        coefficients = tuple(parameter for parameter in parameters if parameter.name in names)
-        setting = {name: float(value) for name, value in placed.effect.settings.items()}
-        effects.append(AcceptedEffect(placed.effect.name, AXES[placed.axis], setting, coefficients, 1.0, 1.0))
-    began_s = session_began_s(identification.trained)
-    return replace(_calibration(estimate.gains, parameters), effects=tuple(effects), session_began_s=began_s)
+from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth, a_calibration, calibrated
 
 
 def _largest_difference(identification: Evidence) -> float:
     """Largest difference of the two predictions on the decimated rows, relative to the largest torque."""
-    calibration = _of(identification)
+    calibration = calibrated(identification)
     expected = identification.estimate.predicted_torque(identification.training)
     rows = [
         decimate_rows(data, CONDITIONING, predict_torque(calibration, identification.model, data).T)
@@ -105,7 +65,7 @@ def test_the_estimates_own_torque_comes_back(identified: Evidence) -> None:
 def test_so_does_that_of_effects(identified: Evidence, effects: tuple[PlacedEffect, ...]) -> None:
     after = with_effects(identified, effects)
     assert _largest_difference(after) < 1e-9
-    without = replace(_of(after), effects=())
+    without = replace(calibrated(after), effects=())
     with pytest.raises(ModelError, match=effects[0].effect.name):
         standard_parameters(without, identified.model)
 
@@ -119,7 +79,7 @@ def test_what_fades_over_a_session_counts_from_its_first_run(truth: Truth, noisy
 
 def test_a_motion_that_no_one_recorded_needs_the_same_current(identified: Evidence) -> None:
     after = with_effects(identified, (PlacedEffect(Spring(), 2), PlacedEffect(LoadFriction(0), 1)))
-    calibration, data = _of(after), after.datasets[1]
+    calibration, data = calibrated(after), after.datasets[1]
     asked = planned(data.motion(), data.rate_hz, data.payload)
     expected = predict_current(calibration, after.model, data)
     assert_allclose(predict_current(calibration, after.model, asked), expected, rtol=0.0, atol=1e-12)
@@ -148,7 +108,7 @@ def test_leading_columns_alone_move_as_all_standard_parameters_do(
     )
     columns = truth.model.regressor(motion.motion())
     expected = np.einsum("jck,c->kj", columns, standard)
-    found = predict_torque(_calibration(GAINS, named), truth.model, motion)
+    found = predict_torque(a_calibration(GAINS, named), truth.model, motion)
     assert found == pytest.approx(expected, abs=1e-6 * np.max(np.abs(expected)))
 
 
@@ -171,7 +131,7 @@ def test_the_true_parameters_predict_the_recorded_current(
     values = (*base.grouping @ truth.parameters, *(value for name, value in PAYLOAD_TRUTH.items() if name != "m"))
     names = (*base.names, *(f"{name}:{MOUNTED.mounting}" for name in PAYLOAD_TRUTH if name != "m"))
     parameters = tuple(Parameter(name, float(value), 0.0, "") for name, value in zip(names, values, strict=True))
-    calibration = _calibration(GAINS, parameters)
+    calibration = a_calibration(GAINS, parameters)
     for run in clean_runs:
         data = differentiate(run, truth.model.drive_train, CONDITIONING)
         _, use = row_masks(truth.model.drive_train, data, CONDITIONING)  # at standstill dry friction is undetermined
@@ -192,11 +152,11 @@ def test_the_true_parameters_predict_the_recorded_current(
 def test_a_payload_that_the_calibration_does_not_know(identified: Evidence, payload: Payload, words: str) -> None:
     data = replace(identified.datasets[1], payload=payload)
     with pytest.raises(DataUnfit, match=words):
-        predict_torque(_of(identified), identified.model, data)
+        predict_torque(calibrated(identified), identified.model, data)
 
 
 def test_a_payload_that_is_known_in_full_needs_nothing_of_the_calibration(identified: Evidence) -> None:
-    calibration, data = _of(identified), identified.datasets[1]
+    calibration, data = calibrated(identified), identified.datasets[1]
     full = dict.fromkeys(PAYLOAD_TRUTH, 0.0)
     weightless = predict_torque(calibration, identified.model, replace(data, payload=Payload("x", "x", full)))
     bare = predict_torque(calibration, identified.model, replace(data, payload=None))
@@ -220,9 +180,9 @@ STIFFNESS = Parameter("spring stiffness 3", 1.0, 0.0, "Nm/rad")
         (AcceptedEffect("spring", "J4", {}, (STIFFNESS,), 1.0, 1.0), "it needs spring stiffness 4"),
     ],
 )
-def test_an_effect_that_does_not_exist_is_refused(effect: AcceptedEffect, words: str) -> None:
+def test_an_effect_that_does_not_exist_is_refused(identified: Evidence, effect: AcceptedEffect, words: str) -> None:
     with pytest.raises(EffectRefused, match=words):
-        placed_effect(effect, _calibration(GAINS, ()))
+        placed_effect(effect, calibrated(identified))
 
 
 @pytest.mark.parametrize(
@@ -248,9 +208,18 @@ def test_an_effect_that_does_not_exist_is_refused(effect: AcceptedEffect, words:
         ("smooth-other-velocity", {"lower": 0.0, "upper": 1.0, "signed": 0, "other_axis": 0}, "other_axis = 0"),
     ],
 )
-def test_settings_that_no_effect_has_are_refused(name: str, settings: dict[str, float], words: str) -> None:
+def test_settings_that_no_effect_has_are_refused(
+    identified: Evidence, name: str, settings: dict[str, float], words: str
+) -> None:
     with pytest.raises(EffectRefused, match=words):
-        placed_effect(AcceptedEffect(name, "J3", settings, (), 1.0, 1.0), _calibration(GAINS, ()))
+        placed_effect(AcceptedEffect(name, "J3", settings, (), 1.0, 1.0), calibrated(identified))
+
+
+def test_an_elasticity_of_an_earlier_version_is_that_of_first_order(identified: Evidence) -> None:
+    compliance = Parameter("elasticity compliance 3", 2e-4, 1e-5, "rad/Nm")
+    earlier = AcceptedEffect("elasticity", "J3", {}, (compliance,), 1.0, 1.0)
+    placed, values = placed_effect(earlier, calibrated(identified))
+    assert (placed, values.tolist()) == (PlacedEffect(Elasticity(), 2), [2e-4])
 
 
 def test_every_effect_of_the_dictionary_has_settings_that_an_effect_can_have() -> None:
@@ -262,7 +231,7 @@ def test_every_effect_of_the_dictionary_has_settings_that_an_effect_can_have() -
 
 
 def test_a_calibration_of_another_robot_is_refused(identified: Evidence) -> None:
-    calibration, data = _of(identified), identified.datasets[0]
+    calibration, data = calibrated(identified), identified.datasets[0]
     with pytest.raises(ModelError, match="5 gains, the model 6 joints"):
         predict_torque(replace(calibration, gains=calibration.gains[:5]), identified.model, data)
     seventh = replace(calibration, parameters=(*calibration.parameters, Parameter("Izz7 + 1.0*Ia7", 1.0, 0.0, "")))

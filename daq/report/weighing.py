@@ -1,0 +1,217 @@
+"""What was weighed on the flange, and contacts: tables, documents and the picture of external torques."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import RenderableType
+from rich.text import Text
+
+from daq.config.cell import Cell
+from daq.files import replace_file
+from daq.report.fit import error_document
+from daq.report.picture import BLACK, ORANGE, SKY, legend_below, panels, render, unformatted
+from daq.report.text import picked, plain_table
+from daq.workflow.fit import DOUBTFUL_PERCENT
+from daq.workflow.weigh import Weighed
+from ident.contact import ExternalTorque
+from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, pseudo_inertia
+
+LISTED = 20  #: Contacts shown in a terminal; `--json` has all
+
+
+def weighed_view(found: Weighed) -> Iterator[RenderableType]:
+    """Mass, centre and inertia, the ten parameters, and doubts."""
+    body = found.body
+    (centre, centre_std), (inertia, inertia_std) = body.centre_m, body.inertia_kg_m2
+    table = plain_table(("", "value ± σ", "unit"), title="Body on the flange", left=(0, 2))
+    table.add_row("mass", _with_std(body.mass_kg, body.mass_std_kg), "kg")
+    for name, value, std in zip("xyz", 1000.0 * centre, 1000.0 * centre_std, strict=True):
+        table.add_row(f"centre {name}", _with_std(value, std), "mm")
+    for name, value, std in zip(LINK_PARAMETERS[:6], inertia, inertia_std, strict=True):
+        table.add_row(f"{name} about the centre", _with_std(value, std), "kg m²")
+    yield table
+    yield "In the frame of the last joint."
+    if found.declared_kg is not None:
+        yield f"The logs declare {found.declared_kg:g} kg: {100.0 * (body.mass_kg / found.declared_kg - 1.0):+.2f} %."
+    within = "moves, gains, robot and effects" if body.complete else "moves and gains"
+    how = "robot and body together, beside runs without load" if found.bare else "on the robot of the calibration"
+    yield f"Found {how}; σ from {body.moves} moves, with the errors of {within}; it leaves {body.error.total:.3g} %."
+    advice = {one.name: f"add {one.seconds:.0f} s of {one.words} (σ {one.std:.2g})" for one in found.help}
+    ten = plain_table(
+        ("parameter", "value ± σ", "unit", "identifiable", ""),
+        title="The ten about the joint's frame",
+        left=(0, 2, 3, 4),
+    )
+    rows = zip(LINK_PARAMETERS, LINK_UNITS, body.values, body.std, body.identifiable, strict=True)
+    for name, unit, value, std, identifiable in rows:
+        ten.add_row(name, _with_std(value, std), unit, "yes" if identifiable else "no", advice.get(name, ""))
+    yield ""
+    yield ten
+    yield from (Text(doubt, style="bold") for doubt in _doubts(found))
+
+
+def _doubts(found: Weighed) -> Iterator[str]:
+    body = found.body
+    if not body.complete:
+        yield "The calibration has no covariance: σ lacks the errors of its robot; fit its logs again."
+    if body.error.total > DOUBTFUL_PERCENT:
+        yield (
+            f"The logs contradict the calibration: {body.error.total:.3g} % of the torque is left. Is it the same "
+            "robot, and one body mounted one way?"
+        )
+    if body.mass_kg < 2.0 * body.mass_std_kg:
+        yield "No body shows: the mass is within two σ of nothing."
+    elif not np.isnan(body.values).any() and np.linalg.eigvalsh(pseudo_inertia(body.values))[0] < 0.0:
+        yield "No solid body has exactly this inertia; use it within its σ."
+
+
+def _with_std(value: float, std: float) -> str:
+    """Value and σ, to two digits of σ."""
+    if not np.isfinite(value + std):
+        return "-"
+    places = 0 if std <= 0.0 else max(0, 1 - int(np.floor(np.log10(std))))
+    return f"{value:.{places}f} ± {std:.{places}f}"
+
+
+def weighed_document(found: Weighed) -> dict[str, Any]:
+    """Build `weigh --json`."""
+    body, advice = found.body, {one.name: one for one in found.help}
+    moves_std = np.sqrt(np.diag(body.moves_covariance))
+    return {
+        "cell": found.cell.name,
+        "logs": [str(log) for log in found.logs],
+        "bare": [str(log) for log in found.bare],
+        "declared_kg": found.declared_kg,
+        "mass_kg": {"value": body.mass_kg, "std": body.mass_std_kg},
+        "centre_m": _pair(*body.centre_m),
+        "inertia_about_centre_kg_m2": _pair(*body.inertia_kg_m2),
+        "parameters": [
+            {
+                "name": name,
+                "unit": unit,
+                "value": float(body.values[index]),
+                "std": float(body.std[index]),
+                "std_of_moves": float(moves_std[index]),
+                "identifiable": bool(body.identifiable[index]),
+                "add": picked(advice[name], "words", "seconds", "std") if name in advice else None,
+            }
+            for index, (name, unit) in enumerate(zip(LINK_PARAMETERS, LINK_UNITS, strict=True))
+        ],
+        "relative_error_percent": error_document(body.error),
+        **picked(body, "moves", "complete"),
+    }
+
+
+def _pair(value: Any, std: Any) -> dict[str, Any]:
+    return {"value": value.tolist(), "std": std.tolist()}
+
+
+def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
+    """Band and threshold of each axis, and the contacts."""
+    headings = ("axis", "quiet s", "band ±", "threshold", "largest", "unit")
+    table = plain_table(headings, title="External torque (medians over the motion)", left=(0, 5))
+    for index, (axis, (band, threshold, largest)) in enumerate(zip(cell.axes, _figures(found), strict=True)):
+        seconds = f"{found.band.quiet_s[index]:.0f}"
+        table.add_row(axis.name, seconds, _digits(band), _digits(threshold), _digits(largest), axis.unit.force)
+    yield table
+    source = f"this log less {found.left_out} stretches that are far out" if found.from_itself else "the quiet logs"
+    yield (
+        f"Band (95 %) and threshold from {source}; less than {found.band.alarms_per_hour:g} false alarm in an hour of "
+        "motion like that, all axes together. Standstill is not judged."
+    )
+    lost = [axis.name for axis, level in zip(cell.axes, found.band.threshold, strict=True) if not np.isfinite(level)]
+    if lost:
+        yield Text(f"Too little quiet motion for a threshold: {', '.join(lost)}. Record longer.", style="bold")
+    contacts = found.contacts
+    yield ""
+    if not contacts:
+        yield "No contact."
+        return
+    listed = plain_table(("axis", "from s", "to s", "peak", "unit", "× threshold"), title="Contacts", left=(0, 4))
+    for one in contacts[:LISTED]:
+        axis = cell.axes[one.axis]
+        numbers = f"{one.start_s:.2f}", f"{one.end_s:.2f}", f"{one.peak_nm:+.3g}", axis.unit.force
+        listed.add_row(axis.name, *numbers, f"{one.peak_over_threshold:.2f}")
+    yield listed
+    if len(contacts) > LISTED:
+        yield f"… and {len(contacts) - LISTED} more; --json lists all."
+
+
+def contact_document(found: ExternalTorque, cell: Cell, log: Path, picture: Path | None) -> dict[str, Any]:
+    """Build `contact --json`."""
+    band = found.band
+    return {
+        "cell": cell.name,
+        "log": str(log),
+        "band_from_this_log": found.from_itself,
+        "stretches_left_out": found.left_out,
+        "alarms_per_hour": band.alarms_per_hour,
+        "axes": [
+            {
+                "axis": axis.name,
+                "unit": axis.unit.force,
+                "scale": band.scale[index].tolist(),
+                "band_over_scale": float(band.factor[index]),
+                "threshold_over_scale": float(band.threshold[index]),
+                "correlation_s": float(band.correlation_s[index]),
+                "quiet_s": float(band.quiet_s[index]),
+                "band": figures[0],
+                "threshold": figures[1],
+                "largest": figures[2],
+            }
+            for index, (axis, figures) in enumerate(zip(cell.axes, _figures(found), strict=True))
+        ],
+        "contacts": [
+            {
+                "axis": cell.axes[one.axis].name,
+                **picked(one, "start_s", "end_s"),
+                "peak": one.peak_nm,
+                "peak_over_threshold": one.peak_over_threshold,
+            }
+            for one in found.contacts
+        ],
+        "picture": None if picture is None else str(picture),
+    }
+
+
+def _figures(found: ExternalTorque) -> Iterator[tuple[float, float, float]]:
+    """Median band and threshold and the largest torque of each joint over its motion; NaN where it did not move."""
+    for band, threshold, torque, use in zip(found.band_nm, found.threshold_nm, found.torque_nm, found.use, strict=True):
+        if use.any():
+            yield float(np.median(band[use])), float(np.median(threshold[use])), float(np.abs(torque[use]).max())
+        else:
+            yield np.nan, np.nan, np.nan
+
+
+def _digits(value: float) -> str:
+    return f"{value:.3g}" if np.isfinite(value) else "-"
+
+
+def draw_contact(found: ExternalTorque, cell: Cell, log: Path, folder: Path) -> Path:
+    """Draw the external torque of each axis with band and threshold; return the picture.
+
+    Raises:
+        OSError: from the file system.
+    """
+    figure, places = panels(len(cell.axes), 2, f"{unformatted(log.stem)}: external torque of {unformatted(cell.name)}")
+    for index, (axis, place) in enumerate(zip(cell.axes, places, strict=True)):
+        use = found.use[index]
+        torque, band, threshold = (
+            np.where(use, one[index], np.nan) for one in (found.torque_nm, found.band_nm, found.threshold_nm)
+        )
+        place.fill_between(found.time_s, -band, band, color=SKY, alpha=0.5, linewidth=0.0, label="band, 95 %")
+        for sign, label in ((1.0, "threshold"), (-1.0, None)):
+            place.plot(found.time_s, sign * threshold, color=ORANGE, linewidth=0.9, label=label)
+        place.plot(found.time_s, torque, color=BLACK, linewidth=0.9, label="external torque")
+        place.set_title(unformatted(axis.name), fontsize=9, loc="left")
+        place.set_ylabel(f"[{axis.unit.force}]", fontsize=8)
+        if index >= len(cell.axes) - 2:
+            place.set_xlabel("time [s]", fontsize=8)
+    legend_below(figure, places[0])
+    path = folder / f"{log.stem}-contact.png"
+    replace_file(path, render(figure))
+    return path

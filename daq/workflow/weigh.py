@@ -1,0 +1,111 @@
+"""Weigh the body on the flange, and find contacts: a calibration used on logs that it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from daq.config.cell import Cell, model_of
+from daq.errors import ConfigurationError, LogRepeated, LogsDiffer
+from daq.log.conversion import load_run
+from daq.workflow.experiment import experiment_of, extra_moves
+from daq.workflow.validate import as_calibrated, check_cell, conditioning_of, unpredictable
+from ident.calibration import Calibration
+from ident.contact import ExternalTorque, external_torque, prediction_band
+from ident.data.run import Run
+from ident.weighing import Help, WeighedBody, moves_that_help, weigh
+
+
+@dataclass(frozen=True, slots=True)
+class Weighed:
+    """A body weighed from logs."""
+
+    cell: Cell  #: as the first log describes it
+    logs: tuple[Path, ...]  #: with the body
+    bare: tuple[Path, ...]  #: without load
+    body: WeighedBody  #: mass, centre and inertia
+    help: tuple[Help, ...]  #: moves for what the logs do not show
+    declared_kg: float | None  #: mass of the payload that the logs declare; None where they do not, or differ
+
+
+def weigh_logs(
+    calibration: Calibration, logs: Sequence[Path], *, bare: Sequence[Path] = (), cell: Cell | None = None
+) -> Weighed:
+    """Weigh the body that some logs carry.
+
+    Args:
+        calibration: of the cell.
+        logs: with one body, mounted one way; the payload that they declare is only reported.
+        bare: of the same robot without load.
+        cell: another description of the cell than the one that the logs carry.
+
+    Raises:
+        DataError, ConfigurationError: a log cannot be used.
+        LogsDiffer: a log is of another cell, or one that should be bare declares a payload.
+        LogRepeated: a log was given twice: its moves would count twice.
+        IdentificationError: see `ident.weigh`.
+    """
+    loaded, cells = zip(*(_loaded(calibration, log, cell) for log in logs), strict=True)
+    without = []
+    for log in bare:
+        run, _ = _loaded(calibration, log, cell)
+        if run.payload is not None:
+            raise LogsDiffer(
+                str(log),
+                found=f"payload {run.payload.name!r}",
+                expected="a run without load",
+                remedy="give --bare logs that were recorded without a payload",
+            )
+        without.append(run)
+    digests = [run.digest for run in (*loaded, *without)]
+    for log, digest in zip((*logs, *bare), digests, strict=True):
+        if digests.count(digest) > 1:
+            raise LogRepeated(str(log), found="the same log twice", expected="every log once", remedy="name other logs")
+    described: Cell = cells[0]
+    body = weigh(calibration, model_of(described), loaded, conditioning_of(calibration), bare=without)
+    help_: tuple[Help, ...] = ()
+    if not body.identifiable.all():
+        with suppress(ConfigurationError):  # the cell does not say enough to plan moves in it
+            help_ = moves_that_help(body, extra_moves(experiment_of(described)))
+    masses = {None if run.payload is None else run.payload.known.get("m") for run in loaded}
+    return Weighed(described, tuple(logs), tuple(bare), body, help_, masses.pop() if len(masses) == 1 else None)
+
+
+def contact_in(
+    calibration: Calibration, log: Path, *, quiet: Sequence[Path] = (), cell: Cell | None = None
+) -> tuple[ExternalTorque, Cell]:
+    """Compute the external torque in a log, with band and thresholds from quiet logs or the log's own quiet part.
+
+    Raises:
+        DataError, ConfigurationError: a log cannot be used.
+        LogsDiffer: a log is of another cell.
+        IdentificationError: see `ident.external_torque`.
+    """
+    conditioning = conditioning_of(calibration)
+    run, described = _loaded(calibration, log, cell)
+    model = model_of(described)
+    band = None
+    if quiet:
+        calm = (_predictable(calibration, one, _loaded(calibration, one, cell)[0]) for one in quiet)
+        band = prediction_band(calibration, model, calm, conditioning)
+    return external_torque(calibration, model, _predictable(calibration, log, run), conditioning, band), described
+
+
+def _loaded(calibration: Calibration, log: Path, cell: Cell | None) -> tuple[Run, Cell]:
+    run, described = load_run(log, cell)
+    check_cell(calibration, log, described)
+    return run, described
+
+
+def _predictable(calibration: Calibration, log: Path, run: Run) -> Run:
+    reason = unpredictable(calibration, run.payload)
+    if reason:
+        raise LogsDiffer(
+            str(log),
+            found=reason,
+            expected="no load, or a payload of the calibration",
+            remedy="give another log, or a calibration whose fit had this payload",
+        )
+    return as_calibrated(calibration, run)

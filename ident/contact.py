@@ -1,0 +1,296 @@
+"""External torque of the joints: what the motors supply beyond the prediction, its band, and a threshold for alarms.
+
+    τ_ext = V g − (W χ + W_L χ_L + E c)
+
+of every row (the filters of the calibration's fit), so some 0.05 s late; a robot that pushes against its surroundings
+has τ_ext in the direction of its push. Rows at standstill do not count: stiction hides any torque below it.
+
+*Band.* The residual grows with what drives it: errors of gains with the torque, of friction with the speed, of inertia
+and of time with the acceleration. The scale of joint j is
+
+    s_j = a_j + b_j |τ_j| + c_j |q̇_j| + d_j |q̈_j|,        a, b, c, d ≥ 0,
+
+the mean of |τ_ext| by least squares over quiet motion, rows weighted by 1/s. Half the band is the 95 % quantile of
+z = |τ_ext|/s times s.
+
+*Threshold.* False alarms are rarer than recordings are long, so the tail of z is extrapolated by its peaks over a
+threshold u, the highest quantile with enough of them (Davison & Smith 1990). Exceedances closer than twice the
+correlation time are one peak, as they would be one alarm. Peaks beyond u follow a generalised Pareto distribution whose
+shape is at least 0, an exponential: a tail that seems to end is not believed. The level is that of the upper 90 % bound
+of the scale. This assumes that the motion to be watched is like the quiet motion (other loads, temperatures or speeds
+need their own), and that no tail heavier than an exponential begins beyond the largest peak seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import nnls
+from scipy.special import gammaincinv
+
+from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.calibration import Calibration
+from ident.data.conditioning import Conditioning
+from ident.data.dataset import differentiate
+from ident.data.run import Run
+from ident.equations.rows import row_filter, row_masks
+from ident.errors import DataUnfit
+from ident.model.model import Model
+from ident.prediction import measured_torque, predict_torque
+
+DRIVERS = ("constant", "torque", "speed", "acceleration")  #: Of the residual's scale
+PREDICTED_SHARE = 0.95  #: Share of quiet rows inside the band
+PEAK_QUANTILES = (0.99, 0.98, 0.97, 0.95, 0.9)  #: u, the first with enough peaks
+ENOUGH_PEAKS = 30
+MIN_PEAKS = 10  #: With fewer at the last of them, nothing can be said about the tail
+TAIL_CONFIDENCE = 0.90  #: Of the tail's scale
+FAR_OUT = 3.0  #: Interquartile ranges above the upper quartile (Tukey's "far out")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Band:
+    """Band and thresholds of every joint, learned from quiet motion."""
+
+    scale: FloatArray  #: (a, b, c, d) of each joint in the order of DRIVERS, shape (n, 4)
+    factor: FloatArray  #: half the band over s, shape (n,)
+    threshold: FloatArray  #: threshold over s; NaN where the quiet motion has fewer than MIN_PEAKS, shape (n,)
+    correlation_s: FloatArray  #: correlation time of the residual [s], shape (n,)
+    quiet_s: FloatArray  #: time that each joint moved in the quiet motion [s], shape (n,)
+    alarms_per_hour: float  #: false alarms of all joints together, in an hour of motion
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """A stretch beyond the threshold."""
+
+    axis: int  #: index from 0
+    start_s: float  #: since the start of the run
+    end_s: float  #: since the start of the run
+    peak_nm: float  #: largest external torque in it, signed [Nm; N for a prismatic joint]
+    peak_over_threshold: float  #: the same over the threshold
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExternalTorque:
+    """External torque of one run; arrays are joint-first, rows last."""
+
+    time_s: FloatArray  #: of each row, since the start of the run, shape (r,)
+    torque_nm: FloatArray  #: τ_ext, shape (n, r)
+    scale_nm: FloatArray  #: s, shape (n, r)
+    use: BoolArray  #: whether each row of a joint counts, moving and valid, shape (n, r)
+    band: Band  #: learned from quiet runs, or from the run's own quiet stretches
+    from_itself: bool  #: the band is from the run's own quiet stretches
+    left_out: int  #: stretches of the run that were not quiet; 0 where the band is from other runs
+
+    @property
+    def band_nm(self) -> FloatArray:
+        """Half the band, shape (n, r)."""
+        return self.scale_nm * self.band.factor[:, None]
+
+    @property
+    def threshold_nm(self) -> FloatArray:
+        """Threshold, shape (n, r)."""
+        return self.scale_nm * self.band.threshold[:, None]
+
+    @property
+    def contacts(self) -> tuple[Contact, ...]:
+        """Stretches beyond the threshold, in order of time."""
+        found = []
+        over = np.abs(self.torque_nm) / self.threshold_nm
+        for axis, beyond in enumerate(self.use & (over > 1.0)):
+            for rows in _stretches(np.flatnonzero(beyond), self.time_s, 2.0 * self.band.correlation_s[axis]):
+                peak = rows[np.argmax(over[axis, rows])]
+                start_s, end_s = (float(self.time_s[row]) for row in (rows[0], rows[-1]))
+                found.append(Contact(axis, start_s, end_s, float(self.torque_nm[axis, peak]), float(over[axis, peak])))
+        return tuple(sorted(found, key=lambda contact: contact.start_s))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Residual:
+    """Decimated rows of one run."""
+
+    time_s: FloatArray  #: shape (r,)
+    torque_nm: FloatArray  #: shape (n, r)
+    drivers: FloatArray  #: shape (n, 4, r)
+    use: BoolArray  #: shape (n, r)
+    move: IntArray  #: shape (r,)
+
+
+def external_torque(
+    calibration: Calibration, model: Model, run: Run, conditioning: Conditioning, band: Band | None = None
+) -> ExternalTorque:
+    """Compute the external torque of a run.
+
+    Args:
+        calibration: of this robot; it knows the run's payload.
+        model: the declared model that it was fitted with.
+        run: any motion.
+        conditioning: the filters of the fit.
+        band: from `prediction_band`. Without one, it is learned from the run itself, less the stretches of at most two
+            seconds in which some joint is far out; this works while contacts fill less than a quarter of the run.
+
+    Raises:
+        DataUnfit: the run is unfit, or no row of it counts.
+        ModelError, EffectRefused: see `ident.predict_torque`.
+    """
+    rows = _residual(calibration, model, run, conditioning)
+    itself, left_out = band is None, 0
+    if band is None:
+        quiet, left_out = _quiet(rows)
+        band = _band([quiet], 1.0)
+    scale = np.einsum("jd,jdr->jr", band.scale, rows.drivers)
+    return ExternalTorque(rows.time_s, rows.torque_nm, scale, rows.use, band, itself, left_out)
+
+
+def prediction_band(
+    calibration: Calibration,
+    model: Model,
+    quiet: Iterable[Run],
+    conditioning: Conditioning,
+    *,
+    alarms_per_hour: float = 1.0,
+) -> Band:
+    """Learn band and thresholds from runs without contact, best held out of the calibration's fit.
+
+    Args:
+        calibration, model, conditioning: as for `external_torque`.
+        quiet: the runs; a minute or more, with the motion that is to be watched.
+        alarms_per_hour: false alarms of all joints together, in an hour of motion.
+
+    Raises:
+        DataUnfit, ModelError, EffectRefused: as from `external_torque`.
+    """
+    return _band([_residual(calibration, model, run, conditioning) for run in quiet], alarms_per_hour)
+
+
+def _residual(calibration: Calibration, model: Model, run: Run, conditioning: Conditioning) -> _Residual:
+    data = differentiate(run, model.drive_train, conditioning)
+    filter_ = row_filter(data, conditioning)
+    use, _ = row_masks(model.drive_train, data, conditioning)
+    if not use.any():
+        raise DataUnfit(data.name, "no row is left after the standstill and validity masks; did the robot move?")
+    predicted = predict_torque(calibration, model, data).T
+    measured = measured_torque(calibration, model, data.current_a).T
+    torque, needed, speed, acceleration = (
+        filter_(one) for one in (measured - predicted, predicted, data.velocity_rad_s.T, data.acceleration_rad_s2.T)
+    )
+    drivers = np.stack((np.ones_like(torque), np.abs(needed), np.abs(speed), np.abs(acceleration)), axis=1)
+    centres = filter_.centres(len(data.time_s))
+    return _Residual(data.time_s[centres] - data.time_s[0], torque, drivers, use, data.move[centres])
+
+
+def _quiet(rows: _Residual) -> tuple[_Residual, int]:
+    """The rows without the stretches that are far out on any joint, and the number of these."""
+    scale = _scales([rows], robust=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(rows.use, np.abs(rows.torque_nm) / np.einsum("jd,jdr->jr", scale, rows.drivers), 0.0)
+    moves, of_move = np.unique(rows.move, return_inverse=True)
+    largest = np.stack([ratio[:, of_move == move].max(axis=1) for move in range(len(moves))], axis=1)
+    lower, upper = np.quantile(largest, (0.25, 0.75), axis=1)
+    loud = np.any(largest > (upper + FAR_OUT * (upper - lower))[:, None], axis=0)
+    use = rows.use & ~loud[of_move]
+    return _Residual(rows.time_s, rows.torque_nm, rows.drivers, use, rows.move), int(loud.sum())
+
+
+def _scales(parts: Sequence[_Residual], *, robust: bool = False) -> FloatArray:
+    """(a, b, c, d) of each joint, shape (n, 4); robust: rows beyond four times the scale are left out."""
+    out = np.zeros((len(parts[0].use), len(DRIVERS)))
+    for joint in range(len(out)):
+        size = np.concatenate([np.abs(part.torque_nm[joint, part.use[joint]]) for part in parts])
+        drivers = np.concatenate([part.drivers[joint][:, part.use[joint]] for part in parts], axis=1)
+        if not size.size or not size.any():
+            continue
+        scale = np.full(len(size), np.median(size) or size.mean())
+        unit = drivers.max(axis=1)
+        unit[unit == 0.0] = 1.0
+        for _ in range(4):
+            # A scale near zero would make the weights of a few rows everything.
+            weight = 1.0 / np.maximum(scale, 0.1 * scale.mean())
+            if robust:
+                weight = np.where(size > 4.0 * scale, 0.0, weight)
+            out[joint] = nnls((drivers / unit[:, None] * weight).T, size * weight)[0] / unit
+            scale = out[joint] @ drivers
+    return out
+
+
+def _band(parts: Sequence[_Residual], alarms_per_hour: float) -> Band:
+    if not parts:
+        raise DataUnfit("", "no quiet run was given; expected at least one without contact")
+    scale = _scales(parts)
+    count = len(scale)
+    factor, threshold, correlation_s, quiet_s = (np.full(count, np.nan) for _ in range(4))
+    row_s = float(np.median(np.diff(parts[0].time_s)))
+    for joint in range(count):
+        runs = []
+        for part in parts:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                signed = part.torque_nm[joint] / (scale[joint] @ part.drivers[joint])
+            runs.append(np.where(part.use[joint] & np.isfinite(signed), signed, np.nan))
+        signed = np.concatenate(runs)
+        rows = int(np.isfinite(signed).sum())
+        quiet_s[joint], correlation_s[joint] = rows * row_s, row_s
+        if rows < 2:
+            continue
+        correlation_s[joint] = row_s * _correlation(runs)
+        factor[joint] = np.nanquantile(np.abs(signed), PREDICTED_SHARE)
+        times = np.concatenate([part.time_s + 1e6 * index for index, part in enumerate(parts)])
+        level = alarm_level(np.abs(signed), times, 2.0 * correlation_s[joint], alarms_per_hour / count, quiet_s[joint])
+        threshold[joint] = np.nan if level is None else level
+    return Band(scale, factor, threshold, correlation_s, quiet_s, alarms_per_hour)
+
+
+def alarm_level(
+    ratio: FloatArray, time_s: FloatArray, gap_s: float, alarms_per_hour: float, observed_s: float
+) -> float | None:
+    """Level that a signal exceeds on fewer occasions an hour than given, extrapolated from its peaks; see the top.
+
+    Args:
+        ratio: the signal, not negative; NaN where it is not observed, shape (r,).
+        time_s: of each entry, shape (r,).
+        gap_s: exceedances closer than this are one.
+        alarms_per_hour: occasions in an hour of observed signal.
+        observed_s: how long it was observed.
+
+    Returns:
+        the level; None with fewer than MIN_PEAKS peaks.
+    """
+    for start in np.nanquantile(ratio, PEAK_QUANTILES).tolist():
+        beyond = np.flatnonzero(np.nan_to_num(ratio) > start)
+        peaks = np.array([ratio[rows].max() for rows in _stretches(beyond, time_s, gap_s)]) - start
+        count = len(peaks)
+        if count >= ENOUGH_PEAKS:
+            break
+    if count < MIN_PEAKS:
+        return None
+    mean = float(peaks.mean())
+    shape = max(0.0, 0.5 * (1.0 - mean**2 / float(peaks.var(ddof=1))))  # by moments (Hosking & Wallis 1987)
+    # The sum of exponential peaks has a gamma distribution: the bound of its scale.
+    scale = (1.0 - shape) * mean * count / float(gammaincinv(count, 1.0 - TAIL_CONFIDENCE))
+    # An hour of signal has so many times more peaks than alarms are allowed.
+    factor = max(1.0, count * 3600.0 / observed_s / alarms_per_hour)
+    return float(start + scale * (np.log(factor) if shape < 1e-9 else (factor**shape - 1.0) / shape))
+
+
+def _correlation(runs: Sequence[FloatArray]) -> float:
+    """Rows until the autocorrelation of a signal with gaps (NaN) falls below 1/e, interpolated; at least 1."""
+    before = 1.0
+    for lag in range(1, 200):
+        first = np.concatenate([run[:-lag] for run in runs])
+        second = np.concatenate([run[lag:] for run in runs])
+        both = np.isfinite(first) & np.isfinite(second)
+        if both.sum() < 10:
+            return float(lag)
+        value = float(first[both] @ second[both]) / float(np.sqrt((first[both] ** 2).sum() * (second[both] ** 2).sum()))
+        if value < np.exp(-1.0):
+            return float(max(1.0, lag - 1 + (before - np.exp(-1.0)) / (before - value)))
+        before = value
+    return 200.0
+
+
+def _stretches(rows: IntArray, time_s: FloatArray, gap_s: float) -> list[IntArray]:
+    """Rows parted where more than a gap lies between two of them."""
+    if not len(rows):
+        return []
+    return np.split(rows, np.flatnonzero(np.diff(time_s[rows]) > gap_s) + 1)

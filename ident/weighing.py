@@ -1,0 +1,367 @@
+"""Weigh the body on the flange with a calibration: mass, centre of mass and inertia, each with its σ.
+
+With the gains g held, the ten parameters p of the body (paper §2.4) are the least-squares solution of the motors'
+equations, rows divided by the deviation σ_i of motor i's residual,
+
+    g_i v_i = (T W χ + T E(p) c + T W_L p)_i,
+
+with the effects E c of the calibration in the model. Load friction, elasticity and saturation depend on the body: E is
+built from the torques that the last p predicts, until p stays. Beside runs without load, χ and c are found again,
+together with p: only the gains are taken from the calibration. Without such runs, χ and c are the calibration's, except
+the friction of the joints, which is found again because it changes with the temperature.
+
+σ has two parts. One leaves out a move at a time, as that of a gain (`jackknife_covariance`). The other, S C Sᵀ, is what
+the errors of the calibration do to p: C is its covariance, S = ∂p/∂(g, χ, c).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.calibration import Calibration
+from ident.data.conditioning import Conditioning
+from ident.data.dataset import Dataset, differentiate
+from ident.data.run import Run
+from ident.effects.effect import effect_torque
+from ident.effects.signals import Signals, declared_signals
+from ident.equations.linearisation import jackknife_covariance
+from ident.equations.rows import Observation, observe
+from ident.equations.system import Equations, System, solve
+from ident.errors import DataUnfit
+from ident.estimators.estimate import RelativeError, relative_error
+from ident.estimators.maximum_likelihood import settled
+from ident.model.base import BaseParameters, base_parameters
+from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
+from ident.model.model import Column, Model
+from ident.planning.excitation import UNSEEN, ExtraMoves, side_of_cube
+from ident.prediction import placed_effect, standard_parameters
+
+MAX_PASSES = 8  #: Of the effects' columns; load friction of a tenth of the load needs three
+STAYS = 1e-3  #: Largest change of the body in the last pass, as a share of its size; each is some 3 % of the one before
+WORTH = 0.7  #: Share of its σ to which moves must bring a parameter in order to be named
+FRICTION = ("fv", "fs")  #: First letters of friction's columns, of joints and of coupled motors
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RowsToWeigh:
+    """Rows of runs without load, then of runs with the body; they serve any calibration of the robot."""
+
+    model: Model  #: the declared model
+    datasets: tuple[Dataset, ...]  #: the runs, without load first
+    bare: int  #: number of runs without load
+    rows: Observation  #: with every standard column, then the ten of the body
+
+    @property
+    def loaded(self) -> BoolArray:
+        """Rows in which the body was mounted, shape (r,)."""
+        return np.asarray(self.rows.run >= self.bare)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scale:
+    """The linear problem that a body was weighed with, for predictions about further moves.
+
+    Its columns are the standard ones, the body's ten, and those of effects.
+    """
+
+    model: Model  #: the declared model
+    unknowns: IntArray  #: which columns belong to unknowns, whether the motion shows them or not, shape (u,)
+    weight: FloatArray  #: 1/(g_i σ_i) of each motor, shape (n,)
+    information: FloatArray  #: AᵀA of the unknowns, shape (u, u)
+    beside_bare_runs: bool  #: the robot was found together with the body
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WeighedBody:
+    """A body on the flange; parameters are in the last joint's frame and in the order of LINK_PARAMETERS."""
+
+    values: FloatArray  #: NaN for a parameter that the motion does not show, shape (10,) [SI]
+    #: From leaving out moves, the calibration taken as exact; NaN likewise, shape (10, 10).
+    moves_covariance: FloatArray
+    covariance: FloatArray  #: with the errors of the calibration; NaN likewise, shape (10, 10)
+    #: The calibration has its covariance. Otherwise σ adds the errors of the gains by size, because one weight sets
+    #: their common scale, and lacks those of the robot's parameters and of the effects.
+    complete: bool
+    moves: int  #: separate moves behind σ
+    error: RelativeError  #: ‖ρ‖/‖Y‖ with the body in the model, on the runs that carried it [%]
+    scale: Scale  #: the equations
+
+    @property
+    def std(self) -> FloatArray:
+        """σ of each parameter, shape (10,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def mass_kg(self) -> float:
+        """m [kg]; NaN where the motion does not show it."""
+        return float(self.values[-1])
+
+    @property
+    def mass_std_kg(self) -> float:
+        """σ of m [kg]."""
+        return float(self.std[-1])
+
+    @property
+    def centre_m(self) -> tuple[FloatArray, FloatArray]:
+        """Centre of mass in the last joint's frame and its σ [m], shape (3,) each."""
+        return self._derived(_centre)
+
+    @property
+    def inertia_kg_m2(self) -> tuple[FloatArray, FloatArray]:
+        """Inertia about the centre of mass (Ixx, Ixy, Ixz, Iyy, Iyz, Izz) and its σ [kg m²], shape (6,) each."""
+        return self._derived(_about_centre)
+
+    @property
+    def size(self) -> FloatArray:
+        """m a², m a and m of a steel cube of side a with the body's mass: compact, hence small, shape (10,)."""
+        mass = abs(self.mass_kg) if np.isfinite(self.mass_kg) else 1.0
+        side = side_of_cube(mass)
+        return np.array([mass * side**2] * 6 + [mass * side] * 3 + [mass])
+
+    @property
+    def identifiable(self) -> BoolArray:
+        """Parameters whose 95 % interval is narrower than what a compact body of this mass has, shape (10,)."""
+        return np.asarray(2.0 * np.nan_to_num(self.std, nan=np.inf) < self.size)
+
+    def _derived(self, quantity: Callable[[FloatArray], FloatArray]) -> tuple[FloatArray, FloatArray]:
+        with np.errstate(invalid="ignore"):  # NaN is what depends on a parameter that is not shown
+            value = quantity(self.values)
+            # Complex steps differentiate polynomials and quotients exactly.
+            slope = np.stack([quantity(self.values + step).imag / 1e-20 for step in 1e-20j * np.eye(10)], axis=1)
+        shown = np.isfinite(self.values)
+        used = slope[:, shown]
+        std = np.sqrt(np.einsum("ij,jk,ik->i", used, self.covariance[np.ix_(shown, shown)], used))
+        return value, np.where(np.isfinite(value), std, np.nan)
+
+
+def _centre(body: FloatArray) -> FloatArray:
+    return np.asarray(body[6:9] / body[9])
+
+
+def _about_centre(body: FloatArray) -> FloatArray:
+    x, y, z = body[6:9]
+    steiner = np.array([y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y])
+    return np.asarray(body[:6] - steiner / body[9])
+
+
+def weigh(
+    calibration: Calibration,
+    model: Model,
+    loaded: Iterable[Run],
+    conditioning: Conditioning,
+    *,
+    bare: Iterable[Run] = (),
+) -> WeighedBody:
+    """Weigh the body that some runs carry; what they say of their payload is ignored.
+
+    Args:
+        calibration: gains, parameters and effects of this robot.
+        model: the declared model that the calibration was fitted with.
+        loaded: runs with the same body, mounted the same way.
+        conditioning: the filters of the calibration's fit.
+        bare: runs of the same robot without load. With them, σ does not depend on the calibration's parameters.
+
+    Raises:
+        DataUnfit: a run is unfit, or no row of the runs counts.
+        TooFewMoves: σ needs more moves.
+        ModelError, EffectRefused: the calibration is of another robot, or holds an unknown effect.
+    """
+    return weigh_rows(calibration, rows_to_weigh(model, loaded, conditioning, bare=bare))
+
+
+def rows_to_weigh(
+    model: Model, loaded: Iterable[Run], conditioning: Conditioning, *, bare: Iterable[Run] = ()
+) -> RowsToWeigh:
+    """Build the rows of runs once, for weighing with several calibrations.
+
+    Raises:
+        DataUnfit: a run is unfit or leaves no usable row, or no run carries the body.
+    """
+
+    def prepared(runs: Iterable[Run]) -> list[Dataset]:
+        return [differentiate(replace(run, payload=None), model.drive_train, conditioning) for run in runs]
+
+    without, mounted = prepared(bare), prepared(loaded)
+    if not mounted:
+        raise DataUnfit("", "no run with the body to weigh was given; expected at least one")
+    datasets = (*without, *mounted)
+    names = tuple(column.name for column in model.columns)
+    every = BaseParameters(tuple(range(len(names))), np.eye(len(names)), names)
+    runs = tuple(data.name for data in datasets)
+    standard = Equations(model.drive_train, every, model.columns, (), (), runs)
+    rows = observe(model, datasets, conditioning, standard)
+    body = tuple(Column(f"{name}:body", unit) for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True))
+    rows = rows.extended(body, rows.flange * (rows.run >= len(without)))
+    return RowsToWeigh(model, datasets, len(without), rows)
+
+
+def weigh_rows(calibration: Calibration, given: RowsToWeigh) -> WeighedBody:
+    """Weigh the body with rows that are at hand; errors are those of `weigh`."""
+    model, standard = given.model, standard_parameters(calibration, given.model)
+    gains = np.array([gain.value for gain in calibration.gains])
+    effects = [placed_effect(accepted, calibration) for accepted in calibration.effects]
+    known = np.concatenate((standard, np.zeros(10), *(coefficients for _, coefficients in effects)))
+    ten = np.arange(len(standard), len(standard) + 10)
+    depends = not all(placed.effect.abscissa.is_kinematic for placed, _ in effects)
+    without, mounted = given.datasets[: given.bare], given.datasets[given.bare :]
+
+    def signals(datasets: Sequence[Dataset], body: FloatArray) -> list[Signals]:
+        whole = standard.copy()
+        whole[model.flange] += body
+        began_s = calibration.session_began_s
+        return [declared_signals(model, data, whole, gains, began_s) for data in datasets] if effects else []
+
+    bare, body = signals(without, np.zeros(10)), np.zeros(10)
+    for _ in range(MAX_PASSES if depends else 1):
+        rows, runs = given.rows, (*bare, *signals(mounted, body))
+        for placed, _ in effects:
+            torque = effect_torque(placed.effect, placed.axis, runs, given.datasets, rows.conditioning, model)
+            rows = rows.extended(placed.columns, torque)
+        system = rows.system()
+        unknowns, free, blurred = _unknowns(system, ten, model, beside_bare_runs=given.bare > 0)
+        held = [index for index in range(len(known)) if index not in free]
+        parameters, noise = settled(system.holding({i: float(known[i]) for i in held}).motors, 1.0 / gains, len(free))
+        found = known.copy()
+        found[list(free)] = parameters
+        before, body = body, found[ten]
+        if np.linalg.norm(body - before) <= STAYS * np.linalg.norm(body):
+            break
+    unknown = system.holding({i: float(known[i]) for i in held})
+    count, own = len(gains), np.isin(free, ten)
+    shown = np.isin(ten, free)
+    moves = jackknife_covariance(unknown, gains, parameters, noise, gains_fixed=True)[count:, count:]
+    seen = system.motors.rows > 0
+    weight = 1.0 / (gains * noise)
+    # A motor that never moved is as noisy as the others, should further moves need it.
+    weight[~seen] = np.median(np.abs(weight[seen]))
+    stacked = system.motors.stacked(weight)
+    columns = stacked[:, 1:-1]
+    motor_of = np.repeat(np.arange(count), [len(factor) for factor in system.motors.factors])
+    right = np.concatenate((stacked[:, :1] * np.eye(count)[motor_of], -columns[:, held]), axis=1)
+    slope = np.zeros((10, count + len(held)))
+    slope[shown] = solve(columns[:, list(free)], right)[0][own]
+    of_moves = np.zeros((10, 10))
+    of_moves[np.ix_(shown, shown)] = moves[np.ix_(own, own)]
+    names = [rows.columns[index].name for index in held]
+    unseen = np.where(shown & ~np.isin(ten, blurred), 0.0, np.nan)
+    on_body = given.loaded
+    regressor = np.concatenate((rows.regressor, rows.effects), axis=1)
+    predicted = np.einsum("jpr,p->jr", regressor[:, :, on_body], found)
+    return WeighedBody(
+        values=body + unseen,
+        moves_covariance=of_moves + unseen + unseen[:, None],
+        covariance=of_moves + _of_calibration(calibration, gains, slope, names) + unseen + unseen[:, None],
+        complete=calibration.covariance_factor is not None,
+        moves=len(system.clusters),
+        error=relative_error(rows.torque(gains, on_body), predicted, rows.use[:, on_body]),
+        scale=Scale(model, unknowns, weight, columns[:, unknowns].T @ columns[:, unknowns], given.bare > 0),
+    )
+
+
+def _unknowns(
+    system: System, ten: IntArray, model: Model, *, beside_bare_runs: bool
+) -> tuple[IntArray, tuple[int, ...], tuple[int, ...]]:
+    """Columns of the unknowns; those that are independent; those of the body that gather others of its parameters."""
+    names = [column.name for column in system.columns]
+    robot = [index for index in range(len(names)) if index not in ten]
+    if not beside_bare_runs:
+        robot = [index for index in robot[: len(model.columns)] if names[index].startswith(FRICTION)]
+    order = np.array([*robot, *ten])
+    columns = np.concatenate([factor[:, system.joint_count : -1] for factor in system.joints.factors])[:, order]
+    base = base_parameters(columns, tuple(names[index] for index in order))
+    free = order[list(base.independent)]
+    regrouped = np.setdiff1d(np.arange(len(order)), base.independent)
+    blurred = np.any(base.grouping[:, regrouped] != 0.0, axis=1)
+    return order, tuple(sorted(free.tolist())), tuple(free[blurred & np.isin(free, ten)].tolist())
+
+
+def _of_calibration(calibration: Calibration, gains: FloatArray, slope: FloatArray, held: Sequence[str]) -> FloatArray:
+    """Covariance of the ten that comes from the calibration's errors, shape (10, 10).
+
+    Args:
+        calibration: with its covariance, or with the σ of its gains alone.
+        gains: its gains, shape (n,).
+        slope: ∂p/∂(g, held parameters), shape (10, n + h).
+        held: names of the columns held, leading names for base parameters.
+    """
+    count = len(gains)
+    covariance = calibration.covariance
+    if covariance is None:
+        size = np.abs(slope[:, :count]) @ [gain.std for gain in calibration.gains]
+        together = np.sign(slope[:, :count] @ gains) * size
+        return np.outer(together, together)
+    place = {name: count + index for index, name in enumerate(held)}
+    used = np.zeros((len(slope), count + len(calibration.parameters)))
+    used[:, :count] = slope[:, :count]
+    for index, parameter in enumerate(calibration.parameters, start=count):
+        column = place.get(parameter.name, place.get(parameter.name.split()[0]))
+        if column is not None:
+            used[:, index] = slope[:, column]
+    return np.asarray(used @ covariance @ used.T)
+
+
+@dataclass(frozen=True, slots=True)
+class Help:
+    """Moves that would show a parameter of the body better."""
+
+    name: str  #: of the parameter
+    words: str  #: the moves, to follow "add": ``fast moves of J6 with the arm stretched``
+    seconds: float  #: their duration
+    std: float  #: predicted σ of the parameter with them [SI]
+
+
+def moves_that_help(weighed: WeighedBody, extras: Sequence[ExtraMoves]) -> tuple[Help, ...]:
+    """Name for each parameter that is not `identifiable` the moves that would show it best.
+
+    Args:
+        weighed: the body.
+        extras: moves that could be made with it, and without load too where it was weighed beside bare runs.
+
+    Returns:
+        an entry for each parameter that some of them bring to WORTH of its σ or less.
+    """
+    scale = weighed.scale
+    place = np.arange(len(scale.unknowns) - 10, len(scale.unknowns))
+    shown = np.sqrt(np.diag(weighed.moves_covariance))
+    alone = _std(scale.information, place)
+    # Rows are correlated, and moves scatter more than rows say: the prediction is of the ratio.
+    usable = np.isfinite(shown) & np.isfinite(alone)
+    factor = float(np.median((shown / alone)[usable])) if usable.any() else 1.0
+    after = [(extra, factor * _std(scale.information + _information(scale, extra), place)) for extra in extras]
+    found = []
+    for index in np.flatnonzero(~weighed.identifiable):
+        extra, std = min(after, key=lambda one: float(one[1][index]), default=(None, shown))
+        if extra is not None and std[index] <= WORTH * np.nan_to_num(shown[index], nan=np.finfo(np.float64).max):
+            found.append(Help(LINK_PARAMETERS[index], extra.words, extra.seconds, float(std[index])))
+    return tuple(found)
+
+
+def _information(scale: Scale, extra: ExtraMoves) -> FloatArray:
+    """JᵀJ of moves with the body, and of the same without load where the robot is unknown too."""
+    columns = scale.model.regressor(extra.excitation.motion)
+    count = columns.shape[1]
+    columns = np.concatenate((columns, columns[:, scale.model.flange]), axis=1)
+    motors = np.tensordot(scale.model.drive_train.to_motor * scale.weight[:, None], columns, axes=1)
+    motors *= extra.excitation.use[:, None, :]
+    rows = np.zeros((motors.shape[0] * motors.shape[2], len(scale.unknowns)))
+    inside = scale.unknowns < columns.shape[1]  # effects come after; their torque is small
+    rows[:, inside] = motors[:, scale.unknowns[inside]].transpose(0, 2, 1).reshape(len(rows), -1)
+    information = rows.T @ rows
+    if scale.beside_bare_runs:
+        rows[:, scale.unknowns >= count] = 0.0
+        information += rows.T @ rows
+    return information
+
+
+def _std(information: FloatArray, wanted: IntArray) -> FloatArray:
+    """σ of some unknowns; inf for one that the information does not fix."""
+    unit = np.sqrt(np.diag(information))
+    unit[unit <= UNSEEN * unit.max()] = np.inf  # rounding, which scaled up would look like information
+    values, vectors = np.linalg.eigh(information / np.outer(unit, unit))
+    seen = values > UNSEEN * values[-1]
+    std = np.sqrt((vectors[wanted][:, seen] ** 2) @ (1.0 / values[seen])) / unit[wanted]
+    return np.where((vectors[wanted][:, ~seen] ** 2).sum(axis=1) > 1e-6, np.inf, std)

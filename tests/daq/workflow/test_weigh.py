@@ -1,0 +1,117 @@
+"""`weigh` and `contact` on the log of a real robot, and what they print."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console, RenderableType
+
+from daq.cli import main
+from daq.config.cell_file import load_cell
+from daq.report.weighing import contact_document, contact_view, weighed_document, weighed_view
+from daq.workflow.calibration_file import load_calibration, save_calibration
+from daq.workflow.weigh import Weighed
+from ident.contact import Band, ExternalTorque
+from ident.estimators.estimate import RelativeError
+from ident.model.bodies import LINK_PARAMETERS
+from ident.weighing import Help, Scale, WeighedBody
+from tests.daq.logs import DISC, demo_content, samples, write
+
+
+def test_a_real_robot_that_touched_nothing(
+    real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, log = real
+    options = ["--calibration", str(file), "--quiet", str(log), "--pictures", str(tmp_path / "new")]
+    assert main(["contact", str(log), *options, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert not found["band_from_this_log"]
+    assert [axis["axis"] for axis in found["axes"]] == ["J1", "J2", "J3", "J4", "J5", "J6"]
+    for axis in found["axes"]:
+        assert 0.0 < axis["band"] < axis["threshold"]
+    assert found["contacts"] == []
+    assert Path(found["picture"]).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_real_flange_without_a_body_weighs_nothing(
+    real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, log = real
+    assert main(["weigh", str(log), "--calibration", str(file)]) == 0
+    text = capsys.readouterr().out
+    assert "No body shows" in text
+    mass, std = map(float, text.partition("mass ")[2].split("kg")[0].split("±"))
+    assert abs(mass) < 3.0 * std < 0.3
+
+
+def test_a_log_that_declares_a_payload_is_not_bare(
+    real: tuple[Path, Path], checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, _ = real
+    calibration = load_calibration(file)
+    axes = tuple(replace(gain, axis=f"J{index + 1}") for index, gain in enumerate(calibration.gains))
+    save_calibration(replace(calibration, cell="demo", gains=axes), tmp_path / "calibration.yaml")
+    angle = np.rint(20000.0 * np.sin(np.arange(2500)[:, None] / 200.0 + np.arange(6))).astype(int)
+    log = str(write(tmp_path / "a.mcap", demo_content(checkout, DISC), samples(angle.tolist())))
+    known = ["--calibration", str(tmp_path / "calibration.yaml")]
+    assert main(["weigh", log, "--bare", log, *known]) == 4
+    assert "found:    payload 'disc'" in capsys.readouterr().err
+    assert main(["weigh", log, log, *known]) == 4
+    assert "found:    the same log twice" in capsys.readouterr().err
+    assert main(["contact", log, *known]) == 4
+    assert "nothing is known of mounting 'flange-a'" in capsys.readouterr().err
+
+
+def _text(parts: Iterable[RenderableType]) -> str:
+    console = Console(width=160, file=StringIO())
+    with console.capture() as printed:
+        for part in parts:
+            console.print(part)
+    return printed.get()
+
+
+def test_a_weighed_body_is_shown_with_what_would_help(checkout: Path) -> None:
+    cell = load_cell(checkout / "configs/cells/demo.yaml")
+    ten = np.array([0.07, -0.02, 0.02, 0.07, 0.03, 0.05, -0.24, -0.25, np.nan, 4.6])
+    std = np.where(np.isnan(ten), np.nan, 0.01)
+    covariance = np.diag(std**2)
+    scale = Scale.__new__(Scale)
+    error = RelativeError((2.0,) * 6, 2.0)
+    body = WeighedBody(ten, covariance, covariance, False, 20, error, scale)
+    helped = Help("mz", "fast moves of all axes", 5.0, 0.004)
+    found = Weighed(cell, (Path("a.mcap"),), (), body, (helped,), 4.59)
+    text = _text(weighed_view(found))
+    assert "4.600 ± 0.010" in text
+    assert "+0.22 %" in text
+    assert "add 5 s of fast moves of all axes (σ 0.004)" in text
+    assert "no covariance" in text
+    document = weighed_document(found)
+    assert document["mass_kg"] == {"value": 4.6, "std": pytest.approx(0.01)}
+    assert [one["name"] for one in document["parameters"]] == list(LINK_PARAMETERS)
+    assert [one["name"] for one in document["parameters"] if one["add"]] == ["mz"]
+    assert [one["name"] for one in document["parameters"] if not one["identifiable"]] == ["mz"]
+    nothing = replace(found, body=replace(body, values=np.full(10, 0.001)), declared_kg=None)
+    assert "No body shows" in _text(weighed_view(nothing))
+
+
+def test_contacts_are_listed(checkout: Path) -> None:
+    cell = load_cell(checkout / "configs/cells/demo.yaml")
+    one, even = np.ones(6), np.ones((6, 500))
+    band = Band(np.ones((6, 4)), 2.0 * one, np.array([5.0] * 5 + [np.nan]), 0.05 * one, 40.0 * one, 1.0)
+    torque = 0.5 * even
+    torque[2, 100:140] = -9.0
+    found = ExternalTorque(np.linspace(0.0, 9.98, 500), torque, even, even > 0.0, band, True, 1)
+    text = _text(contact_view(found, cell))
+    assert "J3" in text
+    assert "1.80" in text
+    assert "Too little quiet motion for a threshold: J6" in text
+    document = contact_document(found, cell, Path("a.mcap"), None)
+    (contact,) = document["contacts"]
+    assert (contact["axis"], contact["peak"], contact["peak_over_threshold"]) == ("J3", -9.0, 1.8)
+    assert (contact["start_s"], contact["end_s"]) == pytest.approx((2.0, 2.78))

@@ -1,0 +1,201 @@
+"""A body weighed with a calibration: its values, its σ, and what the motion does not show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ident.calibration import Calibration
+from ident.data.run import Run
+from ident.errors import DataUnfit, TooFewMoves
+from ident.estimators.estimate import RelativeError
+from ident.model.bodies import LINK_PARAMETERS, Payload, body_of
+from ident.model.robot import Motion
+from ident.planning.excitation import Excitation, ExtraMoves
+from ident.weighing import RowsToWeigh, Scale, WeighedBody, moves_that_help, rows_to_weigh, weigh, weigh_rows
+from tests.ident.recordings import FloatArray, Truth
+from tests.ident.weighed import AXIS, WeighedCell, a_body, noisy_run, weighed_cell
+
+
+@pytest.fixture(scope="module")
+def cells(small_truth: Truth) -> tuple[WeighedCell, ...]:
+    """Two cells with load friction, each calibrated by itself."""
+    return tuple(weighed_cell(small_truth, seed) for seed in range(2))
+
+
+@pytest.fixture(scope="module")
+def rows(small_truth: Truth, cells: tuple[WeighedCell, ...]) -> tuple[RowsToWeigh, RowsToWeigh]:
+    """Rows of the first cell: with the body alone, and beside a run without load."""
+    one = cells[0]
+    return (
+        rows_to_weigh(small_truth.model, [one.loaded], one.conditioning),
+        rows_to_weigh(small_truth.model, [one.loaded], one.conditioning, bare=[one.bare]),
+    )
+
+
+def _without_effects(calibration: Calibration) -> Calibration:
+    left = tuple(one for one in calibration.parameters if "friction" not in one.name)
+    return replace(calibration, parameters=left, effects=(), covariance_factor=None)
+
+
+def _scores(cell: WeighedCell, found: WeighedBody) -> FloatArray:
+    mass = cell.body[-1]
+    centre, std = found.centre_m
+    return np.concatenate(([(found.mass_kg - mass) / found.mass_std_kg], (centre - cell.body[6:9] / mass) / std))
+
+
+def test_errors_are_as_large_as_their_sigma(small_truth: Truth, cells: tuple[WeighedCell, ...]) -> None:
+    """`make weigh-study` counts a hundred cells."""
+    scores = np.array(
+        [
+            _scores(cell, weigh(cell.calibration, small_truth.model, [cell.loaded], cell.conditioning, bare=bare))
+            for cell in cells
+            for bare in ([], [cell.bare])
+        ]
+    )
+    assert 0.5 < np.sqrt(np.mean(scores**2)) < 1.6
+    assert np.abs(scores).max() < 4.0
+
+
+def test_without_the_effects_sigma_is_wide_and_the_residual_large(
+    cells: tuple[WeighedCell, ...], rows: tuple[RowsToWeigh, RowsToWeigh]
+) -> None:
+    whole = weigh_rows(cells[0].calibration, rows[1])
+    without = weigh_rows(_without_effects(cells[0].calibration), rows[1])
+    assert without.moves_covariance[-1, -1] > 1.3**2 * whole.moves_covariance[-1, -1]
+    assert without.error.axes[AXIS] > 1.3 * whole.error.axes[AXIS]
+
+
+@pytest.mark.parametrize("beside", [0, 1])
+def test_an_error_of_the_calibration_is_in_sigma_as_it_is_in_the_body(
+    cells: tuple[WeighedCell, ...], rows: tuple[RowsToWeigh, RowsToWeigh], beside: int
+) -> None:
+    """A calibration whose only error is one direction: its share of σ is the shift that this error makes."""
+    calibration = _without_effects(cells[0].calibration)
+    values = np.array([one.value for one in calibration.gains] + [one.value for one in calibration.parameters])
+    rng = np.random.default_rng(5)
+    error = 1e-4 * rng.standard_normal(len(values)) * np.maximum(np.abs(values), 1e-2)
+    root = tuple((float(value), *([0.0] * index)) for index, value in enumerate(error))
+    certain = weigh_rows(replace(calibration, covariance_factor=root), rows[beside])
+    moved = _changed(calibration, values + error)
+    shift = weigh_rows(moved, rows[beside]).values - weigh_rows(calibration, rows[beside]).values
+    share = np.diag(certain.covariance - certain.moves_covariance)
+    assert np.sqrt(np.abs(share)) == pytest.approx(np.abs(shift), rel=0.03, abs=0.03 * float(np.abs(shift).max()))
+
+
+def _changed(calibration: Calibration, values: FloatArray) -> Calibration:
+    count = len(calibration.gains)
+    pairs = zip(calibration.gains, values[:count], strict=True)
+    rest = zip(calibration.parameters, values[count:], strict=True)
+    return replace(
+        calibration,
+        gains=tuple(replace(gain, value=float(value)) for gain, value in pairs),
+        parameters=tuple(replace(parameter, value=float(value)) for parameter, value in rest),
+    )
+
+
+def test_a_common_error_of_the_gains_scales_the_body_and_leaves_its_centre(
+    cells: tuple[WeighedCell, ...], rows: tuple[RowsToWeigh, RowsToWeigh]
+) -> None:
+    """Without a covariance, σ of the gains is taken as such an error; the scatter of the moves is left alone."""
+    plain = _without_effects(cells[0].calibration)
+    scaled = replace(plain, gains=tuple(replace(gain, value=1.05 * gain.value) for gain in plain.gains))
+    uncertain = replace(plain, gains=tuple(replace(gain, std=0.02 * abs(gain.value)) for gain in plain.gains))
+    exact, heavier, found = (weigh_rows(one, rows[1]) for one in (plain, scaled, uncertain))
+    assert heavier.mass_kg == pytest.approx(1.05 * exact.mass_kg, rel=1e-3)
+    assert heavier.centre_m[0] == pytest.approx(exact.centre_m[0], abs=1e-5)
+    assert not found.complete
+    assert found.mass_std_kg >= 0.02 * found.mass_kg
+    assert found.moves_covariance == pytest.approx(exact.moves_covariance)
+
+
+def test_what_the_logs_say_of_their_payload_is_ignored(small_truth: Truth, cells: tuple[WeighedCell, ...]) -> None:
+    cell = cells[1]
+    calibration = _without_effects(cell.calibration)
+    runs = cell.loaded, replace(cell.loaded, payload=Payload("other", "elsewhere", {"m": 99.0}))
+    first, second = (weigh(calibration, small_truth.model, [run], cell.conditioning) for run in runs)
+    assert first.values.tolist() == second.values.tolist()
+
+
+def test_a_swing_of_the_last_joint_shows_a_part_and_says_what_would_show_the_rest(
+    small_truth: Truth, cells: tuple[WeighedCell, ...]
+) -> None:
+    cell = cells[0]
+    model = small_truth.model
+    rng = np.random.default_rng(1)
+    calm = _only_last(small_truth, noisy_run(small_truth, "swing", rng, None, 24.0))
+    loaded = _recorded(small_truth, calm, cell.body)
+    found = weigh(_without_effects(cell.calibration), model, [loaded], cell.conditioning)
+    seen = dict(zip(LINK_PARAMETERS, found.identifiable.tolist(), strict=True))
+    assert not seen["m"]
+    assert np.isnan(found.mass_kg) == np.isnan(found.centre_m[0]).all()
+    assert seen["mx"] or seen["mz"]  # the weight's lever about the last joint
+
+    def extra(words: str, run: Run) -> ExtraMoves:
+        q = run.position_rad[::5]
+        rate_hz = run.rate_hz / 5.0
+        velocity = np.gradient(q, axis=0) * rate_hz
+        motion = Motion(q, velocity, np.gradient(velocity, axis=0) * rate_hz)
+        return ExtraMoves(words, 24.0, Excitation(motion, (np.abs(velocity) > 0.03).T))
+
+    everything, same = extra("all axes", cell.loaded), extra("more of the same", calm)
+    helped = {one.name: one for one in moves_that_help(found, [same, everything])}
+    assert helped["m"].words == "all axes"
+    assert 2.0 * helped["m"].std < cell.body[-1]
+    assert "m" not in {one.name for one in moves_that_help(found, [same])}
+    assert moves_that_help(found, []) == ()
+
+
+def _only_last(truth: Truth, run: Run) -> Run:
+    still = run.position_rad.copy()
+    still[:, :-1] = 0.3
+    return replace(run, position_rad=still)
+
+
+def _recorded(truth: Truth, run: Run, body: FloatArray) -> Run:
+    """The run with the currents that its motion needs."""
+    rate_hz = run.rate_hz
+    velocity = np.gradient(run.position_rad, axis=0) * rate_hz
+    motion = Motion(run.position_rad, velocity, np.gradient(velocity, axis=0) * rate_hz)
+    parameters = truth.parameters.copy()
+    parameters[truth.model.flange] += body
+    torque = truth.model.torques(motion, parameters)[2]
+    noise = 0.02 * np.random.default_rng(2).standard_normal(torque.shape)
+    return replace(run, current_a=(truth.model.drive_train.to_motor @ torque / truth.gains[:, None] + noise).T)
+
+
+def test_too_little_is_refused(small_truth: Truth, cells: tuple[WeighedCell, ...]) -> None:
+    cell = cells[0]
+    with pytest.raises(DataUnfit, match="no run with the body"):
+        weigh(cell.calibration, small_truth.model, [], cell.conditioning)
+    end = round(6.0 * cell.loaded.rate_hz)
+    arrays = ("time_s", "position_rad", "current_a")
+    short = replace(cell.loaded, **{name: getattr(cell.loaded, name)[:end] for name in arrays})
+    with pytest.raises(TooFewMoves):
+        weigh(cell.calibration, small_truth.model, [short], cell.conditioning)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_centre_and_inertia_are_those_of_the_ten(seed: int) -> None:
+    """Values as of `body_of`; σ as of a finite difference along a single uncertain direction."""
+    rng = np.random.default_rng(seed)
+    ten, step = a_body(rng), 1e-6 * rng.standard_normal(10)
+    certain = np.zeros((10, 10))
+    spread = np.outer(step, step)
+    scale = Scale.__new__(Scale)
+    error = RelativeError((), 0.0)
+    found = WeighedBody(ten, certain, spread, True, 9, error, scale)
+    (centre, centre_std), (inertia, inertia_std) = found.centre_m, found.inertia_kg_m2
+    upper = np.triu_indices(3)
+    body, near = body_of(ten), body_of(ten + step)
+    assert centre == pytest.approx(body.centre_m)
+    assert inertia == pytest.approx(body.inertia_kg_m2[upper], abs=1e-12)
+    assert centre_std == pytest.approx(np.abs(near.centre_m - body.centre_m), rel=1e-2, abs=1e-9)
+    assert inertia_std == pytest.approx(np.abs(near.inertia_kg_m2 - body.inertia_kg_m2)[upper], rel=1e-2, abs=1e-9)
+    lost = replace(found, values=np.where(np.arange(10) == 6, np.nan, ten))
+    assert np.isnan(lost.centre_m[0]).tolist() == [True, False, False]
