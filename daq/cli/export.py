@@ -11,6 +11,7 @@ from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
 from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
 
 if TYPE_CHECKING:
+    from daq.config.cell import Cell
     from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
     from ident.arrays import FloatArray
     from ident.calibration import Calibration
@@ -66,13 +67,14 @@ def export_urdf_verb(
     physical bodies (pip install 'drivegain[physical]'); the change of torque is reported.
     """
     from daq.cli.terminal import check_output, one_of, print_view, status
+    from daq.config.cell import model_of
     from daq.config.cell_file import URDF, bundle
     from daq.config.yaml_file import read_bytes
     from daq.environment import software
     from daq.report.urdf import urdf_document, urdf_view
     from daq.workflow.calibration_file import load_calibration
     from daq.workflow.fit import DOUBTFUL_PERCENT
-    from daq.workflow.urdf_export import FORMAT, parse_markup, physical_robot, require_solver, update_urdf
+    from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, require_solver, update_urdf
     from ident.errors import ModelContradicted
 
     one_of("give the cell file; --urdf is for a robot without one", cell=cell, urdf=urdf)
@@ -92,8 +94,13 @@ def export_urdf_verb(
     if out.exists() and out.read_bytes() == content:
         raise UsageError(str(out), found="the input URDF", expected="a file of its own", remedy="choose another name")
     parse_markup(content, str(given))  # before any other reader sees it
+    if urdf is None:
+        declared = _declared(known, given)
+        model, limits, same = model_of(declared), cell_limits(declared), declared.digest == known.configuration_sha256
+        content = declared.urdf.encode()  # held joints are fixed in it
+    else:
+        model, limits, same = *_plain(content.decode("utf-8")), None
     text = content.decode("utf-8")
-    model, limits, same = _declared(known, given) if urdf is None else (*_plain(text), None)
     with status("finding the nearest physical robot"):
         robot = physical_robot(known, model, limits, text)
     updates = joint_updates(robot)
@@ -123,10 +130,8 @@ def joint_updates(robot: PhysicalRobot) -> dict[str, JointUpdate]:
     }
 
 
-def _declared(calibration: Calibration, path: Path) -> tuple[Model, FloatArray, bool]:
-    from daq.config.cell import model_of
+def _declared(calibration: Calibration, path: Path) -> Cell:
     from daq.config.cell_file import load_cell
-    from daq.workflow.urdf_export import cell_limits
 
     cell = load_cell(path)
     if cell.name != calibration.cell:
@@ -136,7 +141,7 @@ def _declared(calibration: Calibration, path: Path) -> tuple[Model, FloatArray, 
             expected=f"cell {calibration.cell!r}, as in the calibration",
             remedy="give the cell that was calibrated",
         )
-    return model_of(cell), cell_limits(cell), cell.digest == calibration.configuration_sha256
+    return cell
 
 
 def _plain(urdf: str) -> tuple[Model, FloatArray]:

@@ -98,7 +98,8 @@ def fit_verb(
             found = CaseFit(fitted, (), None)
         else:
             chosen = method or (Method.WLS if fixed else Method.ML)
-            found = fit_case(reduce_logs(logs, holdout or (), described), chosen, known, gains_fixed=fixed)
+            reduced = reduce_logs(logs, holdout or (), described, instruments=chosen is Method.IV)
+            found = fit_case(reduced, chosen, known, gains_fixed=fixed)
             one = found.fitted.identification
             require_plausible(one.estimate, one.training_error, found.fitted.cell.axis_names)
         if essential is not None:
@@ -169,9 +170,14 @@ def residual_verb(
     ] = False,
     cell: CellOption = None,
     accept_losses: AcceptLossesOption = False,
+    accept_worse_holdout: Annotated[
+        bool,
+        typer.Option("--accept-worse-holdout", help="Write effects that raise the error of held-out logs, too."),
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Fit, then detect the effect that explains the residual, add it, refit everything, and repeat."""
+    from dataclasses import replace
     from datetime import UTC, datetime
 
     from daq.cli.terminal import check_output, print_view, status
@@ -180,7 +186,7 @@ def residual_verb(
     from daq.report.fit import start_of
     from daq.report.residual import residual_document, residual_view
     from daq.report.residual_page import save_report
-    from daq.workflow.fit import calibration_of, close_loop, fit
+    from daq.workflow.fit import calibration_of, check_holdout, close_loop, fit
     from ident.discovery.before_after import account
     from ident.estimators.method import Method
 
@@ -195,14 +201,15 @@ def residual_verb(
             cell=None if cell is None else load_cell(cell),
             lossy=LossyLogs.ACCEPTED if accept_losses else LossyLogs.REFUSED,
         )
-        closed = close_loop(fitted, seed, report_step)
+        closed = replace(close_loop(fitted, seed, report_step), accept_worse_holdout=accept_worse_holdout)
         calibration = calibration_of(closed, datetime.now(UTC))
         report_step("computing the errors before and after")
         changed = account(start_of(closed), closed.steps, leave_out_runs=leave_out_runs, progress=report_step)
-    _save(closed, calibration, out, pictures)
     if report is not None:
         with status("drawing the report"):
             save_report(closed, changed, calibration, report)
+    check_holdout(closed)
+    _save(closed, calibration, out, pictures)
     if json:
         print_json(residual_document(closed, changed, calibration))
     else:

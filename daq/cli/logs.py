@@ -1,4 +1,4 @@
-"""`drivegain info`, `import` and `salvage`: show a log, convert CSV files to one, save one that is damaged."""
+"""`drivegain info`, `import` and `salvage`: show a log, convert other recordings, save a damaged log."""
 
 from __future__ import annotations
 
@@ -29,24 +29,30 @@ INFO = Verb("info", info, "drivegain info runs/unloaded-1.mcap --json")
 
 def import_files(
     description: Annotated[Path, typer.Argument(help="Import description (YAML): columns, units, rate.")],
-    data: Annotated[Path, typer.Option("--data", help="Folder of the CSV files.")],
+    data: Annotated[Path, typer.Option("--data", help="Folder of the files.")],
     out: NewLogOption,
     cell: Annotated[Path | None, typer.Option("--cell", help="Another cell file than the description's.")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Convert the CSV files of another controller to a log."""
+    """Convert CSV files, MATLAB files or ROS 2 bags of another controller to a log."""
     from dataclasses import asdict
 
     from daq.cli.terminal import WRITTEN
     from daq.environment import software
     from daq.log.csv_import import import_csv
+    from daq.report.log import timing_text
+    from daq.report.text import printable
 
-    statistics = import_csv(description, data, out, software=software(), cell_path=cell)
+    imported = import_csv(description, data, out, software=software(), cell_path=cell)
     WRITTEN.append(out)
+    statistics, timing = imported.statistics, imported.timing
     if json:
-        print_json({"log": str(out), **asdict(statistics)})
-    else:
-        typer.echo(f"{out}: {statistics.samples} samples of {len(statistics.missing)} axes")
+        stamps = None if timing is None else asdict(timing)
+        print_json({"log": str(out), **asdict(statistics), "timing": stamps, "remarks": imported.remarks})
+        return
+    typer.echo(f"{out}: {statistics.samples} samples of {len(statistics.missing)} axes")
+    for line in (*(() if timing is None else (timing_text(timing),)), *imported.remarks):
+        typer.echo(printable(line))
 
 
 IMPORT = Verb(

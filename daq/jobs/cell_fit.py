@@ -31,7 +31,7 @@ from daq.errors import (
 from daq.files import read_regular, replace_file
 from daq.jobs.fleet_survey import CellLogs, StoredLog, at_hand, fingerprint
 from daq.workflow.calibration_file import as_document, decode, encode
-from daq.workflow.fit import calibration_of, close_loop, fit
+from daq.workflow.fit import calibration_of, check_holdout, close_loop, fit
 from drivers.errors import DriverError
 from ident.calibration import Gain
 from ident.errors import IdentificationError
@@ -105,6 +105,7 @@ def fit_cell(
             fitted = fit(logs[: len(cell.fit)], holdout=logs[len(cell.fit) :])
             if loop is Loop.CLOSED:
                 fitted = close_loop(fitted, SEED)
+                check_holdout(fitted)
             for seen in every_log:
                 if fingerprint(seen.log) != seen.fingerprint:
                     raise LogsDiffer(

@@ -32,6 +32,7 @@ from daq.log.salvage import salvage
 from daq.report.fit import start_of
 from daq.report.residual import summary
 from daq.workflow.calibration_file import load_calibration, save_calibration
+from daq.workflow.fit import check_holdout
 from daq.workflow.plan import Plan
 from daq.workflow.plan_file import load_plan, save_plan
 from daq.workflow.record import Recorded
@@ -211,6 +212,7 @@ def fit_session(context: JobContext, session: Session) -> tuple[Session, Calibra
         closed = context.tools.close_loop(
             fitted, context.section.seed, lambda step: context.journal.say(Level.INFO, step)
         )
+        check_holdout(closed)
         changed = context.tools.account(start_of(closed), closed.steps)
     except (DataError, IdentificationError):
         # The same logs would fail again: the next job records new ones.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ident.effects.effect import Effect
 from ident.effects.signals import Abscissa
-from ident.effects.unnamed import Periodic, Smooth
+from ident.effects.unnamed import is_unnamed
 
 WORDS = {
     "stribeck": "dry friction that changes at low speed",
@@ -14,6 +14,7 @@ WORDS = {
     "spring": "a spring",
     "position-friction": "friction that changes with the position",
     "cogging": "torque ripple that repeats with the motor's turn",
+    "ripple": "torque ripple that does not repeat with the motor's turn",
     "saturation": "a motor that gives less torque per ampere at large current",
     "lag": "a current that lags behind the position",
     "time-skew": "positions and currents that were not sampled at the same time",
@@ -21,6 +22,7 @@ WORDS = {
     "presliding": "friction that builds up only some way after each reversal",
     "backlash": "free play in the gear",
     "elasticity": "a gear that gives under load",
+    "efficiency": "a gear that loses a part of the power in both directions",
     "coupling": "friction shared with another joint",
     "inertial-coupling": "inertia shared with another joint",
     "hinge": "a cable or hose that pulls from some position on",
@@ -50,8 +52,3 @@ def other_axis(effect: Effect) -> int | None:
     """Index of the second axis of an effect on two axes."""
     number = effect.settings.get("other_axis", 0)
     return int(number) - 1 if number else None
-
-
-def is_unnamed(effect: Effect) -> bool:
-    """Whether it is a smooth or periodic term, which fits anything and names no cause."""
-    return isinstance(effect, Smooth | Periodic)

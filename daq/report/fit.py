@@ -11,8 +11,8 @@ from rich.text import Text
 
 from daq.report import paper_tables
 from daq.report.bus import actual_current_note
-from daq.report.gains import gain_table, partial_note
-from daq.report.text import percent_text, picked, plain_table
+from daq.report.gains import diagnosis_texts, gain_table, partial_note
+from daq.report.text import percent_text, picked, plain_table, printable
 from daq.workflow.calibration_file import as_document
 from daq.workflow.cases import CASES, CaseFit
 from daq.workflow.fit import DOUBTFUL_PERCENT, Fit, needed_verdicts
@@ -32,6 +32,7 @@ def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | 
     yield gain_table(calibration.gains, title=f"Drive gains of {calibration.cell} by {calibration.method}")
     if (note := partial_note(calibration)) is not None:
         yield Text(note, style="bold")
+    yield from (Text(printable(text), style="bold") for text in diagnosis_texts(calibration.diagnoses))
     if (note := actual_current_note(fitted.cell)) is not None:
         yield note
     if fitted.paper is not None:

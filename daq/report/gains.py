@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +12,7 @@ from rich.table import Table
 from daq.report.picture import BLUE, GREEN, GREY, ORANGE, grid, legend_below, render, unformatted
 from daq.report.text import plain_table, terminal_text
 from ident.calibration import Calibration, Gain
+from ident.errors import Diagnosis
 
 if TYPE_CHECKING:  # `history` needs no effects
     from ident.discovery.before_after import GainShift
@@ -71,6 +72,11 @@ def partial_note(calibration: Calibration) -> str | None:
     return (
         f"PARTIAL or lossy data ({', '.join(partial)}): not for a controller; `apply` refuses it." if partial else None
     )
+
+
+def diagnosis_texts(diagnoses: Iterable[Diagnosis]) -> tuple[str, ...]:
+    """One sentence for each diagnosis, for a view or a page."""
+    return tuple(f"CHECK {one.text}." for one in diagnoses)
 
 
 def with_deviation(value: float, std: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from rich.text import Text
 from daq.config.cell_file import cell_from_bundle
 from daq.errors import LogIncomplete
 from daq.log.conversion import scaling
+from daq.log.metadata import Timing
 from daq.log.reader import LogReader
 from daq.report.bus import current_signals
 from daq.report.text import picked, printable
@@ -86,8 +88,25 @@ def describe_log(path: Path) -> dict[str, Any]:
         if statistics.wall_minus_monotonic_ns is None
         else (statistics.wall_minus_monotonic_ns - run.wall_minus_monotonic_ns) * 1e-9,
         "origin": run.origin,
+        "timing": None if run.timing is None else asdict(run.timing),
         "attachments": {name: len(data) for name, data in sorted(head.files.items())},
     }
+
+
+def timing_text(timing: Timing) -> str:
+    """Describe the time stamps of an import in a sentence: `stamps at 90.9 Hz: steps of 12 ms at most, ...`."""
+    parts = [
+        f"usual step {1e3 * timing.usual_step_s:.6g} ms, longest {1e3 * timing.longest_step_s:.6g} ms",
+        f"jitter {1e3 * timing.jitter_s:.3g} ms",
+        f"drift {1e3 * timing.drift_s:.3g} ms",
+    ]
+    counts = (
+        (timing.missing, "missing and interpolated"),
+        (timing.duplicates, "duplicated and dropped"),
+        (timing.close, "too close to the one before and dropped"),
+    )
+    parts += [f"{count} {text}" for count, text in counts if count]
+    return f"{'resampled to' if timing.resampled else 'uniform at'} {timing.rate_hz:.6g} Hz: {', '.join(parts)}"
 
 
 def log_table(description: Mapping[str, Any]) -> Table:

@@ -168,7 +168,7 @@ def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -
             columns.append((f"{mass.mass_kg:.3f}", *map(percent, percents)))
             if mass.error_percent is not None:
                 errors[label].append(mass.error_percent)
-        figures = zip((f"{run.run}, kg", "%σ", "%σ with the gains'", "%e"), *columns, strict=True)
+        figures = zip((f"{run.run}, kg", "%σ", "%σ with the calibration's", "%e"), *columns, strict=True)
         rows += [row for row in figures if row[0] != "%e" or run.weighed_kg is not None]
     weighed = runs[0].weighed_kg
     if weighed is not None:
@@ -177,15 +177,15 @@ def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -
     method = (
         "Robot and payload together from this run and the runs without load (§2.4)"
         if found.with_bare_runs
-        else "The payload alone, on the robot of the calibration, whose own deviation is not in %σ"
+        else "The payload and the joints' friction, on the robot of the calibration"
     )
     return PaperTable(
         title=f"Table {number}: payload mass of {name} ({mounting}), {of}",
         headings=("run", *labels),
         rows=tuple(rows),
         notes=(
-            f"{method}; gains held, all ten parameters of the payload unknown. %σ: from the scatter of the moves; "
-            "below it with the σ of the gains, whose errors are correlated. A scale is a weak check: errors of "
+            f"{method}; gains held, effects in the model, all ten parameters of the payload unknown. %σ: from the "
+            "scatter of the moves; below it with the errors of the calibration. A scale is a weak check: errors of "
             "several axes can cancel.",
             *dict.fromkeys(notes),
         ),

@@ -13,22 +13,37 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from daq.report.effect_names import effect_text, is_unnamed
+from daq.report.effect_names import effect_text
 from daq.report.fit import coefficients, error_document, error_table
-from daq.report.gains import gain_table, partial_note, with_deviation
+from daq.report.gains import diagnosis_texts, gain_table, partial_note, with_deviation
 from daq.report.text import picked, plain_table
 from daq.workflow.calibration_file import as_document
 from daq.workflow.fit import Fit
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account, BeforeAfter, Errors
+from ident.discovery.gates import runs_to_leave_out
+from ident.discovery.gear_loss import CERTAIN, GearLoss, gear_losses, is_gear_loss
 from ident.discovery.loop import MAX_EFFECTS, Step
 from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect, Side
 from ident.effects.electrical import TimeSkew
+from ident.effects.signals import session_began_s
+from ident.effects.unnamed import is_unnamed
 from ident.estimators.estimate import RelativeError
 
 _SHOWN = 6  #: Findings listed for each turn; the JSON has them all
 _SHOWN_RIVALS = 3
+
+_OF_A_GEAR = (
+    "motoring_rows",
+    "motoring_torque",
+    "loss",
+    "loss_std",
+    "efficiency",
+    "gain_factor",
+    "hidden_shift",
+    "gain_carries_it",
+)
 
 ErrorRow = tuple[str, RelativeError]  #: Name of the error and of the data it is measured on, and the error [%]
 WHEN = ("before", "after")
@@ -68,6 +83,9 @@ def turns_view(fitted: Fit) -> Iterator[RenderableType]:
                 "pass" if finding.passed else "no",
             )
         yield table
+        for aside in step.set_aside:
+            placed = PlacedEffect(aside.finding.effect, aside.finding.axis)
+            yield f"Not added: {placed.name_among(fitted.cell.axis_names)}: {aside.reason(fitted.cell.axis_names)}."
         if step.accepted is None:
             yield "No candidate passes every gate; nothing is added.\n"
         else:
@@ -81,8 +99,9 @@ def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
 
 
 def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
-    """Summarise in sentences: each accepted effect, the whole, the gains, and the limit of detection."""
+    """Summarise in sentences: what to check first, each accepted effect, the whole, the gains, the limit."""
     kept = fitted.steps[-1].after.effects
+    first = diagnosis_texts(fitted.diagnoses)
     found = tuple(
         _effect_sentence(fitted, account, turn, placed, step.accepted.share_of_excess)
         for step, turn in zip(fitted.steps, account.turns, strict=True)
@@ -100,18 +119,52 @@ def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
             f"Currents were sampled {1e3 * abs(skew[0]):.2f} ± {1e3 * skew[1]:.2f} ms "
             f"{'after' if skew[0] > 0 else 'before'} the positions on all axes alike{beside}."
         )
+    ending += gear_sentences(fitted)
+    ending += _holdout_verdict(fitted, account)
+    if kept and not runs_to_leave_out(fitted.steps[-1].after.training):
+        ending.append(
+            "Effects were accepted on moves left out: with three runs or more, each payload in two, runs left out "
+            "judge them too."
+        )
+    ending[:0] = [sentence for step in fitted.steps for sentence in _set_aside(fitted, step)]
     if not found:
-        return (f"No structure found: the error {where} is {after.total:.1f} %{noise}.", *ending)
+        return (*first, f"No structure found: the error {where} is {after.total:.1f} %{noise}.", *ending)
     whole = f"All axes together: the error {where} {error_change_text(before.total, after.total)}{noise}."
     if fitted.estimate.gains_fixed:
-        return (*found, whole, *ending)
+        return (*first, *found, whole, *ending)
     changed = [
         f"{axis} by {change.change_percent:+.1f} %"
         for axis, change in zip(fitted.cell.axis_names, account.total.gains, strict=True)
         if change.significant
     ]
     gains = f"Drive gains that change by more than noise: {', '.join(changed)}."
-    return (*found, whole, gains if changed else "No drive gain changes by more than noise.", *ending)
+    return (*first, *found, whole, gains if changed else "No drive gain changes by more than noise.", *ending)
+
+
+def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
+    """Sentences on findings that did not join the model, where the last model still lacks them."""
+    axes, last = fitted.cell.axis_names, fitted.steps[-1]
+    for aside in step.set_aside:
+        finding = aside.finding
+        axis = PlacedEffect(finding.effect, finding.axis).axis_name(axes)
+        replaced = aside.rival is not None and aside.rival in last.after.effects
+        if step is last or (replaced and not is_unnamed(finding.effect)):
+            yield (
+                f"{axis} may have {effect_text(finding.effect, axes)}: it would change the error of moves left out "
+                f"from {finding.error_before_percent:.1f} to {finding.error_after_percent:.1f} %, and was not "
+                f"added: {aside.reason(axes)}."
+            )
+
+
+def _holdout_verdict(fitted: Fit, account: Account) -> list[str]:
+    if account.holdout_change is None or not account.holdout_change.is_rise:
+        return []
+    if fitted.accept_worse_holdout:
+        return [
+            "The effects raise the error of the held-out runs by more than its noise and were accepted all the same: "
+            "these runs have taken part in the choice, and are no proof."
+        ]
+    return ["The effects raise the error of the held-out runs by more than its noise: no calibration was written."]
 
 
 def time_skew(fitted: Fit) -> tuple[float, float] | None:
@@ -121,6 +174,36 @@ def time_skew(fitted: Fit) -> tuple[float, float] | None:
     """
     skews = [finding for finding in fitted.steps[-1].findings if finding.effect == TimeSkew()]
     return None if not skews else (float(skews[0].coefficients[0]), float(skews[0].deviations[0]))
+
+
+def gear_sentences(fitted: Fit) -> list[str]:
+    """Say which gains carry the efficiency of their gear, and what a loss in the model means for its gain."""
+    if fitted.estimate.gains_fixed:
+        return []
+    in_model = {placed.axis for placed in fitted.steps[-1].after.effects if is_gear_loss(placed.effect)}
+    judged = zip(fitted.cell.axis_names, gear_losses(fitted.steps[-1]), strict=True)
+    return [
+        sentence
+        for axis, (name, gear) in enumerate(judged)
+        if (sentence := _gear_sentence(name, gear, in_model=axis in in_model))
+    ]
+
+
+def _gear_sentence(name: str, gear: GearLoss, *, in_model: bool) -> str:
+    if in_model and gear.efficiency is not None and gear.gain_factor is not None:
+        return (
+            f"The loss in the gear of {name} is an efficiency of {100.0 * gear.efficiency:.1f} % if motor and load "
+            f"lose the same share; its motor's gain is then {100.0 * (gear.gain_factor - 1.0):.2f} % larger than the "
+            "one found, which no residual can show."
+        )
+    if not gear.gain_carries_it or gear.hidden_shift is None or gear.loss_std is None:
+        return ""
+    side, share = ("motor", gear.motoring_torque) if gear.lean > 0.0 else ("load", 1.0 - gear.motoring_torque)
+    return (
+        f"The gain of {name} carries the efficiency of its gear: the {side} drives in {100.0 * share:.0f} % of the "
+        f"squared load torque, and a loss of up to {100.0 * CERTAIN * gear.loss_std:.1f} % would not show; it would "
+        f"change the gain by {100.0 * gear.hidden_shift:.1f} %."
+    )
 
 
 def error_rows(account: Account) -> tuple[ErrorRow, ...]:
@@ -197,9 +280,12 @@ def _silence(fitted: Fit) -> str:
         for axis, limit in zip(fitted.cell.axes, last.limits_nm, strict=True)
     )
     ended = f"The search ended early: {last.ended}. " if last.ended else ""
+    trained = last.after.trained
+    clockless = len(trained) > 1 and session_began_s(trained) is None
+    unseen = " The runs have no common clock: a warm-up over the session cannot be seen." if clockless else ""
     return (
         f"{ended}An effect that the declared model cannot mimic would have been detected above this torque (root mean "
-        f"square in motion): {limits}."
+        f"square in motion): {limits}.{unseen}"
     )
 
 
@@ -233,7 +319,12 @@ def residual_document(fitted: Fit, account: Account, calibration: Calibration) -
             "holdout_error_percent": error_document(account.holdout_floor),
         },
         "time_skew": None if skew is None else {"seconds": skew[0], "std": skew[1]},
+        "gear_loss": [
+            {"axis": axis, **picked(gear, *_OF_A_GEAR)}
+            for axis, gear in zip(axes, gear_losses(fitted.steps[-1]), strict=True)
+        ],
         **_before_after(fitted, account.total),
+        "worse_holdout": None if account.holdout_change is None else account.holdout_change.is_rise,
         "turns": [_turn(fitted, step, turn) for step, turn in zip(fitted.steps, account.turns, strict=True)],
     }
 
@@ -256,6 +347,7 @@ def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> dict[str, Any]:
         **(dict.fromkeys(("before", "after", "gain_changes")) if turn is None else _before_after(fitted, turn)),
         "findings": [_finding(finding, axes) for finding in step.findings],
         "structures": [_finding(finding, axes) for finding in step.structures],
+        "set_aside": [{**_finding(aside.finding, axes), "reason": aside.reason(axes)} for aside in step.set_aside],
         "detection_limits": [
             {"axis": axis.name, "rms": float(limit), "unit": axis.unit.force}
             for axis, limit in zip(fitted.cell.axes, step.limits_nm, strict=True)
@@ -309,6 +401,7 @@ def _finding(finding: Finding, axes: tuple[str, ...]) -> dict[str, Any]:
             for column, value, std in values
         ],
         **picked(finding, *names, "held_out_fall", "passed", "share_of_excess"),
+        "refusals": list(finding.refusals),
         # For findings that failed a gate it would be most of the file and of no use.
         "ambiguity": [rival.name_among(axes) for rival in finding.ambiguity] if finding.passed else None,
     }

@@ -239,7 +239,11 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
             plot_ranking(ranked, rivals, axes, title=f"Turn {number}: the best candidates"),
             "Candidates by how much they reduce the error of left-out moves.",
         )
-    return section(f"Turn {number}: what was tried", paragraph(outcome), ranking)
+    refused = [
+        f"Not added: {PlacedEffect(aside.finding.effect, aside.finding.axis).name_among(axes)}: {aside.reason(axes)}."
+        for aside in step.set_aside
+    ]
+    return section(f"Turn {number}: what was tried", paragraph(" ".join((outcome, *refused))), ranking)
 
 
 def _limits(fitted: Fit) -> str:

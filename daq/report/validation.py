@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from rich.text import Text
 from daq.files import replace_file
 from daq.report import paper_tables
 from daq.report.fit import error_document
+from daq.report.gains import diagnosis_texts
 from daq.report.plots import plot_torques
 from daq.report.text import percent_text, picked, plain_table, printable, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
@@ -36,7 +38,8 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
         f"Position filter {filter_.position_cutoff_hz:g} Hz, decimation {filter_.decimation_cutoff_hz:g} Hz, as in the "
         "fit. Compare relative errors only under the same filters."
     )
-    doubts = [
+    doubts = [*diagnosis_texts((*found.diagnoses, *calibration.diagnoses))]
+    doubts += [
         f"{validation.log} carries another cell configuration than the logs of the fit; check the difference."
         for validation in validations
         if not validation.same_configuration
@@ -119,6 +122,7 @@ def cross_document(found: CrossValidation) -> dict[str, Any]:
     """Build the part of `validate --json` that Tables 5 to 8 show."""
     return {
         "calibrations": list(found.calibrations),
+        "diagnoses": [asdict(one) for one in found.diagnoses],
         "runs": [
             {
                 "log": str(run.log),

@@ -1,7 +1,7 @@
 """`calibration.yaml`, the result of a fit: written whole, read strictly, and every edit by hand is detected.
 
-The file adds percentages for people and writes NaN as null. Sections without such a difference (`Source`, `Recording`)
-are read as the classes of `ident`.
+The file adds percentages for people and writes NaN as null. Sections without such a difference (`Source`, `Recording`,
+`Diagnosis`) are read as the classes of `ident`.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from daq.config.yaml_file import MAX_BYTES, StrictModel, parse_yaml, read_model
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, SchemaMismatch, YamlInvalid
 from daq.files import read_regular, replace_file
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
+from ident.errors import Diagnosis
 from ident.estimators.estimate import RelativeError
 
 _Deviation = Annotated[float, Field(ge=0.0)]
@@ -88,10 +89,12 @@ class CalibrationDocument(StrictModel):
     configuration_sha256: str
     created: str
     software: str
-    # Files of earlier versions lack the following three.
+    # Files of earlier versions lack the following four.
     session_began_s: float | None = None
     nameplate_holdout_error_percent: RelativeErrorEntry | None = None
     recording_configuration_sha256: str | None = None
+    covariance_factor: tuple[tuple[float, ...], ...] | None = None
+    diagnoses: tuple[Diagnosis, ...] = ()
 
 
 _CLASSES: dict[type, type] = {

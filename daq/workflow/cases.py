@@ -12,8 +12,8 @@ import numpy as np
 from daq.config.cell import Cell, model_of
 from daq.errors import ConfigurationInconsistent
 from daq.workflow.choices import Known
-from daq.workflow.fit import Fit, Reading, calibration_of, check_signs
-from ident.calibration import Calibration, Parameter, Source
+from daq.workflow.fit import Fit, Reading, calibration_of, check_signs, with_diagnoses
+from ident.calibration import Calibration, Parameter, Source, factor_of
 from ident.equations.reduction import Reduction, reduce_runs
 from ident.equations.system import require_distinct
 from ident.estimators.comparison import Essential, essential
@@ -66,15 +66,19 @@ class CaseFit:
     essential: Essential | None  #: how its base parameters were chosen, None where all of them stay
 
 
-def reduce_logs(logs: Sequence[Path], holdout: Sequence[Path] = (), cell: Cell | None = None) -> ReducedLogs:
+def reduce_logs(
+    logs: Sequence[Path], holdout: Sequence[Path] = (), cell: Cell | None = None, *, instruments: bool = False
+) -> ReducedLogs:
     """Read and reduce logs; the fit must not see those held out, and `cell` replaces the description in the logs.
+
+    With instruments they can be fitted by ``iv`` too.
 
     Raises:
         DataError, ConfigurationError, IdentificationError: a log cannot be used, or not with the others.
     """
     reading = Reading(logs, cell)
     model, conditioning = model_of(reading.cell), reading.cell.conditioning
-    used = reduce_runs(model, reading.runs(logs, "fit"), conditioning)
+    used = reduce_runs(model, reading.runs(logs, "fit"), conditioning, instruments=instruments)
     rest = each_run(reading.runs(holdout, "holdout"), used.payloads)
     unseen = reduce_runs(model, rest, conditioning, payloads=used.payloads)
     return ReducedLogs(reading.cell, tuple(logs), tuple(holdout), tuple(reading.sources), used, unseen)
@@ -102,7 +106,7 @@ def fit_case(
     rest = unseen.system(system.base, system.payload_columns) if unseen.runs else None
     result = Identification(used.model, used.conditioning, system, rest, estimate)
     paper = None if gains_fixed else tls(system)
-    fitted = Fit(logs.cell, logs.logs, logs.holdout, logs.sources, result, (), paper)
+    fitted = with_diagnoses(Fit(logs.cell, logs.logs, logs.holdout, logs.sources, result, (), paper))
     if ratio is None:
         return CaseFit(fitted, payloads, None)
     return replace(essential_fit(fitted, ratio), payloads=payloads)
@@ -159,4 +163,10 @@ def calibration_of_case(case: CaseFit, created: datetime) -> Calibration:
     )
     kept = tuple(parameter for parameter in calibration.parameters if parameter.name not in removed)
     condition = calibration.condition if case.essential is None else case.essential.estimate.condition
-    return replace(calibration, parameters=kept + given, condition=condition)
+    covariance, gains = calibration.covariance, len(calibration.gains)
+    factor = None
+    if covariance is not None:
+        names = [parameter.name for parameter in calibration.parameters]
+        places = [*range(gains), *(gains + names.index(parameter.name) for parameter in kept)]
+        factor = factor_of(np.pad(covariance[np.ix_(places, places)], (0, len(given))))
+    return replace(calibration, parameters=kept + given, condition=condition, covariance_factor=factor)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from daq.config.cell import Cell, model_of
 from daq.environment import software
-from daq.errors import ConfigurationError, LogRepeated, LogsDiffer, UsageError
+from daq.errors import ConfigurationError, EffectsRefuted, LogRepeated, LogsDiffer, UsageError
 from daq.log.conversion import load_run
 from daq.log.reader import LossyLogs
 from daq.workflow.experiment import LAG_ONE, experiment_of, extra_moves
@@ -22,14 +23,25 @@ from ident.calibration import Calibration, Source
 from ident.calibration import calibration_of as identified_calibration
 from ident.data.dataset import differentiate
 from ident.data.run import Run
-from ident.discovery.loop import Evidence, Step, find_effects, gather
-from ident.errors import IdentificationError, PayloadUnseen, RolesExchanged
+from ident.discovery.before_after import error_on, holdout_change
+from ident.discovery.loop import Evidence, Step, find_effects, gather, without_effects
+from ident.errors import (
+    ChannelsExchanged,
+    Diagnosis,
+    IdentificationError,
+    ModelContradicted,
+    NotConverged,
+    PayloadUnseen,
+    RolesExchanged,
+)
 from ident.estimators.comparison import Comparison, compare
+from ident.estimators.diagnosis import diagnose, exchanged_channels
 from ident.estimators.estimate import Estimate, RelativeError, of_squares
 from ident.estimators.identify import Identification, estimate_with, identify
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS
+from ident.model.robot import read_urdf
 from ident.planning.excitation import (
     GOOD_PERCENT,
     Design,
@@ -56,6 +68,9 @@ class Fit:
     steps: tuple[Step, ...]  #: turns of the loop, empty without a search for effects
     paper: Estimate | None  #: the paper's total least squares on the same equations, None with fixed gains
     lossy: LossyLogs = LossyLogs.REFUSED  #: how logs with losses were handled
+    diagnoses: tuple[Diagnosis, ...] = ()  #: of the fit, or with effects of the last one
+    #: The operator takes effects that held-out runs refute: these have then taken part in the choice.
+    accept_worse_holdout: bool = False
 
     @property
     def estimate(self) -> Estimate:
@@ -141,13 +156,14 @@ def fit_logs(
         progress: receives a line for each step.
 
     Raises:
-        DataError: a log cannot be read, or its samples cannot be used.
+        DataError: a log cannot be read, its samples cannot be used, or held-out runs refute the effects found.
         ConfigurationError: the description of the cell is inconsistent.
         ident.IdentificationError: the runs do not identify the gains.
     """
     fitted = fit(list(map(Path, logs)), holdout=list(map(Path, holdout)), cell=cell)
     if effects:
         fitted = close_loop(fitted, BOOTSTRAP_SEED, progress)
+        check_holdout(fitted)
     return calibration_of(fitted, created or datetime.now(UTC))
 
 
@@ -192,8 +208,12 @@ def fit(
         return Fit(declared, tuple(used), tuple(unseen), tuple(reading.sources), result, (), paper, lossy)
 
     try:
-        return attempt(logs, holdout, method or (Method.WLS if gains_fixed else Method.ML))
+        fitted = with_diagnoses(attempt(logs, holdout, method or (Method.WLS if gains_fixed else Method.ML)))
+    except (ModelContradicted, NotConverged):
+        require_own_channels(logs, cell, lossy)
+        raise
     except PayloadUnseen as error:
+        require_own_channels(logs, cell, lossy)
         contradicting = ""
         for log in logs:
             try:
@@ -206,6 +226,49 @@ def fit(
             )
             break
         raise PayloadUnseen(error.std_percent, error.runs, contradicting) from error
+    if gains_fixed or OF_CHANNELS & {one.name for one in fitted.diagnoses if not one.runs}:
+        require_own_channels(logs, cell, lossy)
+    if any(one.name == "axis-error" and one.runs for one in fitted.diagnoses):
+        exchanged = ((log, channels_of((log,), cell, lossy)) for log in holdout)
+        named = tuple(replace(one, runs=(log.stem,)) for log, one in exchanged if one is not None)
+        return replace(fitted, diagnoses=(*named, *fitted.diagnoses))
+    return fitted
+
+
+OF_CHANNELS = {"axis-error", "current-reversed", "gain-off-nameplate"}
+"""Diagnoses that exchanged currents may leave. Fixed gains need not leave any."""
+
+
+def with_diagnoses(fitted: Fit) -> Fit:
+    """Add the diagnoses of a fit, with effects of the last one.
+
+    Raises:
+        ModelContradicted: one of its kinds; see `ident.estimators.diagnosis.diagnose`.
+    """
+    cell = fitted.cell
+    nameplate = np.array([axis.nameplate_gain for axis in cell.axes])
+    kept = (one for one in fitted.diagnoses if one.name == "channels-exchanged")
+    found = diagnose(fitted.final, cell.axis_names, nameplate, read_urdf(cell.urdf).effort_limit)
+    return replace(fitted, diagnoses=(*kept, *found))
+
+
+def channels_of(logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs) -> Diagnosis | None:
+    """Whether the currents of some axes are each other's; the logs are read again."""
+    first, declared = load_run(logs[0], cell, lossy)
+    runs = chain((first,), (load_run(log, cell, lossy)[0] for log in logs[1:]))
+    return exchanged_channels(model_of(declared), runs, declared.conditioning, declared.axis_names)
+
+
+def require_own_channels(logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs) -> None:
+    """Refuse logs in which the currents of some axes are each other's; they are read again.
+
+    Raises:
+        ChannelsExchanged: they are.
+    """
+    found = channels_of(logs, cell, lossy)
+    if found is not None:
+        subject = f"the currents of {' and '.join(found.axes)}"
+        raise ChannelsExchanged(subject, found=found.found, expected=found.expected, remedy=found.remedy)
 
 
 def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: None) -> Comparison:
@@ -249,7 +312,7 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
     """Detect and add missing effects: refit with every effect that passes the gates.
 
     Args:
-        start: of method ``ml``; another one is refitted by it, because candidates are judged in its terms.
+        start: of method ``ml`` or ``iv``; another one is refitted by ``ml``, in whose terms candidates are judged.
         seed: of the bootstrap.
         progress: receives a line for each step.
 
@@ -258,12 +321,40 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
     """
     evidence = start.evidence()
     before = start.identification
-    if before.estimate.method is not Method.ML:
+    if not before.estimate.method.is_of_currents:
         fixed = before.estimate.gains if before.estimate.gains_fixed else None
         before = replace(before, estimate=estimate_with(Method.ML, before.system, fixed))
         evidence = replace(evidence, estimate=before.estimate)
     steps = find_effects(evidence, np.random.default_rng(seed), progress=progress)
-    return replace(start, identification=before, steps=steps)
+    return with_diagnoses(replace(start, identification=before, steps=steps))
+
+
+def check_holdout(fitted: Fit) -> None:
+    """Refuse effects that raise the error of held-out runs by more than its noise.
+
+    Raises:
+        EffectsRefuted: they do, and the operator has not accepted it.
+    """
+    if not fitted.steps or fitted.accept_worse_holdout:
+        return
+    after = fitted.steps[-1].after
+    before = without_effects(after, fitted.identification.estimate)
+    change = holdout_change(before, after)
+    if change is None or not change.is_rise:
+        return
+    weights_nm_a = before.estimate.gains
+    first, last = (
+        error_on(rows, one.estimate).relative(weights_nm_a).total
+        for one in (before, after)
+        if (rows := one.holdout) is not None
+    )
+    raise EffectsRefuted(
+        ", ".join(placed.name_among(fitted.cell.axis_names) for placed in after.effects),
+        found=f"an error of held-out runs of {last:.2f} %, {first:.2f} % without",
+        expected=f"no rise by more than its noise over their {change.moves} moves",
+        remedy="no calibration was written: take `drivegain fit`, which adds no effects, or record more runs for "
+        "the fit (or pass --accept-worse-holdout to `drivegain residual`)",
+    )
 
 
 def calibration_of(fitted: Fit, created: datetime) -> Calibration:
@@ -290,6 +381,7 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
         software=software(),
         nameplate_holdout_error_percent=_nameplate_error(fitted),
         recording_configuration_sha256=cell.recording_digest,
+        diagnoses=fitted.diagnoses,
     )
 
 
@@ -335,7 +427,7 @@ def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
         first += len(indices)
         payloads.append(ExpectedPayload(frozenset(payload.known) & frozenset(LINK_PARAMETERS), parameters))
     # ml's noise is that of the current references, the others' that of the joint torques.
-    noise = estimate.axis_noise / (1.0 if estimate.method is Method.ML else np.abs(estimate.gains))
+    noise = estimate.axis_noise / (1.0 if estimate.method.is_of_currents else np.abs(estimate.gains))
     expectation = Expectation(
         model=found.model,
         gains=estimate.gains,

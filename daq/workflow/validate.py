@@ -24,13 +24,21 @@ from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.equations.reduction import Reduction, reduce_runs
 from ident.equations.rows import row_filter, row_masks
-from ident.errors import DataUnfit, IdentificationError
+from ident.errors import DataUnfit, Diagnosis, IdentificationError
+from ident.estimators.diagnosis import (
+    axis_error_diagnoses,
+    exchanged_channels,
+    idle_joints,
+    scale_diagnoses,
+)
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.estimators.least_squares import wls
-from ident.estimators.payload_estimate import as_one_body, joined, payload_beside_bare_runs, payload_on_known_robot
+from ident.estimators.payload_diagnosis import payload_diagnoses
+from ident.model.base import BaseParameters
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
 from ident.prediction import measured_torque, predict_torque, standard_parameters
+from ident.weighing import RowsToWeigh, rows_to_weigh, weigh_rows
 
 
 class DataUse(Enum):
@@ -154,19 +162,7 @@ def predicted(
     Raises:
         IdentificationError: the calibration cannot speak of this run.
     """
-    payload = run.payload
-    if payload is not None:
-        # What the calibration itself says of it, given or identified, is not taken from the log.
-        own = _of_mounting(calibration, payload)
-        mass, weighed = own.get("m"), payload.known.get("m")
-        if mass is not None and mass.std == 0.0 and weighed is not None and weighed != mass.value:
-            raise DataUnfit(
-                run.name,
-                f"carries {weighed:g} kg on mounting {payload.mounting!r}; the calibration has {mass.value:g} kg: "
-                "give each way of mounting a name of its own",
-            )
-        left = {name: value for name, value in payload.known.items() if name not in own}
-        run = replace(run, payload=replace(payload, known=left))
+    run = as_calibrated(calibration, run)
     roles = {source.role for source in calibration.sources if source.sha256 == run.digest}
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
@@ -187,6 +183,27 @@ def predicted(
     )
 
 
+def as_calibrated(calibration: Calibration, run: Run) -> Run:
+    """Leave out of a run's payload what the calibration itself says of it, given or identified.
+
+    Raises:
+        DataUnfit: the calibration was given another mass on this mounting.
+    """
+    payload = run.payload
+    if payload is None:
+        return run
+    own = _of_mounting(calibration, payload)
+    mass, weighed = own.get("m"), payload.known.get("m")
+    if mass is not None and mass.std == 0.0 and weighed is not None and weighed != mass.value:
+        raise DataUnfit(
+            run.name,
+            f"carries {weighed:g} kg on mounting {payload.mounting!r}; the calibration has {mass.value:g} kg: "
+            "give each way of mounting a name of its own",
+        )
+    left = {name: value for name, value in payload.known.items() if name not in own}
+    return replace(run, payload=replace(payload, known=left))
+
+
 def _of_mounting(calibration: Calibration, payload: Payload) -> dict[str, Parameter]:
     split = ((*parameter.name.partition(":"), parameter) for parameter in calibration.parameters)
     return {name: parameter for name, _, mounting, parameter in split if mounting == payload.mounting}
@@ -201,7 +218,7 @@ class Mass:
 
     mass_kg: float  #: found [kg]
     std_percent: float  #: σ from the scatter of the moves, the gains taken as exact [% of the mass]
-    std_with_gains_percent: float  #: the same with the σ of the gains
+    std_with_gains_percent: float  #: the same with the errors of the calibration
     error_percent: float | None  #: |found − weighed|/weighed [%], None where it was not weighed
 
 
@@ -240,6 +257,7 @@ class CrossValidation:
     weighed: tuple[WeighedRun, ...]  #: those with a payload
     with_bare_runs: bool  #: the payloads were found together with the robot, from runs without load
     validations: tuple[Validation, ...]  #: of the first calibration, for the runs that it can predict
+    diagnoses: tuple[Diagnosis, ...]  #: of these runs under the first calibration
 
 
 def cross_validate(
@@ -268,6 +286,7 @@ def cross_validate(
                 remedy="a relative error can be compared under one filter only: fit both with one cell file",
             )
     runs, bare, loaded, validations = [], [], [], []
+    diagnoses: list[Diagnosis] = []
     for log in logs:
         run, described = load_run(log, cell)
         model = model_of(described)
@@ -282,23 +301,22 @@ def cross_validate(
                 found[label] = predicted(calibration, conditioning, model, log, run, described.digest)
         if first in found:
             validations.append(found[first])
-        reduction: Reduction | str
-        condition = None
-        try:
-            reduction = reduce_runs(model, (run,), conditioning)
-        except IdentificationError as error:
-            reduction = str(error)
-        else:
-            whole = as_one_body(reduction)
-            with suppress(IdentificationError):
-                condition = wls(whole.system(whole.base(), ()), _gains(calibrations[first])).condition
+        condition, usable = None, False
+        with suppress(IdentificationError):
+            # The payload is taken as part of the last link.
+            whole = reduce_runs(model, (replace(run, payload=None),), conditioning)
+            usable = True
+            condition = wls(whole.system(whole.base(), ()), _gains(calibrations[first])).condition
+        if usable and first in found:
+            reduction = whole if run.payload is None else reduce_runs(model, (run,), conditioning)
+            diagnoses += _diagnosed(calibrations[first], found[first], model, run, reduction)
         if run.payload is not None:
             # From the log, else from the cell, since a body weighs the same anywhere.
             of_cell = (body.mass_kg for body in described.payloads if body.name == run.payload.name)
             kg = run.payload.known.get("m", next(of_cell, None))
-            loaded.append((log, run.payload, kg, reduction))
-        elif isinstance(reduction, Reduction):
-            bare.append(reduction)
+            loaded.append((log, run, run.payload, kg))
+        elif usable:
+            bare.append(run)
         runs.append(
             CheckedRun(
                 log=log,
@@ -312,41 +330,79 @@ def cross_validate(
                 seen_by=tuple(label for label, v in found.items() if v.data_use is DataUse.FIT),
             )
         )
-    together_bare = joined(bare) if bare else None
-    weighed = [
-        WeighedRun(log, log.stem, payload, kg, _masses(calibrations, together_bare, reduction, kg))
-        for log, payload, kg, reduction in loaded
-    ]
+    weighed = []
+    for log, run, payload, kg in loaded:
+        rows: RowsToWeigh | str
+        try:
+            rows = rows_to_weigh(model, (run,), conditioning, bare=bare)
+        except IdentificationError as error:
+            rows = str(error)
+        weighed.append(WeighedRun(log, log.stem, payload, kg, _masses(calibrations, rows, kg)))
     axes = tuple(gain.axis for gain in calibrations[first].gains)
-    return CrossValidation(axes, dict(calibrations), tuple(runs), tuple(weighed), bool(bare), tuple(validations))
+    return CrossValidation(
+        axes, dict(calibrations), tuple(runs), tuple(weighed), bool(bare), tuple(validations), tuple(diagnoses)
+    )
+
+
+def _diagnosed(
+    calibration: Calibration, validation: Validation, model: Model, run: Run, reduction: Reduction
+) -> list[Diagnosis]:
+    """Look for another payload, another scale or sign of a current, and exchanged currents in one run."""
+    name, axes = (run.name,), [gain.axis for gain in calibration.gains]
+    measured, predicted, use = validation.measured_nm, validation.predicted_nm, validation.use
+    rows = np.maximum(use.sum(axis=1), 1)
+    size, left = (np.sqrt(np.sum(v**2, axis=1, where=use) / rows) for v in (measured, measured - predicted))
+    idle = idle_joints(model, size, left)
+    found = list(scale_diagnoses(measured, predicted, use & ~idle[:, None], axes, name))
+    if run.payload is not None and not found:
+        of_payload = {one: parameter.value for one, parameter in _of_mounting(calibration, run.payload).items()}
+        unknown = tuple(
+            index
+            for index, parameter in enumerate(LINK_PARAMETERS)
+            if parameter not in run.payload.known and parameter in of_payload
+        )
+        standard, every = standard_parameters(calibration, model), tuple(column.name for column in model.columns)
+        system = reduction.system(BaseParameters(tuple(range(len(every))), np.eye(len(every)), every), (unknown,))
+        values = np.concatenate((standard, [of_payload[LINK_PARAMETERS[index]] for index in unknown]))
+        found += payload_diagnoses(system, _gains(calibration), values)
+    wrong = list(axis_error_diagnoses(size, left, idle, axes, name))
+    exchanged = exchanged_channels(model, (run,), reduction.conditioning, axes) if wrong else None
+    if exchanged is not None:
+        return [replace(exchanged, runs=name)]
+    return found or wrong  # a cause rather than its trace
 
 
 def _masses(
-    calibrations: Mapping[str, Calibration], bare: Reduction | None, loaded: Reduction | str, kg: float | None
+    calibrations: Mapping[str, Calibration], rows: RowsToWeigh | str, kg: float | None
 ) -> dict[str, Mass | str]:
-    nameplate = np.array([gain.nameplate for gain in next(iter(calibrations.values())).gains])
-    sets = {label: (_gains(c), np.array([gain.std for gain in c.gains])) for label, c in calibrations.items()}
-    if bare is not None and not any(np.array_equal(gains, nameplate) for gains, _ in sets.values()):
-        sets = {MANUFACTURER: (nameplate, np.zeros(len(nameplate))), **sets}
+    first = next(iter(calibrations.values()))
+    nameplate = [gain.nameplate for gain in first.gains]
+    sets = dict(calibrations)
+    if (
+        isinstance(rows, RowsToWeigh)
+        and rows.bare
+        and all([gain.value for gain in one.gains] != nameplate for one in sets.values())
+    ):
+        entered = tuple(replace(gain, value=gain.nameplate, std=0.0) for gain in first.gains)
+        sets = {MANUFACTURER: replace(first, gains=entered, covariance_factor=None), **sets}
     masses: dict[str, Mass | str] = {}
-    for label, (gains, std) in sets.items():
-        if isinstance(loaded, str):
-            masses[label] = loaded
+    for label, calibration in sets.items():
+        if isinstance(rows, str):
+            masses[label] = rows
             continue
         try:
-            if bare is not None:
-                found = payload_beside_bare_runs(bare, loaded, gains)
-            else:
-                robot = standard_parameters(calibrations[label], loaded.model)
-                found = payload_on_known_robot(robot, loaded, gains)
+            found = weigh_rows(calibration, rows)
         except IdentificationError as error:
             masses[label] = str(error)
             continue
         mass = found.mass_kg
+        if np.isnan(mass):
+            masses[label] = "these moves do not distinguish the payload's mass from its other parameters"
+            continue
         masses[label] = Mass(
             mass_kg=mass,
-            std_percent=100.0 * found.mass_std_kg / abs(mass),
-            std_with_gains_percent=100.0 * found.mass_std_with_gains_kg(std) / abs(mass),
+            std_percent=100.0 * float(np.sqrt(found.moves_covariance[-1, -1])) / abs(mass),
+            std_with_gains_percent=100.0 * found.mass_std_kg / abs(mass),
             error_percent=None if kg is None else 100.0 * abs(mass - kg) / kg,
         )
     return masses

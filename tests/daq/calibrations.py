@@ -134,6 +134,7 @@ calibrations = st.builds(
     gains=st.lists(st.builds(Gain, _texts, _numbers, _deviations, _texts, _numbers), max_size=4).map(tuple),
     parameters=st.lists(_parameters, max_size=4).map(tuple),
     effects=st.lists(_effects, max_size=2).map(tuple),
+    covariance_factor=st.none() | st.lists(_numbers, max_size=3).map(lambda row: (tuple(row),)),
     relative_error_percent=_errors,
     holdout_error_percent=st.none() | _errors,
     condition=_numbers,

@@ -19,17 +19,20 @@ from daq.cli.app import main
 from daq.cli.fit import check_report
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
-from daq.errors import ExitCode, OutputFailed, UsageError
+from daq.errors import EffectsRefuted, ExitCode, OutputFailed, UsageError
 from daq.report import residual_page as residual_page_module
 from daq.report.effect_names import WORDS, effect_text, other_axis
 from daq.report.plots import draw_fit
-from daq.report.residual import error_change_text, residual_document, summary
+from daq.report.residual import _gear_sentence, error_change_text, residual_document, summary
 from daq.report.residual_page import DOCUMENT, PAGE, page, paragraph, residual_page, save_report, table
 from daq.report.text import json_text
 from daq.workflow import fit as fit_module
 from daq.workflow.fit import Fit, calibration_of, fit
+from ident.discovery import before_after as before_after_module
 from ident.discovery.before_after import Account, account
-from ident.discovery.loop import Step, with_effects
+from ident.discovery.gates import PairedChange
+from ident.discovery.gear_loss import GearLoss
+from ident.discovery.loop import SetAside, Step, with_effects
 from ident.discovery.search import Finding
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect
@@ -37,6 +40,7 @@ from ident.effects.friction import Coupling, LoadFriction
 from ident.effects.position import Spring
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Periodic, Smooth
+from ident.errors import Diagnosis
 from tests.daq.workflow.test_fit import Shelf
 from tests.ident.recordings import GAINS, MOUNTED, record, tx40_truth
 
@@ -258,6 +262,14 @@ def test_the_document_is_complete_and_described(closed: Closed, checkout: Path) 
     assert set(document["before"]) == set(document["after"]) == set(turn["before"])
 
 
+def test_what_to_check_comes_first(closed: Closed) -> None:
+    odd = Diagnosis("payload-differs", ("loaded-2",), (), "a body", "another", "was it turned?")
+    document = Closed(replace(closed.fitted, diagnoses=(odd,)), closed.account).document()
+    sentence = "CHECK loaded-2: found a body; expected another; was it turned? (payload-differs)."
+    assert document["summary"][0] == sentence
+    assert document["diagnoses"][0]["runs"] == ["loaded-2"]
+
+
 def test_silence_is_reported_with_its_size(closed: Closed) -> None:
     last = closed.fitted.steps[-1]
     start = closed.fitted.evidence()
@@ -265,10 +277,52 @@ def test_silence_is_reported_with_its_size(closed: Closed) -> None:
     outcome, limits = summary(silent, account(start, silent.steps))
     assert outcome.startswith("No structure found")
     assert "1.2 Nm on J2" in limits
+    assert "no common clock: a warm-up over the session cannot be seen" in limits
+    timed = tuple(replace(data, started_s=100.0 * index) for index, data in enumerate(start.datasets))
+    clocked = replace(silent, steps=(replace(last, after=replace(start, datasets=timed)),))
+    assert "clock" not in " ".join(summary(clocked, account(start, silent.steps)))
     nothing_tried = replace(silent, steps=(replace(silent.steps[0], findings=(), structures=()),))
     text = Closed(nothing_tried, account(start, silent.steps)).page()
     assert "No structure found" in Reader(text).text
     assert "No candidate could be tried." in Reader(text).text
+
+
+def test_what_did_not_join_is_reported_with_the_reason(closed: Closed) -> None:
+    first, last = closed.fitted.steps
+    aside = SetAside(_finding(PlacedEffect(Smooth(Abscissa.LOAD), 1)), moved=((3, 2.91),))
+    replaced = SetAside(_finding(PlacedEffect(LoadFriction(0), 1)), "{rival} explains more", SPRING)
+    steps = (replace(first, set_aside=(replaced, aside)), replace(last, set_aside=(aside,)))
+    told = Closed(replace(closed.fitted, steps=steps), closed.account)
+    sentences = summary(told.fitted, told.account)
+    assert sum("and was not added: it has no name, and would move the gain of J4 by 2.9 σ" in s for s in sentences) == 1
+    assert any("J2 may have friction that grows with the load: it would" in one for one in sentences)
+    assert any("added: spring on J3 explains more." in one for one in sentences)
+    assert told.document()["turns"][1]["set_aside"][0]["reason"].endswith("the gain of J4 by 2.9 σ")
+    assert "Not added: smooth-load on J2: it has no name" in Reader(told.page()).text
+
+
+def test_effects_that_held_out_runs_refute_are_not_written(
+    closed: Closed, shelved: Shelf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    del shelved
+    out, folder = tmp_path / "calibration.yaml", tmp_path / "report"
+    for module in (fit_module, before_after_module):
+        monkeypatch.setattr(module, "holdout_change", lambda *_: PairedChange(5.0, 1.0, 20))
+    for name in ("fit", "close_loop"):
+        monkeypatch.setattr(fit_module, name, lambda *_, **__: closed.fitted)
+    command = ["residual", *NAMES[:3], "--holdout", NAMES[3], "--out", str(out), "--report", str(folder)]
+    assert main(command) == ExitCode.DATA_UNFIT
+    told = capsys.readouterr().err
+    assert "spring on J3" in told
+    assert "--accept-worse-holdout" in told
+    assert not out.exists()
+    assert "no calibration was written" in (folder / PAGE).read_text(encoding="utf-8")
+    assert main([*command, "--accept-worse-holdout"]) == ExitCode.OK
+    assert "these runs have taken part in the choice" in capsys.readouterr().out
+    assert out.exists()
+    assert json.loads((folder / DOCUMENT).read_text(encoding="utf-8"))["worse_holdout"] is True
+    with pytest.raises(EffectsRefuted, match="20 moves"):
+        fit_module.check_holdout(closed.fitted)
 
 
 def test_what_rises_is_not_said_to_fall() -> None:
@@ -402,3 +456,18 @@ def test_the_verb_writes_the_report_and_says_the_same(
         document["noise_floor"]["relative_error_percent"]["total"]
     )
     Reader((folder / PAGE).read_text(encoding="utf-8"))
+
+
+def test_a_gain_that_carries_the_efficiency_of_its_gear_is_named(closed: Closed) -> None:
+    one_sided = GearLoss(motoring_rows=0.9, motoring_torque=0.97, loss=0.01, loss_std=0.04)
+    both = GearLoss(motoring_rows=0.5, motoring_torque=0.52, loss=0.01, loss_std=0.04)
+    text = _gear_sentence("J3", one_sided, in_model=False)
+    assert text.startswith("The gain of J3 carries the efficiency of its gear: the motor drives in 97 %")
+    assert "loss of up to 8.0 % would not show; it would change the gain by 7.5 %" in text
+    assert _gear_sentence("J3", both, in_model=False) == ""
+    found = GearLoss(motoring_rows=0.5, motoring_torque=0.5, loss=0.2, loss_std=0.01)
+    assert "efficiency of 81.6 %" in _gear_sentence("J3", found, in_model=True)
+    assert "2.06 % larger" in _gear_sentence("J3", found, in_model=True)
+    listed = closed.document()["gear_loss"]
+    assert [gear["axis"] for gear in listed] == list(closed.fitted.cell.axis_names)
+    assert all(0.0 < gear["motoring_torque"] < 1.0 for gear in listed)

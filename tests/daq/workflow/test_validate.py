@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -12,23 +11,11 @@ import pytest
 
 from daq.cli import main
 from daq.errors import CalibrationUnreadable
-from daq.log.csv_import import import_csv
 from daq.workflow.calibration_file import load_calibration, save_calibration
-from daq.workflow.fit import calibration_of, fit
 from daq.workflow.validate import DataUse, conditioning_of, together, validate
 from ident.calibration import Calibration
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import demo_content, samples, write
-
-
-@pytest.fixture(scope="module")
-def real(checkout: Path, shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A calibration file of the real TX-40 with its gains fixed, and the log that it rests on."""
-    folder = tmp_path_factory.mktemp("tx40")
-    log, file = folder / "tx40.mcap", folder / "calibration.yaml"
-    import_csv(checkout / "configs/imports/tx40.yaml", shared_data / "tx40", log, software="test")
-    save_calibration(calibration_of(fit([log], gains_fixed=True), datetime(2025, 1, 2, tzinfo=UTC)), file)
-    return file, log
 
 
 def test_the_file_gives_the_errors_of_the_fit(real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:

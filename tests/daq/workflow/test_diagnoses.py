@@ -1,0 +1,109 @@
+"""A mistake of a recording reaches `fit`, `validate` and the calibration by name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.report.validation import cross_document
+from daq.workflow import fit as fit_module
+from daq.workflow import validate as validate_module
+from daq.workflow.calibration_file import decode, encode
+from daq.workflow.fit import calibration_of, fit
+from daq.workflow.validate import cross_validate
+from ident.calibration import Calibration
+from ident.data.run import Run
+from ident.errors import ChannelsExchanged
+from ident.estimators.method import Method
+from tests.daq.workflow.test_fit import Shelf
+from tests.ident.recordings import MOUNTED, record, tx40_truth
+
+WHEN = datetime(2025, 1, 2, tzinfo=UTC)
+FIT = [Path("run0"), Path("run1")]
+CROSSED = [0, 2, 1, 3, 4, 5]
+
+
+@pytest.fixture
+def shelf(recorded: Shelf, monkeypatch: pytest.MonkeyPatch) -> Shelf:
+    for module in (fit_module, validate_module):
+        monkeypatch.setattr(module, "load_run", recorded.load)
+    return recorded
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Shelf:
+    """One run without load, three with; of these one has its currents exchanged, one carries nothing."""
+    truth, rng = tx40_truth(), np.random.default_rng(5)
+
+    def made(name: str, *, mounted: bool = False) -> Run:
+        run = record(truth, name, rng, MOUNTED if mounted else None, noise_a=0.1, seconds=16.0, rate_hz=200.0)
+        return replace(run, digest=name.encode().hex().ljust(64, "0"))
+
+    loaded = made("crossed", mounted=True)
+    runs = [
+        made("run0"),
+        made("run1", mounted=True),
+        replace(loaded, current_a=loaded.current_a[:, CROSSED]),
+        replace(made("forgotten"), payload=MOUNTED),
+        replace(loaded, name="thousandfold", current_a=1000.0 * loaded.current_a),
+        replace(loaded, name="good"),
+    ]
+    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    return Shelf(cell, {run.name: run for run in runs})
+
+
+@pytest.fixture(scope="module")
+def calibration(recorded: Shelf) -> Calibration:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_module, "load_run", recorded.load)
+        return calibration_of(fit(FIT), WHEN)
+
+
+def test_nothing_is_said_of_good_recordings(shelf: Shelf, calibration: Calibration) -> None:
+    assert calibration.diagnoses == ()
+    assert cross_validate({"one": calibration}, [*FIT, Path("good")]).diagnoses == ()
+
+
+@pytest.mark.parametrize(
+    ("log", "name", "axes"),
+    [
+        ("crossed", "channels-exchanged", ("J2", "J3")),
+        ("forgotten", "payload-differs", ()),
+        ("thousandfold", "current-off-scale", ("J1",)),
+    ],
+)
+def test_validate_names_the_log(
+    shelf: Shelf, calibration: Calibration, log: str, name: str, axes: tuple[str, ...]
+) -> None:
+    found = cross_validate({"one": calibration}, [Path(log)])
+    assert {one.name for one in found.diagnoses} == {name}
+    assert (found.diagnoses[0].runs, found.diagnoses[0].axes) == ((log,), axes)
+    assert cross_document(found)["diagnoses"][0]["name"] == name
+
+
+def test_exchanged_currents_in_the_fit_are_an_error(shelf: Shelf) -> None:
+    crossed = {name: replace(run, current_a=run.current_a[:, CROSSED]) for name, run in shelf.runs.items()}
+    shelf.runs.update(crossed)
+    try:
+        for fixed in (False, True):
+            with pytest.raises(ChannelsExchanged, match="the currents of J2 and J3: "):
+                fit(FIT, gains_fixed=fixed)
+    finally:
+        shelf.runs.update({n: replace(run, current_a=run.current_a[:, CROSSED]) for n, run in crossed.items()})
+
+
+def test_exchanged_currents_in_a_held_out_run_are_named(shelf: Shelf) -> None:
+    first = fit(FIT, holdout=[Path("crossed")]).diagnoses[0]
+    assert (first.name, first.runs, first.axes) == ("channels-exchanged", ("crossed",), ("J2", "J3"))
+
+
+def test_a_calibration_keeps_what_was_said_of_its_fit(shelf: Shelf) -> None:
+    made = calibration_of(fit(FIT, method=Method.WLS), WHEN)
+    assert {one.name for one in made.diagnoses} == {"estimators-disagree"}
+    assert decode(encode(made), "calibration.yaml").diagnoses == made.diagnoses
