@@ -9,7 +9,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Linear algebra on all cores at once is slower for matrices of this size, and makes timings wander.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup demo test test-vcan vcan-tools check docs screenshots bench bench-stream ident-study gain-study paper planning-study robot-study crash-study drift-study holdout-study effects-study tx40-study words wheel lock clean
+.PHONY: help setup demo test test-vcan vcan-tools check docs screenshots bench bench-stream ident-study gain-study paper planning-study robot-study crash-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study weigh-study words wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -21,16 +21,19 @@ help:
 	@echo "make check   lint, types, import contracts"
 	@echo "make bench   speed and memory: against figaroh 1.0.2, growth to 4 million samples, a whole fit; minutes"
 	@echo "make bench-stream  six axes at 1 kHz through the stream on SocketCAN, with a busy thread beside (docs/evidence/stream.md); minutes"
-	@echo "make ident-study  errors by estimator and noise floor, and whether error bars are true (docs/evidence/estimators.md); 40 min"
+	@echo "make ident-study  errors by estimator and noise floor (docs/evidence/estimators.md); half an hour"
+	@echo "make loop-noise-study  gain errors and whether error bars are true, also with a disturbance in the position loop (docs/evidence/estimators.md); 10 min"
 	@echo "make gain-study  the demonstration on several clean cells; minutes"
 	@echo "make paper   the paper's Tables 1 to 8 on the simulated cell (docs/evidence/paper.md); minutes"
 	@echo "make planning-study  planned against random moves (docs/evidence/planning.md); minutes"
 	@echo "make crash-study  recorders killed at random moments, damaged logs; some minutes"
 	@echo "make drift-study  detection delay and false alarms of a drifting gain (docs/evidence/drift.md); a minute"
 	@echo "make holdout-study  which wrong gains the hold-out gate detects (docs/evidence/hold-out.md); a minute"
+	@echo "make diagnosis-study  false alarms of the diagnoses on clean recordings, and planted mistakes that are named; a minute"
 	@echo "make robot-study  gains of a 7-axis arm and a gantry (docs/evidence/robots.md); minutes"
-	@echo "make effects-study  undeclared effects of every family: named, error before and after (docs/evidence/effects-study.md); two hours"
+	@echo "make effects-study  undeclared effects of every family: named, error before and after (docs/evidence/effects-study.md); hours, resumable"
 	@echo "make tx40-study  the loop closed on a real robot, scored on blocks that were left out (docs/evidence/tx40.md); minutes"
+	@echo "make weigh-study  coverage of the error bars of a weighed payload (docs/evidence/estimators.md); resumable, half an hour"
 	@echo "make words   how much of the old house language is left in code, tests and docs; seconds"
 	@echo "make wheel   build dist/*.whl"
 	@echo "make lock    resolve the dependencies anew into requirements.lock"
@@ -110,8 +113,18 @@ robot-study: setup
 tx40-study: setup
 	$(BIN)/python -m tests.studies.tx40_study
 
+weigh-study: setup
+	$(BIN)/python -m tests.studies.weigh_study --arm three
+	$(BIN)/python -m tests.studies.weigh_study --arm tx40
+
+loop-noise-study: setup
+	$(BIN)/python -m tests.studies.loop_noise
+
 effects-study: setup
 	$(BIN)/python -m tests.studies.effects_study
+
+diagnosis-study: setup
+	$(BIN)/python -m tests.studies.diagnosis_study
 
 holdout-study: setup
 	$(BIN)/python -m tests.studies.holdout_study

@@ -25,10 +25,10 @@ from daq.workflow.plan import Plan, plan
 from drivers.simulation.spec import Body
 from drivers.stream.sample import CellEvent, EventKind, Sample
 from ident.model.bodies import Payload
-from tests.studies.coverage_runs import CELL
 from tests.studies.direct_cell import RawRun, simulate_run
 from tests.studies.side_by_side import side_by_side
 from tests.studies.study_cells import spec_of, study_cell
+from tests.studies.study_plans import CELL
 
 CELLS = 200
 DURATION_S = 12.0
@@ -103,7 +103,7 @@ def make_cell(made: FleetCell) -> str:
         payload = Payload("disc", "flange-a", {"m": mass_kg}) if loaded else None
         spec = spec_of(truth, "disc" if loaded else None, number)
         raw = simulate_run(cell, spec, made.plans[number], name, payload)
-        _write(log, raw, cell, files, START_NS + number * BETWEEN_NS)
+        write_log(log, raw, cell, files, START_NS + number * BETWEEN_NS)
     part.rename(target)
     return made.name
 
@@ -122,7 +122,8 @@ def _of_mass(body: Body, mass_kg: float) -> Body:
     return replace(body, mass_kg=mass_kg, inertia_kg_m2=(xx, xy, xz, yy, yz, zz))
 
 
-def _write(path: Path, raw: RawRun, cell: Cell, files: dict[str, bytes], start_ns: int) -> None:
+def write_log(path: Path, raw: RawRun, cell: Cell, files: dict[str, bytes], start_ns: int) -> None:
+    """Write a run to a log as a recorder does."""
     answers = (
         AxisReadback(axis.name, float(unit), drive={"serial": None if axis.identity is None else axis.identity.serial})
         for axis, unit in zip(cell.axes, raw.ampere_per_unit, strict=True)

@@ -17,6 +17,7 @@ from ident.model.regressor import fill_rigid
 from ident.model.robot import Motion, Robot
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 PIECE_SAMPLES = 2048
 DRIVE_PARAMETERS = ("Ia", "fv", "fs", "off")
@@ -56,57 +57,71 @@ def standard_rows(robot: Robot, samples: int) -> FloatArray:
     return room
 
 
-def fill_rows(robot: Robot, motion: Motion, out: FloatArray) -> None:
-    """Write the rows of a piece of motion into ``standard_rows`` of its length."""
+def fill_rows(robot: Robot, motion: Motion, out: FloatArray, wanted: BoolArray | None = None) -> None:
+    """Write the rows of a piece of motion into ``standard_rows`` of its length; ``wanted`` as in `fill_rigid`."""
     samples, count = motion.position_rad.shape
     position, velocity, acceleration = (
         np.ascontiguousarray(states.T)
         for states in (motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2)
     )
     by_link = out.reshape(count, count, WIDTH, samples)
-    fill_rigid(robot, position, velocity, acceleration, by_link[:, :, : len(LINK_PARAMETERS)])
+    fill_rigid(robot, position, velocity, acceleration, by_link[:, :, : len(LINK_PARAMETERS)], wanted)
     for joint in range(count):
         own = by_link[joint, joint, len(LINK_PARAMETERS) :]
         own[0], own[1] = acceleration[joint], velocity[joint]
         np.sign(velocity[joint], out=own[2])
 
 
+def structure(robot: Robot) -> BaseParameters:
+    """The regrouping that holds in every motion of a robot: that of a random one.
+
+    Columns that depend on others whatever the motion need not be computed sample by sample. The tolerance is close to
+    the rounding errors: a column too many costs time, one too few would cost a parameter.
+    """
+    count = robot.joint_count
+    rng = np.random.default_rng(0)
+    motion = Motion(*(rng.uniform(-np.pi, np.pi, (4 * WIDTH, count)) for _ in range(3)))
+    rows = standard_rows(robot, 4 * WIDTH)
+    fill_rows(robot, motion, rows)
+    return base_parameters(qr_update(None, np.concatenate(list(rows), axis=1)), names(count), tolerance=1e-11)
+
+
 def fit_torques(robot: Robot, pieces: Iterable[tuple[Motion, FloatArray]]) -> TorqueFit:
     """Identify from motions and the joint torques [Nm] measured in them, shape (n, k)."""
-    count = robot.joint_count
-    drives = range(len(LINK_PARAMETERS), WIDTH)
-    places = tuple(
-        (
-            *(WIDTH * link + p for link in links for p in range(len(LINK_PARAMETERS))),
-            *(WIDTH * joint + p for p in drives),
-        )
-        for joint, links in enumerate(moved_links(robot))
-    )
+    count, general = robot.joint_count, structure(robot)
+    needed = np.zeros((count, WIDTH), dtype=np.bool_)
+    needed.flat[list(general.independent)] = True
+    place = np.cumsum(needed).reshape(needed.shape) - 1  # of each column among the needed ones
+    drive = np.arange(WIDTH) >= len(LINK_PARAMETERS)
+    # A joint's torque depends on the links behind it and on its own drive.
+    held = [
+        np.flatnonzero(needed & (np.isin(np.arange(count), links)[:, None] & ~drive | own[:, None] & drive))
+        for own, links in zip(np.eye(count, dtype=np.bool_), moved_links(robot), strict=True)
+    ]
     triangles: list[FloatArray | None] = [None] * count
-    indices = tuple(np.array(columns) for columns in places)
     room, own = standard_rows(robot, 0), np.zeros((WIDTH * count + 1, 0))
     for motion, torque in pieces:
         samples = torque.shape[1]
         if room.shape[2] != samples:
             room, own = standard_rows(robot, samples), np.zeros((WIDTH * count + 1, samples))
-        fill_rows(robot, motion, room)
-        for joint, columns in enumerate(indices):
+        fill_rows(robot, motion, room, needed[:, ~drive])
+        for joint, columns in enumerate(held):
             rows = own[: len(columns) + 1]
             np.take(room[joint], columns, axis=0, out=rows[:-1], mode="clip")  # "raise" would go through a copy
             rows[-1] = torque[joint]
             triangles[joint] = qr_update(triangles[joint], rows)
-    last = WIDTH * count
+    last = len(general.independent)
     whole = qr_merge(
         (
-            (triangle, (*columns, last))
-            for triangle, columns in zip(triangles, places, strict=True)
+            (triangle, (*place.flat[columns], last))
+            for triangle, columns in zip(triangles, held, strict=True)
             if triangle is not None
         ),
         last + 1,
     )
-    base = base_parameters(whole[:, :last], names(count))
+    base = base_parameters(whole[:, :last] @ general.grouping, names(count))
     # R of [W_b | τ]: the least-squares solution is above, the residual's norm in the corner.
-    small = qr_update(None, whole[:, [*base.independent, last]].T)
+    small = qr_update(None, whole[:, [*place.flat[list(base.independent)], last]].T)
     values = solve_triangular(small[:-1, :-1], small[:-1, -1])
     return TorqueFit(base, np.asarray(values), float(abs(small[-1, -1])))
 

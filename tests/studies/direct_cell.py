@@ -42,6 +42,9 @@ from drivers.stream.sync import LockstepSync
 from ident.data.run import Run
 from ident.model.bodies import Payload
 
+MOVING = ("drivers.simulation", "drivers.motion")
+"""What moves a simulated cell: kept runs outlive a change of anything else, as of what reads the samples."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawRun:
@@ -51,6 +54,7 @@ class RawRun:
         name: of the run.
         payload: what was mounted, as declared.
         position_counts: int32, shape (k, n).
+        demand_counts: what the position loops were to follow (6062h), int32, shape (k, n).
         current_raw: per mille of rated current, int16, shape (k, n).
         limited: whether a limit acted (6041h, bit of the drive profile), shape (k, n).
         move: number of the move, shape (k,).
@@ -61,6 +65,7 @@ class RawRun:
     name: str
     payload: Payload | None
     position_counts: NDArray[np.int32]
+    demand_counts: NDArray[np.int32]
     current_raw: NDArray[np.int16]
     limited: NDArray[np.bool_]
     move: NDArray[np.int64]
@@ -105,6 +110,7 @@ def simulate_run(
         name=name,
         payload=payload,
         position_counts=np.array([sample.position_counts for sample in samples], dtype=np.int32),
+        demand_counts=np.array(stream.demand_counts[-len(samples) :], dtype=np.int32),
         current_raw=np.array([sample.current_raw for sample in samples], dtype=np.int16),
         limited=(status & masks) != 0,
         move=move,
@@ -130,6 +136,11 @@ def run_of(raw: RawRun, cell: Cell) -> Run:
     )
 
 
+def demand_rad(raw: RawRun, cell: Cell) -> NDArray[np.float64]:
+    """Position demand of the joints [rad], shape (k, n): the trajectory that the position loops were to follow."""
+    return _scaling(cell, raw.ampere_per_unit).joint_position(raw.demand_counts.astype(np.int64))
+
+
 def _scaling(cell: Cell, ampere_per_unit: Iterable[float]) -> SiScaling:
     answers = (AxisReadback(name, float(scale)) for name, scale in zip(cell.axis_names, ampere_per_unit, strict=True))
     return scaling(cell, Readback(tuple(answers)))
@@ -146,6 +157,7 @@ class DirectStream:
         max_missing_cycles, silent: none is ever missing, and a node always answers.
         events: in their order.
         time_ns: of the last sample.
+        demand_counts: position demand of each sample, with the samples.
         ampere_per_unit: of the raw current, from the drives' own scale objects.
     """
 
@@ -157,6 +169,7 @@ class DirectStream:
         self.silent = False
         self.events: list[CellEvent] = []
         self.time_ns = 0
+        self.demand_counts: list[tuple[int, ...]] = []
         self._cycle = 0
         # Its nodes answer on a bus without readers.
         self._cell = SimulatedCell(spec, cast(can.BusABC, SimpleNamespace(send=lambda _message: None)))
@@ -208,6 +221,7 @@ class DirectStream:
         self._cell._advance(())
         readings = self._cell._amplifiers.readings
         self.time_ns = self._cycle * self.pacing.period_ns
+        self.demand_counts.append(tuple(readings.demand))
         statuswords = tuple(node.drive.statusword() for node in nodes)
         sample = Sample(
             self._cycle, self.time_ns, tuple(readings.position), tuple(readings.current_demand), statuswords

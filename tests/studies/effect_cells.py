@@ -10,10 +10,8 @@ from dataclasses import dataclass, replace
 from itertools import chain
 
 from drivers.simulation.spec import CellSpec, UndeclaredEffect
-from tests.studies.study_cells import spec_of, study_cell
+from tests.studies.study_cells import spec_of, world_cell
 
-NOISE_FACTOR = 1.59
-"""Of the clean cell's current noise: a relative error of 3.5 % without any effect (docs/evidence/estimators.md)."""
 SMALL = 0.4
 
 
@@ -31,9 +29,9 @@ class EffectCase:
     seed: int
     effects: tuple[UndeclaredEffect, ...]
 
-    def spec(self, payload: str | None, run: int) -> CellSpec:
-        """The plant of one of its runs."""
-        return replace(spec_of(study_cell(self.seed, NOISE_FACTOR), payload, run), effects=self.effects)
+    def spec(self, world: str, payload: str | None, run: int) -> CellSpec:
+        """The plant of one of its runs, in one of WORLDS."""
+        return replace(spec_of(world_cell(self.seed, world), payload, run), effects=self.effects)
 
 
 def _effect(name: str, joint: int, **parameters: float) -> UndeclaredEffect:
@@ -193,4 +191,3 @@ TOGETHER = tuple(
     )
 )
 """Two effects on the same axis."""
-ALL = (*SINGLES, *CLEAN, *SMALLS, *APART, *TOGETHER)

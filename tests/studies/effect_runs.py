@@ -1,39 +1,37 @@
 """Runs of the effects study: two without load and two with the disc to fit, and two that no fit may see.
 
-    python -m tests.studies.effect_runs           simulate what is missing
-    python -m tests.studies.effect_runs clean-03  these cases alone
-
 Loaded and unloaded runs alternate in one session, so that the load cannot be taken for the time. Layout:
-out/effects-study/<case>.npz, counts as the amplifiers report them.
+out/effects-study/<world>/<case>.npz, counts as the amplifiers report them. What is there is kept.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
+import tempfile
 import time
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
+
+from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
-from daq.workflow.plan import plan
-from daq.workflow.plan_file import load_plan, save_plan
+from daq.log.conversion import load_run
+from daq.log.csv_import import import_csv
 from ident.data.run import Run
-from tests.studies.coverage_runs import CELL
-from tests.studies.direct_cell import run_of, simulate_run
-from tests.studies.effect_cells import ALL, EffectCase
+from tests.studies.direct_cell import MOVING, RawRun, run_of, simulate_run
+from tests.studies.effect_cells import EffectCase
 from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished
 from tests.studies.raw_runs import read_runs, write_runs
-from tests.studies.side_by_side import side_by_side
 from tests.studies.study_cells import declared_payload
+from tests.studies.study_plans import CELL, PlanTask, kept_plan
 
-OUT = Path("out/effects-study")
 DURATION_S = 40.0
 BETWEEN_S = 60.0
 """From the beginning of one run to that of the next."""
 PLAN_SETS = 6
 PLANS_A_SET = 3
+FIRST_PLAN = 3001
 RUNS = (
     ("bare-1", None, 0),
     ("disc-1", "disc", 0),
@@ -44,6 +42,16 @@ RUNS = (
 )
 """Name, payload and plan (of the case's set) of each run, in the order of the session."""
 HELD_OUT = 2
+SESSION = datetime(2026, 3, 2, 7, 0, tzinfo=UTC)
+"""When the session of imported runs began."""
+IMPORT = """\
+name: {name}
+cell: {cell}
+position: {{file: {name}.csv, columns: [{positions}], unit: rad, side: joint}}
+current: {{file: {name}.csv, columns: [{currents}], unit: A}}
+time: {{file: {name}.csv, column: stamp, unit: us}}
+payload: {payload}
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,109 +63,99 @@ class CaseRuns:
 
 
 @dataclass(frozen=True, slots=True)
-class _PlanTask:
-    out: Path
-    number: int
+class CaseTask:
+    """A case whose runs are to be there.
 
+    Attributes:
+        out: folder of the study.
+        world: of WORLDS.
+        case: the cell and its effects.
+    """
 
-@dataclass(frozen=True, slots=True)
-class _Task:
     out: Path
+    world: str
     case: EffectCase
 
+    @property
+    def path(self) -> Path:
+        """File of the runs."""
+        return self.out / self.world / f"{self.case.name}.npz"
 
-def make_runs(
-    cases: Iterable[EffectCase],
-    *,
-    out: Path = OUT,
-    processes: int = 2,
-    report_line: Callable[[str], None] = lambda _: None,
-) -> None:
-    """Simulate and save what is missing.
-
-    Raises:
-        TaskFailed: planning or simulating failed; what was finished before is kept.
-    """
-    (out / "plans").mkdir(parents=True, exist_ok=True)
-    plans = [_PlanTask(out, number) for number in range(PLAN_SETS * PLANS_A_SET)]
-    for line in side_by_side(_plan, plans, processes):
-        report_line(line)
-    for line in side_by_side(_simulate, [_Task(out, case) for case in cases], processes):
-        report_line(line)
+    @property
+    def plans(self) -> tuple[PlanTask, ...]:
+        """Plans of the case's set."""
+        first = FIRST_PLAN + self.case.seed % PLAN_SETS * PLANS_A_SET
+        return tuple(PlanTask(self.out, first + letter, DURATION_S) for letter in range(PLANS_A_SET))
 
 
-def load_runs(case: EffectCase, out: Path = OUT) -> CaseRuns:
-    """The runs of a case.
-
-    Raises:
-        FileNotFoundError: they have not been simulated.
-    """
-    path = out / f"{case.name}.npz"
-    if not path.is_file():
-        raise FileNotFoundError(f"found no {path}; run `python -m tests.studies.effect_runs {case.name}` first")
-    cell = load_cell(CELL)
-    runs = tuple(run_of(raw, cell) for raw in read_runs(path))
-    return CaseRuns(runs[:-HELD_OUT], runs[-HELD_OUT:])
-
-
-def _plan_path(out: Path, number: int) -> Path:
-    return out / "plans" / f"{number}.yaml"
-
-
-def _plan(task: _PlanTask) -> str:
-    cell = load_cell(CELL)
-    path = _plan_path(task.out, task.number)
-    fingerprint = digest(digest_of_source("daq.workflow.plan"), cell.digest, task.number, DURATION_S)
-    if is_finished(path, fingerprint):
-        return f"plan {task.number}: kept"
-    save_plan(plan(cell, seed=3001 + task.number, duration_s=DURATION_S), path)
-    finish(path, fingerprint)
-    return f"plan {task.number}: made"
-
-
-def _simulate(task: _Task) -> str:
+def make_case(task: CaseTask) -> float:
+    """Simulate the runs of a case unless the same ones are there; return the processor time that it took [s]."""
     begun_s = time.process_time()
-    case, cell = task.case, load_cell(CELL)
-    path = task.out / f"{case.name}.npz"
-    first = case.seed % PLAN_SETS * PLANS_A_SET
-    plans = [load_plan(_plan_path(task.out, first + letter), cell) for letter in range(PLANS_A_SET)]
-    specs = [case.spec(payload, number) for number, (_, payload, _) in enumerate(RUNS)]
+    cell = load_cell(CELL)
+    plans = [kept_plan(made, cell) for made in task.plans]
+    specs = [task.case.spec(task.world, payload, number) for number, (_, payload, _) in enumerate(RUNS)]
     fingerprint = digest(
-        digest_of_source("tests.studies.direct_cell"),
+        digest_of_source("tests.studies.direct_cell", MOVING),
         cell.digest,
-        case,
+        task.case,
         [made.moves for made in plans],
         [(spec.urdf, spec.axes, spec.payload) for spec in specs],
     )
-    if is_finished(path, fingerprint):
-        return f"{case.name}: kept"
+    if is_finished(task.path, fingerprint):
+        return 0.0
     raw = [
         simulate_run(
             cell, spec, plans[letter], name, None if payload is None else declared_payload(payload), BETWEEN_S * number
         )
         for number, (spec, (name, payload, letter)) in enumerate(zip(specs, RUNS, strict=True))
     ]
-    write_runs(path, raw)
-    finish(path, fingerprint)
-    return f"{case.name}: {time.process_time() - begun_s:.1f} s"
+    task.path.parent.mkdir(parents=True, exist_ok=True)
+    write_runs(task.path, raw)
+    finish(task.path, fingerprint)
+    return time.process_time() - begun_s
 
 
-def _print_line(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
+def load_runs(task: CaseTask, *, imported: bool) -> CaseRuns:
+    """The runs of a case.
+
+    Args:
+        task: its runs were simulated.
+        imported: take the way of another controller's recordings, through CSV files with absolute stamps.
+
+    Raises:
+        FileNotFoundError: they have not been simulated.
+        DaqError: from the import.
+    """
+    cell = load_cell(CELL)
+    raw = read_runs(task.path)
+    runs = imported_runs(raw, cell) if imported else tuple(run_of(one, cell) for one in raw)
+    return CaseRuns(runs[:-HELD_OUT], runs[-HELD_OUT:])
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Simulate what is missing."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.effect_runs", description=__doc__)
-    parser.add_argument("cases", nargs="*", help="names; all where none is given")
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=OUT)
-    options = parser.parse_args(arguments)
-    chosen = [case for case in ALL if not options.cases or case.name in options.cases]
-    make_runs(chosen, out=options.out, processes=options.processes, report_line=_print_line)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def imported_runs(raw: tuple[RawRun, ...], cell: Cell) -> tuple[Run, ...]:
+    """Write runs to CSV files, import them and read the logs."""
+    axes = range(1, len(cell.axes) + 1)
+    positions, currents = [f"q{axis}" for axis in axes], [f"i{axis}" for axis in axes]
+    runs = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for one in raw:
+            run = run_of(one, cell)
+            stamp_us = np.rint(1e6 * (SESSION.timestamp() + one.began_s + run.time_s))
+            with (folder / f"{one.name}.csv").open("w", encoding="utf-8") as file:
+                file.write(",".join(["stamp", *positions, *currents]) + "\n")
+                rows = np.column_stack((stamp_us, run.position_rad, run.current_a))
+                np.savetxt(file, rows, fmt=["%d"] + ["%.9f"] * (rows.shape[1] - 1), delimiter=",")
+            description = folder / f"{one.name}.yaml"
+            text = IMPORT.format(
+                name=one.name,
+                cell=CELL.name,
+                positions=", ".join(positions),
+                currents=", ".join(currents),
+                payload="null" if one.payload is None else one.payload.name,
+            )
+            description.write_text(text, encoding="utf-8")
+            log = folder / f"{one.name}.mcap"
+            import_csv(description, folder, log, software="effects study", cell_path=CELL)
+            runs.append(load_run(log)[0])
+    return tuple(runs)

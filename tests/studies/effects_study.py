@@ -1,7 +1,12 @@
 """Which effects are named, how far the error falls, and what happens to the gains: cells with undeclared effects.
 
-Run by `make effects-study`; simulates what is missing (effect_runs.py), writes out/effects-study.json, and prints the
-tables of docs/evidence/effects-study.md. `--only single clean` takes these parts alone, from what was simulated before.
+Run by `make effects-study`; simulates what is missing (effect_runs.py), searches, and prints the tables of
+docs/evidence/effects-study.md. Runs and rows are kept in out/effects-study/<world>, so that a study that was
+interrupted goes on where it ended:
+
+    python -m tests.studies.effects_study --world loop3 --shard 2/4     every fourth case; the tables show all there is
+    python -m tests.studies.effects_study --only single clean --kept    nothing is simulated or searched
+    python -m tests.studies.effects_study --blind 4711 --count 20       cells that nobody has chosen (blind_cells.py)
 
 A row is scored with what no search has seen: the two runs that were held out, and the truth of the cell.
 """
@@ -13,29 +18,30 @@ import json
 import sys
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
+from daq.files import replace_file
 from drivers.simulation.spec import UndeclaredEffect
+from ident.arrays import FloatArray
 from ident.discovery.loop import Evidence, find_effects, gather
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect, Side
 from ident.estimators.identify import identify
-from tests.studies.coverage_runs import CELL
+from tests.studies.blind_cells import blind_cases, confusion
 from tests.studies.data_file import as_csv
 from tests.studies.effect_cells import APART, CLEAN, SINGLES, SMALLS, TOGETHER, EffectCase
-from tests.studies.effect_runs import OUT, load_runs, make_runs
-from tests.studies.side_by_side import side_by_side
-from tests.studies.study_cells import study_cell
+from tests.studies.effect_runs import CaseTask, load_runs, make_case
+from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished, mark_of
+from tests.studies.side_by_side import Shard, shard, side_by_side
+from tests.studies.study_cells import WORLDS, world_cell
+from tests.studies.study_plans import CELL, make_plan
 
-FloatArray = NDArray[np.float64]
-
-REPORT = Path("out/effects-study.json")
+OUT = Path("out/effects-study")
 VARIABLES = {
     "asymmetric-viscous": ("smooth-velocity",),
     "load-friction": ("smooth-load",),
@@ -48,7 +54,9 @@ VARIABLES = {
 
 Stribeck and non-linear viscous friction are not among them: each explains the other (their ambiguity says so)."""
 REMOVED = tuple(case for case in SINGLES if case.effects[0].name in VARIABLES)
-SAME = {"spring": ("hinge", "gravity-compensator")}
+IMPORTED = tuple(case for case in SINGLES if case.effects[0].name == "warm-up")
+"""Cases whose runs are imported from CSV files as well: what depends on the time needs the order of the files."""
+SAME = {"spring": ("hinge", "gravity-compensator"), "cogging": ("ripple",)}
 """Families that say the same as another one, and are removed with it."""
 FRICTION = frozenset(
     {
@@ -61,6 +69,8 @@ FRICTION = frozenset(
         "position-friction",
     }
 )
+LARGEST_RISE_PERCENT = 0.2
+"""By which an accepted set of effects may raise the worst gain error [points], or by the σ of that gain."""
 PARTS: tuple[tuple[str, tuple[EffectCase, ...]], ...] = (
     ("single", SINGLES),
     ("clean", CLEAN),
@@ -68,7 +78,10 @@ PARTS: tuple[tuple[str, tuple[EffectCase, ...]], ...] = (
     ("apart", APART),
     ("together", TOGETHER),
     ("removed", REMOVED),
+    ("imported", IMPORTED),
 )
+Cases = tuple[tuple[str, EffectCase], ...]
+"""Part of the study and case."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,67 +91,130 @@ class Row:
     Attributes:
         part: of the study.
         case: its name.
+        world: of WORLDS.
+        seed: of its truth.
         true: effects of the plant, as `family on J3`.
         named: effects that the search accepted, in its order.
         ambiguity: of the first one.
         error_before_percent, error_after_percent: on the held-out runs, of the first true effect's axis; of the whole
             for a clean cell.
-        floor_percent: the same error of the same seed's clean cell, None where that was not simulated.
-        max_gain_error_percent: after, of the worst gain.
+        clean_percent: the error before the search of each axis, of a clean cell alone.
+        floor_percent: the same error of the same seed's clean cell, None where that was not searched.
+        max_gain_error_before_percent, max_gain_error_percent: of the worst gain before and after.
+        worst_std_percent: σ of that gain after.
         excess_removed: share of the excess over the floor, squared, that went; None without a floor.
         limit_nm: what would have been found on that axis at the end.
         processor_s: of identification and search.
+        simulation_s: processor time of the simulation, 0 where the runs were there.
     """
 
     part: str
     case: str
+    world: str
+    seed: int
     true: tuple[str, ...]
     named: tuple[str, ...]
     ambiguity: tuple[str, ...]
     error_before_percent: float
     error_after_percent: float
-    floor_percent: float | None
+    clean_percent: tuple[float, ...]
     max_gain_error_before_percent: float
     max_gain_error_percent: float
-    excess_removed: float | None
+    worst_std_percent: float
     limit_nm: float
     processor_s: float
+    simulation_s: float
+    floor_percent: float | None = None
+    excess_removed: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    part: str
-    case: EffectCase
-    out: Path
+    runs: CaseTask
+    parts: tuple[str, ...]
+
+    def path(self, part: str) -> Path:
+        """File of the row of a part."""
+        return self.runs.path.with_name(f"{part}-{self.runs.case.name}.json")
 
 
-def study(parts: Iterable[str], out: Path, processes: int, *, simulate: bool) -> tuple[Row, ...]:
-    """Search the cells of some parts.
+def study(
+    chosen: Cases, world: str, *, out: Path = OUT, part: Shard | None = None, processes: int = 2, kept: bool = False
+) -> tuple[Row, ...]:
+    """Search the cases of a shard, and return the rows of all cases that were searched so far.
+
+    Args:
+        chosen: parts and cases.
+        world: of WORLDS.
+        out: folder of runs and rows.
+        part: cases to simulate and search; all by default.
+        processes: side by side.
+        kept: simulate and search nothing.
 
     Raises:
-        TaskFailed: simulating or searching failed.
+        TaskFailed: simulating or searching failed; what was finished before is kept.
     """
-    chosen = [(part, case) for part, cases in PARTS if part in parts for case in cases]
-    if simulate:
-        make_runs(
-            {case.name: case for _, case in chosen}.values(), out=out, processes=processes, report_line=_print_line
-        )
-    rows = []
-    for row in side_by_side(_search, [_Task(part, case, out) for part, case in chosen], processes):
-        rows.append(row)
-        named = ", ".join(row.named) or "nothing"
-        _print_line(
-            f"{row.part} {row.case}: {named}; {row.error_before_percent:.2f} -> {row.error_after_percent:.2f} %, "
-            f"worst gain {row.max_gain_error_percent:.2f} %, {row.processor_s:.0f} s"
-        )
-    return tuple(rows)
+    cases = {case.name: case for _, case in chosen}
+    # A shard has whole cases: two of its parts search the same runs.
+    tasks = [
+        _Task(CaseTask(out, world, case), tuple(name for name, other in chosen if other is case))
+        for case in cases.values()
+    ]
+    mine = () if kept else (part or Shard()).of(tasks)
+    plans = dict.fromkeys(made for task in mine for made in task.runs.plans)
+    for line in side_by_side(make_plan, plans, processes) if mine else ():
+        _print_line(line)
+    for lines in side_by_side(_work, mine, processes) if mine else ():
+        for line in lines:
+            _print_line(line)
+    paths = [task.path(name) for task in tasks for name in task.parts]
+    return with_floors([_row_of(json.loads(path.read_text())) for path in paths if path.is_file()])
 
 
-def _search(task: _Task) -> Row:
+def with_floors(rows: Sequence[Row]) -> tuple[Row, ...]:
+    """Add the errors of the same seed's cells without any effect."""
+    clean = {row.seed: row.clean_percent for row in rows if row.part == "clean"}
+
+    def floored(row: Row) -> Row:
+        if not row.true or row.seed not in clean:
+            return row
+        axis = int(row.true[0].split(" on J")[1].split("+")[0]) - 1
+        floor = clean[row.seed][axis]
+        excess = max(row.error_before_percent**2 - floor**2, 1e-9)
+        removed = (row.error_before_percent**2 - row.error_after_percent**2) / excess
+        return replace(row, floor_percent=floor, excess_removed=removed)
+
+    return tuple(floored(row) for row in rows)
+
+
+def _work(task: _Task) -> tuple[str, ...]:
+    """Simulate and search one case as far as that was not done."""
+    simulation_s = make_case(task.runs)
+    searching = digest_of_source("ident.discovery.loop"), digest_of_source("daq.log.csv_import")
+    lines = []
+    for part in task.parts:
+        path = task.path(part)
+        fingerprint = digest(*searching, mark_of(task.runs.path).read_text())
+        if is_finished(path, fingerprint):
+            lines.append(f"{part} {task.runs.case.name}, {task.runs.world}: kept")
+            continue
+        row = _search(task.runs, part, simulation_s)
+        replace_file(path, json.dumps(asdict(row)).encode())
+        finish(path, fingerprint)
+        lines.append(
+            f"{part} {row.case}, {row.world}: {', '.join(row.named) or 'nothing'}; {row.error_before_percent:.2f} -> "
+            f"{row.error_after_percent:.2f} %, worst gain {row.max_gain_error_percent:.2f} %, "
+            f"{row.processor_s:.0f} s, simulated in {row.simulation_s:.0f} s"
+        )
+        simulation_s = 0.0
+    return tuple(lines)
+
+
+def _search(task: CaseTask, part: str, simulation_s: float) -> Row:
     case = task.case
     cell = load_cell(CELL)
-    runs = load_runs(case, task.out)
-    lacking = case.effects[0].name if task.part == "removed" else ""
+    runs = load_runs(task, imported=part == "imported")
+    lacking = case.effects[0].name if part == "removed" else ""
     removed = (lacking, *SAME.get(lacking, ()))
     families = tuple(family for family in EFFECTS if family[0].name not in removed)
     begun_s = time.process_time()
@@ -146,28 +222,36 @@ def _search(task: _Task) -> Row:
     start = gather(found, runs.fit, runs.held_out)
     steps = find_effects(start, np.random.default_rng(0), families=families)
     spent_s = time.process_time() - begun_s
-    truth = np.array([axis.gain_nm_per_a for axis in study_cell(case.seed).bare.axes])
+    truth = np.array([axis.gain_nm_per_a for axis in world_cell(case.seed, task.world).bare.axes])
     end = steps[-1].after
     axis = case.effects[0].axis if case.effects else None
-    before, after = (_holdout(evidence, axis) for evidence in (start, end))
-    floor = _floor(case, task.out, axis)
     accepted = tuple(step.accepted for step in steps if step.accepted is not None)
-    excess = None if floor is None else max(before**2 - floor**2, 1e-9)
+    error_before, error_after = _gain_error(start, truth), _gain_error(end, truth)
+    worst = int(np.argmax(error_after))
     return Row(
-        part=task.part,
+        part=part,
         case=case.name,
+        world=task.world,
+        seed=case.seed,
         true=tuple(_true(effect) for effect in case.effects),
         named=tuple(_placed(placed) for placed in end.effects),
         ambiguity=() if not accepted else tuple(_placed(rival) for rival in accepted[0].ambiguity),
-        error_before_percent=before,
-        error_after_percent=after,
-        floor_percent=floor,
-        max_gain_error_before_percent=_worst(start, truth),
-        max_gain_error_percent=_worst(end, truth),
-        excess_removed=None if excess is None else (before**2 - after**2) / excess,
+        error_before_percent=_holdout(start, axis),
+        error_after_percent=_holdout(end, axis),
+        clean_percent=() if case.effects else tuple(_holdout(start, one) for one in range(len(truth))),
+        max_gain_error_before_percent=float(error_before.max()),
+        max_gain_error_percent=float(error_after[worst]),
+        worst_std_percent=float(100.0 * end.estimate.gains_std[worst] / abs(end.estimate.gains[worst])),
         limit_nm=float(steps[-1].limits_nm[axis or 0]),
         processor_s=spent_s,
+        simulation_s=simulation_s,
     )
+
+
+def _row_of(document: dict[str, object]) -> Row:
+    """Rebuild a row read back from JSON."""
+    fields = {name: tuple(value) if isinstance(value, list) else value for name, value in document.items()}
+    return Row(**fields)  # type: ignore[arg-type]
 
 
 def _holdout(evidence: Evidence, axis: int | None) -> float:
@@ -177,17 +261,9 @@ def _holdout(evidence: Evidence, axis: int | None) -> float:
     return error.total if axis is None else error.axes[axis]
 
 
-def _floor(case: EffectCase, out: Path, axis: int | None) -> float | None:
-    """The error of the same seed's cell without any effect."""
-    clean = next((other for other in CLEAN if other.seed == case.seed), None)
-    if axis is None or clean is None or not (out / f"{clean.name}.npz").is_file():
-        return None
-    cell, runs = load_cell(CELL), load_runs(clean, out)
-    return _holdout(gather(identify(model_of(cell), runs.fit, cell.conditioning), runs.fit, runs.held_out), axis)
-
-
-def _worst(evidence: Evidence, truth: FloatArray) -> float:
-    return float(100.0 * np.max(np.abs(evidence.estimate.gains / truth - 1.0)))
+def _gain_error(evidence: Evidence, truth: FloatArray) -> FloatArray:
+    """Absolute error of each gain [%], shape (n,)."""
+    return np.asarray(100.0 * np.abs(evidence.estimate.gains / truth - 1.0))
 
 
 def _true(effect: UndeclaredEffect) -> str:
@@ -228,11 +304,26 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
             f"clean: {sum(bool(row.named) for row in clean)} of {len(clean)} with a false effect; "
             f"error {error:.2f} % in the mean, worst gain {gain:.2f} %"
         )
+    if rows:
+        bent = [
+            row
+            for row in rows
+            if row.max_gain_error_percent
+            > row.max_gain_error_before_percent + max(LARGEST_RISE_PERCENT, row.worst_std_percent)
+        ]
+        lines.append(
+            f"worst gain error raised by more than {LARGEST_RISE_PERCENT} points and its σ: {len(bent)} of {len(rows)}"
+            + "".join(f", {row.case}" for row in bent)
+        )
     for part in ("apart", "together"):
         both = [row for row in rows if row.part == part]
         if both:
             hit = sum(set(row.true) <= set(row.named) for row in both)
             lines.append(f"two effects {part}: both named in {hit} of {len(both)}")
+    imported = [row for row in rows if row.part == "imported"]
+    if imported:
+        named = sum(set(row.true) <= set(row.named) for row in imported)
+        lines.append(f"warm-up, imported from CSV: {named} of {len(imported)} named")
     removed = [row for row in rows if row.part == "removed"]
     if removed:
         right = [row for row in removed if _is_structure_of(row)]
@@ -279,23 +370,32 @@ def main(arguments: list[str] | None = None) -> int:
     """Make the study and print its tables."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.effects_study", description=__doc__)
     names = [part for part, _ in PARTS]
+    parser.add_argument("--world", nargs="+", choices=WORLDS, default=["measurement"])
     parser.add_argument("--only", nargs="+", choices=names, default=names)
-    parser.add_argument("--kept", action="store_true", help="simulate nothing: take what is there")
+    parser.add_argument("--cases", nargs="+", default=[], help="these alone, as clean-03")
+    parser.add_argument("--blind", type=int, metavar="SEED", help="draw the cells from a seed instead")
+    parser.add_argument("--count", type=int, default=20, help="of the blind cells")
+    parser.add_argument("--shard", type=shard, default=Shard(), help="i/n: every n-th case from the i-th on")
+    parser.add_argument("--kept", action="store_true", help="simulate and search nothing: report what is there")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args(arguments)
-    rows = study(options.only, options.out, options.processes, simulate=not options.kept)
-    REPORT.parent.mkdir(parents=True, exist_ok=True)
-    kept = (
-        []
-        if not REPORT.is_file()
-        else [row for row in json.loads(REPORT.read_text())["rows"] if row["part"] not in options.only]
-    )
-    REPORT.write_text(json.dumps({"rows": [*kept, *(asdict(row) for row in rows)]}, indent=1) + "\n")
-    _print_line(table(rows))
-    REPORT.with_suffix(".csv").write_text(as_csv(table(rows)), encoding="utf-8")
-    for line in verdicts(rows):
-        _print_line(line)
+    blind = options.blind is not None
+    for world in options.world:
+        chosen: Cases = tuple((part, case) for part, cases in PARTS if part in options.only for case in cases)
+        if blind:
+            chosen = tuple(("blind", case) for case in blind_cases(options.blind, options.count))
+        chosen = tuple(pair for pair in chosen if not options.cases or pair[1].name in options.cases)
+        rows = study(chosen, world, out=options.out, part=options.shard, processes=options.processes, kept=options.kept)
+        name = f"blind-{options.blind}-{world}" if blind else world
+        report = options.out / f"{name}.json"
+        replace_file(report, json.dumps({"rows": [asdict(row) for row in rows]}, indent=1).encode())
+        shown = confusion([(row.true, row.named) for row in rows]) if blind else table(rows)
+        replace_file(report.with_suffix(".csv"), as_csv(shown).encode())
+        for line in (f"\n{name}: {len(rows)} of {len(chosen)} searched\n", table(rows), "", shown if blind else ""):
+            _print_line(line)
+        for line in verdicts(rows):
+            _print_line(line)
     return 0
 
 

@@ -17,11 +17,12 @@ def digest(*things: object) -> str:
     return hashlib.sha256(repr(things).encode()).hexdigest()
 
 
-def digest_of_source(module: str) -> str:
+def digest_of_source(module: str, rooms: tuple[str, ...] = ROOMS) -> str:
     """Digest of a module and of all modules of this repository that it imports, in hex; docstrings and comments apart.
 
     Args:
         module: dotted name.
+        rooms: beginnings of the names of modules that are followed.
     """
     sources: dict[str, str] = {}
     waiting = [module]
@@ -32,7 +33,7 @@ def digest_of_source(module: str) -> str:
             continue
         tree = ast.parse(path.read_text())
         for node in ast.walk(tree):
-            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in ROOMS:
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith(rooms):
                 # `from ident.estimators import wls` may name a module as well as a function.
                 waiting += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
         sources[name] = ast.dump(_Wordless().visit(tree))
@@ -41,16 +42,17 @@ def digest_of_source(module: str) -> str:
 
 def is_finished(path: Path, fingerprint: str) -> bool:
     """Whether a file is there and was marked with this fingerprint."""
-    mark = _mark(path)
+    mark = mark_of(path)
     return path.is_file() and mark.is_file() and mark.read_text().strip() == fingerprint
 
 
 def finish(path: Path, fingerprint: str) -> None:
     """Mark a finished file."""
-    replace_file(_mark(path), f"{fingerprint}\n".encode())
+    replace_file(mark_of(path), f"{fingerprint}\n".encode())
 
 
-def _mark(path: Path) -> Path:
+def mark_of(path: Path) -> Path:
+    """Return the file that holds the fingerprint of a finished file."""
     return path.with_name(path.name + ".fingerprint")
 
 

@@ -1,7 +1,7 @@
-"""How far the gains are off, by estimator and noise floor, and whether the error bars are true.
+"""How far the gains are off, by estimator and noise floor.
 
-Run by `make ident-study`; records what is missing (record_study.py, over the real driver path; coverage_runs.py, the
-plant alone), writes out/ident-study.json and prints the tables of docs/evidence/estimators.md.
+Run by `make ident-study`; records what is missing (record_study.py, over the real driver path), writes
+out/ident-study.json and prints the first table of docs/evidence/estimators.md.
 """
 
 from __future__ import annotations
@@ -26,18 +26,13 @@ from ident.equations.reduction import reduce_runs
 from ident.equations.system import System
 from ident.estimators.comparison import ESTIMATORS
 from ident.estimators.least_squares import wls
-from ident.estimators.maximum_likelihood import ml
 from ident.model.model import Model
-from tests.studies.coverage_runs import CELLS, load_coverage, make_coverage
-from tests.studies.coverage_runs import OUT as COVERAGE
 from tests.studies.record_study import CELL, FLOORS, SEEDS, StudyLogs, record_study, study_logs
 
 FloatArray = NDArray[np.float64]
 
 OUT = Path("out/ident-study.json")
 PLATE = "plate"
-NORMAL_95 = 1.959964
-"""Half-width of a 95 % interval in standard deviations: some hundred moves leave nothing of Student's t."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,18 +107,6 @@ def summarise(scores: Sequence[Score]) -> Summary:
     )
 
 
-def coverage(model: Model, conditioning: Conditioning) -> tuple[FloatArray, FloatArray]:
-    """Share of the cells whose 95 % interval holds the true gain [%], and root mean square of the scores, by axis."""
-    scores = []
-    for cell in load_coverage():
-        found = ml(_system(model, cell.runs, conditioning))
-        scores.append((found.gains - np.array(cell.truth.gains_nm_per_a)) / found.gains_std)
-        if len(scores) % 10 == 0:
-            _print_line(f"coverage: {len(scores)} cells")
-    inside = np.abs(scores) <= NORMAL_95
-    return 100.0 * inside.mean(axis=0), np.sqrt(np.mean(np.square(scores), axis=0))
-
-
 def _key(estimator: str) -> str:
     """`tls` is the paper's, rows weighted per joint."""
     return "tls" if estimator == "tls, rows (paper)" else estimator
@@ -139,11 +122,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.studies.ident_study", description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
     parser.add_argument("--floors", nargs="+", choices=tuple(FLOORS), default=list(FLOORS))
-    parser.add_argument("--cells", type=int, default=CELLS, help="of the coverage study; 0 leaves it out")
     parser.add_argument("--kept", action="store_true", help="score what was recorded, whatever software recorded it")
     options = parser.parse_args(arguments)
     cell = load_cell(CELL)
-    model, axes = model_of(cell), cell.axis_names
+    model = model_of(cell)
     if options.kept:
         logs = study_logs(options.seeds, options.floors)
     else:
@@ -163,16 +145,6 @@ def main(arguments: list[str] | None = None) -> int:
                 f"{reported.max_percent:.2f} | {reported.second_payload_percent:.2f} / "
                 f"{reported.second_payload_max_percent:.2f} |"
             )
-    if options.cells:
-        if len(list(COVERAGE.glob("*.npz"))) != options.cells:
-            make_coverage(options.cells, report_line=_print_line)
-        inside, spread = coverage(model, cell.conditioning)
-        result["coverage_percent"] = {axis: float(share) for axis, share in zip(axes, inside, strict=True)}
-        result["score_rms"] = {axis: float(size) for axis, size in zip(axes, spread, strict=True)}
-        lines += ["", "| axis | " + " | ".join(axes) + " |", "|---" * (len(axes) + 1) + "|"]
-        shares, sizes = (" | ".join(texts) for texts in ((f"{x:.0f}" for x in inside), (f"{x:.2f}" for x in spread)))
-        lines.append(f"| 95 % intervals that hold the truth, % | {shares} |")
-        lines.append(f"| error / σ, root mean square | {sizes} |")
     result["cells"] = cells
     OUT.parent.mkdir(parents=True, exist_ok=True)
     OUT.write_text(json.dumps(result, indent=2) + "\n")

@@ -20,6 +20,7 @@ def write_runs(path: Path, raw: Sequence[RawRun]) -> None:
     for run in raw:
         # Steps of positions are small numbers, which pack better than positions; the first one is a step from zero.
         arrays[f"{run.name}.position_steps"] = np.diff(run.position_counts, axis=0, prepend=np.int32(0)).T
+        arrays[f"{run.name}.error_counts"] = (run.demand_counts - run.position_counts).T
         arrays[f"{run.name}.current_raw"] = run.current_raw.T
         arrays[f"{run.name}.limited"] = run.limited.T
         arrays[f"{run.name}.move"] = run.move.astype(np.int32)
@@ -35,12 +36,14 @@ def read_runs(path: Path) -> tuple[RawRun, ...]:
     raw = []
     with np.load(path) as arrays:
         for name, (payload, began_s) in json.loads(str(arrays["runs"])).items():
+            position = np.cumsum(arrays[f"{name}.position_steps"].T, axis=0, dtype=np.int32)
             raw.append(
                 RawRun(
                     name=name,
                     payload=None if payload is None else declared_payload(payload),
                     began_s=began_s,
-                    position_counts=np.cumsum(arrays[f"{name}.position_steps"].T, axis=0, dtype=np.int32),
+                    position_counts=position,
+                    demand_counts=position + arrays[f"{name}.error_counts"].T,
                     current_raw=np.ascontiguousarray(arrays[f"{name}.current_raw"].T),
                     limited=np.ascontiguousarray(arrays[f"{name}.limited"].T),
                     move=arrays[f"{name}.move"].astype(np.int64),

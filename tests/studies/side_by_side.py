@@ -1,10 +1,11 @@
-"""Tasks of a study in several processes."""
+"""Tasks of a study in several processes, and in shards that run apart."""
 
 from __future__ import annotations
 
+import argparse
 import multiprocessing
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -14,6 +15,26 @@ Made = TypeVar("Made")
 
 class TaskFailed(RuntimeError):
     """A task failed in its process; the message is its traceback."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shard:
+    """Every `count`-th task of a study, from the `number`-th on (both from 1): shards together are the whole."""
+
+    number: int = 1
+    count: int = 1
+
+    def of(self, tasks: Sequence[Task]) -> tuple[Task, ...]:
+        """Return the tasks of this shard."""
+        return tuple(tasks[self.number - 1 :: self.count])
+
+
+def shard(text: str) -> Shard:
+    """Read `i/n`, for the option `--shard`."""
+    number, _, count = text.partition("/")
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected i/n with i from 1 to n, as 2/4")
+    return Shard(int(number), int(count))
 
 
 @dataclass(frozen=True, slots=True)

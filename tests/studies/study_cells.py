@@ -17,6 +17,26 @@ from drivers.simulation.spec import AxisSpec, Body, CellSpec
 from ident.model.bodies import LINK_PARAMETERS, Payload
 
 PAYLOADS = ("disc", "plate")
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """Noise of a study's cells.
+
+    Attributes:
+        noise_factor: of the current noise, against the clean cell.
+        disturbance_percent: torque disturbance inside the position loop, root mean square in percent of rated torque.
+    """
+
+    noise_factor: float
+    disturbance_percent: float
+
+
+WORLDS = {"measurement": World(1.59, 0.0), "loop3": World(1.0, 3.0), "loop8": World(1.0, 8.0)}
+"""The first leaves a relative error of 3.5 % without any effect (docs/evidence/estimators.md)."""
+MEASUREMENT = WORLDS["measurement"]
+CORRELATION_S = (0.002, 0.050)
+"""Range of the disturbance's correlation time, drawn for each axis, logarithmically uniform [s]."""
 GAIN_SPREAD = 0.10
 """Half-widths of uniform draws, as a share of the clean cell's value: gains keep their sign."""
 FRICTION_SPREAD = 0.30
@@ -83,23 +103,27 @@ class StudyCell:
     bodies: dict[str, Body]
 
 
-def study_cell(seed: int, noise_factor: float = 1.0) -> StudyCell:
+def study_cell(seed: int, noise_factor: float = 1.0, disturbance_percent: float = 0.0) -> StudyCell:
     """Draw a cell.
 
-    The noise factor changes the noise alone: cells of one seed have one truth on every noise floor.
+    Noise and disturbance change nothing else: cells of one seed have one truth in every world.
 
     Args:
         seed: the same seed gives the same cell.
         noise_factor: of the current noise, against the clean cell.
+        disturbance_percent: of every axis, with a correlation time drawn for each.
 
     Raises:
         ConfigurationError: from the clean cell's file.
     """
     path = shipped_simulation("clean")
     bare = load_simulation(path)
-    axes_rng, links_rng, payload_rng = (
-        np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(part,))) for part in range(3)
+    # The fourth stream draws the drawing of a payload (`truth_of`).
+    axes_rng, links_rng, payload_rng, loop_rng = (
+        np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(part,))) for part in (0, 1, 2, 4)
     )
+    low, high = np.log(CORRELATION_S)
+    correlation_s = np.exp(loop_rng.uniform(float(low), float(high), len(bare.axes)))
     bodies = {}
     for name in PAYLOADS:
         body = load_simulation(path, name).payload
@@ -109,9 +133,22 @@ def study_cell(seed: int, noise_factor: float = 1.0) -> StudyCell:
     spec = replace(
         bare,
         urdf=_drawn_links(bare.urdf, links_rng),
-        axes=tuple(_drawn_axis(axis, axes_rng, noise_factor) for axis in bare.axes),
+        axes=tuple(
+            replace(
+                _drawn_axis(axis, axes_rng, noise_factor),
+                torque_disturbance_percent=disturbance_percent,
+                disturbance_correlation_s=float(time_s),
+            )
+            for axis, time_s in zip(bare.axes, correlation_s, strict=True)
+        ),
     )
     return StudyCell(seed, noise_factor, spec, bodies)
+
+
+def world_cell(seed: int, world: str) -> StudyCell:
+    """Draw a cell of one of WORLDS."""
+    chosen = WORLDS[world]
+    return study_cell(seed, chosen.noise_factor, chosen.disturbance_percent)
 
 
 def spec_of(cell: StudyCell, payload: str | None, run: int) -> CellSpec:

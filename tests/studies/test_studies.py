@@ -1,0 +1,89 @@
+"""The tools of the studies: what is kept comes back, shards are the whole, blind cells are what they say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.simulation.plant import Plant
+from tests.studies.blind_cells import FAMILIES, NOTHING, blind_cases, confusion
+from tests.studies.direct_cell import RawRun
+from tests.studies.raw_runs import read_runs, write_runs
+from tests.studies.side_by_side import Shard
+from tests.studies.study_cells import CORRELATION_S, WORLDS, declared_payload, world_cell
+
+
+@settings(max_examples=25)
+@given(count=st.integers(1, 9), tasks=st.integers(0, 40))
+def test_the_shards_of_a_study_have_every_task_once(count: int, tasks: int) -> None:
+    shards = [Shard(number, count).of(range(tasks)) for number in range(1, count + 1)]
+    assert sorted(task for part in shards for task in part) == list(range(tasks))
+    assert max(map(len, shards)) - min(map(len, shards)) <= 1
+
+
+def test_runs_come_back_with_their_demand(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    position = np.cumsum(rng.integers(-40_000, 40_000, (500, 6)), axis=0).astype(np.int32)
+    raw = RawRun(
+        name="disc-1",
+        payload=declared_payload("disc"),
+        position_counts=position,
+        demand_counts=position + rng.integers(-300, 300, position.shape).astype(np.int32),
+        current_raw=rng.integers(-2000, 2000, position.shape).astype(np.int16),
+        limited=rng.random(position.shape) < 0.1,
+        move=np.repeat(np.arange(5), 100),
+        ampere_per_unit=rng.random(6),
+        began_s=60.0,
+    )
+    write_runs(tmp_path / "runs.npz", [raw])
+    (back,) = read_runs(tmp_path / "runs.npz")
+    assert (back.name, back.payload, back.began_s) == (raw.name, raw.payload, raw.began_s)
+    for name in ("position_counts", "demand_counts", "current_raw", "limited", "move", "ampere_per_unit"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(raw, name))
+
+
+def test_cells_of_one_seed_have_one_truth_in_every_world() -> None:
+    cells = [world_cell(7, world).bare for world in WORLDS]
+    assert len({cell.urdf for cell in cells}) == 1
+    assert len({tuple(axis.gain_nm_per_a for axis in cell.axes) for cell in cells}) == 1
+    for cell, world in zip(cells, WORLDS.values(), strict=True):
+        assert {axis.torque_disturbance_percent for axis in cell.axes} == {world.disturbance_percent}
+        times_s = [axis.disturbance_correlation_s for axis in cell.axes]
+        assert CORRELATION_S[0] <= min(times_s) < max(times_s) <= CORRELATION_S[1]
+
+
+@settings(max_examples=2)
+@given(seed=st.integers(0, 2**31))
+def test_blind_cells_are_the_same_however_many_are_drawn_and_can_be_built(seed: int) -> None:
+    cases = blind_cases(seed, 3)
+    assert blind_cases(seed, 2) == cases[:2]
+    for case in cases:
+        Plant(case.spec("loop3", "disc", 1))
+        places = {(effect.name, effect.axis) for effect in case.effects}
+        assert len(places) == len(case.effects) <= 3
+        assert {effect.name for effect in case.effects} <= set(FAMILIES)
+
+
+def test_the_confusion_table_counts_every_true_and_every_false_effect_once() -> None:
+    cells = [
+        (("spring on J2",), ("spring on J2",)),
+        (("stribeck on J4", "spring on J1"), ("nonlinear-viscous on J4",)),
+        (("coupling on J4+J5",), ("stribeck on J5", "lag on J1")),
+        ((), ("lag on J3",)),
+    ]
+    lines = confusion(cells).splitlines()
+    columns = [text.strip() for text in lines[0].strip("|").split("|")]
+    counts: dict[tuple[str, str], int] = {}
+    for line in lines[2:]:
+        row, *texts = (text.strip() for text in line.strip("|").split("|"))
+        counts |= {(row, column): int(text) for column, text in zip(columns[1:], texts, strict=True) if text}
+    assert counts == {
+        ("spring", "spring"): 1,
+        ("stribeck", "nonlinear-viscous"): 1,
+        ("spring", NOTHING): 1,
+        ("coupling", "stribeck"): 1,
+        (NOTHING, "lag"): 2,
+    }
