@@ -220,7 +220,7 @@ def test_a_simulated_cell_is_shown_and_left_as_it_was(cell: Path, capsys: pytest
         bus.shutdown()
         witness.shutdown()
     assert simulated.cycles == 0
-    aborted = 0x80  # on a loaded machine an answer may come too late; the client then ends the transfer, and nothing else
+    aborted = 0x80  # where an answer comes too late on a loaded machine, the client ends the transfer, and nothing else
     masters = {one for one in asked if one[0] < 0x700 and one[1] != aborted}
     assert masters == {(0x600 + node, 0x40) for node in range(1, 7)}
     assert document["source"] == "asked"
