@@ -312,7 +312,7 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
     """Detect and add missing effects: refit with every effect that passes the gates.
 
     Args:
-        start: of method ``ml`` or ``iv``; another one is refitted by ``ml``, in whose terms candidates are judged.
+        start: of method ``ml``; another one is refitted by ``ml``, in whose terms candidates are judged.
         seed: of the bootstrap.
         progress: receives a line for each step.
 
@@ -321,7 +321,7 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
     """
     evidence = start.evidence()
     before = start.identification
-    if not before.estimate.method.is_of_currents:
+    if before.estimate.method is not Method.ML:
         fixed = before.estimate.gains if before.estimate.gains_fixed else None
         before = replace(before, estimate=estimate_with(Method.ML, before.system, fixed))
         evidence = replace(evidence, estimate=before.estimate)

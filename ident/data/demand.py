@@ -2,7 +2,8 @@
 
 A torque disturbance inside the position loop moves the arm, and comes back in the current: the recorded motion and the
 equation's error then share a cause, and least squares are biased (Söderström & Stoica, System Identification, §10). The
-set-point of the loop knows nothing of the disturbance. Its motion gives the *instruments* of `ident.estimators.iv`.
+set-point of the loop knows nothing of the disturbance. Its motion gives the *instruments* of
+`ident.estimators.maximum_likelihood.iv`.
 
 A drive in profile position mode makes a trapezoid of velocity from each set-point (CiA 402-2). So every motion of a
 motor between two rests is fitted by one, with three unknowns: when it starts, how long it accelerates, how long it
@@ -34,8 +35,8 @@ ITERATIONS = 25
 MAX_SPLITS = 4  #: Moves to each move that was found at first: continuous motion is not cut up for ever
 FOUND = 0.98  #: Share of a motor's squared velocity that is followed when every move was found
 EXPLAINED = 0.9
-"""Least share of each motor's squared velocity that the trapezoids must follow. Point-to-point moves reach 0.98 and
-more, continuous motion less than 0.6."""
+"""Least share of each motor's squared velocity that the trapezoids must follow; point-to-point moves reach 0.98 and
+more. A sine between two turning points may pass too: its trapezoid resembles it, which is all that is asked."""
 
 
 def with_demand(data: Dataset, drive_train: DriveTrain, conditioning: Conditioning) -> Dataset:

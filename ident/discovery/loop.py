@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, IntArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.demand import as_demanded, with_demand
@@ -46,10 +46,11 @@ from ident.effects.effect import Effect, PlacedEffect, effect_torque
 from ident.effects.signals import fitted_signals, session_began_s
 from ident.effects.transmission import Ripple
 from ident.effects.unnamed import is_unnamed
-from ident.equations.rows import Observation, observe
+from ident.equations.rows import Observation, observe, on_demanded_motion
 from ident.errors import NotConverged, RankDeficient
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.identify import Identification, estimate_with
+from ident.estimators.method import Method
 from ident.model.model import Model
 
 UNFITTED = (NotConverged, RankDeficient, np.linalg.LinAlgError)
@@ -296,9 +297,35 @@ def _join(
         if moved := moved_gains(together.gain_shifts, gains_std):
             return SetAside(accepted, moved=moved)
     pruned = _pruned(joined, accepted, rng, gates)
-    if isinstance(pruned, _Model) and _keys(pruned.evidence) in seen:
-        return SetAside(accepted, "it would only exchange places with an effect that it replaces")
-    return pruned
+    if isinstance(pruned, SetAside):
+        return pruned
+    exchanged = "it would only exchange places with an effect that it replaces"
+    why = exchanged if _keys(pruned.evidence) in seen else _refuted_by_instruments(pruned.evidence, last)
+    return SetAside(accepted, why) if why else pruned
+
+
+def _refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
+    """Why an effect of a joint fit may be a disturbance in the position loop alone; empty where it may not.
+
+    A torque that disturbs the arm moves it, and comes back in the current: columns of the recorded motion then explain
+    a part of it, which those of the demanded motion do not.
+    """
+    try:
+        estimate = by_instruments(evidence)
+    except UNFITTED:
+        return ""  # too little is left of the columns to refute anything
+    if estimate is None:
+        return ""
+    own = _own_unknowns(estimate, placed)
+    place = len(estimate.gains) + own
+    noise = in_noise(estimate.parameters[own], estimate.covariance[np.ix_(place, place)])
+    return f"with instruments from the demanded motion, {noise}" if noise else ""
+
+
+def _own_unknowns(estimate: Estimate, placed: PlacedEffect) -> IntArray:
+    """Places of an effect's coefficients among the parameters of an estimate, shape (p,)."""
+    names = {column.name for column in placed.columns}
+    return np.array([index for index, column in enumerate(estimate.unknowns) if column.name in names])
 
 
 def _pruned(model: _Model, accepted: Finding, rng: np.random.Generator, gates: Gates) -> _Model | SetAside:
@@ -333,8 +360,7 @@ def _beside_others(model: _Model, placed: PlacedEffect, rng: np.random.Generator
     if trial is None:
         return 0.0, "the model contains it already"
     (finding,) = rank_families(problem, (FamilyTrials(placed.axis, ((placed.effect, trial),)),), rng, gates)
-    names = {column.name for column in placed.columns}
-    own = np.array([index for index, column in enumerate(estimate.unknowns) if column.name in names])
+    own = _own_unknowns(estimate, placed)
     values, place = estimate.parameters[own], len(estimate.gains) + own
     joint = in_noise(values, estimate.covariance[np.ix_(place, place)])
     physics = impossible(placed.effect.coefficients, values, estimate.parameters_std[own])
@@ -374,8 +400,6 @@ def gather(found: Identification, runs: Iterable[Run], holdout: Iterable[Run] = 
     model, conditioning = found.model, found.conditioning
     trained = tuple(differentiate(run, model.drive_train, conditioning) for run in runs)
     unseen = tuple(differentiate(run, model.drive_train, conditioning) for run in holdout)
-    if found.system.instruments:
-        trained = tuple(with_demand(data, model.drive_train, conditioning) for data in trained)
     rows = observe(model, (*trained, *unseen), conditioning, found.system)
     training, rest = _split_holdout(rows, len(unseen))
     return Evidence(model, conditioning, (*trained, *unseen), len(unseen), rows, training, rest, (), found.estimate)
@@ -393,14 +417,30 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...]) -> Evidenc
     for _ in range(passes):
         rows = before.rows_without_effects
         if effects:
-            torque, demanded = _torques(effects, current, before.datasets, began_s), None
-            if rows.instruments is not None:
-                demanded = _torques(effects, current, tuple(map(as_demanded, before.datasets)), began_s)
-            rows = rows.extended(tuple(column for placed in effects for column in placed.columns), torque, demanded)
+            torque = _torques(effects, current, before.datasets, began_s)
+            rows = rows.extended(tuple(column for placed in effects for column in placed.columns), torque)
         training, rest = _split_holdout(rows, before.held_out)
         estimate = estimate_with(before.estimate.method, training.system(), fixed)
         current = replace(before, training=training, holdout=rest, effects=effects, estimate=estimate)
     return current
+
+
+def by_instruments(evidence: Evidence) -> Estimate | None:
+    """Estimate the same model of the same runs by ``iv``; None where the demanded motion of no run is known.
+
+    Load and current of the effects' columns are predictions of the estimate by ``ml``, in the instruments too.
+    """
+    model, conditioning, estimate = evidence.model, evidence.conditioning, evidence.estimate
+    asked = tuple(with_demand(data, model.drive_train, conditioning) for data in evidence.trained)
+    if all(data.demanded is None for data in asked):
+        return None
+    demanded = on_demanded_motion(model, asked, evidence.training)
+    if evidence.effects:
+        datasets, began_s = tuple(map(as_demanded, asked)), session_began_s(evidence.trained)
+        demanded = replace(demanded, effects=_torques(evidence.effects, evidence, datasets, began_s))
+    return estimate_with(
+        Method.IV, evidence.training.system(demanded), estimate.gains if estimate.gains_fixed else None
+    )
 
 
 def _torques(

@@ -103,9 +103,7 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
     centres = filter_.centres(len(data.time_s))
     time_s, move = data.time_s[centres] - data.time_s[0], data.move[centres]
     first, support = 0, model.support
-    asked = None
-    if data.demanded is not None:  # slow enough for the rate of rows: an instrument need not be exact
-        asked = Motion(*(filter_(getattr(data.demanded, field.name).T).T for field in fields(Motion)))
+    asked = None if data.demanded is None else _decimated(data.demanded, filter_)
     for part in chunks(filter_, len(data.time_s), chunk_rows):
         regressor = model.regressor(data.motion(part))
         standard = np.zeros((*support.shape, filter_.rows(regressor.shape[2])))
@@ -121,6 +119,11 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
             time_s=time_s[piece],
             move=move[piece],
         )
+
+
+def _decimated(demanded: Motion, filter_: Decimator) -> Motion:
+    """A demanded motion at the rows: it is slow enough for their rate, and an instrument need not be exact."""
+    return Motion(*(filter_(getattr(demanded, field.name).T).T for field in fields(Motion)))
 
 
 def _part(motion: Motion, rows: slice) -> Motion:
@@ -146,8 +149,6 @@ class Observation(Equations):
     move: IntArray  #: number of each row's move, unique over all runs, shape (r,)
     mounting: IntArray  #: index into payloads, −1 without load, shape (r,)
     conditioning: Conditioning  #: the filters these rows went through
-    #: The same rows with the columns of the demanded motion, instruments of `iv`; None where no run's is known.
-    instruments: Observation | None = None
 
     def linear(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
         """[W | W_uL] of some rows, shape (n, p, rows)."""
@@ -181,22 +182,11 @@ class Observation(Equations):
 
     def only(self, rows: BoolArray | IntArray | slice) -> Observation:
         """Keep some of the rows, in the order of their indices; those of a slice are views."""
-        kept = {name: getattr(self, name)[..., rows] for name in OF_ROWS}
-        return replace(self, **kept, instruments=None if self.instruments is None else self.instruments.only(rows))
+        return replace(self, **{name: getattr(self, name)[..., rows] for name in OF_ROWS})
 
-    def extended(
-        self, columns: tuple[Column, ...], torque: FloatArray, demanded_torque: FloatArray | None = None
-    ) -> Observation:
-        """Add columns to W, torque of shape (n, extra, r) [Nm per unit], and those of the demanded motion."""
-        instruments = self.instruments
-        if instruments is not None:
-            instruments = instruments.extended(columns, torque if demanded_torque is None else demanded_torque)
-        return replace(
-            self,
-            columns=self.columns + columns,
-            effects=np.concatenate((self.effects, torque), axis=1),
-            instruments=instruments,
-        )
+    def extended(self, columns: tuple[Column, ...], torque: FloatArray) -> Observation:
+        """Add columns to W, torque of shape (n, extra, r) [Nm per unit]."""
+        return replace(self, columns=self.columns + columns, effects=np.concatenate((self.effects, torque), axis=1))
 
     def _by_move(self, first_column: int = 0) -> tuple[tuple[FloatArray, ...], ...]:
         """The motors' rows that count, parted by move, with their columns from one on."""
@@ -208,8 +198,12 @@ class Observation(Equations):
             parts.append([piece.T for piece in pieces])
         return tuple(zip(*parts, strict=True))
 
-    def system(self) -> System:
-        """Reduce the rows to triangles."""
+    def system(self, demanded: Observation | None = None) -> System:
+        """Reduce the rows to triangles.
+
+        Args:
+            demanded: the same rows and columns for the demanded motion: they become the system's instruments.
+        """
         linear, known = self.linear(), self.known()
         direction = self.drive_train.direction
         joints = []
@@ -233,7 +227,7 @@ class Observation(Equations):
             motors=Triangles(tuple(motors), self.motor_use.sum(axis=1)),
             clusters=clusters,
             cluster_runs=tuple(runs),
-            instruments=() if self.instruments is None else self.instruments._by_move(first_column=1),
+            instruments=() if demanded is None else demanded._by_move(first_column=1),
         )
 
 
@@ -263,7 +257,7 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
             run.append(np.full(len(rows.move), index, dtype=np.int64))
             mounting.append(np.full(len(rows.move), mounted, dtype=np.int64))
         first_move = last
-    found = Observation(
+    return Observation(
         drive_train=model.drive_train,
         columns=like.columns[: len(base)],
         base=like.base,
@@ -277,13 +271,22 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
         payload_columns=like.payload_columns,
         runs=tuple(data.name for data in datasets),
         conditioning=conditioning,
-        instruments=None,
         **{name: np.concatenate([getattr(rows, name) for rows, _, _ in parts], axis=-1) for name in shared},
     )
-    if all(data.demanded is None for data in datasets):
-        return found
-    regressor, flange = (
-        np.concatenate([rows.instrument[:, columns] for rows, _, _ in parts], axis=2)
-        for columns in (base, model.flange)
-    )
-    return replace(found, instruments=replace(found, regressor=regressor, flange=flange))
+
+
+def on_demanded_motion(model: Model, datasets: Sequence[Dataset], rows: Observation) -> Observation:
+    """Replace the columns of rows without effects by those of the demanded motion, where a run's is known.
+
+    Args:
+        model: the declared model.
+        datasets: the runs of the rows.
+        rows: of these runs.
+    """
+    regressor, flange, base = rows.regressor.copy(), rows.flange.copy(), list(rows.base.independent)
+    for index, data in enumerate(datasets):
+        if data.demanded is not None:
+            own = rows.run == index
+            standard = model.regressor(_decimated(data.demanded, row_filter(data, rows.conditioning)))
+            regressor[:, :, own], flange[:, :, own] = standard[:, base], standard[:, model.flange]
+    return replace(rows, regressor=regressor, flange=flange)

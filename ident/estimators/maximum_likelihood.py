@@ -91,7 +91,7 @@ def _maximum_likelihood(system: System, recorded: System, method: Method, fixed_
         unknowns=system.unknowns,
         parameters=parameters,
         covariance=covariance,
-        axis_noise=noise if method is Method.ML else noise_of(recorded.motors, gamma, parameters, free),
+        axis_noise=noise_of(recorded.motors, gamma, parameters, free),
         singular_values=weighted,
         condition=float(weighted[0] / weighted[-1]),
         rows=int(triangles.rows.sum()),

@@ -26,7 +26,7 @@ from ident.discovery.gates import (
     whitened_columns,
     without_effects_of,
 )
-from ident.discovery.loop import Evidence, SetAside, find_effects, with_effects
+from ident.discovery.loop import Evidence, SetAside, find_effects, gather, with_effects
 from ident.discovery.search import Finding, Gates, effect_key, rank_effects
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
@@ -34,8 +34,10 @@ from ident.effects.friction import NonlinearViscous, Stribeck, WarmUp
 from ident.effects.position import Spring
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Smooth
+from ident.estimators.identify import identify
 from ident.model.model import Column
-from tests.ident.recordings import Truth, acting_on, bent, search_problem_of
+from tests.ident.loops import record_in_loop
+from tests.ident.recordings import CONDITIONING, MOUNTED, Truth, acting_on, bent, search_problem_of
 
 FloatArray = NDArray[np.float64]
 GATES = Gates(draws=199)
@@ -273,6 +275,38 @@ def test_rivals_are_those_that_stop_passing_beside_it(small: Evidence, small_tru
     passed = [{effect_key(one.effect, one.axis) for one in step.findings if one.passed} for step in (first, second)]
     for rival in first.accepted.ambiguity:
         assert effect_key(rival.effect, rival.axis) in passed[0] - passed[1]
+
+
+@pytest.fixture(scope="module")
+def disturbed(small_truth: Truth) -> Evidence:
+    """Identified from runs with a disturbance in the position loop, and nothing else undeclared in them."""
+    rng = np.random.default_rng(0)
+    conditioning = replace(CONDITIONING, standstill_rad_s=(0.03,) * 3)
+    runs = [
+        record_in_loop(small_truth, f"run{index}", rng, MOUNTED if index % 2 else None, disturbance_nm=2.0)
+        for index in range(4)
+    ]
+    return gather(identify(small_truth.model, runs, conditioning), runs)
+
+
+@pytest.mark.parametrize("has_gate", [True, False])
+def test_a_disturbance_in_the_loop_is_no_effect(
+    disturbed: Evidence, has_gate: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without instruments the search takes it for a skew of the time stamps."""
+    if not has_gate:
+        monkeypatch.setattr(loop, "by_instruments", lambda _: None)
+    families = tuple(family for family in EFFECTS if family[0].name == "time-skew")
+    first, *_ = find_effects(disturbed, np.random.default_rng(0), GATES, families)
+    assert (first.accepted is None) == has_gate
+    refused = [one.finding.effect.name for one in first.set_aside if "instruments from the demanded" in one.words]
+    assert ("time-skew" in refused) == has_gate
+
+
+def test_an_effect_joins_beside_a_disturbance_in_the_loop(disturbed: Evidence, small_truth: Truth) -> None:
+    first, *_ = find_effects(_sticking(disturbed, small_truth, 12.0), np.random.default_rng(0), GATES, (STICKING,))
+    assert first.accepted is not None
+    assert first.after.effects == (PlacedEffect(STICKING[0], 1),)
 
 
 def test_two_runs_are_judged_on_moves_alone(small: Evidence, small_runs: tuple[Run, ...]) -> None:

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.discovery.loop import gather, with_effects
+from ident.discovery.loop import by_instruments, gather, with_effects
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import LoadFriction
 from ident.errors import DataUnfit
 from ident.estimators.identify import Identification, identify
-from ident.estimators.maximum_likelihood import iv
+from ident.estimators.method import Method
 from tests.ident.loops import record_in_loop
 from tests.ident.recordings import CONDITIONING, MOUNTED, Truth, record
 
@@ -81,20 +81,22 @@ def test_the_loop_bends_ml_and_not_iv(small_truth: Truth) -> None:
 
 
 def test_instruments_of_rows_are_those_of_the_reduction(small_truth: Truth) -> None:
-    """The search builds its rows whole, the fit as triangles: both give the same estimate."""
+    """The search builds its rows whole, the fit as triangles: both give the same estimate, with and without effects."""
     rng = np.random.default_rng(5)
     runs = [
         record_in_loop(small_truth, name, rng, payload, disturbance_nm=2.0, seconds=8.0)
         for name, payload in (("bare", None), ("loaded", MOUNTED))
     ]
     found = identify(small_truth.model, runs, THREE, method="iv")
-    evidence = gather(found, runs)
-    again = iv(evidence.training.system())
+    evidence = gather(identify(small_truth.model, runs, THREE), runs)
+    again = by_instruments(evidence)
+    assert again is not None
     assert again.gains == pytest.approx(found.estimate.gains, rel=1e-6)
     assert again.gains_std == pytest.approx(found.estimate.gains_std, rel=1e-3)
-    joined = with_effects(evidence, (PlacedEffect(LoadFriction(0), 1),))
-    assert joined.estimate.method is found.estimate.method
-    assert len(joined.estimate.parameters) == len(found.estimate.parameters) + 1
+    joined = by_instruments(with_effects(evidence, (PlacedEffect(LoadFriction(0), 1),)))
+    assert joined is not None
+    assert joined.method is Method.IV
+    assert len(joined.parameters) == len(found.estimate.parameters) + 1
 
 
 def test_continuous_motion_has_no_instruments(small_truth: Truth) -> None:
