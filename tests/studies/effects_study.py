@@ -28,9 +28,10 @@ from daq.config.cell_file import load_cell
 from daq.files import replace_file
 from drivers.simulation.spec import UndeclaredEffect
 from ident.arrays import FloatArray
-from ident.discovery.loop import Evidence, find_effects, gather
+from ident.discovery.loop import Evidence, by_instruments, find_effects, gather
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect, Side
+from ident.estimators.estimate import Estimate
 from ident.estimators.identify import identify
 from tests.studies.blind_cells import blind_cases, confusion
 from tests.studies.data_file import as_csv
@@ -71,6 +72,7 @@ FRICTION = frozenset(
 )
 LARGEST_RISE_PERCENT = 0.2
 """By which an accepted set of effects may raise the worst gain error [points], or by the σ of that gain."""
+WITHIN_95 = 1.96  #: Half-width of a 95 % interval in σ
 PARTS: tuple[tuple[str, tuple[EffectCase, ...]], ...] = (
     ("single", SINGLES),
     ("clean", CLEAN),
@@ -106,6 +108,9 @@ class Row:
         limit_nm: what would have been found on that axis at the end.
         processor_s: of identification and search.
         simulation_s: processor time of the simulation, 0 where the runs were there.
+        set_aside: findings that passed the search, but not a gate of the joint fit.
+        gain_error_percent, gain_std_percent: of each gain after the search, the error with its sign.
+        iv_gain_error_percent, iv_gain_std_percent: the same by ``iv``; empty where no demanded motion is known.
     """
 
     part: str
@@ -126,6 +131,11 @@ class Row:
     simulation_s: float
     floor_percent: float | None = None
     excess_removed: float | None = None
+    set_aside: tuple[str, ...] = ()
+    gain_error_percent: tuple[float, ...] = ()
+    gain_std_percent: tuple[float, ...] = ()
+    iv_gain_error_percent: tuple[float, ...] = ()
+    iv_gain_std_percent: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,6 +238,8 @@ def _search(task: CaseTask, part: str, simulation_s: float) -> Row:
     accepted = tuple(step.accepted for step in steps if step.accepted is not None)
     error_before, error_after = _gain_error(start, truth), _gain_error(end, truth)
     worst = int(np.argmax(error_after))
+    (error, std), refitted = _gains_of(end.estimate, truth), by_instruments(end)
+    aside = [PlacedEffect(one.finding.effect, one.finding.axis) for step in steps for one in step.set_aside]
     return Row(
         part=part,
         case=case.name,
@@ -245,6 +257,11 @@ def _search(task: CaseTask, part: str, simulation_s: float) -> Row:
         limit_nm=float(steps[-1].limits_nm[axis or 0]),
         processor_s=spent_s,
         simulation_s=simulation_s,
+        set_aside=tuple(map(_placed, aside)),
+        gain_error_percent=error,
+        gain_std_percent=std,
+        iv_gain_error_percent=() if refitted is None else _gains_of(refitted, truth)[0],
+        iv_gain_std_percent=() if refitted is None else _gains_of(refitted, truth)[1],
     )
 
 
@@ -263,7 +280,13 @@ def _holdout(evidence: Evidence, axis: int | None) -> float:
 
 def _gain_error(evidence: Evidence, truth: FloatArray) -> FloatArray:
     """Absolute error of each gain [%], shape (n,)."""
-    return np.asarray(100.0 * np.abs(evidence.estimate.gains / truth - 1.0))
+    return np.abs(_gains_of(evidence.estimate, truth)[0])
+
+
+def _gains_of(estimate: Estimate, truth: FloatArray) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Error and σ of each gain [% of the truth]."""
+    error, std = 100.0 * (estimate.gains / truth - 1.0), 100.0 * estimate.gains_std / np.abs(truth)
+    return tuple(error.tolist()), tuple(std.tolist())
 
 
 def _true(effect: UndeclaredEffect) -> str:
@@ -301,9 +324,22 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
             max(row.max_gain_error_percent for row in clean),
         )
         lines.append(
-            f"clean: {sum(bool(row.named) for row in clean)} of {len(clean)} with a false effect; "
+            f"clean: {sum(bool(row.named) for row in clean)} of {len(clean)} with a false effect, "
+            f"{sum(bool(row.set_aside) and not row.named for row in clean)} with one that was set aside; "
             f"error {error:.2f} % in the mean, worst gain {gain:.2f} %"
         )
+    for name, group in (("clean", clean), ("with one effect", single)):
+        for method in ("", "iv_"):
+            errors, stds = (
+                np.array([getattr(row, f"{method}gain_{kind}_percent") for row in group if row.iv_gain_error_percent])
+                for kind in ("error", "std")
+            )
+            if errors.size:
+                held = 100.0 * np.mean(np.abs(errors) < WITHIN_95 * stds)
+                lines.append(
+                    f"gains of cells {name} by {method.strip('_') or 'ml'}: error {np.abs(errors).mean():.2f} % in the "
+                    f"mean, {np.abs(errors).max():.2f} % at most; 95 % intervals hold {held:.1f} %"
+                )
     if rows:
         bent = [
             row
