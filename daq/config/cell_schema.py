@@ -204,7 +204,7 @@ class CellModel(StrictModel):
     sync: Sync | None = None
     axes: Annotated[tuple[AxisModel, ...], Field(min_length=1, max_length=32)]
     payloads: tuple[PayloadModel, ...] = ()
-    conditioning: ConditioningModel
+    conditioning: ConditioningModel = ConditioningModel()
     controller: Controller | None = None
     workspace: WorkspaceSection | None = None
     clearance: ClearanceSection | None = None

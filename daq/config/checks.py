@@ -228,7 +228,7 @@ def _limit_faults(path: Location, axis: AxisModel, in_si: tuple[float, float] | 
 
 
 def _standstill_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
-    """Check for one speed for each axis, in the list of its unit; without prismatic axes the other list is empty."""
+    """Check for one speed for each axis, in the list of its unit, or for none at all: they are then derived."""
     n = len(model.axes)
     lists = {
         "standstill_rad_s": model.conditioning.standstill_rad_s,
@@ -238,6 +238,8 @@ def _standstill_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fa
         axis.limits.unit is MILLIMETRE for axis in model.axes
     ]
     needed = {"standstill_rad_s": not all(prismatic), "standstill_mm_s": any(prismatic)}
+    if not any(lists.values()):
+        return
     complete = True
     for key, speeds in lists.items():
         if len(speeds) != n and (speeds or needed[key]):

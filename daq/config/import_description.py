@@ -21,10 +21,12 @@ SomeColumns = Annotated[tuple[Column, ...], Field(min_length=1)]
 
 
 class PositionUnit(Enum):
-    """Unit of the position columns."""
+    """Unit of the position columns; `rad` and `deg` are m and mm for the prismatic axes of a robot that has both."""
 
     RAD = "rad"
     DEG = "deg"
+    M = "m"
+    MM = "mm"
     COUNTS = "counts"
 
 
@@ -101,10 +103,12 @@ class CurrentColumns:
 
 
 class VelocityUnit(Enum):
-    """Unit of the velocity columns."""
+    """Unit of the velocity columns, as PositionUnit."""
 
     RAD = "rad/s"
     DEG = "deg/s"
+    M = "m/s"
+    MM = "mm/s"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from daq.config.cell import Cell
+from daq.config.cell import MILLIMETRE, Cell
 from daq.config.cell_file import bundle, load_cell
 from daq.config.import_description import ImportDescription, PositionUnit, Side, VelocityUnit, load_import
 from daq.errors import ConfigurationInconsistent, PositionImplausible, TableUnfit
@@ -222,7 +222,7 @@ def _counts(
             return position.astype(np.int64), None
         turn = np.array([axis.counts_per_revolution for axis in cell.axes], dtype=np.float64)
         position = unwrapped(position.astype(np.int32)) * (2.0 * pi / turn)
-    elif wanted.position.unit is PositionUnit.DEG:
+    elif wanted.position.unit in {PositionUnit.DEG, PositionUnit.MM}:
         # On the joint side a prismatic axis is in mm; on the motor side everything is an angle.
         units = [axis.unit.si if wanted.position.side is Side.JOINT else pi / 180.0 for axis in cell.axes]
         position = position * np.array(units)
@@ -279,6 +279,16 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
             expected="counts_per_revolution for each axis of the cell",
             remedy="add it to the cell file",
         )
+    lengths = {PositionUnit.M, PositionUnit.MM, VelocityUnit.M, VelocityUnit.MM}
+    for key, section in (("position", wanted.position), ("velocity", wanted.velocity)):
+        turning = [axis.name for axis in cell.axes if axis.unit is not MILLIMETRE]
+        if section is not None and section.unit in lengths and (turning or section.side is Side.MOTOR):
+            raise ConfigurationInconsistent(
+                f"{description}: {key}.unit",
+                found=f"{section.unit.value}, while {'axis ' + turning[0] if turning else 'a motor'} turns",
+                expected="rad or deg (m or mm for the prismatic axes among them), or counts",
+                remedy="correct the unit; convert the columns of the file to it",
+            )
     _payload(wanted, cell)
 
 
@@ -296,7 +306,7 @@ def _check_velocity(
     stated = files[velocity.file].take(velocity.columns)
     if clock is not None:
         stated = clock.currents(stated[clock.row])
-    if velocity.unit is VelocityUnit.DEG:
+    if velocity.unit in {VelocityUnit.DEG, VelocityUnit.MM}:
         units = [axis.unit.si if velocity.side is Side.JOINT else pi / 180.0 for axis in cell.axes]
         stated = stated * np.array(units)
     if velocity.side is Side.MOTOR:

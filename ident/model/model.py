@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -66,6 +66,12 @@ class Column:
     unit: str
     least: float = -np.inf
     largest: float = np.inf
+
+    def at(self, kind: JointKind) -> Column:
+        """The same at a joint: Nm and rad of a revolute one are N and m of a prismatic one."""
+        if kind is JointKind.REVOLUTE:
+            return self
+        return replace(self, unit=self.unit.replace("Nm", "N").replace("rad", "m"))
 
 
 @dataclass(frozen=True, slots=True)
