@@ -308,18 +308,25 @@ def _refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
     """Why an effect of a joint fit may be a disturbance in the position loop alone; empty where it may not.
 
     A torque that disturbs the arm moves it, and comes back in the current: columns of the recorded motion then explain
-    a part of it, which those of the demanded motion do not.
+    a part of it, which those of the demanded motion do not. Their coefficients may be zero, and are nearer to zero than
+    to those of the fit. Instruments that would not show an effect of that size refute no named one.
     """
     try:
         estimate = by_instruments(evidence)
     except UNFITTED:
-        return ""  # too little is left of the columns to refute anything
+        return ""
     if estimate is None:
         return ""
     own = _own_unknowns(estimate, placed)
-    place = len(estimate.gains) + own
-    noise = in_noise(estimate.parameters[own], estimate.covariance[np.ix_(place, place)])
-    return f"with instruments from the demanded motion, {noise}" if noise else ""
+    place, values, fitted = len(estimate.gains) + own, estimate.parameters[own], evidence.estimate.parameters[own]
+    covariance = estimate.covariance[np.ix_(place, place)]
+    if not (why := in_noise(values, covariance)):
+        return ""
+    precision = np.linalg.pinv(covariance, hermitian=True)
+    nearer = float(fitted @ precision @ (fitted - 2.0 * values)) > 0.0  # |values − fitted|² > |values|²
+    if not is_unnamed(placed.effect) and (not nearer or in_noise(fitted, covariance)):
+        return ""
+    return f"with instruments from the demanded motion, {why}"
 
 
 def _own_unknowns(estimate: Estimate, placed: PlacedEffect) -> IntArray:
@@ -418,7 +425,9 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...]) -> Evidenc
         rows = before.rows_without_effects
         if effects:
             torque = _torques(effects, current, before.datasets, began_s)
-            rows = rows.extended(tuple(column for placed in effects for column in placed.columns), torque)
+            joints = before.model.robot.joints
+            columns = (column.at(joints[placed.axis].kind) for placed in effects for column in placed.columns)
+            rows = rows.extended(tuple(columns), torque)
         training, rest = _split_holdout(rows, before.held_out)
         estimate = estimate_with(before.estimate.method, training.system(), fixed)
         current = replace(before, training=training, holdout=rest, effects=effects, estimate=estimate)
