@@ -6,7 +6,7 @@ docs/reference/residual-json.md describes the keys of the document.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from rich.console import RenderableType
@@ -24,6 +24,7 @@ from ident.discovery.before_after import Account, BeforeAfter, Errors
 from ident.discovery.gates import runs_to_leave_out
 from ident.discovery.gear_loss import CERTAIN, GearLoss, gear_losses, is_gear_loss
 from ident.discovery.loop import MAX_EFFECTS, Step
+from ident.discovery.noise_floor import FloorSource
 from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect, Side
 from ident.effects.electrical import TimeSkew
@@ -120,6 +121,7 @@ def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
             f"{'after' if skew[0] > 0 else 'before'} the positions on all axes alike{beside}."
         )
     ending += gear_sentences(fitted)
+    ending += floor_sentences(account, fitted.cell.axis_names)
     ending += _holdout_verdict(fitted, account)
     if kept and not runs_to_leave_out(fitted.steps[-1].after.training):
         ending.append(
@@ -154,6 +156,20 @@ def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
                 f"from {finding.error_before_percent:.1f} to {finding.error_after_percent:.1f} %, and was not "
                 f"added: {aside.reason(axes)}."
             )
+
+
+def floor_sentences(account: Account, axes: Sequence[str]) -> list[str]:
+    """Name the axes whose noise floor lies above what the model leaves, and the likely cause."""
+    causes = {
+        FloorSource.STANDSTILL: ("at standstill", "a brake that takes the load over, dither or an axis that hunts"),
+        FloorSource.REPEATED_MOVES: ("between repeated moves", "warm-up or a disturbance"),
+    }
+    return [
+        f"{axis} has no noise floor: its current {causes[floor.source][0]} scatters {floor.noise_a / left_a:.1f} times "
+        f"as much as the model's error in motion; the likely cause is {causes[floor.source][1]}."
+        for axis, floor, left_a in zip(axes, account.floors, account.left_a, strict=True)
+        if floor is not None and floor.is_refuted(left_a)
+    ]
 
 
 def _holdout_verdict(fitted: Fit, account: Account) -> list[str]:
@@ -310,10 +326,15 @@ def residual_document(fitted: Fit, account: Account, calibration: Calibration) -
                 else {
                     "axis": axis,
                     "noise": floor.noise_a,
-                    **picked(floor, "std_percent", "dwells"),
+                    "source": floor.source.value,
+                    "std_percent": floor.std_percent,
+                    "dwells": floor.parts if floor.source is FloorSource.STANDSTILL else None,
+                    "pairs": floor.parts if floor.source is FloorSource.REPEATED_MOVES else None,
                     "degrees_of_freedom": floor.freedom,
+                    "left": left_a,
+                    "refuted": floor.is_refuted(left_a),
                 }
-                for axis, floor in zip(axes, account.floors, strict=True)
+                for axis, floor, left_a in zip(axes, account.floors, account.left_a.tolist(), strict=True)
             ],
             "relative_error_percent": error_document(account.floor),
             "holdout_error_percent": error_document(account.holdout_floor),

@@ -145,8 +145,8 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration) -> st
                 paragraph(
                     "Error: the share of each motor's current that the model leaves, ‖e‖/‖v‖, over the rows in motion; "
                     "in total with each current weighted by its gain. Compare errors only under the same filters (end "
-                    "of this page). Noise floor: the share that the noise at standstill would leave; in motion the "
-                    "noise is larger."
+                    "of this page). Noise floor: the share that the current's noise would leave, as measured at "
+                    "standstill or between repeated moves, whichever is smaller."
                 ),
             ),
             *sections,
@@ -256,7 +256,7 @@ def _limits(fitted: Fit) -> str:
         "Backlash or elasticity behind an encoder on the motor may leave no trace in these signals.",
         "An effect is named after the variable it depends on and the shape of that dependence; another cause with the "
         "same dependence would get the same name. Indistinguishable effects are listed with each effect.",
-        "The noise floor is that of standstill, a lower bound: an error above it need not be an effect.",
+        "The noise floor is a lower bound: an error above it need not be an effect.",
     )
     return section("What these data can and cannot show", listed(limits))
 

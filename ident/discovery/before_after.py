@@ -69,6 +69,13 @@ def error_on(observation: Observation, estimate: Estimate) -> CurrentError:
     return CurrentError(np.sum(measured**2, axis=1, where=use), np.sum(residual**2, axis=1, where=use))
 
 
+def left_on(observation: Observation, estimate: Estimate) -> FloatArray:
+    """Root mean square of each motor's e_i [A], shape (n,); NaN for a motor without a row."""
+    rows = observation.motor_use.sum(axis=1)
+    left = error_on(observation, estimate).left
+    return np.asarray(np.sqrt(np.divide(left, rows, out=np.full(len(rows), np.nan), where=rows > 0)))
+
+
 def holdout_change(before: Evidence, after: Evidence) -> PairedChange | None:
     """Compare the squared errors of two models on held-out rows by move, currents weighted by the gains before [Nm²].
 
@@ -223,8 +230,9 @@ class BeforeAfter:
 class Account:
     """Change by a whole search for effects."""
 
-    floors: tuple[NoiseFloor | None, ...]  #: noise of each motor at standstill, None where it rested too little
-    #: Error that this noise alone would leave on the rows of the fit [%]; NaN where it is not known.
+    floors: tuple[NoiseFloor | None, ...]  #: noise of each motor's current, None where it is not known
+    left_a: FloatArray  #: `left_on` the rows of the fit after the last turn [A]
+    #: Error that this noise alone would leave on the rows of the fit [%]; NaN where it is not known or refuted.
     floor: RelativeError
     holdout_floor: RelativeError | None  #: the same on held-out rows, None without any
     turns: tuple[BeforeAfter | None, ...]  #: change by each turn of the loop, None where it added nothing
@@ -264,11 +272,16 @@ def account(
             continue
         before, last = last, assessed(step.after)
         turns.append(before_after(before, last))
-    floors = noise_floors(start.trained, start.conditioning)
+    floors, end = noise_floors(start.trained, start.conditioning), steps[-1].after
+    left_a = left_on(end.training, end.estimate)
+    bounds = tuple(
+        None if floor is None or floor.is_refuted(left) else floor for floor, left in zip(floors, left_a, strict=True)
+    )
     return Account(
         floors=floors,
-        floor=floor_on(start.training, floors).relative(weights_nm_a),
-        holdout_floor=None if start.holdout is None else floor_on(start.holdout, floors).relative(weights_nm_a),
+        left_a=left_a,
+        floor=floor_on(start.training, bounds).relative(weights_nm_a),
+        holdout_floor=None if start.holdout is None else floor_on(start.holdout, bounds).relative(weights_nm_a),
         turns=tuple(turns),
         total=before_after(first, last),
         holdout_change=holdout_change(start, steps[-1].after),
@@ -335,7 +348,7 @@ def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
 
 
 def floor_on(observation: Observation, floors: Sequence[NoiseFloor | None]) -> CurrentError:
-    """Error that the noise at standstill would leave on some rows; NaN for a motor whose noise is not known."""
+    """Error that noise alone would leave on some rows; NaN for a motor whose noise is not known."""
     use = observation.motor_use
     noise_a = np.array([np.nan if floor is None else floor.noise_a for floor in floors])
     return CurrentError(np.sum(observation.current**2, axis=1, where=use), use.sum(axis=1) * noise_a**2)

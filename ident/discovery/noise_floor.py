@@ -1,40 +1,68 @@
-"""Noise floor: the noise of each motor's current at standstill, which bounds a model's error from below.
+"""Noise floor: the noise of each motor's current, which bounds a model's error from below.
 
-While a joint stands still no model of motion has anything to explain: friction holds it within ±Fs, the amplifier's
-integrator creeps, and faster changes of the current are noise of measurement and control. Each standstill of a motor
-is filtered and decimated like every row (windows wholly inside), a parabola in time is subtracted, and the rest gives
-an estimate of σ² from each dwell d,
+Two estimates of σ² are made of parts in which no model has anything to explain:
+
+- a dwell: while a joint stands still, friction holds it within ±Fs, the amplifier's integrator creeps, and faster
+  changes of the current are noise of measurement and control;
+- a pair of repeated moves: two stretches in which the motor moves and all axes follow the same path. In the difference
+  of their currents, divided by √2, torques that depend on the path cancel, and so do the errors of any model of them.
+  Disturbances, quantisation, noise of encoder and control, and ripple whose phase is random remain.
+
+Each part is filtered and decimated like every row (windows wholly inside), a parabola in time is subtracted, and the
+rest gives an estimate of σ² from each part d,
 
     s_d² = ‖M_d v_d‖²/tr(M_d P_d),        M_d = I − H_d,
 
 with H_d the projection on (1, t, t²) and P_d the correlation that the filter itself gives to rows of white noise, so
-that a short dwell counts only by what the detrending leaves of it. s_d² is nearly σ² χ²_ν/ν with ν = tr(MP)²/tr(MPMP)
-(Satterthwaite 1946); divided by the median of χ²_ν/ν every dwell is as likely above σ² as below, and σ² is their
-median, weighted by ν. A median, because an axis slips or rings in some of its dwells.
+that a short part counts only by what the detrending leaves of it. s_d² is nearly σ² χ²_ν/ν with ν = tr(MP)²/tr(MPMP)
+(Satterthwaite 1946); divided by the median of χ²_ν/ν every part is as likely above σ² as below, and σ² is their
+median, weighted by ν. A median, because an axis slips or rings in some of its dwells and is disturbed in some moves.
+
+Pairs are neighbours in time, so that warm-up changes little between them; the parabola subtracts a change of Coulomb
+friction. Of m repetitions they are m − 1 pairs, each of which shares a move with the next: together they have
+2(m − 1)²/(3m − 4) times the freedom of one (von Neumann, Kent, Bellinson & Hart 1941), not m − 1 times.
+
+The smaller estimate is taken: either can be too high, standstill where an axis hunts about its target or a brake takes
+the load over in most dwells, repeated moves where the robot warms up or the paths differ a little.
 
 Limits. It is a lower bound: standstill does not show ripple, commutation error and the differentiated noise of the
-encoder; noise slower than a dwell is subtracted with the parabola. It is too high where an axis hunts about its target
-in most of its dwells. Dwells with one constant number (power stage off, brake on) are no measurement and are left out.
+encoder; noise slower than a part is subtracted with the parabola. A floor above the error of a model on rows in motion
+is refuted (`NoiseFloor.is_refuted`). Parts with one constant number (power stage off, brake on, one run given twice)
+are no measurement and are left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from functools import lru_cache
 
 import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
 
-from ident.arrays import FloatArray
+from ident.arrays import BoolArray, FloatArray
 from ident.data.conditioning import Conditioning, decimator
 from ident.data.dataset import Dataset
 from ident.equations.rows import row_filter
 
 MIN_DWELLS = 8
+MIN_PAIRS = 4  #: Fewer than dwells: a stretch of motion is longer, and no brake or settling controller is in it
 MIN_FREEDOM = 20.0  #: σ is then known to 20 %
+PATH_TOLERANCE = 2e-3
+"""Largest distance between the paths of two repetitions, as a share of each axis's travel: the torques of both then
+differ by about as small a share, and a difference that is left makes the estimate too high, never too low."""
+DURATION_TOLERANCE = 0.1  #: Largest difference in duration: an axis creeps into its target
+REFUTED_SIGMAS = 3.0  #: Under a perfect model, one floor in 700 is refuted by chance
 _TREND = 3  #: Coefficients of the parabola: a straight line would leave the bend of a settling controller
 _MEDIAN_EFFICIENCY = 2.0 / np.pi  #: Efficiency of a median of many against their mean (van der Vaart 1998, §21.2)
+
+
+class FloorSource(Enum):
+    """What a noise floor is measured on."""
+
+    STANDSTILL = "standstill"
+    REPEATED_MOVES = "repeated moves"
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,55 +70,173 @@ class NoiseFloor:
     """Noise floor of one motor."""
 
     noise_a: float  #: σ of the current in the observation's rows [A]
-    dwells: int  #: number of standstills used
-    freedom: float  #: their degrees of freedom, ν summed
+    source: FloorSource
+    parts: int  #: number of standstills, or of pairs of repeated moves, used
+    freedom: float  #: their degrees of freedom; pairs that share a move count less
 
     @property
     def std_percent(self) -> float:
         """Relative standard deviation of noise_a itself, for Gaussian noise [%]."""
         return 100.0 / float(np.sqrt(2.0 * _MEDIAN_EFFICIENCY * self.freedom))
 
+    def is_refuted(self, left_a: float) -> bool:
+        """Whether a model leaves so little on rows in motion [A, root mean square] that the floor is too high."""
+        return bool(self.noise_a > (1.0 + REFUTED_SIGMAS * self.std_percent / 100.0) * left_a)
 
-def noise_floors(datasets: Sequence[Dataset], conditioning: Conditioning) -> tuple[NoiseFloor | None, ...]:
-    """Estimate the noise of each motor's current in rows, None where it rested too seldom or too briefly.
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """One estimate of σ², from a dwell or from a pair of repeated moves."""
+
+    variance_a2: float  #: s_d²
+    freedom: float  #: ν
+    weight: float  #: freedom that it adds to the others'
+
+
+def noise_floors(
+    datasets: Sequence[Dataset],
+    conditioning: Conditioning,
+    sources: Sequence[FloorSource] = tuple(FloorSource),
+) -> tuple[NoiseFloor | None, ...]:
+    """Estimate the noise of each motor's current in rows.
+
+    Args:
+        datasets: of one robot.
+        conditioning: the filter of the rows.
+        sources: estimates to make.
+
+    Returns:
+        one a motor: the smallest of the estimates, None where the data allow none.
 
     Raises:
         DataUnfit: a run is too short for the filter.
     """
-    return tuple(_floor(datasets, conditioning, motor) for motor in range(datasets[0].current_a.shape[1]))
-
-
-def _floor(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) -> NoiseFloor | None:
-    dwells: list[tuple[float, float]] = []
     for data in datasets:
-        filter_ = row_filter(data, conditioning)
-        still = ~data.motor_moving[:, motor] & data.valid[:, motor]
-        edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
-        for start, stop in zip(edges[::2], edges[1::2], strict=True):
-            current = data.current_a[start:stop, motor]
-            if filter_.rows(len(current)) > _TREND and np.ptp(current) > 0.0:
-                dwells.append(_variance(filter_(current), data.rate_hz, conditioning.decimation_cutoff_hz))
-    if len(dwells) < MIN_DWELLS:
+        row_filter(data, conditioning)
+    parts_of = {FloorSource.STANDSTILL: _dwells, FloorSource.REPEATED_MOVES: _pairs}
+    floors: list[NoiseFloor | None] = []
+    for motor in range(datasets[0].current_a.shape[1]):
+        made = [_floor(tuple(parts_of[source](datasets, conditioning, motor)), source) for source in sources]
+        known = [floor for floor in made if floor is not None]
+        floors.append(min(known, key=lambda floor: floor.noise_a, default=None))
+    return tuple(floors)
+
+
+def _floor(parts: Sequence[_Part], source: FloorSource) -> NoiseFloor | None:
+    """Weighted median of the parts, None if they are too few or too short."""
+    fewest = MIN_DWELLS if source is FloorSource.STANDSTILL else MIN_PAIRS
+    total = sum(part.weight for part in parts)
+    if len(parts) < fewest or total < MIN_FREEDOM:
         return None
-    variance, freedom = np.array(dwells).T
-    if freedom.sum() < MIN_FREEDOM:
-        return None
+    variance, freedom, weight = np.array([(part.variance_a2, part.freedom, part.weight) for part in parts]).T
     likely = variance * freedom / scipy.special.chdtri(freedom, 0.5)
     order = np.argsort(likely)
-    share = np.cumsum(freedom[order]) / freedom.sum()
+    share = np.cumsum(weight[order]) / total
     middle = likely[order][int(np.searchsorted(share, 0.5))]
-    return NoiseFloor(float(np.sqrt(middle)), len(dwells), float(freedom.sum()))
+    return NoiseFloor(float(np.sqrt(middle)), source, len(parts), float(total))
 
 
-def _variance(seen: FloatArray, rate_hz: float, cutoff_hz: float) -> tuple[float, float]:
-    """Variance s_d² [A²] and freedom ν of one dwell, by its rows."""
-    trend, expected, freedom = _detrending(rate_hz, cutoff_hz, len(seen))
-    return float(np.sum((seen - trend @ (trend.T @ seen)) ** 2)) / expected, freedom
+def _dwells(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) -> Iterator[_Part]:
+    for data in datasets:
+        for dwell in _stretches(~data.motor_moving[:, motor] & data.valid[:, motor]):
+            yield from _part(data.current_a[dwell, motor], data.rate_hz, conditioning)
+
+
+def _pairs(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) -> Iterator[_Part]:
+    for differences, rate_hz in _repetitions(datasets, motor):
+        pairs = len(differences)
+        for difference in differences:
+            yield from _part(difference / np.sqrt(2.0), rate_hz, conditioning, share=2.0 * pairs / (3.0 * pairs - 1.0))
+
+
+def _part(current_a: FloatArray, rate_hz: float, conditioning: Conditioning, share: float = 1.0) -> Iterator[_Part]:
+    """Variance and freedom of one part by its rows; nothing where it is too short or constant."""
+    filter_ = decimator(rate_hz, conditioning.decimation_cutoff_hz)
+    if filter_.rows(len(current_a)) <= _TREND or np.ptp(current_a) == 0.0:
+        return
+    seen = filter_(current_a)
+    trend, expected, freedom = _detrending(rate_hz, conditioning.decimation_cutoff_hz, len(seen))
+    yield _Part(float(np.sum((seen - trend @ (trend.T @ seen)) ** 2)) / expected, freedom, share * freedom)
+
+
+def _stretches(flags: BoolArray) -> list[slice]:
+    """Samples that follow each other and are all set, shape (k,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], flags, [False])).astype(np.int8)))
+    return [slice(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Chain:
+    """Repetitions of one move of a motor, as they followed each other."""
+
+    data: Dataset  #: run of the last one
+    part: slice  #: its samples
+    differences: tuple[FloatArray, ...]  #: of the currents of each and the one before [A], shape (k,)
+
+
+def _repetitions(datasets: Sequence[Dataset], motor: int) -> Iterator[tuple[tuple[FloatArray, ...], float]]:
+    """Differences of a motor's current between repetitions of each of its moves, and their sampling rate [Hz].
+
+    A move of the motor is a stretch between two standstills or reversals of it, so that continuous motion has moves.
+    """
+    moved = np.any([data.moving.any(axis=0) for data in datasets], axis=0)
+    travel = np.max([np.ptp(data.position_rad, axis=0) for data in datasets], axis=0)
+    scale = np.where(moved, 1.0 / np.where(moved, travel, 1.0), 0.0)  # an axis that rests throughout has no path
+    chains: list[_Chain] = []
+    ends = np.empty((0, 2, len(scale)))  # of the last move of each chain
+    for data in sorted(datasets, key=lambda data: data.started_s or 0.0):
+        for part in _stretches(data.motor_moving[:, motor] & data.valid[:, motor]):
+            end = data.position_rad[[part.start, part.stop - 1]] * scale
+            # Where a move begins is known to some samples only, in which other axes move on.
+            near = np.flatnonzero(np.all(np.abs(ends - end) < 10.0 * PATH_TOLERANCE, axis=(1, 2)))
+            for index in near:
+                difference = _difference(chains[index], data, part, motor, scale)
+                if difference is not None:
+                    chains[index] = _Chain(data, part, (*chains[index].differences, difference))
+                    ends[index] = end
+                    break
+            else:
+                chains.append(_Chain(data, part, ()))
+                ends = np.concatenate((ends, end[None]))
+    for chain in chains:
+        if chain.differences:
+            yield chain.differences, chain.data.rate_hz
+
+
+def _difference(chain: _Chain, data: Dataset, part: slice, motor: int, scale: FloatArray) -> FloatArray | None:
+    """Current of a move minus that of the last one of a chain [A], shape (k,); None if it is no repetition of it.
+
+    The two are aligned by their paths, because neither log nor controller starts a move at a sample. With q' = q + λ q̇
+    where the later one is ahead by λ, λ is found by least squares over all axes, scaled by their travel.
+    """
+    before, rate = chain.data, data.rate_hz
+    lengths = (chain.part.stop - chain.part.start, part.stop - part.start)
+    length = min(lengths)
+    if (
+        max(lengths) > (1.0 + DURATION_TOLERANCE) * length
+        or before.payload != data.payload
+        or not np.isclose(before.rate_hz, rate, rtol=1e-4)
+    ):
+        return None
+    first = slice(chain.part.start, chain.part.start + length)
+    speed = before.velocity_rad_s[first] * scale
+    start, ahead = part.start, 0.0
+    for _ in range(2):
+        start -= round(ahead)
+        if start < 1 or start + length >= len(data.time_s):
+            return None
+        apart = (data.position_rad[start : start + length] - before.position_rad[first]) * scale
+        ahead = float(np.sum(speed * apart) / np.sum(speed**2)) * rate  # in samples
+    if np.max(np.abs(apart - ahead / rate * speed)) > PATH_TOLERANCE or abs(ahead) > 1.0:
+        return None
+    current, step = data.current_a[:, motor], -1 if ahead > 0.0 else 1
+    nearest, next_ = current[start : start + length], current[start + step : start + step + length]
+    return np.asarray(nearest + abs(ahead) * (next_ - nearest) - before.current_a[first, motor])
 
 
 @lru_cache(maxsize=1024)
 def _detrending(rate_hz: float, cutoff_hz: float, rows: int) -> tuple[FloatArray, float, float]:
-    """Orthonormal parabolas over so many rows, shape (rows, 3), tr(MP) and ν: every dwell of this length has them."""
+    """Orthonormal parabolas over so many rows, shape (rows, 3), tr(MP) and ν: every part of this length has them."""
     filter_ = decimator(rate_hz, cutoff_hz)
     trend, _ = np.linalg.qr(np.vander(np.arange(rows, dtype=np.float64), _TREND))
     rest = np.eye(rows) - trend @ trend.T

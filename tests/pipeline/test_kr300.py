@@ -1,4 +1,4 @@
-"""The real KUKA KR300: what two runs call for, a third one does not refute."""
+"""The real KUKA KR300: a third run does not refute the effects of two, and a floor from standstill is refuted."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from ident.data.run import Run
-from ident.discovery.before_after import holdout_change
+from ident.discovery.before_after import holdout_change, left_on
 from ident.discovery.gates import impossible
 from ident.discovery.loop import find_effects, gather
+from ident.discovery.noise_floor import FloorSource, noise_floors
 from ident.estimators.identify import identify
 from ident.estimators.method import Method
 
@@ -37,3 +38,20 @@ def test_no_impossible_effect_joins_and_no_effect_raises_the_held_out_error(shar
     estimate = after.estimate
     assert not impossible(estimate.unknowns, estimate.parameters, estimate.parameters_std)
     assert not any(placed.effect.name == "warm-up" for placed in after.effects)
+
+
+def test_the_current_at_standstill_is_no_noise_floor(shared_data: Path) -> None:
+    """Before and after each motion the load passes between brakes, friction and motors of the standing arm."""
+    folder = shared_data / "kr300"
+    cell, runs = load_cell(folder / "kr300-cell.yaml"), [_run(folder, name) for name in "ABC"]
+    gains = np.array([axis.nameplate_gain for axis in cell.axes])
+    found = identify(model_of(cell), runs, cell.conditioning, method=Method.ML, fixed_gains=gains)
+    start = gather(found, runs)
+    left_a = left_on(start.training, start.estimate)
+    *others, floor = noise_floors(start.trained, cell.conditioning)
+    assert others == [None] * 5
+    assert floor is not None
+    assert floor.noise_a > 3.0 * left_a[5]
+    assert floor.is_refuted(left_a[5])
+    # No run repeats a move of another or its own.
+    assert noise_floors(start.trained, cell.conditioning, (FloorSource.REPEATED_MOVES,)) == (None,) * 6

@@ -33,6 +33,7 @@ from ident.discovery.before_after import Account, account
 from ident.discovery.gates import PairedChange
 from ident.discovery.gear_loss import GearLoss
 from ident.discovery.loop import SetAside, Step, with_effects
+from ident.discovery.noise_floor import FloorSource, NoiseFloor
 from ident.discovery.search import Finding
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect
@@ -255,7 +256,8 @@ def test_the_document_is_complete_and_described(closed: Closed, checkout: Path) 
     document = closed.document()
     finding, turn = document["turns"][0]["findings"][0], document["turns"][0]
     described = (checkout / "docs" / "reference" / "residual-json.md").read_text(encoding="utf-8")
-    named = (document, turn, finding, document["before"], document["gain_changes"][0], document["noise_floor"])
+    floors = document["noise_floor"]
+    named = (document, turn, finding, document["before"], document["gain_changes"][0], floors, floors["motors"][0])
     for key in {key for part in named for key in part}:
         assert f"`{key}`" in described, key
     assert document["filter"]["position_cutoff_hz"] == closed.fitted.cell.conditioning.position_cutoff_hz
@@ -270,11 +272,30 @@ def test_what_to_check_comes_first(closed: Closed) -> None:
     assert document["diagnoses"][0]["runs"] == ["loaded-2"]
 
 
+def test_a_noise_floor_above_the_error_of_the_model_is_reported_with_its_cause(closed: Closed) -> None:
+    left_a = closed.account.left_a
+    floors = (
+        NoiseFloor(4.0 * float(left_a[0]), FloorSource.STANDSTILL, 20, 100.0),
+        NoiseFloor(2.0 * float(left_a[1]), FloorSource.REPEATED_MOVES, 20, 100.0),
+        NoiseFloor(0.9 * float(left_a[2]), FloorSource.REPEATED_MOVES, 12, 100.0),
+        *(None,) * 3,
+    )
+    refuted = Closed(closed.fitted, replace(closed.account, floors=floors))
+    first, second = (line for line in summary(refuted.fitted, refuted.account) if "no noise floor" in line)
+    assert first.startswith("J1 has no noise floor: its current at standstill scatters 4.0 times as much as")
+    assert second.startswith("J2 has no noise floor: its current between repeated moves scatters 2.0 times")
+    motors = refuted.document()["noise_floor"]["motors"]
+    assert [motor and motor["refuted"] for motor in motors] == [True, True, False, None, None, None]
+    assert [motor["dwells"] for motor in motors[:3]] == [20, None, None]
+    assert (motors[2]["source"], motors[2]["pairs"]) == ("repeated moves", 12)
+    assert motors[2]["left"] == pytest.approx(left_a[2])
+
+
 def test_silence_is_reported_with_its_size(closed: Closed) -> None:
     last = closed.fitted.steps[-1]
     start = closed.fitted.evidence()
     silent = replace(closed.fitted, steps=(replace(last, after=start),))
-    outcome, limits = summary(silent, account(start, silent.steps))
+    outcome, limits, *_ = summary(silent, account(start, silent.steps))
     assert outcome.startswith("No structure found")
     assert "1.2 Nm on J2" in limits
     assert "no common clock: a warm-up over the session cannot be seen" in limits

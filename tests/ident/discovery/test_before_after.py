@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.data.run import Run
+from ident.discovery import before_after as before_after_module
 from ident.discovery.before_after import (
     Account,
     CurrentError,
@@ -19,10 +20,11 @@ from ident.discovery.before_after import (
     error_on,
     floor_on,
     holdout_change,
+    left_on,
     left_out_runs,
 )
 from ident.discovery.loop import Evidence, Step, gather, with_effects, without_effects
-from ident.discovery.noise_floor import NoiseFloor
+from ident.discovery.noise_floor import FloorSource, NoiseFloor
 from ident.effects.effect import PlacedEffect
 from ident.effects.electrical import Saturation
 from ident.effects.position import Spring
@@ -222,13 +224,28 @@ def test_a_left_out_run_is_predicted_by_the_others_alone(
 
 
 def test_the_noise_floor_is_relative_to_the_same_currents(start: Evidence) -> None:
-    floors = (NoiseFloor(0.05, 20, 100.0),) * 5 + (None,)
+    floors = (NoiseFloor(0.05, FloorSource.STANDSTILL, 20, 100.0),) * 5 + (None,)
     error = floor_on(start.training, floors).relative(start.estimate.gains)
     used = start.training.motor_use[0]
     rms_a = np.sqrt(np.mean(start.training.current[0, used] ** 2))
     assert error.axes[0] == pytest.approx(100.0 * 0.05 / rms_a)
     assert np.isnan(error.axes[5])
     assert np.isnan(error.total)
+
+
+def test_a_refuted_floor_bounds_no_error(start: Evidence, after: Evidence, monkeypatch: pytest.MonkeyPatch) -> None:
+    left_a = left_on(after.training, after.estimate)
+    factors = np.array([0.9, 1.1, 2.0, 0.9, 1.1, 2.0])  # of what the model leaves; these floors are known to 9 %
+    floors = tuple(NoiseFloor(float(noise_a), FloorSource.STANDSTILL, 20, 100.0) for noise_a in factors * left_a)
+    monkeypatch.setattr(before_after_module, "noise_floors", lambda *_: floors)
+    made = account(start, [Step((), (), np.zeros(6), None, after)])
+    assert made.floors == floors
+    assert made.left_a == pytest.approx(left_a)
+    assert np.isnan(made.floor.axes).tolist() == [False, False, True] * 2
+    ratio = np.array(made.floor.axes) / made.total.after.in_sample.axes
+    assert ratio[[0, 1]] == pytest.approx(factors[[0, 1]])
+    assert made.holdout_floor is not None
+    assert np.isnan(made.holdout_floor.axes).tolist() == [False, False, True] * 2
 
 
 def test_fixed_gains_do_not_change(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:

@@ -1,7 +1,8 @@
-"""Noise floor: a known noise is recovered, whatever the axis does at rest; without data there is no floor."""
+"""Noise floor: a known noise is recovered at rest and between repeated moves; without data there is no floor."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 
 from ident.data.conditioning import decimator
 from ident.data.dataset import Dataset, differentiate
-from ident.discovery.noise_floor import NoiseFloor, noise_floors
-from tests.ident.recordings import CONDITIONING, Truth, record
+from ident.discovery.noise_floor import FloorSource, NoiseFloor, noise_floors
+from tests.ident.recordings import CONDITIONING, MOUNTED, Truth, record
 
 FloatArray = NDArray[np.float64]
 
@@ -42,10 +43,11 @@ def _parts(still: NDArray[np.bool_]) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def _noisy(runs: tuple[Dataset, ...], seed: int = 5) -> tuple[Dataset, ...]:
+def _noisy(runs: Sequence[Dataset], seed: int = 5) -> tuple[Dataset, ...]:
     rng = np.random.default_rng(seed)
+    noise_a = NOISE_A[: runs[0].current_a.shape[1]]
     return tuple(
-        replace(data, current_a=data.current_a + NOISE_A * rng.standard_normal(data.current_a.shape)) for data in runs
+        replace(data, current_a=data.current_a + noise_a * rng.standard_normal(data.current_a.shape)) for data in runs
     )
 
 
@@ -63,7 +65,7 @@ def _all(floors: tuple[NoiseFloor | None, ...]) -> tuple[NoiseFloor, ...]:
 def _expected_a(data: Dataset) -> FloatArray:
     """σ of a filtered row of white noise."""
     taps = decimator(data.rate_hz, CONDITIONING.decimation_cutoff_hz).taps
-    return np.asarray(NOISE_A * np.linalg.norm(taps))
+    return np.asarray(NOISE_A[: data.current_a.shape[1]] * np.linalg.norm(taps))
 
 
 def test_a_known_noise_comes_back(resting: tuple[Dataset, ...]) -> None:
@@ -132,4 +134,90 @@ def test_it_has_the_unit_of_the_current_and_no_offset(
     scaled = [replace(data, current_a=factor * (data.current_a + offset)) for data in noisy]
     for one, other in zip(floors, _all(noise_floors(scaled, CONDITIONING)), strict=True):
         assert other.noise_a == pytest.approx(factor * one.noise_a, rel=1e-6)
-        assert (other.dwells, other.freedom) == (one.dwells, one.freedom)
+        assert (other.parts, other.freedom) == (one.parts, one.freedom)
+
+
+SMALL = replace(CONDITIONING, standstill_rad_s=(0.03,) * 3)
+MOVES = (FloorSource.REPEATED_MOVES,)
+
+
+@pytest.fixture(scope="module")
+def repeated(small_truth: Truth) -> tuple[Dataset, ...]:
+    """Three noiseless runs of the same moves, each 2.4 samples later than the one before."""
+
+    def run(number: int) -> Dataset:
+        def later(q: FloatArray) -> FloatArray:
+            at = np.arange(len(q))
+            return np.stack([np.interp(at - 2.4 * number, at, axis) for axis in q.T], axis=1)
+
+        made = record(small_truth, f"run{number}", np.random.default_rng(8), seconds=22.0, bend=later)
+        return differentiate(made, small_truth.model.drive_train, SMALL)
+
+    return tuple(run(number) for number in range(3))
+
+
+def test_repeated_moves_recover_a_known_noise(repeated: tuple[Dataset, ...]) -> None:
+    """Torques of the motion cancel, ten times larger than the noise in a row; the start of a move is no sample."""
+    drawn = [_all(noise_floors(_noisy(repeated, seed), SMALL, MOVES)) for seed in range(20)]
+    assert all(floor.source is FloorSource.REPEATED_MOVES and floor.parts > 30 for floor in drawn[0])
+    relative = np.array([[floor.noise_a for floor in floors] for floors in drawn]) / _expected_a(repeated[0])
+    reported = np.mean([floor.std_percent for floor in drawn[0]]) / 100.0
+    assert relative.mean() == pytest.approx(1.0, abs=3.0 * reported / np.sqrt(relative.size) + 0.01)
+    # 60 estimates: their scatter is known to 1/√120 of itself, 9 %; three of those.
+    assert relative.std() == pytest.approx(reported, rel=0.27)
+
+
+def test_pairs_that_share_a_move_have_less_freedom(repeated: tuple[Dataset, ...]) -> None:
+    """Three repetitions have 8/5 of the freedom of two, not twice (von Neumann et al. 1941)."""
+    same = _noisy((repeated[0],) * 3)
+    three, two = (_all(noise_floors(runs, SMALL, MOVES)) for runs in (same, same[:2]))
+    for many, few in zip(three, two, strict=True):
+        assert many.parts == 2 * few.parts
+        assert many.freedom == pytest.approx(1.6 * few.freedom)
+
+
+def test_friction_that_changes_between_repetitions_is_no_noise(repeated: tuple[Dataset, ...]) -> None:
+    noisy = _noisy(repeated)
+    warming = [
+        replace(data, current_a=data.current_a + 5.0 * number * np.sign(data.velocity_rad_s))
+        for number, data in enumerate(noisy)
+    ]
+    for one, other in zip(*(_all(noise_floors(runs, SMALL, MOVES)) for runs in (noisy, warming)), strict=True):
+        assert other.noise_a == pytest.approx(one.noise_a, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("loud_in_motion", "source"), [(False, FloorSource.REPEATED_MOVES), (True, FloorSource.STANDSTILL)]
+)
+def test_the_smaller_of_both_estimates_is_taken(
+    repeated: tuple[Dataset, ...], loud_in_motion: bool, source: FloorSource
+) -> None:
+    """A robot that hunts at standstill, and one that is disturbed in motion."""
+    rng, runs = np.random.default_rng(2), []
+    for data in _noisy([replace(data, current_a=data.current_a * data.motor_moving) for data in repeated]):
+        loud = 3.0 * rng.standard_normal(data.current_a.shape) * (data.motor_moving == loud_in_motion)
+        runs.append(replace(data, current_a=data.current_a + loud))
+    for floor, expected in zip(_all(noise_floors(runs, SMALL)), _expected_a(runs[0]), strict=True):
+        assert floor.source is source
+        assert floor.noise_a == pytest.approx(expected, rel=DEVIATIONS * floor.std_percent / 100.0)
+
+
+def test_other_paths_payloads_and_rates_are_no_repetition(repeated: tuple[Dataset, ...]) -> None:
+    first, second, _ = _noisy(repeated)
+    others = (
+        replace(second, position_rad=second.position_rad + np.array([0.05, 0.0, 0.0])),  # 1 % of the travel
+        replace(second, payload=MOUNTED),
+        replace(second, rate_hz=1.01 * second.rate_hz),
+        replace(second, valid=np.zeros_like(second.valid)),
+        first,  # one run given twice
+    )
+    for other in others:
+        assert noise_floors((first, other), SMALL, MOVES) == (None,) * 3
+
+
+def test_a_floor_far_above_the_error_of_a_model_is_refuted() -> None:
+    floor = NoiseFloor(0.12, FloorSource.STANDSTILL, 10, 80.0)
+    assert floor.std_percent == pytest.approx(9.9, abs=0.1)
+    assert floor.is_refuted(0.09)
+    assert not floor.is_refuted(0.1)
+    assert not floor.is_refuted(float("nan"))
