@@ -23,6 +23,7 @@ from ident.effects.friction import LoadFriction
 from ident.effects.transmission import Efficiency
 from ident.equations.rows import Observation
 from ident.estimators.estimate import Estimate
+from ident.model.model import dry_friction_columns, link_columns
 
 CERTAIN = 2.0  #: Standard deviations of the loss that count against the gain
 SMALL_SHIFT = 0.01  #: Relative error of a gain below which an unseen loss does not matter
@@ -82,15 +83,14 @@ def driving_shares(observation: Observation, estimate: Estimate) -> tuple[tuple[
     count = observation.joint_count
     standard = np.array(observation.base.independent)
     linear = observation.linear()
-    # Payload columns follow those of the effects, which follow the base parameters: of these, bodies are a joint's
-    # first ten.
+    # Payload columns follow those of the effects, which follow the base parameters.
     is_load = np.ones(linear.shape[1], dtype=np.bool_)
     is_load[: len(observation.columns)] = False
-    is_load[: len(standard)] = (standard < 14 * count) & (standard % 14 < 10)
+    is_load[: len(standard)] = np.isin(standard, link_columns(count))
     load = np.einsum("jpr,p->jr", linear[:, is_load], estimate.parameters[is_load]) + observation.known()
     shares: list[tuple[float, float]] = []
-    for joint, used in enumerate(observation.use):
-        dry = np.flatnonzero(standard == 14 * joint + 12)
+    for joint, (used, friction) in enumerate(zip(observation.use, dry_friction_columns(count), strict=True)):
+        dry = np.flatnonzero(standard == friction)
         if not len(dry) or not used.any():
             shares.append((float("nan"), float("nan")))
             continue

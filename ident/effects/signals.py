@@ -14,7 +14,7 @@ from ident.data.dataset import Dataset
 from ident.equations.rows import Observation
 from ident.estimators.estimate import Estimate
 from ident.model.bodies import LINK_PARAMETERS, Payload
-from ident.model.model import Model
+from ident.model.model import Model, link_columns
 from ident.model.regressor import mass_matrix
 
 STICKING_RAD_S = 0.005  #: Below this speed the noise of the filtered encoder decides the sign
@@ -161,7 +161,7 @@ def _inertia_of_joints(model: Model, data: Dataset, standard: FloatArray) -> Flo
     """Mass matrix of links and payload, shape (n, n, k), interpolated between postures because it changes slowly."""
     samples, count = data.position_rad.shape
     postures = np.linspace(0, samples - 1, max(2, samples // POSTURE_SAMPLES)).round().astype(np.int64)
-    links = standard[: 14 * count].reshape(count, 14)[:, : len(LINK_PARAMETERS)]
+    links = standard[link_columns(count)]
     coarse = mass_matrix(model.robot, np.ascontiguousarray(data.position_rad[postures].T), links)
     mass = np.empty((count, count, samples))
     for row, joint in zip(*np.tril_indices(count), strict=True):

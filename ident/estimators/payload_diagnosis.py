@@ -13,6 +13,7 @@ from ident.equations.linearisation import MIN_MOVES_TO_LEAVE_OUT, left_out_shift
 from ident.equations.system import System
 from ident.errors import Diagnosis, PayloadDiffers
 from ident.estimators.maximum_likelihood import noise_of
+from ident.model.model import link_columns
 
 LEAST_SHARE = 0.15  #: Torque of a payload's difference, relative to the payload's
 UNSEEN_SHARE = 0.3  #: The same in a held-out run, where the errors of all other parameters are in it
@@ -91,8 +92,7 @@ def payload_differences(
     if not system.payloads or tuple(column.name for column in system.columns[:leading]) != system.base.names:
         return []  # parameters were taken out, and the flange's columns with them
     count = system.joint_count
-    last = 14 * (count - 1)
-    of_base = system.base.grouping[:, last : last + 10]
+    of_base = system.base.grouping[:, link_columns(count)[-1]]
     noise = noise_of(system.motors, 1.0 / gains, parameters, 0)
     first, least = (held, LEAST_SHARE) if held is not None else (count + len(parameters), UNSEEN_SHARE)
     blocks = []  # J, e and X of each move

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.arrays import BoolArray, FloatArray, as_array, require_kind
+from ident.arrays import BoolArray, FloatArray, IntArray, as_array, require_kind
 from ident.errors import ModelError
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
 from ident.model.regressor import fill_rigid, rigid_torque
@@ -14,6 +14,17 @@ from ident.model.robot import JointKind, Motion, Robot
 
 DRIVE_UNITS = {JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"), JointKind.PRISMATIC: ("N", "m/s", "kg")}
 """Units of torque or force along a joint, of its speed, and of a rotor's inertia seen there."""
+JOINT_COLUMNS = 14  #: Standard parameters of a joint: ten of its link (LINK_PARAMETERS), then Ia, fv, fs, off
+
+
+def link_columns(joints: int) -> IntArray:
+    """Columns of the links' parameters among the standard ones, shape (joints, 10)."""
+    return JOINT_COLUMNS * np.arange(joints)[:, None] + np.arange(len(LINK_PARAMETERS))
+
+
+def dry_friction_columns(joints: int) -> IntArray:
+    """Columns of fs among the standard ones, shape (joints,)."""
+    return JOINT_COLUMNS * np.arange(joints) + 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +125,7 @@ class Model:
     @property
     def flange(self) -> slice:
         """The ten columns of the last link; a payload on it has the same."""
-        first = 14 * (self.robot.joint_count - 1)
+        first = JOINT_COLUMNS * (self.robot.joint_count - 1)
         return slice(first, first + 10)
 
     @property
@@ -123,14 +134,14 @@ class Model:
         count = self.robot.joint_count
         out = np.zeros((count, len(self.columns)), dtype=np.bool_)
         for link in range(count):
-            first = 14 * link
-            out[link, first + 10 : first + 14] = True
+            first = JOINT_COLUMNS * link
+            out[link, first + 10 : first + JOINT_COLUMNS] = True
             joint = link
             while joint >= 0:  # a link loads its own joint and those before it
                 out[joint, first : first + 10] = True
                 joint = self.robot.joints[joint].parent
         for index, motor in enumerate(self.drive_train.coupled):
-            first = 14 * count + 3 * index
+            first = JOINT_COLUMNS * count + 3 * index
             out[:, first : first + 3] = (self.drive_train.direction[motor] != 0.0)[:, None]
         return out
 
@@ -147,7 +158,7 @@ class Model:
         count, samples = position.shape
         sign = np.sign(velocity)
         out = np.zeros((count, len(self.columns), samples))
-        by_link = out[:, : 14 * count].reshape(count, count, 14, samples)
+        by_link = out[:, : JOINT_COLUMNS * count].reshape(count, count, JOINT_COLUMNS, samples)
         fill_rigid(self.robot, position, velocity, acceleration, by_link[:, :, :10])
         for joint in range(count):
             own = by_link[joint, joint]
@@ -155,7 +166,7 @@ class Model:
         direction = self.drive_train.direction
         motor_speed = direction @ velocity
         for index, motor in enumerate(self.drive_train.coupled):
-            first = 14 * count + 3 * index
+            first = JOINT_COLUMNS * count + 3 * index
             r = direction[motor]
             cross = np.outer(r, r) - np.diag(r**2)
             out[:, first] = cross @ acceleration
@@ -171,8 +182,8 @@ class Model:
             standard: χ_st, shape (c,).
         """
         position, velocity, acceleration = self._joint_first(motion)
-        own, motors = np.split(standard, [14 * self.robot.joint_count])
-        own, motors = own.reshape(-1, 14), motors.reshape(-1, 3, 1)
+        own, motors = np.split(standard, [JOINT_COLUMNS * self.robot.joint_count])
+        own, motors = own.reshape(-1, JOINT_COLUMNS), motors.reshape(-1, 3, 1)
         load = rigid_torque(self.robot, position, velocity, acceleration, own[:, :10])
         geared = load + own[:, 11, None] * velocity + own[:, 12, None] * np.sign(velocity)
         whole = geared + own[:, 10, None] * acceleration + own[:, 13, None]

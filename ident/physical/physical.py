@@ -16,7 +16,7 @@ from ident.errors import IdentificationError, ModelError
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.model.base import BaseParameters
 from ident.model.bodies import Body, link_parameters, pseudo_inertia
-from ident.model.model import Model
+from ident.model.model import Model, link_columns
 from ident.model.robot import Motion, read_urdf
 
 MARGIN = 1e-4  #: Every pseudo-inertia is at least this share of its prior's, in every direction (Q ⪰ MARGIN·1)
@@ -462,4 +462,4 @@ def _turned_together(model: Model) -> tuple[tuple[int, ...], ...]:
 
 
 def _link_columns(model: Model) -> IntArray:
-    return 14 * np.arange(model.robot.joint_count)[:, None] + np.arange(10)
+    return link_columns(model.robot.joint_count)

@@ -10,6 +10,8 @@ from ident.data.run import Run
 from ident.equations.reduction import reduce_runs
 from ident.equations.rows import observe
 from ident.model.base import base_parameters
+from ident.model.bodies import LINK_PARAMETERS
+from ident.model.model import dry_friction_columns, link_columns
 from tests.ident.recordings import CONDITIONING, Truth
 
 
@@ -24,6 +26,14 @@ def test_the_tx40_has_61(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
     measured = observation.torque(truth.gains)
     size = np.max(np.abs(measured[:, observation.use.any(axis=0)]))
     assert np.max(np.abs((torque - measured)[observation.use])) < 2e-3 * size
+
+
+def test_columns_of_the_links_and_of_dry_friction_are_those_of_their_names(truth: Truth) -> None:
+    names = np.array([column.name for column in truth.model.columns])
+    numbers = range(1, 7)
+    assert names[link_columns(6)].tolist() == [[f"{name}{number}" for name in LINK_PARAMETERS] for number in numbers]
+    assert names[dry_friction_columns(6)].tolist() == [f"fs{number}" for number in numbers]
+    assert np.arange(len(names))[truth.model.flange].tolist() == link_columns(6)[-1].tolist()
 
 
 def test_a_tiny_column_is_zero_and_not_a_parameter() -> None:
