@@ -169,18 +169,29 @@ def _dates(file: _Lines, time: TimeColumn) -> Stamps:
     index, stamp_ns = _index(file, time.column), []
     for number, row in enumerate(file.rows):
         text = file.fields(row)[index]
-        try:
-            whole, fraction, zone = _ISO.fullmatch(text).groups(default="")  # type: ignore[union-attr]
-            second = int(datetime.fromisoformat(whole + zone).timestamp())
-        except (AttributeError, ValueError) as error:
+        date_ns = _date_ns(text)
+        if date_ns is None:
             raise TableUnfit(
                 f"{file.path}:{file.first_line + number}, column {time.column}",
                 found=repr(text),
                 expected="a date and time with its zone, as 2026-03-01T08:00:00.004+01:00 or ...Z",
                 remedy="correct `unit` of `time` in the import description, or add the zone to the file",
-            ) from error
-        stamp_ns.append(second * 10**9 + int(fraction.ljust(9, "0")))
+            )
+        stamp_ns.append(date_ns)
     return stamps_of_ns(stamp_ns)
+
+
+def _date_ns(text: str) -> int | None:
+    """Nanoseconds since 1970 of a date and time with its zone, None for any other text."""
+    match = _ISO.fullmatch(text)
+    if match is None:
+        return None
+    whole, fraction, zone = match.groups(default="")
+    try:
+        second = int(datetime.fromisoformat(whole + zone).timestamp())
+    except ValueError:  # the 30th of February
+        return None
+    return second * 10**9 + int(fraction.ljust(9, "0"))
 
 
 def _numbers(file: _Lines, columns: Sequence[str | int]) -> FloatArray:

@@ -20,6 +20,7 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -265,10 +266,12 @@ def _search(task: CaseTask, part: str, simulation_s: float) -> Row:
     )
 
 
-def _row_of(document: dict[str, object]) -> Row:
+def _row_of(document: dict[str, Any]) -> Row:
     """Rebuild a row read back from JSON."""
-    fields = {name: tuple(value) if isinstance(value, list) else value for name, value in document.items()}
-    return Row(**fields)  # type: ignore[arg-type]
+    fields: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in document.items()
+    }
+    return Row(**fields)
 
 
 def _holdout(evidence: Evidence, axis: int | None) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,14 +27,14 @@ VALUES = np.array([[float(field) for field in row.split(",")] for row in ROWS])
 
 
 def _read(
-    tmp_path: Path, data: bytes, columns: tuple[str | int, ...], time: TimeUnit | None = None, **layout: object
+    tmp_path: Path, data: bytes, columns: tuple[str | int, ...], time: TimeUnit | None = None, **layout: Any
 ) -> Table:
     path = tmp_path / "run.csv"
     path.write_bytes(data)
     wanted = ImportDescription(
         name="run",
         cell="cell.yaml",
-        table=CsvLayout(**layout),  # type: ignore[arg-type]
+        table=CsvLayout(**layout),
         position=PositionColumns(file="run.csv", columns=columns[:1], unit=PositionUnit.RAD, side=Side.JOINT),
         current=CurrentColumns(file="run.csv", columns=columns[1:], unit="A"),
     )
