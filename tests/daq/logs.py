@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -63,3 +64,15 @@ def write(
             log.write(sample)
         log.conclude(*verdict)
     return path
+
+
+def damaged(data: bytes, kind: str, at: int, rng: random.Random, junk_bytes: int) -> bytes:
+    """A file with a bit flipped ("flip"), its end lost ("cut") or some bytes replaced ("junk"), from an offset on."""
+    hurt = bytearray(data)
+    if kind == "flip":
+        hurt[at] ^= 1 << rng.randrange(8)
+    elif kind == "cut":
+        del hurt[at:]
+    else:
+        hurt[at : at + junk_bytes] = rng.randbytes(junk_bytes)
+    return bytes(hurt)

@@ -25,6 +25,7 @@ from daq.log.conversion import load_run
 from daq.log.message import DEFINITIONS, JOINTS_SCHEMA
 from daq.log.reader import read_log
 from daq.log.table import Table
+from tests.daq.logs import damaged
 
 JOINTS = tuple(f"J{number}" for number in range(1, 7))
 START_NS = 1_700_000_000_123_456_789
@@ -113,8 +114,10 @@ def test_chunks_and_checksums_are_optional(options: dict[str, Any], tmp_path: Pa
 
 
 def test_several_publishers_make_one_row_a_stamp(tmp_path: Path) -> None:
-    """The wrist comes from another driver than the arm, a gripper on the same topic is nobody's axis, and the bag began
-    and ended between two messages of one stamp."""
+    """One driver publishes the arm and another the wrist, each in a message of its own; a gripper is no axis.
+
+    The bag begins after the arm's message of its first stamp, and ends before the wrist's of its last one.
+    """
     parts = [
         ("/joint_states", part)
         for row in range(ROWS)
@@ -254,15 +257,8 @@ def test_a_bag_of_a_killed_recorder_is_called_unfinished(tmp_path: Path) -> None
 def test_a_damaged_bag_is_refused_or_the_same(seed: int, hurt: str, bag_bytes: bytes, tmp_path_factory: Any) -> None:
     """With the checksums of ROS 2 (chunks only), damage between them may remove a chunk, never change a number."""
     rng = random.Random(seed)
-    data, at = bytearray(bag_bytes), rng.randrange(len(bag_bytes))
-    if hurt == "flip":
-        data[at] ^= 1 << rng.randrange(8)
-    elif hurt == "cut":
-        del data[at:]
-    else:
-        data[at : at + 40] = rng.randbytes(40)
     path = tmp_path_factory.getbasetemp() / "hurt.mcap"
-    path.write_bytes(data)
+    path.write_bytes(damaged(bag_bytes, hurt, rng.randrange(len(bag_bytes)), rng, junk_bytes=40))
     try:
         table = read(path)
     except DataError as error:

@@ -23,6 +23,7 @@ from daq.errors import TableUnfit
 from daq.log.conversion import load_run
 from daq.log.mat_table import read_mat
 from daq.log.table import Table
+from tests.daq.logs import damaged
 
 ROWS = 300
 Q = 20.0 * np.sin(np.arange(ROWS)[:, None] / 40.0 + np.arange(6))
@@ -178,16 +179,10 @@ def test_a_damaged_file_is_read_or_refused(
 ) -> None:
     """The format has no checksum: a flipped bit of a number passes, as in every reader of it."""
     rng = random.Random(seed)
-    data = bytearray(rng.choice(files))
+    data = rng.choice(files)
     at = rng.choice((rng.randrange(len(data)), rng.randrange(100, 400)))
-    if hurt == "flip":
-        data[at] ^= 1 << rng.randrange(8)
-    elif hurt == "cut":
-        del data[at:]
-    else:
-        data[at : at + 12] = rng.randbytes(12)
     path = tmp_path_factory.getbasetemp() / "hurt.mat"
-    path.write_bytes(data)
+    path.write_bytes(damaged(data, hurt, at, rng, junk_bytes=12))
     try:
         table = read(path, "run.q.1", "q.2")
     except TableUnfit as error:

@@ -313,13 +313,13 @@ def test_what_did_not_join_is_reported_with_the_reason(closed: Closed) -> None:
     aside = SetAside(_finding(PlacedEffect(Smooth(Abscissa.LOAD), 1)), moved=((3, 2.91),))
     replaced = SetAside(_finding(PlacedEffect(LoadFriction(0), 1)), "{rival} explains more", SPRING)
     steps = (replace(first, set_aside=(replaced, aside)), replace(last, set_aside=(aside,)))
-    told = Closed(replace(closed.fitted, steps=steps), closed.account)
-    sentences = summary(told.fitted, told.account)
+    made = Closed(replace(closed.fitted, steps=steps), closed.account)
+    sentences = summary(made.fitted, made.account)
     assert sum("and was not added: it has no name, and would move the gain of J4 by 2.9 σ" in s for s in sentences) == 1
     assert any("J2 may have friction that grows with the load: it would" in one for one in sentences)
     assert any("added: spring on J3 explains more." in one for one in sentences)
-    assert told.document()["turns"][1]["set_aside"][0]["reason"].endswith("the gain of J4 by 2.9 σ")
-    assert "Not added: smooth-load on J2: it has no name" in Reader(told.page()).text
+    assert made.document()["turns"][1]["set_aside"][0]["reason"].endswith("the gain of J4 by 2.9 σ")
+    assert "Not added: smooth-load on J2: it has no name" in Reader(made.page()).text
 
 
 def test_effects_that_held_out_runs_refute_are_not_written(
@@ -333,9 +333,9 @@ def test_effects_that_held_out_runs_refute_are_not_written(
         monkeypatch.setattr(fit_module, name, lambda *_, **__: closed.fitted)
     command = ["residual", *NAMES[:3], "--holdout", NAMES[3], "--out", str(out), "--report", str(folder)]
     assert main(command) == ExitCode.DATA_UNFIT
-    told = capsys.readouterr().err
-    assert "spring on J3" in told
-    assert "--accept-worse-holdout" in told
+    message = capsys.readouterr().err
+    assert "spring on J3" in message
+    assert "--accept-worse-holdout" in message
     assert not out.exists()
     assert "no calibration was written" in (folder / PAGE).read_text(encoding="utf-8")
     assert main([*command, "--accept-worse-holdout"]) == ExitCode.OK
