@@ -301,21 +301,20 @@ def cross_validate(
                 found[label] = predicted(calibration, conditioning, model, log, run, described.digest)
         if first in found:
             validations.append(found[first])
-        condition, usable = None, False
+        condition, reduction = None, None
         with suppress(IdentificationError):
-            # The payload is taken as part of the last link.
-            whole = reduce_runs(model, (replace(run, payload=None),), conditioning)
-            usable = True
-            condition = wls(whole.system(whole.base(), ()), _gains(calibrations[first])).condition
-        if usable and first in found:
-            reduction = whole if run.payload is None else reduce_runs(model, (run,), conditioning)
+            reduction = reduce_runs(model, (run,), conditioning)
+            # A payload without columns of its own is part of the last link.
+            system = reduction.system(reduction.base(), ((),) * len(reduction.payloads))
+            condition = wls(system, _gains(calibrations[first])).condition
+        if reduction is not None and first in found:
             diagnoses += _diagnosed(calibrations[first], found[first], model, run, reduction)
         if run.payload is not None:
             # From the log, else from the cell, since a body weighs the same anywhere.
             of_cell = (body.mass_kg for body in described.payloads if body.name == run.payload.name)
             kg = run.payload.known.get("m", next(of_cell, None))
             loaded.append((log, run, run.payload, kg))
-        elif usable:
+        elif reduction is not None:
             bare.append(run)
         runs.append(
             CheckedRun(
