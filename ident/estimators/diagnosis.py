@@ -29,7 +29,6 @@ from ident.errors import CurrentReversed, Diagnosis, IdentificationError, UnitsM
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import wls
 from ident.estimators.maximum_likelihood import ml, noise_of
-from ident.estimators.method import Method
 from ident.estimators.payload_diagnosis import payload_diagnoses
 from ident.model.model import Model
 
@@ -51,8 +50,8 @@ ALIKE = 0.25  #: Least squared correlation of two torques of which one is the ot
 EXCHANGE = 0.4
 """Least fall of the logarithm of the motors' errors, in sum, of exchanged channels; with the right ones it is zero. Of
 all pairs of channels of two real robots and of five simulated arms the smallest is 0.6."""
-SMALL_ERROR = 0.02  #: Relative error of a motor below which its current needs no other explanation
 LEVEL = 0.05  #: Largest rise of the same, where it decides nothing and the sign of the friction must
+SMALL_ERROR = 0.02  #: Relative error of a motor below which its current needs no other explanation
 FRICTION = re.compile(r"f[vs]m?([0-9]+)\b")  #: Names of the friction of a joint or of its coupled motor
 FRICTION_SIGMAS = 15.0  #: In the σ of independent rows, which is some three times too small
 WEIGHT_SIGMAS = 30.0  #: Likewise, for the weight of a payload
@@ -81,7 +80,7 @@ def diagnose(
         require_units(estimate.gains, nameplate)
         diagnoses += gain_diagnoses(estimate, nameplate, axes)
     likeliest = estimate
-    if estimate.method is not Method.ML:
+    if not estimate.method.is_of_currents:
         with suppress(IdentificationError):
             likeliest = ml(system, estimate.gains if estimate.gains_fixed else None)
         diagnoses += estimator_diagnoses(estimate, likeliest, axes)
@@ -289,7 +288,7 @@ def estimator_diagnoses(estimate: Estimate, likeliest: Estimate, axes: Sequence[
             f"a gain of {estimate.gains[axis]:.4g} by {estimate.method.value}, {percent:.0f} % from "
             f"{likeliest.gains[axis]:.4g} ± {likeliest.gains_std[axis]:.2g} by ml on the same rows",
             f"at most {100.0 * GAIN_DIFFERENCE:.0f} %, or {GAIN_SIGMAS:g} σ",
-            "use --method ml: noise in the currents biases the other estimators",
+            "use --method ml: noise in the currents biases this estimator",
         )
 
 
@@ -361,8 +360,7 @@ def axis_error_diagnoses(
 
 def torque_diagnoses(system: System, estimate: Estimate, effort_limit: FloatArray) -> Iterator[Diagnosis]:
     """Compare the torques with the effort limits of the URDF: a unit puts all of them above."""
-    gains = np.concatenate((estimate.gains, np.zeros(len(estimate.parameters) + 1)))
-    torque = np.sqrt(system.joints.square_sum(gains) / np.maximum(system.joints.rows, 1))
+    torque, _ = joint_torques(system, estimate)
     if np.any(np.isfinite(effort_limit)) and np.all(
         torque[np.isfinite(effort_limit)] > TORQUE_RATIO * effort_limit[np.isfinite(effort_limit)]
     ):
