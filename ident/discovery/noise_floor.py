@@ -8,8 +8,8 @@ Two estimates of σ² are made of parts in which no model has anything to explai
   of their currents, divided by √2, torques that depend on the path cancel, and so do the errors of any model of them.
   Disturbances, quantisation, noise of encoder and control, and ripple whose phase is random remain.
 
-Each part is filtered and decimated like every row (windows wholly inside), a parabola in time is subtracted, and the
-rest gives an estimate of σ² from each part d,
+Parts longer than LONGEST_MOVE_S are cut, as moves are. Each is filtered and decimated like every row (windows wholly
+inside), a parabola in time is subtracted, and the rest gives an estimate of σ² from each part d,
 
     s_d² = ‖M_d v_d‖²/tr(M_d P_d),        M_d = I − H_d,
 
@@ -43,7 +43,7 @@ import scipy  # loads scipy.special when it is first used: a fit needs none of i
 
 from ident.arrays import BoolArray, FloatArray
 from ident.data.conditioning import Conditioning, decimator
-from ident.data.dataset import Dataset
+from ident.data.dataset import LONGEST_MOVE_S, Dataset
 from ident.equations.rows import row_filter
 
 MIN_DWELLS = 8
@@ -71,7 +71,7 @@ class NoiseFloor:
 
     noise_a: float  #: σ of the current in the observation's rows [A]
     source: FloorSource
-    parts: int  #: number of standstills, or of pairs of repeated moves, used
+    parts: int  #: number of standstills, or of pairs of repeated moves, used; long ones count as several
     freedom: float  #: their degrees of freedom; pairs that share a move count less
 
     @property
@@ -139,24 +139,27 @@ def _floor(parts: Sequence[_Part], source: FloorSource) -> NoiseFloor | None:
 def _dwells(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) -> Iterator[_Part]:
     for data in datasets:
         for dwell in _stretches(~data.motor_moving[:, motor] & data.valid[:, motor]):
-            yield from _part(data.current_a[dwell, motor], data.rate_hz, conditioning)
+            yield from _parts(data.current_a[dwell, motor], data.rate_hz, conditioning)
 
 
 def _pairs(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) -> Iterator[_Part]:
     for differences, rate_hz in _repetitions(datasets, motor):
         pairs = len(differences)
         for difference in differences:
-            yield from _part(difference / np.sqrt(2.0), rate_hz, conditioning, share=2.0 * pairs / (3.0 * pairs - 1.0))
+            yield from _parts(difference / np.sqrt(2.0), rate_hz, conditioning, share=2.0 * pairs / (3.0 * pairs - 1.0))
 
 
-def _part(current_a: FloatArray, rate_hz: float, conditioning: Conditioning, share: float = 1.0) -> Iterator[_Part]:
-    """Variance and freedom of one part by its rows; nothing where it is too short or constant."""
+def _parts(current_a: FloatArray, rate_hz: float, conditioning: Conditioning, share: float = 1.0) -> Iterator[_Part]:
+    """Variance and freedom by the rows of each piece of a part; nothing where it is too short or constant."""
     filter_ = decimator(rate_hz, conditioning.decimation_cutoff_hz)
-    if filter_.rows(len(current_a)) <= _TREND or np.ptp(current_a) == 0.0:
-        return
-    seen = filter_(current_a)
-    trend, expected, freedom = _detrending(rate_hz, conditioning.decimation_cutoff_hz, len(seen))
-    yield _Part(float(np.sum((seen - trend @ (trend.T @ seen)) ** 2)) / expected, freedom, share * freedom)
+    longest = round(LONGEST_MOVE_S * rate_hz)
+    for first in range(0, len(current_a), longest):
+        piece = current_a[first : first + longest]
+        if filter_.rows(len(piece)) <= _TREND or np.ptp(piece) == 0.0:
+            continue
+        seen = filter_(piece)
+        trend, expected, freedom = _detrending(rate_hz, conditioning.decimation_cutoff_hz, len(seen))
+        yield _Part(float(np.sum((seen - trend @ (trend.T @ seen)) ** 2)) / expected, freedom, share * freedom)
 
 
 def _stretches(flags: BoolArray) -> list[slice]:

@@ -19,6 +19,8 @@ from tests.ident.recordings import CONDITIONING, MOUNTED, Truth, record
 FloatArray = NDArray[np.float64]
 
 NOISE_A = np.array([0.3, 0.1, 0.05, 0.2, 0.4, 0.02])
+SMALL = replace(CONDITIONING, standstill_rad_s=(0.03,) * 3)
+MOVES = (FloorSource.REPEATED_MOVES,)
 DEVIATIONS = 4.0
 """Limit in σ of the estimate itself, by its std_percent: one of six motors is outside by chance in 2600 runs."""
 
@@ -54,6 +56,21 @@ def _noisy(runs: Sequence[Dataset], seed: int = 5) -> tuple[Dataset, ...]:
 @pytest.fixture(scope="module")
 def resting(truth: Truth) -> tuple[Dataset, ...]:
     return _resting(truth)
+
+
+@pytest.fixture(scope="module")
+def repeated(small_truth: Truth) -> tuple[Dataset, ...]:
+    """Three noiseless runs of the same moves, each 2.4 samples later than the one before."""
+
+    def run(number: int) -> Dataset:
+        def later(q: FloatArray) -> FloatArray:
+            at = np.arange(len(q))
+            return np.stack([np.interp(at - 2.4 * number, at, axis) for axis in q.T], axis=1)
+
+        made = record(small_truth, f"run{number}", np.random.default_rng(8), seconds=22.0, bend=later)
+        return differentiate(made, small_truth.model.drive_train, SMALL)
+
+    return tuple(run(number) for number in range(3))
 
 
 def _all(floors: tuple[NoiseFloor | None, ...]) -> tuple[NoiseFloor, ...]:
@@ -124,6 +141,17 @@ def test_too_few_dwells_and_a_drive_that_reports_a_constant_report_nothing(resti
     assert noise_floors(always_moving, CONDITIONING) == (None,) * 6
 
 
+def test_an_axis_that_rests_throughout_a_run_counts_as_many_dwells(repeated: tuple[Dataset, ...]) -> None:
+    still = replace(
+        repeated[0],
+        motor_moving=np.zeros_like(repeated[0].motor_moving),
+        current_a=np.zeros_like(repeated[0].current_a),
+    )
+    for floor, expected in zip(_all(noise_floors(_noisy([still]), SMALL)), _expected_a(still), strict=True):
+        assert floor.parts == 11
+        assert floor.noise_a == pytest.approx(expected, rel=DEVIATIONS * floor.std_percent / 100.0)
+
+
 @settings(max_examples=20, deadline=None)
 @given(factor=st.floats(0.01, 100.0), offset=st.floats(-10.0, 10.0))
 def test_it_has_the_unit_of_the_current_and_no_offset(
@@ -135,25 +163,6 @@ def test_it_has_the_unit_of_the_current_and_no_offset(
     for one, other in zip(floors, _all(noise_floors(scaled, CONDITIONING)), strict=True):
         assert other.noise_a == pytest.approx(factor * one.noise_a, rel=1e-6)
         assert (other.parts, other.freedom) == (one.parts, one.freedom)
-
-
-SMALL = replace(CONDITIONING, standstill_rad_s=(0.03,) * 3)
-MOVES = (FloorSource.REPEATED_MOVES,)
-
-
-@pytest.fixture(scope="module")
-def repeated(small_truth: Truth) -> tuple[Dataset, ...]:
-    """Three noiseless runs of the same moves, each 2.4 samples later than the one before."""
-
-    def run(number: int) -> Dataset:
-        def later(q: FloatArray) -> FloatArray:
-            at = np.arange(len(q))
-            return np.stack([np.interp(at - 2.4 * number, at, axis) for axis in q.T], axis=1)
-
-        made = record(small_truth, f"run{number}", np.random.default_rng(8), seconds=22.0, bend=later)
-        return differentiate(made, small_truth.model.drive_train, SMALL)
-
-    return tuple(run(number) for number in range(3))
 
 
 def test_repeated_moves_recover_a_known_noise(repeated: tuple[Dataset, ...]) -> None:
