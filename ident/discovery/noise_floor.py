@@ -8,15 +8,21 @@ Two estimates of σ² are made of parts in which no model has anything to explai
   of their currents, divided by √2, torques that depend on the path cancel, and so do the errors of any model of them.
   Disturbances, quantisation, noise of encoder and control, and ripple whose phase is random remain.
 
+A disturbance also moves the arm a little, and a model that is given the measured motion explains the inertia's share of
+the current. So the differences of acceleration of all axes are fitted to that of a pair and subtracted: without this,
+pairs exceed the error of the fit where a disturbance acts inside the position loop. Differences of position and
+velocity stay in: the controller makes its current of them, and they would take the disturbance away.
+
 Parts longer than LONGEST_MOVE_S are cut, as moves are. Each is filtered and decimated like every row (windows wholly
 inside), a parabola in time is subtracted, and the rest gives an estimate of σ² from each part d,
 
     s_d² = ‖M_d v_d‖²/tr(M_d P_d),        M_d = I − H_d,
 
-with H_d the projection on (1, t, t²) and P_d the correlation that the filter itself gives to rows of white noise, so
-that a short part counts only by what the detrending leaves of it. s_d² is nearly σ² χ²_ν/ν with ν = tr(MP)²/tr(MPMP)
-(Satterthwaite 1946); divided by the median of χ²_ν/ν every part is as likely above σ² as below, and σ² is their
-median, weighted by ν. A median, because an axis slips or rings in some of its dwells and is disturbed in some moves.
+with H_d the projection on (1, t, t²) and the differences of acceleration, and P_d the correlation that the filter
+itself gives to rows of white noise, so that a short part counts only by what the projection leaves of it. s_d² is
+nearly σ² χ²_ν/ν with ν = tr(MP)²/tr(MPMP) (Satterthwaite 1946); divided by the median of χ²_ν/ν every part is as likely
+above σ² as below, and σ² is their median, weighted by ν. A median, because an axis slips or rings in some of its dwells
+and is disturbed in some moves.
 
 Pairs are neighbours in time, so that warm-up changes little between them; the parabola subtracts a change of Coulomb
 friction. Of m repetitions they are m − 1 pairs, each of which shares a move with the next: together they have
@@ -139,7 +145,7 @@ def _floor(parts: Sequence[_Part], source: FloorSource) -> NoiseFloor | None:
 def _dwells(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) -> Iterator[_Part]:
     for data in datasets:
         for dwell in _stretches(~data.motor_moving[:, motor] & data.valid[:, motor]):
-            yield from _parts(data.current_a[dwell, motor], data.rate_hz, conditioning)
+            yield from _parts(data.current_a[dwell, motor][None], data.rate_hz, conditioning)
 
 
 def _pairs(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) -> Iterator[_Part]:
@@ -149,17 +155,44 @@ def _pairs(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) 
             yield from _parts(difference / np.sqrt(2.0), rate_hz, conditioning, share=2.0 * pairs / (3.0 * pairs - 1.0))
 
 
-def _parts(current_a: FloatArray, rate_hz: float, conditioning: Conditioning, share: float = 1.0) -> Iterator[_Part]:
-    """Variance and freedom by the rows of each piece of a part; nothing where it is too short or constant."""
+def _parts(signals: FloatArray, rate_hz: float, conditioning: Conditioning, share: float = 1.0) -> Iterator[_Part]:
+    """Variance and freedom by the rows of each piece of a part; nothing where it is too short or constant.
+
+    Args:
+        signals: the current [A], and after it what is subtracted from it by least squares, shape (s, k).
+        rate_hz: sampling rate.
+        conditioning: the filter of the rows.
+        share: of its freedom that a part adds to that of the others.
+    """
     filter_ = decimator(rate_hz, conditioning.decimation_cutoff_hz)
     longest = round(LONGEST_MOVE_S * rate_hz)
-    for first in range(0, len(current_a), longest):
-        piece = current_a[first : first + longest]
-        if filter_.rows(len(piece)) <= _TREND or np.ptp(piece) == 0.0:
+    for first in range(0, signals.shape[1], longest):
+        piece = signals[:, first : first + longest]
+        rows = filter_.rows(piece.shape[1])
+        if rows < _TREND + len(piece) or np.ptp(piece[0]) == 0.0:
             continue
-        seen = filter_(piece)
-        trend, expected, freedom = _detrending(rate_hz, conditioning.decimation_cutoff_hz, len(seen))
-        yield _Part(float(np.sum((seen - trend @ (trend.T @ seen)) ** 2)) / expected, freedom, share * freedom)
+        current, *others = filter_(piece)
+        powers, correlation = _of_length(rate_hz, conditioning.decimation_cutoff_hz, rows)
+        if others:
+            taken, expected, freedom = _projection(np.column_stack((powers, *others)), correlation)
+        else:
+            taken, expected, freedom = _detrending(rate_hz, conditioning.decimation_cutoff_hz, rows)
+        yield _Part(float(np.sum((current - taken @ (taken.T @ current)) ** 2)) / expected, freedom, share * freedom)
+
+
+def _projection(columns: FloatArray, correlation: FloatArray) -> tuple[FloatArray, float, float]:
+    """Orthonormal basis of the columns, tr(MP) and ν."""
+    basis, _ = np.linalg.qr(columns)
+    spread = correlation - basis @ (basis.T @ correlation)
+    spread -= (spread @ basis) @ basis.T
+    expected = float(np.trace(spread))
+    return basis, expected, expected**2 / float(np.sum(spread**2))
+
+
+@lru_cache(maxsize=1024)
+def _detrending(rate_hz: float, cutoff_hz: float, rows: int) -> tuple[FloatArray, float, float]:
+    """`_projection` on the powers of time alone: every dwell of this length has it."""
+    return _projection(*_of_length(rate_hz, cutoff_hz, rows))
 
 
 def _stretches(flags: BoolArray) -> list[slice]:
@@ -174,11 +207,11 @@ class _Chain:
 
     data: Dataset  #: run of the last one
     part: slice  #: its samples
-    differences: tuple[FloatArray, ...]  #: of the currents of each and the one before [A], shape (k,)
+    differences: tuple[FloatArray, ...]  #: of each and the one before, as of `_difference`
 
 
 def _repetitions(datasets: Sequence[Dataset], motor: int) -> Iterator[tuple[tuple[FloatArray, ...], float]]:
-    """Differences of a motor's current between repetitions of each of its moves, and their sampling rate [Hz].
+    """Differences between repetitions of each move of a motor, and their sampling rate [Hz].
 
     A move of the motor is a stretch between two standstills or reversals of it, so that continuous motion has moves.
     """
@@ -207,7 +240,9 @@ def _repetitions(datasets: Sequence[Dataset], motor: int) -> Iterator[tuple[tupl
 
 
 def _difference(chain: _Chain, data: Dataset, part: slice, motor: int, scale: FloatArray) -> FloatArray | None:
-    """Current of a move minus that of the last one of a chain [A], shape (k,); None if it is no repetition of it.
+    """A move minus the last one of a chain: current [A] and accelerations of all axes, shape (1 + n, k).
+
+    None if it is no repetition.
 
     The two are aligned by their paths, because neither log nor controller starts a move at a sample. With q' = q + λ q̇
     where the later one is ahead by λ, λ is found by least squares over all axes, scaled by their travel.
@@ -232,21 +267,20 @@ def _difference(chain: _Chain, data: Dataset, part: slice, motor: int, scale: Fl
         ahead = float(np.sum(speed * apart) / np.sum(speed**2)) * rate  # in samples
     if np.max(np.abs(apart - ahead / rate * speed)) > PATH_TOLERANCE or abs(ahead) > 1.0:
         return None
-    current, step = data.current_a[:, motor], -1 if ahead > 0.0 else 1
-    nearest, next_ = current[start : start + length], current[start + step : start + step + length]
-    return np.asarray(nearest + abs(ahead) * (next_ - nearest) - before.current_a[first, motor])
+    step = -1 if ahead > 0.0 else 1
+    nearest, next_ = (_signals(data, slice(at, at + length), motor) for at in (start, start + step))
+    return nearest + abs(ahead) * (next_ - nearest) - _signals(before, first, motor)
+
+
+def _signals(data: Dataset, part: slice, motor: int) -> FloatArray:
+    return np.stack((data.current_a[part, motor], *data.acceleration_rad_s2[part].T))
 
 
 @lru_cache(maxsize=1024)
-def _detrending(rate_hz: float, cutoff_hz: float, rows: int) -> tuple[FloatArray, float, float]:
-    """Orthonormal parabolas over so many rows, shape (rows, 3), tr(MP) and ν: every part of this length has them."""
+def _of_length(rate_hz: float, cutoff_hz: float, rows: int) -> tuple[FloatArray, FloatArray]:
+    """Powers of time of so many rows, shape (rows, 3), and P, shape (rows, rows)."""
     filter_ = decimator(rate_hz, cutoff_hz)
-    trend, _ = np.linalg.qr(np.vander(np.arange(rows, dtype=np.float64), _TREND))
-    rest = np.eye(rows) - trend @ trend.T
-    lags = filter_.factor * np.arange(rows)
-    taps = filter_.taps
+    lags, taps = filter_.factor * np.arange(rows), filter_.taps
     of_lag = np.array([float(taps[lag:] @ taps[: len(taps) - lag]) if lag < len(taps) else 0.0 for lag in lags])
     correlation = of_lag[np.abs(np.subtract.outer(np.arange(rows), np.arange(rows)))] / of_lag[0]
-    spread = rest @ correlation @ rest
-    expected = float(np.trace(spread))
-    return trend, expected, expected**2 / float(np.sum(spread**2))
+    return np.vander(np.linspace(-1.0, 1.0, rows), _TREND), correlation

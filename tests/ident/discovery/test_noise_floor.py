@@ -195,6 +195,22 @@ def test_friction_that_changes_between_repetitions_is_no_noise(repeated: tuple[D
         assert other.noise_a == pytest.approx(one.noise_a, rel=1e-6)
 
 
+def test_motion_that_a_disturbance_causes_is_no_noise(small_truth: Truth) -> None:
+    """A model explains the inertia's torque of the measured motion; it would make the floor of axis 2 twice as high."""
+
+    def run(number: int) -> Dataset:
+        def shaken(q: FloatArray) -> FloatArray:
+            phase = np.array([0.0, 1.0, 2.0]) + 2.5 * number
+            return np.asarray(q + 1e-3 * np.sin(0.05 * np.arange(len(q))[:, None] + phase))
+
+        made = record(small_truth, f"run{number}", np.random.default_rng(8), seconds=22.0, bend=shaken)
+        return differentiate(made, small_truth.model.drive_train, SMALL)
+
+    runs = _noisy([run(0), run(1)])
+    for floor, expected in zip(_all(noise_floors(runs, SMALL, MOVES)), _expected_a(runs[0]), strict=True):
+        assert floor.noise_a == pytest.approx(expected, rel=DEVIATIONS * floor.std_percent / 100.0)
+
+
 @pytest.mark.parametrize(
     ("loud_in_motion", "source"), [(False, FloorSource.REPEATED_MOVES), (True, FloorSource.STANDSTILL)]
 )
