@@ -159,14 +159,17 @@ def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
 
 
 def floor_sentences(account: Account, axes: Sequence[str]) -> list[str]:
-    """Name the axes whose noise floor lies above what the model leaves, and the likely cause."""
+    """Name the axes whose noise floor lies above what the model leaves, and possible causes."""
     causes = {
-        FloorSource.STANDSTILL: ("at standstill", "a brake that takes the load over, dither or an axis that hunts"),
-        FloorSource.REPEATED_MOVES: ("between repeated moves", "warm-up or a disturbance"),
+        FloorSource.STANDSTILL: (
+            "at standstill",
+            "a brake that takes the load over, dither, an axis that hunts, or axes that move meanwhile",
+        ),
+        FloorSource.REPEATED_MOVES: ("between repeated moves", "warm-up, or moves that are not quite the same"),
     }
     return [
         f"{axis} has no noise floor: its current {causes[floor.source][0]} scatters {floor.noise_a / left_a:.1f} times "
-        f"as much as the model's error in motion; the likely cause is {causes[floor.source][1]}."
+        f"as much as the model's error in motion; possible causes: {causes[floor.source][1]}."
         for axis, floor, left_a in zip(axes, account.floors, account.left_a, strict=True)
         if floor is not None and floor.is_refuted(left_a)
     ]
