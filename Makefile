@@ -9,7 +9,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Linear algebra on all cores at once is slower for matrices of this size, and makes timings wander.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup demo test test-vcan vcan-tools check docs screenshots bench bench-stream ident-study gain-study paper planning-study robot-study crash-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study weigh-study words wheel lock clean
+.PHONY: help setup demo test test-vcan vcan-tools check docs screenshots bench bench-stream ident-study gain-study coverage-study paper planning-study robot-study crash-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study weigh-study words wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -23,6 +23,7 @@ help:
 	@echo "make bench-stream  six axes at 1 kHz through the stream on SocketCAN, with a busy thread beside (docs/evidence/stream.md); minutes"
 	@echo "make ident-study  errors by estimator and noise floor (docs/evidence/estimators.md); half an hour"
 	@echo "make loop-noise-study  gain errors and whether error bars are true, also with a disturbance in the position loop (docs/evidence/estimators.md); 10 min"
+	@echo "make coverage-study  whether the error bars of the gains are true: clean, disturbed, after the search, without rests (docs/evidence/estimators.md); resumable, an hour"
 	@echo "make gain-study  the demonstration on several clean cells; minutes"
 	@echo "make paper   the paper's Tables 1 to 8 on the simulated cell (docs/evidence/paper.md); minutes"
 	@echo "make planning-study  planned against random moves (docs/evidence/planning.md); minutes"
@@ -119,6 +120,9 @@ weigh-study: setup
 
 loop-noise-study: setup
 	$(BIN)/python -m tests.studies.loop_noise
+
+coverage-study: setup
+	$(BIN)/python -m tests.studies.coverage_cases
 
 effects-study: setup
 	$(BIN)/python -m tests.studies.effects_study

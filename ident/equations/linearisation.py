@@ -20,6 +20,7 @@ from ident.equations.system import System
 from ident.errors import TooFewMoves
 
 MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter, and each fold holds one
+CORRELATED = 2.0  #: Standard errors of the correlation of neighbouring clusters, above which they are joined
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +132,44 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0])
 
 
+def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Join neighbouring clusters of a run in pairs, again and again, until they are independent of each other.
+
+    Clusters are moves, and pieces of 2 s of longer moves: long beside the noise of drives, but not beside every misfit
+    of a model. The correlation of neighbours, in units in which all unknowns are known equally well, is
+
+        r = Σ z_cᵀz_c₊₁ / Σ z_cᵀz_c,      z = L⁻¹ s,      L Lᵀ = H,
+
+    and its standard error is the root of Σ (z_cᵀz_c₊₁)² over the same sum; that of independent clusters is a little
+    below zero, because all scores together are zero. Blocks become longer until r no longer shows (batch means:
+    Fishman 1978).
+
+    Args:
+        grams: G_c of each cluster, shape (m, f, f), in the order of time.
+        scores: s_c, shape (m, f).
+        runs: run of each cluster, shape (m,).
+
+    Returns:
+        G_c and s_c of the blocks, at least MIN_MOVES_TO_LEAVE_OUT where there are as many clusters.
+    """
+    hessian = grams.sum(axis=0)
+    unit = 1.0 / np.sqrt(np.where(np.diag(hessian) > 0.0, np.diag(hessian), 1.0))
+    scaled = hessian * np.outer(unit, unit)
+    scaled[np.diag_indices_from(scaled)] += 1e-9  # a direction that no row shows
+    lower = np.linalg.cholesky(scaled)
+    while True:
+        z = linalg.solve_triangular(lower, (scores * unit).T, lower=True).T
+        products = np.sum(z[1:] * z[:-1], axis=1)[runs[1:] == runs[:-1]]
+        if float(products.sum()) <= CORRELATED * float(np.linalg.norm(products)):
+            return grams, scores
+        first = np.concatenate([np.flatnonzero(runs == run)[::2] for run in np.unique(runs)])
+        if len(first) < MIN_MOVES_TO_LEAVE_OUT:
+            return grams, scores
+        first.sort()
+        grams, scores = np.add.reduceat(grams, first), np.add.reduceat(scores, first)
+        runs = runs[first]
+
+
 def jackknife_covariance(
     system: System,
     gains: FloatArray,
@@ -144,6 +183,7 @@ def jackknife_covariance(
 
     The residual of a geared robot is correlated over a move (lag one about 0.67): rows are not independent, moves
     nearly are (MacKinnon & White 1985; for clusters Bell & McCaffrey 2002, CR3; docs/explanation/uncertainty.md).
+    Where they are not, several are left out together (`independent_blocks`).
 
     Args:
         system: of the fit.
@@ -170,10 +210,11 @@ def jackknife_covariance(
                 residual = motor_jacobian(measured, motor, gains, parameters, noise)[1]
             grams[index] += jacobian.T @ jacobian
             scores[index] += jacobian.T @ residual
-    shifts = left_out_shifts(grams[:, free, free], scores[:, free])
-    centred = shifts - shifts.mean(axis=0)
+    runs = np.array([run for run, _ in system.cluster_runs])
+    shifts = left_out_shifts(*independent_blocks(grams[:, free, free], scores[:, free], runs))
+    blocks, centred = len(shifts), shifts - shifts.mean(axis=0)
     covariance = np.zeros((size, size))
-    covariance[free, free] = (clusters - 1) / clusters * (centred.T @ centred)
+    covariance[free, free] = (blocks - 1) / blocks * (centred.T @ centred)
     return covariance
 
 

@@ -47,6 +47,7 @@ class GainScore:
         z: error of each gain in its σ.
         relative_error_percent: of the fit.
         processor_s: of the identification.
+        effects: in the model, where they were searched for.
     """
 
     seed: int
@@ -54,6 +55,7 @@ class GainScore:
     z: tuple[float, ...]
     relative_error_percent: float
     processor_s: float
+    effects: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,12 +8,15 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daq.config.cell_file import load_cell
 from drivers.simulation.plant import Plant
 from tests.studies.blind_cells import FAMILIES, NOTHING, blind_cases, confusion
-from tests.studies.direct_cell import RawRun
+from tests.studies.direct_cell import RawRun, demand_rad, run_of
+from tests.studies.followed_cell import follow, without_rest
 from tests.studies.raw_runs import read_runs, write_runs
 from tests.studies.side_by_side import Shard
-from tests.studies.study_cells import CORRELATION_S, WORLDS, declared_payload, world_cell
+from tests.studies.study_cells import CORRELATION_S, WORLDS, declared_payload, spec_of, world_cell
+from tests.studies.study_plans import CELL
 
 
 @settings(max_examples=25)
@@ -43,6 +46,18 @@ def test_runs_come_back_with_their_demand(tmp_path: Path) -> None:
     assert (back.name, back.payload, back.began_s) == (raw.name, raw.payload, raw.began_s)
     for name in ("position_counts", "demand_counts", "current_raw", "limited", "move", "ampere_per_unit"):
         np.testing.assert_array_equal(getattr(back, name), getattr(raw, name))
+
+
+def test_a_cell_follows_a_demand_without_any_rest() -> None:
+    cell, spec = load_cell(CELL), spec_of(world_cell(7, "loop3"), None, 0)
+    demand = without_rest(cell, spec.start_rad, np.random.default_rng(1), 0.5)
+    raw = follow(cell, spec, demand, "bare-1", None)
+    recorded = run_of(raw, cell).position_rad
+    asked = demand.position_rad[demand.first + 1 :][: len(recorded)]  # a sample is read at the end of its cycle
+    assert 490 <= len(recorded) <= 500
+    assert np.max(np.abs(demand_rad(raw, cell) - asked)) < 1e-3
+    assert np.max(np.abs(recorded - asked)) < 0.05
+    assert np.all(np.max(np.abs(np.diff(recorded, axis=0)), axis=1) > 1e-5)
 
 
 def test_cells_of_one_seed_have_one_truth_in_every_world() -> None:

@@ -5,10 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from numpy.typing import NDArray
+from scipy import signal
 
 from ident.data.run import Run
 from ident.discovery.loop import gather
-from ident.equations.linearisation import left_out_shifts, linearise, motor_jacobian
+from ident.equations.linearisation import (
+    MIN_MOVES_TO_LEAVE_OUT,
+    independent_blocks,
+    left_out_shifts,
+    linearise,
+    motor_jacobian,
+)
 from ident.estimators.identify import Identification
 from tests.ident.recordings import Truth
 
@@ -60,3 +68,50 @@ def test_the_triangle_of_rows_has_their_jacobian(truth: Truth) -> None:
         jacobian, residual = motor_jacobian(part, 2, truth.gains, parameters, noise)
         products.append(np.column_stack((jacobian.T @ jacobian, jacobian.T @ residual)))
     assert products[0] == pytest.approx(products[1], abs=1e-10 * np.abs(products[0]).max())
+
+
+FloatArray = NDArray[np.float64]
+
+
+def _slow_line(rng: np.random.Generator, correlation_rows: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Six slow columns fitted to noise alone: the estimate, and G and s of 120 clusters of 50 rows."""
+    rows = np.arange(6000)
+    turns, phase = rng.uniform(1e-3, 2.5e-2, 5), rng.uniform(0.0, 6.0, 5)
+    jacobian = np.column_stack((np.ones(len(rows)), np.sin(np.outer(rows, turns) + phase)))
+    keep = np.exp(-1.0 / correlation_rows) if correlation_rows else 0.0
+    noise = signal.lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(len(rows) + 1000))[1000:]
+    estimate = np.linalg.lstsq(jacobian, noise, rcond=None)[0]
+    parts, left = jacobian.reshape(-1, 50, 6), (noise - jacobian @ estimate).reshape(-1, 50)
+    return estimate, np.einsum("mri,mrj->mij", parts, parts), np.einsum("mri,mr->mi", parts, left)
+
+
+def _std(grams: FloatArray, scores: FloatArray) -> FloatArray:
+    shifts, blocks = left_out_shifts(grams, scores), len(grams)
+    return np.asarray(np.sqrt((blocks - 1) / blocks * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0)))
+
+
+def test_clusters_with_independent_noise_stay_as_they_are() -> None:
+    runs, kept = np.repeat([0, 1, 2], 40), 0
+    for seed in range(20):
+        _, grams, scores = _slow_line(np.random.default_rng(seed), 0.0)
+        kept += len(independent_blocks(grams, scores, runs)[0]) == len(grams)
+    assert kept >= 19
+
+
+def test_clusters_within_one_correlation_time_are_joined_until_sigma_is_true() -> None:
+    """A misfit that outlives three clusters: plain clusters claim half of the scatter, blocks nearly all of it."""
+    runs, plain, joined = np.repeat([0, 1], 60), [], []
+    for seed in range(60):
+        estimate, grams, scores = _slow_line(np.random.default_rng(seed), 150.0)
+        blocks = independent_blocks(grams, scores, runs)
+        assert len(blocks[0]) >= MIN_MOVES_TO_LEAVE_OUT
+        assert blocks[0].sum(axis=0) == pytest.approx(grams.sum(axis=0))
+        plain.append(estimate / _std(grams, scores))
+        joined.append(estimate / _std(*blocks))
+    assert np.sqrt(np.mean(np.square(plain))) > 1.6
+    assert np.sqrt(np.mean(np.square(joined))) < 1.3
+
+
+def test_clusters_of_different_runs_are_never_joined() -> None:
+    _, grams, scores = _slow_line(np.random.default_rng(1), 150.0)
+    assert len(independent_blocks(grams, scores, np.arange(len(grams)))[0]) == len(grams)
