@@ -23,6 +23,8 @@ is the jackknife of the change itself: leaving out move c shifts g by d_c = −(
 (ident/equations/linearisation.py), and
 
     σ_Δ² = (m − 1)/m Σ_c (Δd_c − mean)²,        Δd_c = d_c after − d_c before.
+
+It takes the effects as given; σ after the whole search includes their choice (ident/discovery/choice.py).
 """
 
 from __future__ import annotations
@@ -190,6 +192,7 @@ class Assessment:
     errors: Errors  #: of the model
     gains: FloatArray  #: drive gains [Nm at the joint per A], shape (n,)
     gains_std: FloatArray  #: their σ, shape (n,)
+    choice_std: FloatArray  #: the part of it that comes from the choice of the effects, shape (n,)
     shifts: FloatArray  #: of the gains when each move is left out, shape (m, n); zero for fixed gains
 
 
@@ -201,6 +204,7 @@ class GainShift:
     before_std: float  #: its σ
     after: float  #: estimate with the effects
     after_std: float  #: its σ
+    choice_std: float  #: the part of it that comes from the choice of the effects (`choice_covariance`)
     change_std: float  #: σ of the change, 0 for a fixed gain
     significant: bool  #: whether the change is more than noise, at FALSE_ALARM over all axes
 
@@ -272,8 +276,10 @@ def account(
             continue
         before, last = last, assessed(step.after)
         turns.append(before_after(before, last))
-    floors, end = noise_floors(start.trained, start.conditioning), steps[-1].after
-    left_a = left_on(end.training, end.estimate)
+    end, floors = steps[-1], noise_floors(start.trained, start.conditioning)
+    if end.choice_std is not None:
+        last = replace(last, gains_std=end.after.estimate.gains_std, choice_std=end.choice_std)
+    left_a = left_on(end.after.training, end.after.estimate)
     bounds = tuple(
         None if floor is None or floor.is_refuted(left) else floor for floor, left in zip(floors, left_a, strict=True)
     )
@@ -284,7 +290,7 @@ def account(
         holdout_floor=None if start.holdout is None else floor_on(start.holdout, bounds).relative(weights_nm_a),
         turns=tuple(turns),
         total=before_after(first, last),
-        holdout_change=holdout_change(start, steps[-1].after),
+        holdout_change=holdout_change(start, end.after),
     )
 
 
@@ -318,6 +324,7 @@ def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns |
         ),
         gains=estimate.gains,
         gains_std=estimate.gains_std,
+        choice_std=np.zeros(count),
         shifts=shifts,
     )
 
@@ -339,6 +346,7 @@ def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
                 before_std=float(before.gains_std[motor]),
                 after=float(after.gains[motor]),
                 after_std=float(after.gains_std[motor]),
+                choice_std=float(after.choice_std[motor]),
                 change_std=float(change_std[motor]),
                 significant=bool(abs(after.gains[motor] - before.gains[motor]) > limit * change_std[motor]),
             )

@@ -214,11 +214,17 @@ def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effect
 
 def gain_shifts(folds: Folds, torque: FloatArray) -> FloatArray:
     """Shift of each gain when a whitened torque, shape (rows,), joins the model [Nm at the joint per A], shape (n,)."""
-    problem = folds.problem
-    step = -linalg.cho_solve(folds.full_factor, problem.jacobian.T @ torque) * problem.scale
-    shifts = np.zeros(len(problem.gamma))
-    is_gain = problem.free < len(shifts)
-    shifts[problem.free[is_gain]] = step[is_gain]
+    count = len(folds.problem.gamma)
+    return shifts_by(folds, torque, max(count, int(folds.problem.free[-1]) + 1))[:count]
+
+
+def shifts_by(folds: Folds, torque: FloatArray, size: int) -> FloatArray:
+    """Shift of (gains, parameters), size of them, when a whitened torque, shape (rows,), joins the model.
+
+    It is zero for what is fixed and for what the problem does not hold.
+    """
+    problem, shifts = folds.problem, np.zeros(size)
+    shifts[problem.free] = -linalg.cho_solve(folds.full_factor, problem.jacobian.T @ torque) * problem.scale
     return shifts
 
 

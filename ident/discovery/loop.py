@@ -16,6 +16,7 @@ from ident.data.dataset import Dataset, differentiate
 from ident.data.demand import as_demanded, with_demand
 from ident.data.run import Run
 from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, prepare_search, score_candidates
+from ident.discovery.choice import choice_covariance, is_small
 from ident.discovery.gates import (
     RunsLeftOut,
     gain_shifts,
@@ -119,6 +120,8 @@ class Step:
     after: Evidence  #: the model with it
     set_aside: tuple[SetAside, ...] = ()  #: what would have joined the model, but for a gate of the joint fit
     ended: str = ""  #: reason why the search ended here although the residual may call for more; else empty
+    #: σ of each gain [Nm/A] from the choice of the effects, contained in that of `after`, shape (n,); last turn only.
+    choice_std: FloatArray | None = None
 
 
 def find_effects(
@@ -151,7 +154,7 @@ def find_effects(
     accepted effect holds what could not be distinguished from it, passed before, and does not pass beside it.
 
     It ends when nothing passes, at one effect for PIECES_PER_EFFECT pieces, or after MAX_EFFECTS turns. Held-out runs
-    take no part in it.
+    take no part in it. The covariance of the last estimate includes the choice of its effects (`choice_covariance`).
 
     Args:
         start: identified by ``ml``, from `gather`.
@@ -178,7 +181,24 @@ def find_effects(
         seen.add(_keys(model.evidence))
     else:
         steps[-1] = _settled(steps[-1], model.search_problem, (), rng, gates)
-    return tuple(steps)
+    return (*steps[:-1], _with_choice(steps, model, gates))
+
+
+def _with_choice(steps: Sequence[Step], model: _Model, gates: Gates) -> Step:
+    """Return the last step, what the choice of its effects adds to the covariance of its estimate included."""
+    estimate, accepted = model.evidence.estimate, list[tuple[Finding, tuple[Finding, ...]]]()
+    for step in steps:
+        found = step.accepted
+        if found is not None and PlacedEffect(found.effect, found.axis) in model.evidence.effects:
+            accepted.append((found, (*step.findings, *step.structures)))
+    last = steps[-1]
+    left = [aside.finding for aside in last.set_aside if aside.moved]
+    if last.accepted is None:
+        left += [found for found in (*last.findings, *last.structures) if is_small(found, gates)]
+    choice = choice_covariance(model.search_problem, estimate, accepted, left)
+    std = np.sqrt(np.diag(choice)[: len(estimate.gains)])
+    chosen = replace(estimate, covariance=estimate.covariance + choice)
+    return replace(last, after=replace(model.evidence, estimate=chosen), choice_std=std)
 
 
 @dataclass(frozen=True, slots=True)

@@ -252,6 +252,21 @@ def test_the_document_has_the_numbers_of_the_rows(closed: Closed) -> None:
     assert last["detection_limits"][1] == {"axis": "J2", "rms": 1.25, "unit": "Nm"}
 
 
+def test_what_the_choice_of_effects_adds_to_sigma_is_said_where_it_counts(closed: Closed) -> None:
+    """On J2 it is half of σ, on the others a tenth."""
+    gains = closed.account.total.gains
+    chosen = tuple(
+        replace(gain, choice_std=share * gain.after_std)
+        for gain, share in zip(gains, (0.1, 0.5, 0.1, 0.1, 0.1, 0.1), strict=True)
+    )
+    told = replace(closed.account, total=replace(closed.account.total, gains=chosen))
+    sentence = "σ of the gains includes the choice of the effects (squares add): 50 % of it on J2."
+    assert sentence in summary(closed.fitted, told)
+    assert not any("choice of the effects" in text for text in summary(closed.fitted, closed.account))
+    document = Closed(closed.fitted, told).document()
+    assert document["gain_changes"][1]["choice_std"] == chosen[1].choice_std
+
+
 def test_the_document_is_complete_and_described(closed: Closed, checkout: Path) -> None:
     document = closed.document()
     finding, turn = document["turns"][0]["findings"][0], document["turns"][0]

@@ -269,12 +269,18 @@ def test_rivals_are_those_that_stop_passing_beside_it(small: Evidence, small_tru
 
     families = tuple(family for family in EFFECTS if family[0].name in {"hinge", "gravity-compensator", "stribeck"})
     start = bent(small, small_truth, torque)
-    first, second = find_effects(start, np.random.default_rng(0), GATES, families)[:2]
+    steps = find_effects(start, np.random.default_rng(0), GATES, families)
+    first, second = steps[:2]
     assert first.accepted is not None
     assert first.accepted.ambiguity
     passed = [{effect_key(one.effect, one.axis) for one in step.findings if one.passed} for step in (first, second)]
     for rival in first.accepted.ambiguity:
         assert effect_key(rival.effect, rival.axis) in passed[0] - passed[1]
+    plain, whole = with_effects(start, steps[-1].after.effects).estimate, steps[-1].after.estimate
+    added = steps[-1].choice_std
+    assert added is not None
+    assert np.all(added > 0.0)
+    assert whole.gains_std == pytest.approx(np.hypot(plain.gains_std, added), rel=1e-3)
 
 
 @pytest.fixture(scope="module")

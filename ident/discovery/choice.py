@@ -1,0 +1,105 @@
+"""What the choice of effects adds to σ: rivals of those that joined, and those that stayed out.
+
+The covariance of a joint fit takes its effects as given. But the search has chosen them, on the same data. Another
+model r could be the true one. It would put the gains and parameters θ at θ_r, and averaged over the models (Buckland,
+Burnham & Augustin 1997; here around the one that was chosen, whose estimate is kept) the covariance grows by
+
+    C_r = w_r (θ_r − θ)(θ_r − θ)ᵀ,      w_r = o_r/(1 + Σ o),      o_r = p_r/(1 − p_r),
+
+with p_r the probability that r predicts left-out moves better than the chosen model, by a paired comparison over folds
+(Student's t). Models that do equally well have equal weights. They are
+
+- for each effect in the fit, those of its ambiguity set in its place;
+- for each axis, one further effect that is no noise (`Gates.false_alarm`, over all candidates) and possible, but too
+  small for the other gates: a saturation that explains 3 % of the residual may move a gain by five σ. A term without a
+  name that did not join because it moves a gain is one of them.
+
+θ_r is taken to first order, from products with columns that the search has made before: no refit. The error of the
+settings that were searched (exponents, time constants) is left out: it was below a tenth of σ wherever it was measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy  # loads scipy.special when it is first used: a fit needs none of it
+
+from ident.arrays import FloatArray
+from ident.discovery.candidates import SearchProblem, score_candidates
+from ident.discovery.gates import impossible, shifts_by, whitened_columns, without_effects_of
+from ident.discovery.search import Finding, Gates
+from ident.effects.effect import PlacedEffect
+from ident.estimators.estimate import Estimate
+
+
+def choice_covariance(
+    search_problem: SearchProblem,
+    estimate: Estimate,
+    accepted: Sequence[tuple[Finding, Sequence[Finding]]],
+    left: Sequence[Finding],
+) -> FloatArray:
+    """Covariance of (gains, parameters) from the choice of the effects in a joint fit, shape (n + p, n + p).
+
+    Args:
+        search_problem: linearised around the joint fit.
+        estimate: the joint fit.
+        accepted: each effect that is still in the fit, with the findings of its turn.
+        left: findings of the last turn that are no noise, but did not join.
+    """
+    shifts = [np.zeros((0, len(estimate.covariance)))]
+    for finding, others in accepted:
+        placed = PlacedEffect(finding.effect, finding.axis)
+        found = {(one.effect, one.axis): one for one in others}
+        rivals = [found[key] for one in finding.ambiguity if (key := (one.effect, one.axis)) in found]
+        if rivals:
+            reduced = without_effects_of(search_problem, estimate, (placed,))
+            torque, errors = reduced.torque, finding.fold_errors
+            shifts.append(_by_rivals(reduced.search_problem, torque, errors, rivals, len(estimate.covariance)))
+    folds = search_problem.folds
+    errors, nothing = folds.square_sum(folds.residual).sum(axis=1), np.zeros(len(folds.residual))
+    for axis in sorted({one.axis for one in left}):
+        rivals = [one for one in left if one.axis == axis]
+        shifts.append(_by_rivals(search_problem, nothing, errors, rivals, len(estimate.covariance)))
+    whole = np.concatenate(shifts)
+    return whole.T @ whole
+
+
+def is_small(finding: Finding, gates: Gates) -> bool:
+    """Whether a finding is no noise and possible, but failed a gate of size; runs left out may refute larger ones."""
+    if finding.probability > gates.false_alarm:
+        return False
+    if impossible(finding.effect.coefficients, finding.coefficients, finding.deviations):
+        return False
+    return (
+        finding.folds_better < gates.folds_better
+        or finding.explained < gates.explained
+        or finding.error_fall < gates.error_fall
+    )
+
+
+def _by_rivals(
+    search_problem: SearchProblem, torque: FloatArray, fold_errors: FloatArray, rivals: Sequence[Finding], size: int
+) -> FloatArray:
+    """√w_r (θ_r − θ) of models with another effect in the place of the chosen one, shape (rivals, size).
+
+    Args:
+        search_problem: around the fit, without the chosen effect.
+        torque: of the chosen effect, whitened, shape (rows,); zero where there is none.
+        fold_errors: ‖e‖² of the chosen model on each fold, shape (folds,).
+        rivals: the other effects.
+        size: n + p.
+    """
+    gain = fold_errors - np.stack([one.fold_errors for one in rivals])
+    folds = gain.shape[1]
+    error = np.maximum(gain.std(axis=1, ddof=1), np.finfo(np.float64).tiny) * np.sqrt(folds)
+    better = scipy.special.stdtr(folds - 1, gain.sum(axis=1) / error)
+    odds = better / np.maximum(1.0 - better, np.finfo(np.float64).eps)
+    shifts = []
+    for rival, weight in zip(rivals, odds / (1.0 + odds.sum()), strict=True):
+        columns = whitened_columns(search_problem, rival.effect, rival.axis)
+        (trial,) = score_candidates(search_problem.folds, columns, (slice(0, columns.shape[1]),))
+        if trial is not None:
+            moved = shifts_by(search_problem.folds, columns @ trial.coefficients - torque, size)
+            shifts.append(np.sqrt(weight) * moved)
+    return np.reshape(shifts, (-1, size))
