@@ -631,6 +631,8 @@ def test_torque_columns_give_a_slope_and_temperature_columns_a_temperature(bench
     with_slow_columns(bench, 1000.0 * torque, temperature_c, side=side, factor=0.001)
     assert bench.run() == 0
     run, _ = load_run(bench.out)
+    # 300 rows at 50 Hz: a torque in every second row, a temperature a second.
+    assert describe_log(bench.out)["slow_readings"] == {"torque": 6 * 150, "temperature": 6 * 6}
     slopes = [torque_slope([channel]) for channel in run.torque_channels]
     assert [slope.value for slope in slopes if slope is not None] == pytest.approx(gain, rel=1e-6)
     assert run.temperature_c is not None
