@@ -8,7 +8,7 @@ from math import ceil
 from typing import TYPE_CHECKING
 
 import drivers
-from daq.config.cell import Bus, Cell, PacingMode
+from daq.config.cell import Bus, Cell, PacingMode, Sync
 from daq.errors import ConfigurationInconsistent
 from drivers.canopen.pdo import HEARTBEAT_MS, SETPOINT_PDOS, STATUSWORD, pack
 from drivers.profiles.profile import Axis, DriveProfile, ObjectEntry
@@ -178,6 +178,33 @@ def load_warnings(cell: Cell) -> tuple[str, ...]:
         for bus, load in bus_loads(cell)
         if load.start > 1.0
     )
+
+
+def polling_fits(cell: Cell) -> bool:
+    """Return whether every period has room for an SDO request and its answer beside all answers to the SYNC.
+
+    Both frames may fall into one period, and an answer after the next SYNC makes a run invalid. In lockstep there is
+    always room.
+    """
+    if cell.sync is None or cell.sync.pacing is PacingMode.LOCKSTEP:
+        return True
+    return all(load.worst + _sdo_share(cell.sync, bus) <= LARGEST_WORST for bus, load in bus_loads(cell))
+
+
+def polling_warnings(cell: Cell) -> tuple[str, ...]:
+    """Warn of a cell in which torque and temperature are not logged beside the samples: see `polling_fits`."""
+    if cell.sync is None or polling_fits(cell):
+        return ()
+    most = max((load.worst + _sdo_share(cell.sync, bus)) * cell.sync.period_us for bus, load in bus_loads(cell))
+    return (
+        "no room for SDO between two SYNCs: the drives' torque is not logged, and their temperature only before and "
+        f"after the run; a sync.period_us of {100 * ceil(most / 100)} has room",
+    )
+
+
+def _sdo_share(sync: Sync, bus: Bus) -> float:
+    """Share of a period of an SDO request and its answer, with maximal stuffing."""
+    return 2 * frame_bits(8) * 1e6 / (bus.bitrate_bit_s * sync.period_us)
 
 
 def bus_address(cell: Cell) -> drivers.BusAddress:

@@ -25,6 +25,7 @@ from drivers.profiles.profile import (
     Save,
     ScaleForm,
     TapPoint,
+    Thermometer,
 )
 
 Index = Annotated[int, Field(ge=0x1000, le=0xFFFF)]
@@ -45,7 +46,7 @@ class EntryModel(StrictModel):
 
 
 class SignalModel(EntryModel):
-    """A signal that is mapped into the TPDO: at most 32 bits, because logs hold int32."""
+    """A signal of at most 32 bits: logs hold int32 of what a TPDO carries, and slow readings come in one SDO frame."""
 
     type: Literal["i8", "i16", "i32", "u8", "u16"]
 
@@ -118,6 +119,16 @@ class RatedModel(StrictModel):
         return RatedMotor(self.current.entry(), self.ampere_per_unit, torque, self.newton_metre_per_unit)
 
 
+class TemperatureModel(SignalModel):
+    """Object with the temperature of the motor or the drive."""
+
+    kelvin_per_unit: Positive
+
+    def thermometer(self) -> Thermometer:
+        """Convert to the class of `drivers`."""
+        return Thermometer(self.entry(), self.kelvin_per_unit)
+
+
 class SaveModel(StrictModel):
     """Command with which the drive stores its parameters."""
 
@@ -151,6 +162,8 @@ class FactsModel(StrictModel):
     rated: FactModel
     save: FactModel
     toggle_bit: FactModel | None = None
+    torque: FactModel | None = None
+    temperature: FactModel | None = None
 
     def facts(self) -> tuple[Fact, ...]:
         """Convert to the class of `drivers`."""
@@ -172,6 +185,9 @@ class DriveModel(StrictModel):
     """CiA 402 leaves these bits to the maker; the others have a meaning in profile position mode."""
     update_period_us: Annotated[int, Field(gt=0)]
     rated: RatedModel | None = None
+    torque: SignalModel | None = None
+    """Torque actual value, in thousandths of the rated torque, which the drive must report (`rated.torque`)."""
+    temperature: TemperatureModel | None = None
     save: SaveModel | None = None
     save_semantics: str
     source: Annotated[str, Field(min_length=1)]
@@ -180,9 +196,12 @@ class DriveModel(StrictModel):
     facts: FactsModel | None = None
 
     @model_validator(mode="after")
-    def _toggle_bit_and_source(self) -> DriveModel:
-        if self.facts is not None and (self.toggle_bit is None) != (self.facts.toggle_bit is None):
-            raise ValueError("toggle_bit and facts.toggle_bit, both or neither")
+    def _options_and_sources(self) -> DriveModel:
+        for key in ("toggle_bit", "torque", "temperature"):
+            if self.facts is not None and (getattr(self, key) is None) != (getattr(self.facts, key) is None):
+                raise ValueError(f"{key} and facts.{key}, both or neither")
+        if self.torque is not None and (self.rated is None or self.rated.torque is None):
+            raise ValueError("torque with rated.torque, of which it is given in thousandths")
         return self
 
 
@@ -221,4 +240,6 @@ def drive_from_text(text: bytes, name: str) -> DriveProfile:
         rated=None if model.rated is None else model.rated.rated(),
         save=None if model.save is None else model.save.save(),
         toggle_bit=model.toggle_bit,
+        torque=None if model.torque is None else model.torque.entry(),
+        temperature=None if model.temperature is None else model.temperature.thermometer(),
     )

@@ -84,12 +84,11 @@ class PositionColumns:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CurrentColumns:
-    """Columns of the current-loop reference, one for each axis; numbers × factor are in the gains' unit."""
+class ScaledColumns:
+    """Columns of a quantity, one for each axis, and the factor to its unit."""
 
     file: FileName
     columns: SomeColumns
-    unit: Annotated[str, Field(min_length=1)]
     #: One for all axes, a list in their order, or a mapping from their names.
     factor: Factor | Annotated[tuple[Factor, ...], Field(min_length=1)] | dict[Name, Factor] = 1.0
 
@@ -100,6 +99,28 @@ class CurrentColumns:
         if isinstance(self.factor, dict):
             return tuple(self.factor[axis] for axis in axes) if self.factor.keys() == set(axes) else None
         return self.factor if len(self.factor) == len(axes) else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CurrentColumns(ScaledColumns):
+    """Columns of the current-loop reference; numbers × factor are in the gains' unit."""
+
+    unit: Annotated[str, Field(min_length=1)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TorqueColumns(ScaledColumns):
+    """Columns of the controller's own torque, for a comparison with the gains; numbers × factor are Nm (or N)."""
+
+    side: Side
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TemperatureColumns:
+    """Columns of the temperature of each motor or its drive [°C]."""
+
+    file: FileName
+    columns: SomeColumns
 
 
 class VelocityUnit(Enum):
@@ -135,6 +156,9 @@ class TimeColumn:
     largest_gap_periods: Annotated[float, Field(ge=1.5, le=100.0)] = 3.0
 
 
+Section = PositionColumns | ScaledColumns | VelocityColumns | TemperatureColumns
+
+
 class ImportDescription(StrictModel):
     """A whole import description."""
 
@@ -144,6 +168,8 @@ class ImportDescription(StrictModel):
     position: PositionColumns  #: column of the position
     current: CurrentColumns  #: column of the current
     velocity: VelocityColumns | None = None  #: columns of the velocity, for a check alone
+    torque: TorqueColumns | None = None  #: columns of the controller's own torque, for a comparison alone
+    temperature: TemperatureColumns | None = None  #: columns of the temperature
     rate_hz: Rate | None = None  #: sampling rate [Hz]; either this or `time`
     time: TimeColumn | None = None  #: the time column, instead of a rate
     topic: str | None = None  #: topic of the joint states in a ROS 2 bag; needed if it has several
@@ -151,11 +177,15 @@ class ImportDescription(StrictModel):
     mounting: Name | None = None  #: its mounting, as named in the cell; None without load
     operator: str = ""  #: person who recorded it
 
+    def sections(self) -> tuple[tuple[str, Section], ...]:
+        """Return the sections with a column for each axis, by their keys."""
+        stated = ((key, getattr(self, key)) for key in ("position", "current", "velocity", "torque", "temperature"))
+        return tuple((key, section) for key, section in stated if section is not None)
+
     def files(self) -> dict[str, tuple[Column, ...]]:
         """Return the files, each with its columns of numbers; the time column is not among them."""
         columns: dict[str, dict[Column, None]] = {}
-        sections = (self.position, self.current, *(() if self.velocity is None else (self.velocity,)))
-        for section in sections:
+        for _, section in self.sections():
             columns.setdefault(section.file, {}).update(dict.fromkeys(section.columns))
         if self.time is not None:
             columns.setdefault(self.time.file, {})
@@ -178,13 +208,13 @@ def load_import(path: Path) -> ImportDescription:
     if wanted.position.unit is PositionUnit.COUNTS and wanted.position.side is Side.JOINT:
         expected = "motor; counts are of the motor encoder"
         faults.append(Fault(("position", "side"), "joint, with encoder counts", expected))
-    factor = wanted.current.factor
-    if 0.0 in ((factor,) if isinstance(factor, float) else factor.values() if isinstance(factor, dict) else factor):
-        faults.append(Fault(("current", "factor"), "0", "the unit of the gain for each unit in the file"))
     axes = len(wanted.position.columns)
-    for name, section in (("current", wanted.current), ("velocity", wanted.velocity)):
+    for name, section in wanted.sections():
+        factor = section.factor if isinstance(section, ScaledColumns) else 1.0
+        if 0.0 in ((factor,) if isinstance(factor, float) else factor.values() if isinstance(factor, dict) else factor):
+            faults.append(Fault((name, "factor"), "0", "the unit of the log for each unit in the file"))
         # One name may be a whole matrix or field (daq.log.readers.with_columns); then the import counts.
-        if section is not None and len(section.columns) != axes and 1 not in {axes, len(section.columns)}:
+        if len(section.columns) != axes and 1 not in {axes, len(section.columns)}:
             found = f"{len(section.columns)} columns"
             faults.append(Fault((name, "columns"), found, f"{axes}, as many as of position"))
     timed = () if wanted.time is None else (wanted.time.column,)

@@ -31,12 +31,15 @@ from daq.log.message import (
     EVENTS_SCHEMA,
     EVENTS_TOPIC,
     LARGEST_AXES,
+    READING_SCHEMA,
+    READING_TOPICS,
     SAMPLES_SCHEMA,
     SAMPLES_TOPIC,
     event_from_bytes,
+    reading_from_bytes,
     sample_dtype,
 )
-from drivers.stream.sample import CellEvent
+from drivers.stream.sample import CellEvent, SlowReading
 
 MAGIC = b"\x89MCAP0\r\n"
 UNFINISHED = ".part"  #: Suffix of a log that is being written, or whose recorder has died
@@ -261,6 +264,8 @@ def _parse(read: Callable[[ReadDataStream], Record], body: bytes, file: RecordFi
 
 
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+_QUANTITIES = {topic: quantity for quantity, topic in READING_TOPICS.items()}
+_SCHEMAS = {SAMPLES_TOPIC: SAMPLES_SCHEMA, EVENTS_TOPIC: EVENTS_SCHEMA, **dict.fromkeys(_QUANTITIES, READING_SCHEMA)}
 
 
 class ChunkContents:
@@ -268,16 +273,18 @@ class ChunkContents:
 
     Attributes:
         events: events of all chunks so far, in the order of the log.
+        readings: slow readings of all chunks so far, likewise.
     """
 
     def __init__(self, file: RecordFile) -> None:
         self.events: list[CellEvent] = []
+        self.readings: list[SlowReading] = []
         self._file = file
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
 
     def samples(self, offset: int, data: bytes) -> Iterator[tuple[int, NDArray[np.void]]]:
-        """Yield the samples of a chunk, all at once if it holds nothing else; its events go to `events`.
+        """Yield the samples of a chunk, all at once if it holds nothing else; its events and readings are collected.
 
         Args:
             offset: offset of the chunk in the file, for messages.
@@ -319,6 +326,11 @@ class ChunkContents:
                     self.events.append(event_from_bytes(record[_MESSAGE_HEAD.size :]))
                 except (ValueError, struct.error) as error:
                     raise self._file.corrupt(offset, f"a broken event ({error})", EVENTS_SCHEMA) from error
+            elif topic in _QUANTITIES:
+                try:
+                    self.readings.append(reading_from_bytes(record[_MESSAGE_HEAD.size :], _QUANTITIES[topic]))
+                except (ValueError, struct.error) as error:
+                    raise self._file.corrupt(offset, f"a broken reading ({error})", READING_SCHEMA) from error
         if samples:
             axes = self._axes(offset, len(samples[0]) - 9)
             dtype = sample_dtype(axes)
@@ -349,7 +361,7 @@ class ChunkContents:
             self._schemas[record.id] = record
         elif isinstance(record, Channel):
             schema = self._schemas.get(record.schema_id)
-            expected = {SAMPLES_TOPIC: SAMPLES_SCHEMA, EVENTS_TOPIC: EVENTS_SCHEMA}.get(record.topic)
+            expected = _SCHEMAS.get(record.topic)
             name = schema.name if schema else "no schema"
             if expected and (record.message_encoding != "cdr" or name != expected):
                 raise self._file.foreign(

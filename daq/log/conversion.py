@@ -15,15 +15,19 @@ from daq.config.cell_file import cell_from_bundle
 from daq.errors import ClockImplausible, CurrentSaturated, CyclesLost, LogIncomplete, PositionImplausible, RunInvalid
 from daq.log.metadata import Readback
 from daq.log.reader import Log, LossyLogs, read_log, reports_only_losses
-from drivers.stream.sample import CellEvent, EventKind
+from drivers.stream.sample import CellEvent, EventKind, Quantity
 from ident.arrays import BoolArray, FloatArray
 from ident.data.run import Recording, Run
+from ident.data.torque_channel import TorqueChannel
+from ident.model.model import DriveTrain
 
 _LOG = logging.getLogger("drivegain")
 LIMIT_MARGIN = 0.05  #: Largest excursion beyond the limits, as a share of the joint's range
 LARGEST_SATURATED = 0.1  #: Largest share of an axis's samples with an active limit; these samples are masked
 STEP_TOLERANCE = 0.5
 """Largest deviation of a time step, as a share of the period. From half a period on it could be another cycle."""
+BESIDE_S = 0.005  #: Distance from a torque within which the current belongs to it
+NEARBY_S = 0.01, 0.03  #: Distances from it at which the current has another noise, but hardly another value
 RATE_TOLERANCE = 0.01  #: Largest relative difference between the requested rate and that of the time stamps
 
 
@@ -170,6 +174,8 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
         valid=valid,
         started_s=float(samples.time_ns[0]) * 1e-9 if run.has_clock else None,
         partial=log.partial or accepted,
+        temperature_c=temperatures(log),
+        torque_channels=torque_channels(log, cell, samples.current_raw * scale.current_per_unit, valid),
         recording=Recording(
             # An import without the time of day writes 0.
             recorded_s=run.started_wall_ns * 1e-9 if run.started_wall_ns else None,
@@ -195,6 +201,66 @@ def moves(events: tuple[CellEvent, ...], time_ns: NDArray[np.int64]) -> NDArray[
     begin_ns = np.array([start[0] for start in starts], dtype=np.int64)
     number = np.array([start[1] for start in starts], dtype=np.int64)
     return number[np.maximum(np.searchsorted(begin_ns, time_ns, side="right") - 1, 0)]
+
+
+def temperatures(log: Log) -> FloatArray | None:
+    """Return the temperature of each axis at each sample [°C], shape (k, n); None in a log without any.
+
+    It is interpolated between readings, and constant before the first and after the last; NaN for an axis without.
+    """
+    readings = [reading for reading in log.readings if reading.quantity is Quantity.TEMPERATURE]
+    if not readings:
+        return None
+    time_ns = log.samples.time_ns
+    found = np.full(log.samples.position_counts.shape, np.nan)
+    for axis in {reading.axis for reading in readings}:
+        own = sorted((one.time_ns - int(time_ns[0]), one.value) for one in readings if one.axis == axis)
+        at_ns, values = np.array(own).T
+        found[:, axis] = np.interp(time_ns - time_ns[0], at_ns, values)
+    return found
+
+
+def torque_channels(log: Log, cell: Cell, current: FloatArray, valid: BoolArray) -> tuple[TorqueChannel, ...]:
+    """Return each axis's own torque beside its current, one channel an axis; none in a log without torques.
+
+    The current is the mean over BESIDE_S around the reading, because an SDO shows only within some milliseconds when
+    the drive read its torque; the current nearby is the mean over NEARBY_S before and after it.
+
+    Args:
+        log: with the readings.
+        cell: its drive train leads from the motors to the joints.
+        current: recorded currents in the gains' unit, shape (k, n).
+        valid: samples that may be used, shape (k, n).
+    """
+    readings = [reading for reading in log.readings if reading.quantity is Quantity.TORQUE]
+    if not readings:
+        return ()
+    time_ns, rate_hz = log.samples.time_ns, log.head.run.rate_hz
+    half = round(BESIDE_S * rate_hz)
+    near, far = max(half + 1, round(NEARBY_S[0] * rate_hz)), max(half + 2, round(NEARBY_S[1] * rate_hz))
+    sums = np.zeros((2, len(current) + 1, len(cell.axes)))
+    np.cumsum((current, valid), axis=1, out=sums[:, 1:])
+    channels = []
+    for axis, reduction in enumerate(DriveTrain(cell.ratio).reduction):
+        own = sorted((one.time_ns, one.value) for one in readings if one.axis == axis)
+        at_ns = np.array([stamp for stamp, _ in own], dtype=np.int64)
+        row = np.searchsorted(time_ns, at_ns - round(0.5e9 / rate_hz))
+        inside = (row >= far) & (row + far < len(time_ns))
+        row, at_ns = row[inside], at_ns[inside]
+        beside, before, after = (
+            (sums[:, last, axis] - sums[:, first, axis]) / (last - first)
+            for first, last in ((row - half, row + half + 1), (row - far, row - near), (row + near + 1, row + far + 1))
+        )
+        whole = beside[1] + before[1] + after[1] == 3.0
+        channels.append(
+            TorqueChannel(
+                time_s=(at_ns[whole] - time_ns[0]) * 1e-9,
+                current_a=beside[0, whole],
+                nearby_a=0.5 * (before[0] + after[0])[whole],
+                torque_nm=float(reduction) * np.array([value for _, value in own])[inside][whole],
+            )
+        )
+    return tuple(channels)
 
 
 def check_limits(name: str, position_rad: FloatArray, cell: Cell, valid: BoolArray | None = None) -> None:

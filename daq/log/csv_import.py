@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import ceil, log2, pi
 from pathlib import Path
@@ -17,7 +18,14 @@ import numpy as np
 
 from daq.config.cell import MILLIMETRE, Cell
 from daq.config.cell_file import bundle, load_cell
-from daq.config.import_description import ImportDescription, PositionUnit, Side, VelocityUnit, load_import
+from daq.config.import_description import (
+    ImportDescription,
+    PositionUnit,
+    ScaledColumns,
+    Side,
+    VelocityUnit,
+    load_import,
+)
 from daq.errors import ConfigurationInconsistent, PositionImplausible, TableUnfit
 from daq.log.conversion import check_limits, scaling, unwrapped
 from daq.log.metadata import AxisReadback, Readback, RunInfo, RunStatistics, Timing
@@ -25,7 +33,7 @@ from daq.log.readers import reader_of, with_columns
 from daq.log.resampling import Clock, clock_of
 from daq.log.table import Table
 from daq.log.writer import NOTHING_KEPT, LogContent, LogWriter
-from drivers.stream.sample import Sample
+from drivers.stream.sample import Quantity, Sample, SlowReading
 from ident.arrays import FloatArray, IntArray
 from ident.model.bodies import Payload
 
@@ -40,6 +48,8 @@ SPEED_PERCENTILE = 99.9
 """Percentile of a run's speeds that is compared with the limit: a few outliers do not mean a wrong rate."""
 SLOW_SHARE = 0.1
 """Share of the velocity limits; if no joint is ever faster, the real rate may be ten times the declared one."""
+TORQUE_HZ, TEMPERATURE_HZ = 20.0, 1.0
+"""Rates at which the controller's own torque and temperatures are kept: enough for a slope and for a warm-up."""
 VELOCITY_WINDOW_S = 0.1  #: Time over which the ways by velocities and by positions are compared
 STILL = 1e-3  #: Difference of speed that is no contradiction, as a share of the velocity limit
 UNIX_NS = range(10**18, 3 * 10**18)  #: Stamps from 2001 to 2065 are since 1970; any others since some start
@@ -86,10 +96,10 @@ def import_csv(description: Path, data: Path, out: Path, *, software: str, cell_
     rate_hz = wanted.rate_hz if clock is None else clock.timing.rate_hz
     assert rate_hz is not None  # load_import requires one of the two
     if clock is not None:
-        position, current = position[clock.row], current[clock.row]
+        position = position[clock.row]
     counts, count_rad = _counts(wanted, cell, position, clock)
     factors = wanted.current.factors(cell.axis_names)
-    raw, unit = quantise((current if clock is None else clock.currents(current)) * np.array(factors))
+    raw, unit = quantise(_on_clock(current, clock) * np.array(factors))
     readback = Readback(
         tuple(
             AxisReadback(axis.name, float(unit[i]), None if count_rad is None else float(count_rad[i]))
@@ -103,6 +113,7 @@ def import_csv(description: Path, data: Path, out: Path, *, software: str, cell_
     _check_speed(str(table.path), joint_rad, rate_hz, cell)
     _check_velocity(wanted, cell, files, clock, joint_rad, rate_hz)
     digests = {name: file.digest for name, file in files.items()}
+    slow = _slow(wanted, cell, files, clock)
     started_ns, started_wall_ns, timing = _start(wanted, files, clock)
     run = RunInfo(
         run_id=f"import-{hashlib.sha256(repr(sorted(digests.items())).encode()).hexdigest()[:16]}",
@@ -124,6 +135,7 @@ def import_csv(description: Path, data: Path, out: Path, *, software: str, cell_
             time_ns = (started_ns + np.rint(np.arange(len(counts)) * (1e9 / rate_hz)).astype(np.int64)).tolist()
             silent = (0,) * len(cell.axes)
             for cycle, row in enumerate(zip(time_ns, counts.tolist(), raw.tolist(), strict=True)):
+                log.readings(_readings(slow, cycle, row[0]))
                 log.write(Sample(cycle, row[0], tuple(row[1]), tuple(row[2]), silent))
             log.conclude(valid=True)
     except BaseException:
@@ -154,6 +166,38 @@ def _clock(wanted: ImportDescription, files: dict[str, Table]) -> Clock | None:
     if wanted.time is None:
         return None
     return clock_of(files[wanted.time.file], wanted.time, np.hstack([file.values for file in files.values()]))
+
+
+def _on_clock(values: FloatArray, clock: Clock | None) -> FloatArray:
+    """Move columns of the file, shape (rows, n), to the samples of the log, shape (k, n)."""
+    return values if clock is None else clock.currents(values[clock.row])
+
+
+def _slow(
+    wanted: ImportDescription, cell: Cell, files: dict[str, Table], clock: Clock | None
+) -> list[tuple[Quantity, int, FloatArray]]:
+    """Return torques of the motors [Nm] and temperatures [°C] at every sample, each with its period in samples."""
+    rate_hz = wanted.rate_hz if clock is None else clock.timing.rate_hz
+    assert rate_hz is not None
+    found = []
+    if (torque := wanted.torque) is not None:
+        factors = np.array(torque.factors(cell.axis_names))
+        values = _on_clock(files[torque.file].take(torque.columns), clock) * factors
+        if torque.side is Side.JOINT:
+            values = values @ np.linalg.inv(cell.ratio)  # τ_joint = Rᵀ τ_motor (eq. 24)
+        found.append((Quantity.TORQUE, max(1, round(rate_hz / TORQUE_HZ)), values))
+    if (temperature := wanted.temperature) is not None:
+        values = _on_clock(files[temperature.file].take(temperature.columns), clock)
+        found.append((Quantity.TEMPERATURE, max(1, round(rate_hz / TEMPERATURE_HZ)), values))
+    return found
+
+
+def _readings(slow: list[tuple[Quantity, int, FloatArray]], cycle: int, time_ns: int) -> Iterator[SlowReading]:
+    """Return the slow readings of a sample."""
+    for quantity, every, values in slow:
+        if cycle % every == 0:
+            for axis, value in enumerate(values[cycle].tolist()):
+                yield SlowReading(time_ns, axis, quantity, value)
 
 
 def _start(wanted: ImportDescription, files: dict[str, Table], clock: Clock | None) -> tuple[int, int, Timing | None]:
@@ -249,13 +293,20 @@ def _payload(wanted: ImportDescription, cell: Cell) -> Payload | None:
 
 def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> None:
     n = len(cell.axes)
-    for key, section in (("position", wanted.position), ("current", wanted.current), ("velocity", wanted.velocity)):
-        if section is not None and len(section.columns) != n:
+    for key, section in wanted.sections():
+        if len(section.columns) != n:
             raise ConfigurationInconsistent(
                 f"{description}: {key}.columns",
                 found=f"{len(section.columns)} columns",
                 expected=f"{n}, one for each axis of cell {cell.name!r}",
                 remedy="correct the description, or choose the cell with --cell",
+            )
+        if isinstance(section, ScaledColumns) and section.factors(cell.axis_names) is None:
+            raise ConfigurationInconsistent(
+                f"{description}: {key}.factor",
+                found=str(section.factor),
+                expected=f"one for each of {', '.join(cell.axis_names)}",
+                remedy="write a number for all axes, a list in their order, or a mapping from their names",
             )
     for axis in cell.axes:
         if axis.gain_unit not in {f"Nm/{wanted.current.unit}", f"N/{wanted.current.unit}"}:
@@ -265,13 +316,6 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
                 expected=f"current in {axis.gain_unit.partition('/')[2]!r}",
                 remedy="state that unit, and `factor` to convert the numbers of the file to it",
             )
-    if wanted.current.factors(cell.axis_names) is None:
-        raise ConfigurationInconsistent(
-            f"{description}: current.factor",
-            found=str(wanted.current.factor),
-            expected=f"one for each of {', '.join(cell.axis_names)}",
-            remedy="write a number for all axes, a list in their order, or a mapping from their names",
-        )
     if wanted.position.unit is PositionUnit.COUNTS and any(a.counts_per_revolution is None for a in cell.axes):
         raise ConfigurationInconsistent(
             f"{description}: position.unit",
@@ -280,12 +324,12 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
             remedy="add it to the cell file",
         )
     lengths = {PositionUnit.M, PositionUnit.MM, VelocityUnit.M, VelocityUnit.MM}
-    for key, section in (("position", wanted.position), ("velocity", wanted.velocity)):
+    for key, moved in (("position", wanted.position), ("velocity", wanted.velocity)):
         turning = [axis.name for axis in cell.axes if axis.unit is not MILLIMETRE]
-        if section is not None and section.unit in lengths and (turning or section.side is Side.MOTOR):
+        if moved is not None and moved.unit in lengths and (turning or moved.side is Side.MOTOR):
             raise ConfigurationInconsistent(
                 f"{description}: {key}.unit",
-                found=f"{section.unit.value}, while {'axis ' + turning[0] if turning else 'a motor'} turns",
+                found=f"{moved.unit.value}, while {'axis ' + turning[0] if turning else 'a motor'} turns",
                 expected="rad or deg (m or mm for the prismatic axes among them), or counts",
                 remedy="correct the unit; convert the columns of the file to it",
             )
@@ -303,9 +347,7 @@ def _check_velocity(
     """Compare velocity columns with the positions, by the way moved in VELOCITY_WINDOW_S: it needs no derivative."""
     if (velocity := wanted.velocity) is None:
         return
-    stated = files[velocity.file].take(velocity.columns)
-    if clock is not None:
-        stated = clock.currents(stated[clock.row])
+    stated = _on_clock(files[velocity.file].take(velocity.columns), clock)
     if velocity.unit in {VelocityUnit.DEG, VelocityUnit.MM}:
         units = [axis.unit.si if velocity.side is Side.JOINT else pi / 180.0 for axis in cell.axes]
         stated = stated * np.array(units)

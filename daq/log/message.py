@@ -8,16 +8,20 @@ given number of axes an AxisSamples message has a constant size, so numpy reads 
 from __future__ import annotations
 
 import functools
+import math
 import struct
 from collections.abc import Sequence
 
 import numpy as np
 
-from drivers.stream.sample import CellEvent, EventKind, Sample
+from drivers.stream.sample import CellEvent, EventKind, Quantity, Sample, SlowReading
 
 SAMPLES_TOPIC, EVENTS_TOPIC, JOINTS_TOPIC = "/cell/samples", "/cell/events", "/joint_states"
 SAMPLES_SCHEMA, EVENTS_SCHEMA = "drivegain_msgs/msg/AxisSamples", "drivegain_msgs/msg/CellEvent"
 JOINTS_SCHEMA = "sensor_msgs/msg/JointState"
+READING_TOPICS = {Quantity.TORQUE: "/cell/torque", Quantity.TEMPERATURE: "/cell/temperature"}
+"""Topics of the slow readings; a log without such readings has no such topic."""
+READING_SCHEMA = "drivegain_msgs/msg/AxisReading"
 LARGEST_AXES = 32  #: Number of bits in `missing`
 
 _SEPARATOR = "=" * 80 + "\n"
@@ -42,6 +46,13 @@ uint32 code                       # EMCY code, NMT state, statusword, number of 
 string text                       # for people
 """
     + _TIME,
+    READING_SCHEMA: """\
+# A value that is read a few times a second, beside the samples.
+builtin_interfaces/Time stamp
+int16 axis                        # from 0
+float64 value                     # /cell/torque: the drive's own, at the motor [Nm]; /cell/temperature: [degC]
+"""
+    + _TIME,
     JOINTS_SCHEMA: """\
 std_msgs/Header header
 string[] name
@@ -57,6 +68,7 @@ float64[] effort
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR, little-endian
 _EVENT = struct.Struct("<4siIh2x")
+_READING = struct.Struct("<4siIh6xd")
 WHOLE_CELL = -1
 
 
@@ -145,6 +157,28 @@ def event_from_bytes(data: bytes) -> CellEvent:
         raise ValueError(f"time {seconds} s, {nanoseconds} ns")
     time_ns = seconds * 1_000_000_000 + nanoseconds
     return CellEvent(time_ns, None if axis == WHOLE_CELL else axis, EventKind(kind), code, text)
+
+
+def reading_bytes(reading: SlowReading) -> bytes:
+    """Encode one slow reading; the topic names its quantity."""
+    seconds, nanoseconds = divmod(reading.time_ns, 1_000_000_000)
+    return _READING.pack(_ENCAPSULATION, seconds, nanoseconds, reading.axis, reading.value)
+
+
+def reading_from_bytes(data: bytes, quantity: Quantity) -> SlowReading:
+    """Decode one slow reading.
+
+    Raises:
+        ValueError, struct.error: the bytes are not an AxisReading of this software.
+    """
+    head, seconds, nanoseconds, axis, value = _READING.unpack(data)
+    if head != _ENCAPSULATION:
+        raise ValueError(f"encapsulation {head!r}, expected little-endian CDR")
+    if seconds < 0 or nanoseconds >= 1_000_000_000:
+        raise ValueError(f"time {seconds} s, {nanoseconds} ns")
+    if not 0 <= axis < LARGEST_AXES or not math.isfinite(value):
+        raise ValueError(f"a value of {value} for axis {axis}")
+    return SlowReading(seconds * 1_000_000_000 + nanoseconds, axis, quantity, value)
 
 
 def _string(text: str) -> bytes:

@@ -29,7 +29,7 @@ from daq.log.metadata import (
     statistics_from_record,
     unsealed,
 )
-from drivers.stream.sample import CellEvent
+from drivers.stream.sample import CellEvent, SlowReading
 
 BLOCK_SAMPLES = 4096  #: Samples of a block; at most these and one chunk are in memory
 
@@ -64,6 +64,7 @@ class Log:
         head: everything before the samples.
         samples: all samples.
         events: in the order of the log.
+        readings: torques and temperatures that were read beside the samples, in the order of the log.
         statistics: the recorder's summary at the end.
         partial: the end of the recording is unknown: it was salvaged, or never got its final name.
     """
@@ -73,6 +74,7 @@ class Log:
     head: LogHead
     samples: SampleBlock
     events: tuple[CellEvent, ...]
+    readings: tuple[SlowReading, ...]
     statistics: RunStatistics
     partial: bool
 
@@ -120,6 +122,11 @@ class LogReader:
     def events(self) -> list[CellEvent]:
         """Events read so far."""
         return self._chunks.events
+
+    @property
+    def readings(self) -> list[SlowReading]:
+        """Slow readings read so far."""
+        return self._chunks.readings
 
     @property
     def whole_bytes(self) -> int:
@@ -252,6 +259,7 @@ def read_log(path: Path | str) -> Log:
             str(path), found="no samples", expected=f"some on {SAMPLES_TOPIC}", remedy="record or import the run again"
         )
     widths = {block.position_counts.shape[1] for block in blocks}
+    widths |= {reading.axis + 1 for reading in reader.readings if reading.axis >= len(head.readback.axes)}
     if widths != {len(head.readback.axes)}:
         raise LogIncomplete(
             str(path),
@@ -270,7 +278,8 @@ def read_log(path: Path | str) -> Log:
     columns = {name: [getattr(block, name) for block in blocks] for name in SampleBlock.__slots__}
     blocks.clear()  # so that a long log is not in memory twice
     samples = SampleBlock(**{name: np.concatenate(columns.pop(name)) for name in SampleBlock.__slots__})
-    return Log(path, reader.digest, head, samples, tuple(reader.events), statistics, reader.partial)
+    events, readings = tuple(reader.events), tuple(reader.readings)
+    return Log(path, reader.digest, head, samples, events, readings, statistics, reader.partial)
 
 
 MASKED = (

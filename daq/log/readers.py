@@ -54,9 +54,9 @@ def with_columns(wanted: ImportDescription, data: Path, axis_names: Sequence[str
         TableUnfit: a file is of a format that is not read.
     """
     changed = {}
-    for key, field in (("position", "position"), ("current", "effort"), ("velocity", "velocity")):
-        section = getattr(wanted, key)
-        reader = None if section is None else reader_of(data / section.file)
+    for key, section in wanted.sections():
+        field = key if key in FIELDS else "effort"  # a bag of joint states has no temperature
+        reader = reader_of(data / section.file)
         if reader is read_bag:
             names = [str(column) for column in section.columns]
             if len(names) == 1 and names[0] in FIELDS:

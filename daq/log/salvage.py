@@ -100,7 +100,7 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
 def _copy(
     reader: LogReader, blocks: Iterable[SampleBlock], log: LogWriter, axes: int, progress: Callable[[int], None]
 ) -> None:
-    known_events = 0
+    known_events = known_readings = 0
     for block in blocks:
         width = block.position_counts.shape[1]
         if width != axes:
@@ -113,12 +113,15 @@ def _copy(
         for event in reader.events[known_events:]:
             log.event(event)
         known_events = len(reader.events)
+        log.readings(reader.readings[known_readings:])
+        known_readings = len(reader.readings)
         columns = (getattr(block, name).tolist() for name in SampleBlock.__slots__)
         for cycle, time_ns, position, current, statusword, missing in zip(*columns, strict=True):
             log.write(Sample(cycle, time_ns, tuple(position), tuple(current), tuple(statusword), missing))
         progress(log.statistics.samples)
     for event in reader.events[known_events:]:
         log.event(event)
+    log.readings(reader.readings[known_readings:])
     if reader.concluded:
         valid, reason = reader.statistics.valid, reader.statistics.reason
     else:  # no verdict of the recorder: that of the losses and faults in samples and events

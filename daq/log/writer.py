@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from io import BufferedWriter
@@ -23,11 +23,14 @@ from daq.log.message import (
     EVENTS_TOPIC,
     JOINTS_SCHEMA,
     JOINTS_TOPIC,
+    READING_SCHEMA,
+    READING_TOPICS,
     SAMPLES_SCHEMA,
     SAMPLES_TOPIC,
     event_bytes,
     joint_state_bytes,
     joint_state_prefix,
+    reading_bytes,
     sample_bytes,
     sample_struct,
 )
@@ -43,7 +46,7 @@ from daq.log.metadata import (
     sealed,
     statistics_record,
 )
-from drivers.stream.sample import CellEvent, Sample
+from drivers.stream.sample import CellEvent, Quantity, Sample, SlowReading
 
 FLUSH_NS = 150_000_000
 """Time between two flushes, recorded or wall time, whichever ends first [ns]. A kill may cost 200 ms: the rest is
@@ -102,6 +105,7 @@ class LogWriter:
         self._layout = sample_struct(self._axes)
         self._prefix = joint_state_prefix(content.joint_names)
         self._held: list[tuple[int, int, bytes]] = []
+        self._reading_channels: dict[Quantity, int] = {}
         self._samples = 0
         self._lost = 0
         self._missing = [0] * self._axes
@@ -178,6 +182,19 @@ class LogWriter:
     def event(self, event: CellEvent) -> None:
         """Append one event."""
         self._held.append((self._events_channel, event.time_ns, event_bytes(event)))
+
+    def reading(self, reading: SlowReading) -> None:
+        """Append one slow reading."""
+        channel = self._reading_channels.get(reading.quantity)
+        if channel is None:
+            channel = self._channel(READING_TOPICS[reading.quantity], READING_SCHEMA)
+            self._reading_channels[reading.quantity] = channel
+        self._held.append((channel, reading.time_ns, reading_bytes(reading)))
+
+    def readings(self, readings: Iterable[SlowReading]) -> None:
+        """Append several slow readings."""
+        for reading in readings:
+            self.reading(reading)
 
     def conclude(
         self, valid: bool, reason: str = "", *, partial: bool = False, wall_minus_monotonic_ns: int | None = None

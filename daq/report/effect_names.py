@@ -19,6 +19,7 @@ WORDS = {
     "lag": "a current that lags behind the position",
     "time-skew": "positions and currents that were not sampled at the same time",
     "warm-up": "friction that changes while the robot warms up",
+    "temperature-friction": "friction that changes with the temperature",
     "presliding": "friction that builds up only some way after each reversal",
     "backlash": "free play in the gear",
     "elasticity": "a gear that gives under load",

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from daq.report import paper_tables
 from daq.report.bus import actual_current_note
-from daq.report.gains import diagnosis_texts, gain_table, partial_note
+from daq.report.gains import diagnosis_texts, gain_table, partial_note, torque_document, torque_table
 from daq.report.text import percent_text, picked, plain_table, printable
 from daq.workflow.calibration_file import as_document
 from daq.workflow.cases import CASES, CaseFit
@@ -35,6 +35,8 @@ def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | 
     yield from (Text(printable(text), style="bold") for text in diagnosis_texts(calibration.diagnoses))
     if (note := actual_current_note(fitted.cell)) is not None:
         yield note
+    if fitted.torque_slopes:
+        yield torque_table(fitted.torque_slopes, calibration.gains)
     if fitted.paper is not None:
         values = ", ".join(f"{value:.4g}" for value in fitted.paper.gains)
         yield f"For comparison, the paper's total least squares on the same rows: {values}"
@@ -67,6 +69,9 @@ def fit_document(found: CaseFit, calibration: Calibration, comparison: Compariso
     return {
         **as_document(calibration),
         "compared": compared,
+        **(
+            {"torque_channel": torque_document(fitted.torque_slopes, calibration.gains)} if fitted.torque_slopes else {}
+        ),
         "removed": _removed(found),
         "verdicts": [
             {

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.table import Table
@@ -12,6 +12,7 @@ from rich.table import Table
 from daq.report.picture import BLUE, GREEN, GREY, ORANGE, grid, legend_below, render, unformatted
 from daq.report.text import plain_table, terminal_text
 from ident.calibration import Calibration, Gain
+from ident.data.torque_channel import TorqueSlope
 from ident.errors import Diagnosis
 
 if TYPE_CHECKING:  # `history` needs no effects
@@ -64,6 +65,45 @@ def gain_table(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
             row += [f"{truth[gain.axis]:.4g}", f"{100.0 * (gain.value / truth[gain.axis] - 1.0):+.2f}"]
         table.add_row(terminal_text(gain.axis), *row, terminal_text(gain.unit))
     return table
+
+
+def torque_table(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]) -> Table:
+    """Table of the slopes of the drives' own torque over the current, beside the identified gains; no fit uses them.
+
+    A ratio shows how far the torque constant in a drive is from the gain: gear losses, or a wrong entry.
+    """
+    headings = ("axis", "slope ± σ", "gain ± σ", "slope/gain", "readings", "unit")
+    title = "The drives' own torque against the current, not used in the fit"
+    table = plain_table(headings, title=title, left=(0, len(headings) - 1))
+    for slope, gain in zip(slopes, gains, strict=True):
+        row = ("-", with_deviation(gain.value, gain.std), "-", "0")
+        if slope is not None:
+            ratio = with_deviation(slope.value / gain.value, _ratio_std(slope, gain))
+            row = (with_deviation(slope.value, slope.std), row[1], ratio, str(slope.readings))
+        table.add_row(terminal_text(gain.axis), *row, terminal_text(gain.unit))
+    return table
+
+
+def torque_document(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]) -> list[dict[str, Any]]:
+    """Return the same for --json; null for an axis whose torque shows no slope."""
+    return [
+        {"axis": gain.axis, "slope": None}
+        if slope is None
+        else {
+            "axis": gain.axis,
+            "slope": slope.value,
+            "std": slope.std,
+            "ratio": slope.value / gain.value,
+            "ratio_std": _ratio_std(slope, gain),
+            "readings": slope.readings,
+        }
+        for slope, gain in zip(slopes, gains, strict=True)
+    ]
+
+
+def _ratio_std(slope: TorqueSlope, gain: Gain) -> float:
+    """Standard deviation of slope/gain; the two are taken as independent: no fit uses the torque."""
+    return math.hypot(slope.std / gain.value, slope.value * gain.std / gain.value**2)
 
 
 def partial_note(calibration: Calibration) -> str | None:

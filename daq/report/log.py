@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -72,6 +73,7 @@ def describe_log(path: Path) -> dict[str, Any]:
         "duration_s": samples / run.rate_hz,
         "stamped_duration_s": 0.0 if first_ns is None else (last_ns - first_ns) * 1e-9,
         "moves": sum(event.kind is EventKind.MOVE_START for event in reader.events),
+        "slow_readings": dict(Counter(reading.quantity.value for reading in reader.readings)),
         "lost_cycles": statistics.lost_cycles,
         "missing": dict(zip(cell.axis_names, statistics.missing, strict=True)),
         "partial": reader.partial,

@@ -23,6 +23,7 @@ from ident.calibration import Calibration, Source
 from ident.calibration import calibration_of as identified_calibration
 from ident.data.dataset import differentiate
 from ident.data.run import Run
+from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
 from ident.discovery.before_after import error_on, holdout_change
 from ident.discovery.loop import Evidence, Step, find_effects, gather, without_effects
 from ident.errors import (
@@ -69,6 +70,8 @@ class Fit:
     paper: Estimate | None  #: the paper's total least squares on the same equations, None with fixed gains
     lossy: LossyLogs = LossyLogs.REFUSED  #: how logs with losses were handled
     diagnoses: tuple[Diagnosis, ...] = ()  #: of the fit, or with effects of the last one
+    #: Slope of each axis's own torque over its current, beside the gains; empty where no log has such torques.
+    torque_slopes: tuple[TorqueSlope | None, ...] = ()
     #: The operator takes effects that held-out runs refute: these have then taken part in the choice.
     accept_worse_holdout: bool = False
 
@@ -96,6 +99,7 @@ class Reading:
         self._lossy = lossy
         self._seen: dict[str, Path] = {}
         self.sources: list[Source] = []
+        self._torques: list[tuple[TorqueChannel, ...]] = []
         run, self.cell = load_run(logs[0], cell, lossy)
         self._first = {logs[0]: run}
 
@@ -128,9 +132,15 @@ class Reading:
                     remedy="name other logs",
                 )
             self._seen[content] = log
+            if run.torque_channels and role == "fit":
+                self._torques.append(run.torque_channels)
             name, mass_kg = (None, None) if run.payload is None else (run.payload.name, run.payload.known.get("m"))
             self.sources.append(Source(run.name, run.digest, role, run.partial, name, mass_kg, run.recording))
             yield run
+
+    def torque_slopes(self) -> tuple[TorqueSlope | None, ...]:
+        """Slope of each axis's own torque over the runs of the fit; empty without such torques."""
+        return tuple(torque_slope(channels) for channels in zip(*self._torques, strict=True))
 
 
 BOOTSTRAP_SEED = 0
@@ -205,7 +215,17 @@ def fit(
         if not gains_fixed:
             check_signs(result.estimate, nameplate)
         paper = None if gains_fixed else tls(result.system)
-        return Fit(declared, tuple(used), tuple(unseen), tuple(reading.sources), result, (), paper, lossy)
+        return Fit(
+            cell=declared,
+            logs=tuple(used),
+            holdout=tuple(unseen),
+            sources=tuple(reading.sources),
+            identification=result,
+            steps=(),
+            paper=paper,
+            lossy=lossy,
+            torque_slopes=reading.torque_slopes(),
+        )
 
     try:
         fitted = with_diagnoses(attempt(logs, holdout, method or (Method.WLS if gains_fixed else Method.ML)))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from daq.config import cell as declared
-from daq.config.bus import cell_address, drive_axes, load_warnings
+from daq.config.bus import cell_address, drive_axes, load_warnings, polling_fits, polling_warnings
 from daq.config.cell import Cell
 from daq.config.cell_file import bundle
 from daq.environment import software
@@ -37,6 +37,7 @@ from drivers.errors import MotionRefused
 from drivers.motion.execute import execute
 from drivers.motion.move import AxisLimits, MotionPermission, Move, check_moves, synchronised_move
 from drivers.stream.answers import StreamStatistics
+from drivers.stream.polling import Polling
 from drivers.stream.sample import CellEvent, EventKind, Sample
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import (
@@ -147,7 +148,11 @@ def record(
     check_entered_mass(cell, payload, entered_kg)
     with defer_full_gc(), network_of(cell, block_signals) as network, _sync_producer(cell, network) as producer:
         network.prepare()
-        warnings = (*load_warnings(cell), *check_currents(cell, network.scales()), *network.unguarded())
+        polling = Polling(network, beside_stream=polling_fits(cell))
+        warnings = (
+            *(*load_warnings(cell), *check_currents(cell, network.scales()), *network.unguarded(), *polling.remarks),
+            *(polling_warnings(cell) if polling else ()),
+        )
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
         scale = scaling(cell, readback)
         rate_hz, files = 1e6 / _sync(cell).period_us, bundle(cell_file)
@@ -163,6 +168,7 @@ def record(
         longest_s = duration_of(moves, start_counts, rate_hz) + ALLOWANCE_S
         room.require(largest_log_bytes(cell.axis_names, rate_hz, longest_s, files))
         short: DiskSpaceShort | None = None
+        temperatures = polling.temperatures(clocks.wall_ns())
         # Before the first SYNC of the recording's stream, whose schedule does not wait either.
         before_motion()
         started_ns = clocks.monotonic_ns()
@@ -189,7 +195,9 @@ def record(
                     done += 1
                     progress(done, len(moves))
 
+            log.readings(temperatures)
             stream = SyncStream(network, _pacing(cell, run.started_wall_ns, clocks, producer), keep)
+            polling.begin(stream, log.reading)
             for sample in until_complete(stream):
                 log.write(sample)
             with closing(execute(network, stream, moves, permission)) as samples:
@@ -198,10 +206,13 @@ def record(
                 except DiskSpaceShort as error:
                     short = error
             stream.read_on(LATE_LOSSES_S)
-            valid, reason = _verdict(stream.statistics)
-            if short is not None:
-                valid, reason = False, f"stopped after {done} of {len(moves)} moves: {short.found}"
-            log.conclude(valid, reason, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns())
+            log.readings(polling.temperatures(stream.time_ns))
+            verdict = (
+                _verdict(stream.statistics)
+                if short is None
+                else (False, f"stopped after {done} of {len(moves)} moves: {short.found}")
+            )
+            log.conclude(*verdict, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns())
         if short is not None:
             raise short
         return Recorded(out, log.statistics, stream.statistics, warnings)

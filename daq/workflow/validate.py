@@ -5,6 +5,7 @@ Several calibrations are compared on runs that they may never have seen (paper Â
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -22,6 +23,8 @@ from ident.calibration import Calibration, Parameter
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
+from ident.effects.friction import TemperatureFriction
+from ident.effects.signals import REFERENCE_C
 from ident.equations.reduction import Reduction, reduce_runs
 from ident.equations.rows import row_filter, row_masks
 from ident.errors import DataUnfit, Diagnosis, IdentificationError
@@ -39,6 +42,8 @@ from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
 from ident.prediction import measured_torque, predict_torque, standard_parameters
 from ident.weighing import RowsToWeigh, rows_to_weigh, weigh_rows
+
+_LOG = logging.getLogger("drivegain")
 
 
 class DataUse(Enum):
@@ -186,9 +191,16 @@ def predicted(
 def as_calibrated(calibration: Calibration, run: Run) -> Run:
     """Leave out of a run's payload what the calibration itself says of it, given or identified.
 
+    Warns of a run without the temperatures that an effect of the calibration depends on.
+
     Raises:
         DataUnfit: the calibration was given another mass on this mounting.
     """
+    for effect in calibration.effects:
+        if effect.name == TemperatureFriction.name and not _has_temperature(calibration, run, effect.axis):
+            _LOG.warning(
+                "%s has no temperature of %s: its friction is predicted at %g Â°C", run.name, effect.axis, REFERENCE_C
+            )
     payload = run.payload
     if payload is None:
         return run
@@ -202,6 +214,13 @@ def as_calibrated(calibration: Calibration, run: Run) -> Run:
         )
     left = {name: value for name, value in payload.known.items() if name not in own}
     return replace(run, payload=replace(payload, known=left))
+
+
+def _has_temperature(calibration: Calibration, run: Run, axis: str) -> bool:
+    axes = [gain.axis for gain in calibration.gains]
+    if axis not in axes:
+        return True  # the prediction refuses it
+    return run.temperature_c is not None and not np.isnan(run.temperature_c[:, axes.index(axis)]).any()
 
 
 def _of_mounting(calibration: Calibration, payload: Payload) -> dict[str, Parameter]:

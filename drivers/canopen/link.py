@@ -10,6 +10,7 @@ import struct
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
+from typing import Protocol
 
 import can
 
@@ -49,6 +50,13 @@ class NmtCommand(IntEnum):
     START = 1
     STOP = 2
     ENTER_PRE_OPERATIONAL = 128
+
+
+class SdoListener(Protocol):
+    """Receives every SDO answer of one node."""
+
+    def receive(self, data: bytearray) -> None:
+        """Take an answer; most are for others."""
 
 
 def nmt_name(state: int | None) -> str:
@@ -101,7 +109,7 @@ class Link:
         self._next_beat_ns = 0
         self._opener = opener
         self._bus: can.BusABC | None = None
-        self._clients: dict[int, list[SynchronousSdoClient]] = {}
+        self._listeners: dict[int, list[SdoListener]] = {}
         self._access: dict[tuple[int, SdoPolicy], ObjectAccess] = {}
         self._events: deque[tuple[int, EventKind, int, str]] = deque()
 
@@ -199,8 +207,8 @@ class Link:
             self._events.append((node_id, kind, code, text))
         elif service == _SDO_ANSWER:
             self.answered.add(node_id)
-            for client in self._clients.get(node_id, ()):
-                client.receive(message.data)
+            for listener in self._listeners.get(node_id, ()):
+                listener.receive(message.data)
         else:
             return False
         return True
@@ -241,9 +249,13 @@ class Link:
         policy = policy or self.policy
         if (node_id, policy) not in self._access:
             client = SynchronousSdoClient(node_id, self, policy)
-            self._clients.setdefault(node_id, []).append(client)
+            self.listen(node_id, client)
             self._access[node_id, policy] = ObjectAccess(node_id, client, policy, self.names.get(node_id, ""))
         return self._access[node_id, policy]
+
+    def listen(self, node_id: int, listener: SdoListener) -> None:
+        """Pass every SDO answer of a node to a listener."""
+        self._listeners.setdefault(node_id, []).append(listener)
 
     def command_nmt(self, node_id: int, command: NmtCommand) -> int:
         """Send an NMT command; node 0 means all. Returns the time by the clock [ns]."""

@@ -29,7 +29,7 @@ from drivers.profiles.cia402 import (
     next_command,
 )
 from drivers.stream.sample import CellEvent, EventKind, Sample
-from drivers.stream.stream import SyncStream
+from drivers.stream.stream import SyncStream, nothing_to_send
 from drivers.stream.sync import LockstepSync
 
 _LAYOUTS = tuple(map(layout, SETPOINT_PDOS))
@@ -246,6 +246,7 @@ class _Execution:
     def stop(self) -> Iterator[Sample]:
         """Quick stop all axes, then remove their power; failures to confirm it are in `problems`."""
         self._stream.outgoing.clear()  # a set-point that was not sent yet must not start a move now
+        self._stream.spare = nothing_to_send
         self.emit(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
         self.problems = []
         unconfirmed = tuple(self._axes)

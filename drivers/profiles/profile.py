@@ -114,6 +114,14 @@ class RatedMotor:
 
 
 @dataclass(frozen=True, slots=True)
+class Thermometer:
+    """Object with the temperature of the motor or the drive."""
+
+    entry: ObjectEntry
+    kelvin_per_unit: float  #: its unit; zero is 0 °C
+
+
+@dataclass(frozen=True, slots=True)
 class Save:
     """Command that saves a drive's parameters."""
 
@@ -151,6 +159,10 @@ class DriveProfile:
     #: Bit of statusword 6041h that the drive inverts whenever it refreshes its PDO, None when it has none: then frozen
     #: data show as values that do not change in a move (drivers/motion/watch.py).
     toggle_bit: int | None = None
+    #: Torque actual value [per mille of the rated torque], None where the drive has none. It is compared with the
+    #: identified gain, and no fit uses it.
+    torque: ObjectEntry | None = None
+    temperature: Thermometer | None = None  #: of the motor or the drive, None where the drive reports none
 
     @property
     def signal(self) -> str:

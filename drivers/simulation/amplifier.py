@@ -290,6 +290,7 @@ class AmplifierSet:
         self.loops["piece"] = SEGMENTS
         self.reported_a = np.zeros(n)  #: current reference with its noise, as in 6074h [A]; renewed once a SYNC
         self.actual_a = np.zeros(n)  #: current of the motor at the same moment [A]
+        self.temperature_c = plant.temperature_c  #: of the motors [°C]; the plant's own array
         self._counts_per_rad = counts_per_rad(spec)
         # Read the encoders at power-on, so that the position of a resting axis does not jump.
         for state in ("counts", "demand", "target"):

@@ -16,6 +16,8 @@ import numpy as np
 
 from drivers.simulation.spec import FloatArray, SpecInvalid, UndeclaredEffect
 
+AMBIENT_C = 25.0  #: Temperature of the cell and of everything in it at power-on
+
 
 @dataclass(slots=True)
 class Moment:
@@ -37,6 +39,7 @@ class Moment:
     viscous_nm_s_rad: FloatArray  #: of viscous friction, shape (N,); may be changed
     torque_nm: FloatArray  #: other torques on each coordinate, shape (N,); may be changed
     motor_torque_nm: FloatArray  #: of each motor, in joint units, shape (n,); may be changed
+    temperature_c: FloatArray  #: of each motor with its gear, shape (n,); may be changed, and is kept
 
 
 Effect = Callable[[Moment], None]  #: Changes the moment; called once a substep
@@ -106,6 +109,38 @@ def warm_up(moment: Moment, axis: int, cold_fraction: float, time_constant_s: fl
     factor = 1.0 + cold_fraction * math.exp(-moment.time_s / time_constant_s)
     moment.bound_nm[axis] *= factor
     moment.viscous_nm_s_rad[axis] *= factor
+
+
+@dataclass(slots=True)
+class TemperatureFriction:
+    """Friction that changes with the temperature of a drive, which its own losses heat: one thermal mass.
+
+        time_constant · dΔ/dt = resistance · P − Δ,    P = winding · i² + (Fs + Fv |v|) |v|,
+
+    with Δ over AMBIENT_C. Dry and viscous friction of the joint are multiplied by 1 + change · Δ / 100, never below 0.
+    """
+
+    axis: int  #: joint and motor
+    viscous_percent_per_k: float  #: change of the viscous friction
+    coulomb_percent_per_k: float  #: change of the dry friction
+    time_constant_s: float  #: of the drive's temperature
+    resistance_k_per_w: float  #: thermal resistance to the surroundings
+    winding_ohm: float = 0.0  #: of the motor: copper losses i² · winding
+
+    def __call__(self, moment: Moment) -> None:
+        """Heat the drive over the step by the exact solution for constant losses, and change its friction."""
+        axis, speed = self.axis, abs(moment.velocity_rad_s[self.axis])
+        above_k = moment.temperature_c[axis] - AMBIENT_C
+        for friction, percent in (
+            (moment.bound_nm, self.coulomb_percent_per_k),
+            (moment.viscous_nm_s_rad, self.viscous_percent_per_k),
+        ):
+            friction[axis] *= max(0.0, 1.0 + 0.01 * percent * above_k)
+        losses_w = self.winding_ohm * moment.current_a[axis] ** 2
+        losses_w += (moment.bound_nm[axis] + moment.viscous_nm_s_rad[axis] * speed) * speed
+        end_k = self.resistance_k_per_w * losses_w
+        above_k = end_k + (above_k - end_k) * math.exp(-moment.step_s / self.time_constant_s)
+        moment.temperature_c[axis] = AMBIENT_C + above_k
 
 
 @dataclass(slots=True)
@@ -202,7 +237,9 @@ class Lag:
         reported_a[self.axis] = self.value_a
 
 
-UNDECLARED_EFFECTS: dict[str, Callable[..., None] | type[Presliding | Coupling | Elasticity | Lag]] = {
+WithState = TemperatureFriction | Presliding | Coupling | Elasticity
+
+UNDECLARED_EFFECTS: dict[str, Callable[..., None] | type[WithState | Lag]] = {
     "stribeck": stribeck,
     "load-friction": load_friction,
     "efficiency": efficiency,
@@ -214,6 +251,7 @@ UNDECLARED_EFFECTS: dict[str, Callable[..., None] | type[Presliding | Coupling |
     "saturation": saturation,
     "lag": Lag,
     "warm-up": warm_up,
+    "temperature-friction": TemperatureFriction,
     "presliding": Presliding,
     "backlash": Backlash,
     "elasticity": Elasticity,
@@ -243,7 +281,7 @@ def build_effect(effect: UndeclaredEffect, axes: int) -> Effect | Lag:
         raise SpecInvalid(f"{effect.name}: {'; '.join(wrong)}; its parameters are {', '.join(known)}")
     if not isinstance(physics, type):
         return partial(physics, axis=effect.axis, **effect.parameters)
-    built: Presliding | Coupling | Elasticity | Lag = physics(axis=effect.axis, **effect.parameters)
+    built: WithState | Lag = physics(axis=effect.axis, **effect.parameters)
     if isinstance(built, Coupling) and (not 0 <= built.other < axes or built.other == built.axis):
         raise SpecInvalid(f"{effect.name}: other_axis {built.other_axis:g} is not another axis from 1 to {axes}")
     return built

@@ -278,6 +278,7 @@ class Node:
         i, drive, amplifiers = self._index, self.drive, self._amplifiers
         live: dict[int, Callable[[], int]] = {
             0x1001: lambda: int(drive.error is not ErrorCode.NONE),
+            0x2005: lambda: round(10.0 * float(amplifiers.temperature_c[i])),
             0x603F: lambda: int(drive.error),
             0x6040: lambda: drive.controlword,
             0x6041: lambda: drive.statusword() | self._toggle,

@@ -119,6 +119,7 @@ def _cia402(axis: AxisSpec) -> Dictionary:
         (0x2003, 0): Entry(Kind.U8, 2),
         (0x2003, 1): Entry(Kind.I32, round(1000 * axis.entered_gain_nm_per_a), writable=True),
         (0x2003, 2): Entry(Kind.U32, _REAL32_BITS.unpack(_REAL32.pack(axis.entered_gain_nm_per_a))[0], writable=True),
+        (0x2005, 0): Entry(Kind.I16),  # manufacturer specific: temperature of the motor [0.1 °C]
         (0x6007, 0): Entry(Kind.I16, 1, writable=True, lowest=0, highest=3),
         (0x603F, 0): Entry(Kind.U16, mappable=transmit),
         (0x6040, 0): Entry(Kind.U16, writable=True, mappable=receive),
@@ -137,8 +138,8 @@ def _cia402(axis: AxisSpec) -> Dictionary:
         (0x6073, 0): Entry(Kind.U16, peak_per_mille, writable=True, mappable=receive, highest=peak_per_mille),
         (0x6074, 0): Entry(Kind.I16, mappable=transmit),
         (0x6075, 0): Entry(Kind.U32, round(1000 * axis.rated_current_a)),
-        # Zero until a master enters the motor's rated torque: the cell must not reveal its true torque constant.
-        (0x6076, 0): Entry(Kind.U32, 0, writable=True),
+        # Zero unless the motor's rated torque was entered: the cell must not reveal its true torque constant.
+        (0x6076, 0): Entry(Kind.U32, round(1000 * axis.entered_torque_nm), writable=True),
         (0x6077, 0): Entry(Kind.I16, mappable=transmit),
         (0x6078, 0): Entry(Kind.I16, mappable=transmit),
         (0x607A, 0): Entry(Kind.I32, writable=True, mappable=receive),

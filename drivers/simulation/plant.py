@@ -9,7 +9,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from drivers.simulation.dynamics import TOLERANCE_RAD_S, Mechanics, advance
-from drivers.simulation.effects import Coupling, Effect, Elasticity, Lag, Moment, build_effect
+from drivers.simulation.effects import AMBIENT_C, Coupling, Effect, Elasticity, Lag, Moment, build_effect
 from drivers.simulation.noise import ColouredNoise, random_streams
 from drivers.simulation.spec import Body, CellSpec, FloatArray, FrictionUnsolved, SpecInvalid
 
@@ -103,6 +103,7 @@ class Plant:
         position_rad, velocity_rad_s: of the coordinates, shape (N,).
         load_torque_nm: torque of the links on the joints in the last step, shape (n,).
         motor_rad: angle of each rotor [rad], shape (n,); zero at joint position zero.
+        temperature_c: temperature of each motor [°C], shape (n,); AMBIENT_C without an effect that warms it.
         disturbance_nm: random torque on each motor in the last step, in joint units, shape (n,).
         time_s: since power-on.
     """
@@ -131,6 +132,7 @@ class Plant:
         self.velocity_rad_s = np.zeros(total)
         self.load_torque_nm = np.zeros(n)
         self.motor_rad = self._mechanics.rotor_direction @ self.position_rad
+        self.temperature_c = np.full(n, AMBIENT_C)
         self._model, self._data = model, model.createData()
         self._acting = tuple(e for e in effects if not isinstance(e, Lag))
         self._rows = motor_rows(spec.ratio)
@@ -155,6 +157,7 @@ class Plant:
             viscous_nm_s_rad=np.zeros(total),
             torque_nm=np.zeros(total),
             motor_torque_nm=np.zeros(n),
+            temperature_c=self.temperature_c,
         )
         self._impulse = np.zeros(m)
         self.disturbance_nm = np.zeros(n)

@@ -70,6 +70,8 @@ class AxisSpec:
     toggle_bit: ToggleBit | None = None  #: bit of statusword 6041h that is inverted with every SYNC, or None
     #: Gain entered in 2003h (:01 in mNm/A, :02 in Nm/A as REAL32); the loops do not use it.
     entered_gain_nm_per_a: float = 0.0
+    #: Rated torque of the motor entered at commissioning, in 6076h; the drive's own torque 6077h is in thousandths.
+    entered_torque_nm: NotNegative = 0.0
     #: Root mean square of a random torque on the motor, in percent of its rated torque |gain| · rated current; inside
     #: the control loops, so that it moves the arm and returns, late, in the current.
     torque_disturbance_percent: Annotated[float, Interval(ge=0, le=10)] = 0.0

@@ -1,4 +1,4 @@
-"""One SYNC cycle of a cell as the amplifiers sent it, and the events between."""
+"""One SYNC cycle of a cell as the amplifiers sent it, and the events and slow readings between."""
 
 from __future__ import annotations
 
@@ -67,3 +67,20 @@ class CellEvent:
 
 EventSink = Callable[[CellEvent], None]
 """Receives events in the order in which they happen, before the sample of their cycle is returned."""
+
+
+class Quantity(Enum):
+    """Quantity of a slow reading."""
+
+    TORQUE = "torque"  #: the drive's own torque, at the motor [Nm]
+    TEMPERATURE = "temperature"  #: of the motor or the drive [°C]
+
+
+@dataclass(frozen=True, slots=True)
+class SlowReading:
+    """Value that is read a few times a second, beside the samples."""
+
+    time_ns: int  #: on the clock of the samples [ns since 1970]
+    axis: int  #: index of the axis from 0
+    quantity: Quantity
+    value: float  #: in the unit of the quantity

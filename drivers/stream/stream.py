@@ -6,7 +6,7 @@ pacing is described in sync.py.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import can
 
@@ -26,6 +26,11 @@ SHORTENED, STRAGGLING = 16, 4
 LARGEST_LAG_NS = 1_000_000_000  #: Largest delay of the reader behind the bus; older data cannot protect moving axes
 FRAMES_PER_S = 50_000
 """Frames per second of time-out to read past the deadline before a producer is dead; two full buses carry fewer."""
+
+
+def nothing_to_send(_: int) -> Sequence[can.Message]:
+    """Return no frames: see `SyncStream.spare`."""
+    return ()
 
 
 def _is_plain(message: can.Message) -> bool:
@@ -72,6 +77,8 @@ class SyncStream:
         self.time_ns = pacing.start_ns
         #: Frames to send right before the next SYNC, which triggers synchronous RPDOs.
         self.outgoing: list[can.Message] = []
+        #: Returns frames that may wait, for a cycle that has no others to send; receives the last SYNC's time [ns].
+        self.spare: Callable[[int], Sequence[can.Message]] = nothing_to_send
         self._link = network.link
         self._answers = Answers(network.axes)
         self._sync = can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False)
@@ -173,9 +180,8 @@ class SyncStream:
     def _follow_sync(self, pacing: FollowedSync) -> int:
         """Send waiting frames, and read until the next SYNC; returns the deadline of the SYNC after it."""
         self._link.beat()
-        if self.outgoing:
+        if outgoing := self._take_outgoing():
             # As early in the period as possible: all of it should arrive before the next SYNC.
-            outgoing, self.outgoing = self.outgoing, []
             self._link.send(outgoing)
         sync, self._early_sync = self._early_sync, None
         # A cycle that waited in vain for answers waited for this SYNC too: half of the time-out is enough.
@@ -245,10 +251,13 @@ class SyncStream:
             self._too_late(slipped * pacing.period_ns)
             self.time_ns = pacing.start_ns + now - self._first_sync_ns
             deadline_ns = self._next_sync_ns = self._next_sync_ns + (slipped + 1) * pacing.period_ns
-        outgoing, self.outgoing = self.outgoing, []
-        self._link.send((*outgoing, self._sync))
+        self._link.send((*self._take_outgoing(), self._sync))
         self._cycles += 1
         return deadline_ns
+
+    def _take_outgoing(self) -> Sequence[can.Message]:
+        outgoing, self.outgoing = self.outgoing, []
+        return outgoing or self.spare(self.time_ns)
 
     def _next_frame(self, deadline_ns: int) -> can.Message | None:
         """Return the next frame of this cycle; None at its deadline, or at the next followed SYNC."""

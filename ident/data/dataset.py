@@ -44,6 +44,8 @@ class Dataset:
     started_s: float | None = None
     #: Motion that the drives were asked for, all k samples; None where it is not known (`ident.data.demand`).
     demanded: Motion | None = None
+    #: Temperature of each motor or its drive [°C], NaN for one without; None where none was recorded.
+    temperature_c: FloatArray | None = None
 
     def motion(self, part: slice = slice(None)) -> Motion:
         """Motion of the joints over some of the samples."""
@@ -70,6 +72,9 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     current = as_array("current_a", run.current_a, shape, each, refuse)
     usable = None if run.valid is None else as_array("valid", run.valid, shape, each, refuse)
     logged = None if run.move is None else as_array("move", run.move, shape[:1], "one entry per sample", refuse)
+    warmth = None if run.temperature_c is None else np.asarray(run.temperature_c, dtype=np.float64)
+    if warmth is not None and warmth.shape != shape:
+        raise refuse(f"temperature_c has shape {warmth.shape}; expected {shape}, {each}")
     run = replace(run, time_s=time_s)
     _check(run, shape[1], conditioning, refuse)
     rate = run.rate_hz
@@ -106,6 +111,7 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
         move=move,
         payload=run.payload,
         started_s=run.started_s,
+        temperature_c=None if warmth is None else np.asfortranarray(warmth[1:-1]),
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.data.torque_channel import TorqueChannel
 from ident.model.bodies import Payload
 
 
@@ -44,6 +45,10 @@ class Run:
     #: It is what was saved of a recording that was never finished, or one whose losses were accepted.
     partial: bool = False
     recording: Recording | None = None  #: how the log was made; None where the run is from no log
+    #: Temperature of each motor or its drive [°C], shape (k, n), NaN for one without; None where none was recorded.
+    temperature_c: FloatArray | None = None
+    #: The controller's own torque, one an axis, for a comparison with the gains that no fit uses; empty without any.
+    torque_channels: tuple[TorqueChannel, ...] = ()
 
     @property
     def rate_hz(self) -> float:

@@ -159,7 +159,8 @@ def prepare_search(
     rows: list[Signals] = []
     for run, data in zip(runs, datasets, strict=True):
         at_rate = {array.name: getattr(run, array.name) for array in fields(run) if array.name != "rate_hz"}
-        arrays = {name: decimate_rows(data, observation.conditioning, array) for name, array in at_rate.items()}
+        known = {name: array for name, array in at_rate.items() if array is not None}
+        arrays = {name: decimate_rows(data, observation.conditioning, array) for name, array in known.items()}
         time_s = arrays["time_s"]
         rows.append(Signals(rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])), **arrays))
     return SearchProblem(

@@ -102,14 +102,13 @@ def rank_effects(
 
     What is proposed for an axis takes the place of the families of the same name there.
     """
-    fitting = (tuple(effect for effect in family if effect.fits_in(search_problem.runs)) for family in families)
-    families = tuple(family for family in fitting if family)
     tested: list[FamilyTrials] = []
     for axis in range(search_problem.axes):
         own = (proposed or {}).get(axis, ())
         names = {family[0].name for family in own}
         shared = (family for family in families if family[0].name not in names)
-        tested += search_problem.test((*shared, *own), axis)
+        fitting = (tuple(one for one in family if one.fits_in(search_problem.runs, axis)) for family in (*shared, *own))
+        tested += search_problem.test((family for family in fitting if family), axis)
     return rank_families(search_problem, tested, rng, gates or Gates())
 
 

@@ -110,9 +110,9 @@ class Effect(ABC):
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Torque per unit coefficient [Nm], (p, k); (2, p, k) of two joints, (n, p, k) of all joints or motors."""
 
-    def fits_in(self, runs: Sequence[Signals]) -> bool:
-        """Whether the data are long enough for its settings: no time constant is longer than what was recorded."""
-        del runs
+    def fits_in(self, runs: Sequence[Signals], axis: int) -> bool:
+        """Whether the data can show it on an axis: no time constant is longer than them, and its variable is there."""
+        del runs, axis
         return True
 
     @property

@@ -10,7 +10,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.effects.effect import AxisNumber, Effect, Property, Range, Sense, Side, Switch
-from ident.effects.signals import Abscissa, Signals, distance_since_reversal
+from ident.effects.signals import REFERENCE_C, Abscissa, Signals, distance_since_reversal
 from ident.model.model import Column
 
 
@@ -171,8 +171,9 @@ class WarmUp(Effect):
     #: 1 where t counts from the first run of the session, 0 where from the beginning of each run, as after a power-on.
     whole_session: Switch
 
-    def fits_in(self, runs: Sequence[Signals]) -> bool:
+    def fits_in(self, runs: Sequence[Signals], axis: int) -> bool:
         """Whether the friction fades while it is watched: over the session, or over the longest run."""
+        del axis
         if self.whole_session:
             began_s, ended_s = (choose(run.session_s[end] for run in runs) for choose, end in ((min, 0), (max, -1)))
             return bool(self.time_constant_s <= ended_s - began_s)
@@ -183,6 +184,37 @@ class WarmUp(Effect):
         time_s = signals.session_s if self.whole_session else signals.time_s
         cold, v = np.exp(-time_s / self.time_constant_s), signals.velocity_rad_s[axis]
         return np.stack((cold * np.sign(v), cold * v))
+
+
+SMALLEST_WARMING_K = 1.0  #: Range of a temperature that some sensors of drives round away
+
+
+@dataclass(frozen=True, slots=True)
+class TemperatureFriction(Effect):
+    """τ = (T − T₀) · (c_s · sign(q̇) + c_v · q̇), T the recorded temperature, T₀ = 40 °C;  c_v < 0: less while warm.
+
+    The declared friction is then that at T₀, for which see `ident.effects.signals.REFERENCE_C`. A lubricant's viscosity
+    falls with temperature, so c_v is not positive; dry friction may go either way, by preload and by film. Source:
+    Bittencourt & Gunnarsson, "Static friction in a robot joint: modeling and identification of load and temperature
+    effects", ASME J. Dynamic Systems, Measurement, and Control 134 (2012), to first order. Signature: temperature.
+    """
+
+    name = "temperature-friction"
+    declares = Property.ODD_IN_VELOCITY
+    abscissa = Abscissa.TEMPERATURE
+    coefficients = (Column("dry", "Nm/K"), Column("viscous", "Nm/(rad/s)/K", largest=0.0))
+
+    def fits_in(self, runs: Sequence[Signals], axis: int) -> bool:
+        """Whether every run has the temperature of the axis, and it changes over them."""
+        if any(run.temperature_c is None or np.isnan(run.temperature_c[axis]).any() for run in runs):
+            return False
+        values = [run.temperature(axis) for run in runs]
+        return bool(max(map(np.max, values)) - min(map(np.min, values)) >= SMALLEST_WARMING_K)
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Columns, shape (2, k); zero where the temperature was not recorded."""
+        above_k, v = signals.temperature(axis) - REFERENCE_C, signals.velocity_rad_s[axis]
+        return np.stack((above_k * np.sign(v), above_k * v))
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,9 @@ from ident.model.regressor import mass_matrix
 
 STICKING_RAD_S = 0.005  #: Below this speed the noise of the filtered encoder decides the sign
 UNIX_S = 1e9  #: Times from here on, September 2001, are since 1970; earlier ones since some start
+REFERENCE_C = 40.0
+"""Temperature at which the declared friction holds beside a friction that depends on it; motors are rated at this
+ambient temperature (IEC 60034-1). The fit is the same for any; a fixed one keeps calibrations comparable."""
 POSTURE_SAMPLES = 20  #: Samples between two postures in which the mass matrix is computed
 
 
@@ -36,6 +39,7 @@ class Abscissa(Enum):
     LOAD_CURVATURE = "second derivative of the load torque [Nm/s²]"
     DISTANCE = "way since the last reversal [rad]"
     OTHER_VELOCITY = "velocity of the other joint [rad/s]"
+    TEMPERATURE = "temperature of the motor or its drive [°C]"
 
     @property
     def is_kinematic(self) -> bool:
@@ -66,6 +70,15 @@ class Signals:
     geared_torque_nm: FloatArray  #: torque through the gear of each joint: load and friction
     motor_torque_nm: FloatArray  #: torque of each motor in joint units (g v), friction included, effects left out
     current_a: FloatArray  #: the same in the unit of the current reference
+    #: Of each motor or its drive [°C], NaN for one without; None where none was recorded.
+    temperature_c: FloatArray | None = None
+
+    def temperature(self, axis: int) -> FloatArray:
+        """Temperature of an axis [°C], shape (k,); REFERENCE_C where it was not recorded."""
+        if self.temperature_c is None:
+            return np.full(len(self.time_s), REFERENCE_C)
+        recorded = self.temperature_c[axis]
+        return np.asarray(np.where(np.isnan(recorded), REFERENCE_C, recorded))
 
     def variable(self, abscissa: Abscissa, axis: int, other: int | None = None) -> FloatArray:
         """Return a variable of an axis along the run, shape (k,); `other` is the second axis of OTHER_VELOCITY."""
@@ -80,6 +93,7 @@ class Signals:
             Abscissa.TORQUE_RATE: lambda: np.gradient(self.motor_torque_nm[axis]) * self.rate_hz,
             Abscissa.LOAD_CURVATURE: lambda: curvature(self.load_torque_nm[axis], self.rate_hz),
             Abscissa.DISTANCE: lambda: distance_since_reversal(self.velocity_rad_s[axis], self.rate_hz)[1],
+            Abscissa.TEMPERATURE: lambda: self.temperature(axis),
             Abscissa.OTHER_VELOCITY: lambda: self.velocity_rad_s[axis if other is None else other],
         }
         return np.asarray(choices[abscissa](), dtype=np.float64)
@@ -136,6 +150,7 @@ def declared_signals(
         geared_torque_nm=geared,
         motor_torque_nm=motor,
         current_a=motor / gains[:, None],
+        temperature_c=None if data.temperature_c is None else data.temperature_c.T,
     )
 
 

@@ -49,6 +49,8 @@ def disagreements(profile: DriveProfile, sheet: ObjectDictionary) -> tuple[str, 
     read = [*scale.objects, *(() if scale.switch is None else (scale.switch,))]
     if rated is not None:
         read += [rated.current, *(() if rated.torque is None else (rated.torque,))]
+    if profile.torque is not None:
+        read.append(profile.torque)
     if profile.save is not None:
         read.append(profile.save.command)
     mapped = (profile.position, profile.current)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from math import cos, pi, sin
 
 import pytest
@@ -19,10 +20,13 @@ from daq.config.bus import (
     bus_loads,
     frame_bits,
     load_warnings,
+    polling_fits,
+    polling_warnings,
     shortest_period_us,
     split_answers,
     usual_bits,
 )
+from daq.config.cell import PacingMode, Sync
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.environment import shipped_configurations
 from daq.report.bus import load_lines
@@ -187,3 +191,19 @@ def test_the_demo_cell_may_be_sampled_by_the_clock_and_its_starts_are_warned_of(
     two = cell_from_bundle({**files, "cell.yaml": on_two_buses(timed, "socketcand", "a", "b").encode()})
     assert load_warnings(two) == ()
     assert [line.partition(": ")[2] for line in load_lines(two)] == ["loaded by 41 % on average, 46 % at worst"] * 2
+
+
+def test_torque_and_temperature_are_read_only_where_a_period_has_room_for_an_sdo() -> None:
+    """Six axes at 1 ms fill up to 87 % of a bus; a request and its answer take up to 27 % of such a period."""
+    assert CELL.sync is not None
+    timed = replace(CELL, sync=replace(CELL.sync, pacing=PacingMode.TIMED))
+    assert not polling_fits(timed)
+    (warning,) = polling_warnings(timed)
+    assert "sync.period_us of 1200 has room" in warning
+    slower = replace(timed, sync=Sync(1200))
+    assert polling_fits(slower)
+    assert polling_warnings(slower) == ()
+    assert not polling_fits(replace(slower, sync=Sync(1100)))
+    # A simulated cell waits for its frames.
+    assert CELL.sync.pacing is PacingMode.LOCKSTEP
+    assert polling_fits(CELL)

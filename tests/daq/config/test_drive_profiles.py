@@ -32,7 +32,7 @@ from drivers.canopen.bus import open_bus
 from drivers.profiles.profile import Basis, DriveProfile, ObjectEntry, ScaleForm, TapPoint
 from drivers.simulation.amplifier import AmplifierSet
 from drivers.simulation.cell import SimulatedCell
-from drivers.simulation.spec import Dialect
+from drivers.simulation.spec import Dialect, UndeclaredEffect
 from ident.data.run import Run
 from tests.daq.config.data_sheet import data_sheet, disagreements
 
@@ -78,7 +78,8 @@ def test_every_make_of_the_issue_has_a_profile() -> None:
 def test_a_shipped_profile_is_whole_and_every_fact_has_a_source(name: str) -> None:
     profile = profile_of(name)
     assert profile.name == name
-    assert {fact.about for fact in profile.facts} == {
+    slow = {name for name in ("torque", "temperature") if getattr(profile, name) is not None}
+    assert {fact.about for fact in profile.facts} == slow | {
         "position", "current", "current_scale", "amplitude", "tap", "saturation_bit", "update_period_us", "rated",
         "save",
     }  # fmt: skip
@@ -275,7 +276,7 @@ def test_a_data_sheet_is_read_with_its_empty_fields() -> None:
     assert set(read) == {0x6064, 0x1008, 0x1018}
     agreed = profile_of("elmo-gold")
     profile = replace(agreed, current=agreed.position, current_scale=replace(agreed.current_scale, objects=()))
-    profile = replace(profile, rated=None, save=None)
+    profile = replace(profile, rated=None, torque=None, save=None)
     assert disagreements(profile, read) == ()
     name, vendor = ObjectEntry(0x1008, 0, 32, signed=False), ObjectEntry(0x1018, 1, 32, signed=False)
     assert disagreements(replace(profile, position=name, current=vendor), read) == (
@@ -309,6 +310,12 @@ condition: 100.0
 moves:
   - {target_deg: [8, -6, 82, 10, -6, 12], velocity: 0.5, acceleration: 0.5, dwell_s: 0.02}
 """
+LONGER = (
+    PLAN
+    + """  - {target_deg: [-40, 20, 40, -30, 30, -40], velocity: 0.5, acceleration: 0.5, dwell_s: 0.2}
+  - {target_deg: [30, -40, 80, 30, -30, 30], velocity: 0.5, acceleration: 0.5, dwell_s: 0.2}
+"""
+)
 STEP_A = {
     Dialect.EPOS4: (0.001,) * 6,
     Dialect.COPLEY: (0.01,) * 6,
@@ -326,6 +333,13 @@ MAKES = {
 }
 
 
+ENTERED_NM = 1.2
+HEATED = {"time_constant_s": 2.0, "resistance_k_per_w": 5.0}
+WARMING = UndeclaredEffect(
+    "temperature-friction", 1, {"viscous_percent_per_k": -1.0, "coulomb_percent_per_k": 0.0, **HEATED}
+)
+
+
 @dataclass(frozen=True)
 class RecordedRun:
     """A run, and the true currents of every SYNC [A]."""
@@ -338,7 +352,9 @@ class RecordedRun:
     actual_a: NDArray[np.float64]
 
 
-def recorded(checkout: Path, folder: Path, patch: pytest.MonkeyPatch, dialect: Dialect) -> RecordedRun:
+def recorded(
+    checkout: Path, folder: Path, patch: pytest.MonkeyPatch, dialect: Dialect, plan: str = PLAN
+) -> RecordedRun:
     """A short run of the demo cell, its amplifiers being of another make."""
     make = MAKES[dialect]
     drives = folder / "drives"
@@ -346,7 +362,10 @@ def recorded(checkout: Path, folder: Path, patch: pytest.MonkeyPatch, dialect: D
     text = (checkout / "configs/cells/demo.yaml").read_text().replace("../robots", str(checkout / "configs/robots"))
     text = text.replace("period_us: 1000", "period_us: 2000").replace("channel: demo", f"channel: {folder.name}")
     for peak_a in (8, 6):
-        (drives / f"{make}-{peak_a}.yaml").write_text(text_of(make, peak_a))
+        # The simulated amplifier reports the temperature of its motor.
+        found = "{index: 0x22A3, subindex: 1, type: u16, kelvin_per_unit: 1.0}"
+        text_of_make = text_of(make, peak_a).replace(found, "{index: 0x2005, type: i16, kelvin_per_unit: 0.1}")
+        (drives / f"{make}-{peak_a}.yaml").write_text(text_of_make)
     # Two sizes of amplifier, as a person would enter them for a make that does not report its peak current.
     first, second = text[: text.index("- name: J4")], text[text.index("- name: J4") :]
     cell_file = folder / "cell.yaml"
@@ -354,10 +373,11 @@ def recorded(checkout: Path, folder: Path, patch: pytest.MonkeyPatch, dialect: D
         first.replace("drive: generic-cia402", f"drive: {make}-8")
         + second.replace("drive: generic-cia402", f"drive: {make}-6")
     )
-    (folder / "plan.yaml").write_text(PLAN)
+    (folder / "plan.yaml").write_text(plan)
     cell = load_cell(cell_file)
     spec = load_simulation(checkout / "configs/simulation/clean.yaml")
-    spec = replace(spec, sync_period_us=2000, axes=tuple(replace(axis, dialect=dialect) for axis in spec.axes))
+    axes = tuple(replace(axis, dialect=dialect, entered_torque_nm=ENTERED_NM) for axis in spec.axes)
+    spec = replace(spec, sync_period_us=2000, axes=axes, effects=(WARMING,))
     seen: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
     report = AmplifierSet.report
 
@@ -377,6 +397,25 @@ def recorded(checkout: Path, folder: Path, patch: pytest.MonkeyPatch, dialect: D
     assert done.log.valid, done.log.reason
     run, _ = load_run(done.path)
     return RecordedRun(cell_file, cell, done.path, run, *(np.array(column) for column in zip(*seen, strict=True)))
+
+
+def test_torque_and_temperature_are_read_beside_the_samples(
+    checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = recorded(checkout, tmp_path, monkeypatch, Dialect.CIA402, LONGER)
+    assert made.run.valid is not None
+    assert made.run.valid.all()
+    for axis, channel in enumerate(made.run.torque_channels):
+        # 6077h is in thousandths of the entered torque at the rated current.
+        expected = made.cell.ratio[axis, axis] * ENTERED_NM / (STEP_A[Dialect.CIA402][axis] * 1000)
+        assert len(channel.time_s) >= 10
+        slope = channel.torque_nm @ channel.nearby_a / (channel.current_a @ channel.nearby_a)
+        assert slope == pytest.approx(expected, rel=0.05)
+    assert made.run.temperature_c is not None
+    warmth = made.run.temperature_c[[0, -1]]
+    assert warmth[0] == pytest.approx(25.0, abs=0.1)
+    assert warmth[1, 1] > 27.0
+    assert warmth[1, [0, 2, 3, 4, 5]] == pytest.approx(25.0)
 
 
 @pytest.mark.parametrize("dialect", list(Dialect))

@@ -22,6 +22,7 @@ from daq.log.conversion import load_run
 from daq.log.csv_import import import_csv, quantise
 from daq.log.reader import read_log
 from daq.report.log import describe_log
+from ident.data.torque_channel import torque_slope
 
 FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 NAMES = [f"q{i}" for i in range(1, 7)] + [f"i{i}" for i in range(1, 7)]
@@ -603,3 +604,61 @@ def test_a_full_disk_is_not_reported_as_a_recording(bench: Bench) -> None:
         import_csv(bench.description, bench.data, bench.out, software="test")
     assert "nothing was written" in str(caught.value)
     assert "record" not in str(caught.value)
+
+
+# -- the controller's own torque, and temperatures -------------------------------------------------------------------
+
+
+def with_slow_columns(bench: Bench, torque_nm: FloatArray, temperature_c: FloatArray, **torque: object) -> None:
+    """Add a file of torques and temperatures."""
+    names = [f"t{i}" for i in range(1, 7)] + [f"c{i}" for i in range(1, 7)]
+    values = np.hstack((torque_nm, temperature_c)).tolist()
+    lines = [",".join(names), *(",".join(map(repr, row)) for row in values)]
+    (bench.data / "slow.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    bench.describe(
+        rate_hz=50,
+        torque={"file": "slow.csv", "columns": names[:6], **torque},
+        temperature={"file": "slow.csv", "columns": names[6:]},
+    )
+
+
+@pytest.mark.parametrize("side", ["motor", "joint"])
+def test_torque_columns_give_a_slope_and_temperature_columns_a_temperature(bench: Bench, side: str) -> None:
+    ratio, gain = load_run_of(bench), np.array([33.0, 32.0, 24.0, -9.0, 16.0, 6.8])
+    motor_nm = gain * bench.current_a / np.diag(ratio)
+    torque = motor_nm if side == "motor" else motor_nm @ ratio
+    temperature_c = np.linspace(25.0, 31.0, 300)[:, None] + np.arange(6)
+    with_slow_columns(bench, 1000.0 * torque, temperature_c, side=side, factor=0.001)
+    assert bench.run() == 0
+    run, _ = load_run(bench.out)
+    # 300 rows at 50 Hz: a torque in every second row, a temperature a second.
+    assert describe_log(bench.out)["slow_readings"] == {"torque": 6 * 150, "temperature": 6 * 6}
+    slopes = [torque_slope([channel]) for channel in run.torque_channels]
+    assert [slope.value for slope in slopes if slope is not None] == pytest.approx(gain, rel=1e-6)
+    assert run.temperature_c is not None
+    # One reading a second, interpolated; the last second keeps its value.
+    np.testing.assert_allclose(run.temperature_c[:250], temperature_c[:250], atol=1e-6)
+    np.testing.assert_allclose(run.current_a, bench.current_a, atol=1e-9)
+
+
+def test_a_torque_column_too_few_and_a_factor_of_zero_are_refused(bench: Bench) -> None:
+    for torque, said in (
+        ({"columns": ["i1", "i2"], "side": "motor"}, "2 columns"),
+        ({"columns": NAMES[6:], "side": "motor", "factor": 0.0}, "factor"),
+        ({"columns": NAMES[6:], "side": "motor", "factor": [1.0, 2.0]}, "torque.factor"),
+    ):
+        bench.describe(torque={"file": "run.csv", **torque})
+        with pytest.raises(ConfigurationInconsistent, match=said):
+            import_csv(bench.description, bench.data, bench.out, software="test")
+    # Every section is checked, whatever comes after it.
+    current = {"file": "run.csv", "columns": NAMES[6:], "unit": "A", "factor": [1.0, 2.0]}
+    bench.describe(current=current, torque={"file": "run.csv", "columns": NAMES[6:], "side": "motor"})
+    with pytest.raises(ConfigurationInconsistent, match=r"current\.factor"):
+        import_csv(bench.description, bench.data, bench.out, software="test")
+
+
+def test_an_import_without_them_has_neither(bench: Bench) -> None:
+    assert bench.run() == 0
+    run, _ = load_run(bench.out)
+    assert run.torque_channels == ()
+    assert run.temperature_c is None

@@ -20,7 +20,7 @@ from daq.errors import LogIncomplete, OutputFailed, UsageError
 from daq.log.container import RecordFile
 from daq.log.reader import LogReader, read_log
 from daq.log.writer import LogWriter
-from drivers.stream.sample import CellEvent, EventKind, Sample
+from drivers.stream.sample import CellEvent, EventKind, Quantity, Sample, SlowReading
 from tests.daq.logs import DISC, START_NS, content, joints, samples, write
 
 I32 = st.integers(-(2**31), 2**31 - 1)
@@ -58,6 +58,49 @@ EVENTS = st.lists(
     ),
     max_size=5,
 )
+
+
+READINGS = st.lists(
+    st.builds(
+        SlowReading,
+        st.integers(0, 2**31 * 10**9 - 1),
+        st.integers(0, 0),
+        st.sampled_from(Quantity),
+        st.floats(allow_nan=False, allow_infinity=False),
+    ),
+    max_size=5,
+)
+
+
+@settings(deadline=None, max_examples=20)
+@given(_recordings(), READINGS)
+def test_slow_readings_come_back_and_leave_the_samples_alone(
+    recording: tuple[int, list[Sample]], readings: list[SlowReading]
+) -> None:
+    axes, rows = recording
+    with TemporaryDirectory() as folder:
+        path, bare = Path(folder) / "a.mcap", write(Path(folder) / "b.mcap", content(axes), rows)
+        with LogWriter(path, content(axes), joints, clock_ns=lambda: 0) as writer:
+            writer.readings(readings)
+            for sample in rows:
+                writer.write(sample)
+            writer.conclude(valid=True)
+        found, without = read_log(path), read_log(bare)
+        # Such topics are in a log only where it has some.
+        assert [b"AxisReading" in log.read_bytes() for log in (path, bare)] == [bool(readings), False]
+    assert found.readings == tuple(readings)
+    assert without.readings == ()
+    assert found.samples.position_counts.tolist() == without.samples.position_counts.tolist()
+
+
+def test_a_reading_of_an_axis_that_the_log_lacks_is_refused(tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "a.mcap", content(2), joints, clock_ns=lambda: 0) as log:
+        log.reading(SlowReading(5, 2, Quantity.TORQUE, 1.0))
+        for sample in samples([(1, 2), (3, 4)]):
+            log.write(sample)
+        log.conclude(valid=True)
+    with pytest.raises(LogIncomplete, match="3 axes"):
+        read_log(tmp_path / "a.mcap")
 
 
 @settings(deadline=None, max_examples=60)

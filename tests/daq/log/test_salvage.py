@@ -39,12 +39,14 @@ from daq.workflow.fit import Reading
 from daq.writeback.gates.gate import Gate, GateContext
 from daq.writeback.gates.table import check_gates
 from daq.writeback.request import Edit, Request
-from drivers.stream.sample import CellEvent, EventKind
+from drivers.stream.sample import CellEvent, EventKind, Quantity, SlowReading
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import DISC, START_NS, demo_content, joints, samples, write
 
 ROWS = samples([[100 * k + axis for axis in range(6)] for k in range(700)])
 MOVES = [CellEvent(START_NS + 50_000_000 * k, None, EventKind.MOVE_START, k, f"move {k}") for k in range(3)]
+
+READINGS = [SlowReading(START_NS + 300_000_000 * k, 2, Quantity.TEMPERATURE, 25.0 + k) for k in range(2)]
 
 
 @pytest.fixture
@@ -60,6 +62,7 @@ def _broken_off(path: Path, checkout: Path, *events: CellEvent) -> Path:
     ):
         for event in (*MOVES, *events):
             log.event(event)
+        log.readings(READINGS)
         for sample in ROWS:
             log.write(sample)
         raise RuntimeError("gone")
@@ -85,6 +88,7 @@ def test_what_was_recorded_comes_back_and_is_labelled(part: Path, tmp_path: Path
     log = read_log(saved.log)
     assert _same(log.samples, 700)
     assert log.events == tuple(MOVES)
+    assert log.readings == tuple(READINGS)
     assert log.partial
     assert (log.statistics.valid, log.statistics.samples) == (True, 700)
     assert log.head.run.payload == DISC

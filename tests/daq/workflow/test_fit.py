@@ -16,15 +16,16 @@ from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import LogRepeated, LogsDiffer
 from daq.log.reader import LossyLogs
-from daq.report.fit import fit_view
+from daq.report.fit import fit_document, fit_view
 from daq.workflow import fit as fit_module
 from daq.workflow.cases import CaseFit
 from daq.workflow.fit import calibration_of, fit
 from ident.data.run import Run
+from ident.data.torque_channel import TorqueChannel
 from ident.errors import PayloadUnseen
 from ident.estimators.estimate import RelativeError
 from ident.estimators.method import Method
-from tests.ident.recordings import MOUNTED, record, tx40_truth
+from tests.ident.recordings import GAINS, MOUNTED, record, tx40_truth
 
 
 @dataclass(frozen=True)
@@ -107,3 +108,42 @@ def test_an_axis_that_did_not_move_has_a_dash_and_no_number(shelf: Shelf, monkey
     Console(file=out, width=100).print(*fit_view(CaseFit(found, (), None), rested_on, None), sep="\n")
     (held_out,) = (line.split() for line in out.getvalue().splitlines() if line.strip().startswith("held out"))
     assert held_out == ["held", "out", "1.00", "-", "3.00", "4.00", "5.00", "6.00", "7.00"]
+
+
+def test_the_drives_own_torque_is_shown_beside_the_gains_and_changes_none(
+    shelf: Shelf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A torque constant entered 4 % too large, and an axis whose drive reports no torque."""
+    rng = np.random.default_rng(1)
+
+    def load(path: Path, cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+        run, described = shelf.load(path, cell)
+        channels = []
+        for axis, gain in enumerate(GAINS):
+            rows = slice(0, 0) if axis == 5 else slice(50, -50, 50)
+            current = run.current_a[rows, axis]
+            torque = 1.04 * gain * current + 0.5 * rng.standard_normal(len(current))
+            channels.append(TorqueChannel(run.time_s[rows], current, current, torque))
+        return replace(run, torque_channels=tuple(channels)), described
+
+    monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    without = fit(_paths("run0", "run1"), holdout=_paths("run2"))
+    monkeypatch.setattr(fit_module, "load_run", load)
+    found = fit(_paths("run0", "run1"), holdout=_paths("run2"))
+    np.testing.assert_array_equal(found.estimate.gains, without.estimate.gains)
+    assert without.torque_slopes == ()
+    assert found.torque_slopes[5] is None
+    calibration = calibration_of(found, datetime(2025, 1, 2, tzinfo=UTC))
+    case = CaseFit(found, (), None)
+    document = fit_document(case, calibration, None)["torque_channel"]
+    assert [row["axis"] for row in document] == list(found.cell.axis_names)
+    assert document[5] == {"axis": "J6", "slope": None}
+    for slope, row, gain in zip(found.torque_slopes[:5], document, GAINS, strict=False):
+        assert slope is not None
+        assert abs(slope.value - 1.04 * gain) < 4.0 * slope.std
+        assert abs(row["ratio"] - 1.04) < 4.0 * row["ratio_std"] < 0.1
+        assert slope.readings == len(range(50, 22000 - 50, 50)) * 2
+    assert "torque_channel" not in fit_document(CaseFit(without, (), None), calibration, None)
+    out = io.StringIO()
+    Console(file=out, width=80).print(*fit_view(case, calibration, None), sep="\n")
+    assert "own torque against the current, not used in the fit" in out.getvalue()

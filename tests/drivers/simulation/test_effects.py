@@ -155,10 +155,49 @@ def test_warm_up_fades_with_time() -> None:
     assert later / cold == pytest.approx(math.exp(-1.0), rel=1e-3)
 
 
+HEATED = {
+    "viscous_percent_per_k": -2.0, "coulomb_percent_per_k": 0.5, "time_constant_s": 10.0, "resistance_k_per_w": 0.4,
+}  # fmt: skip
+
+
+def test_losses_heat_a_drive_to_their_balance_and_its_friction_follows() -> None:
+    """Dry 5 Nm and viscous 10 Nm s/rad at 0.8 rad/s, and 2 Ω at 3 A, for 10 s and then for ever."""
+    effect = build_effect(UndeclaredEffect("temperature-friction", 0, HEATED | {"winding_ohm": 2.0}), 1)
+    assert not isinstance(effect, Lag)
+    moment = Moment(0.0, 0.1, *(np.zeros(1) for _ in range(10)))
+    moment.temperature_c[0], moment.velocity_rad_s[0], moment.current_a[0] = 25.0, -0.8, 3.0
+    above_k = 0.0
+    for step in range(1000):
+        moment.bound_nm[0], moment.viscous_nm_s_rad[0] = 5.0, 10.0
+        warm_k = float(moment.temperature_c[0]) - 25.0
+        effect(moment)
+        assert moment.bound_nm[0] == pytest.approx(5.0 * (1.0 + 0.005 * warm_k))
+        assert moment.viscous_nm_s_rad[0] == pytest.approx(10.0 * (1.0 - 0.02 * warm_k))
+        dry_w, viscous_w = moment.bound_nm[0] * 0.8, moment.viscous_nm_s_rad[0] * 0.64
+        # Euler's steps of a hundredth of the time constant.
+        above_k += 0.01 * (0.4 * (2.0 * 9.0 + dry_w + viscous_w) - above_k)
+        assert moment.temperature_c[0] - 25.0 == pytest.approx(above_k, rel=0.02)
+        if step == 99:
+            assert 0.6 < above_k / (0.4 * (18.0 + dry_w + viscous_w)) < 0.66
+    # At the balance the temperature is resistance times losses.
+    assert moment.temperature_c[0] - 25.0 == pytest.approx(0.4 * (18.0 + dry_w + viscous_w), rel=1e-3)
+
+
+def test_a_plant_without_that_effect_stays_at_the_temperature_of_its_surroundings() -> None:
+    heated = UndeclaredEffect("temperature-friction", 1, HEATED)
+    plant = Plant(clean_cell(effects=(heated,)))
+    plant.set_brakes(np.zeros(6, dtype=np.bool_))
+    plant.velocity_rad_s[:] = SPEED
+    for _ in range(20):
+        plant.step(np.zeros(6))
+    assert plant.temperature_c[1] > 25.0
+    assert plant.temperature_c[[0, 2, 3, 4, 5]].tolist() == [25.0] * 5
+
+
 def test_presliding_builds_up_over_its_distance_after_a_reversal() -> None:
     effect = Presliding(axis=0, torque_nm=3.0, distance_rad=0.01)
     effect.bristle = -1.0
-    moment = Moment(0.0, STEP_S, *(np.zeros(1) for _ in range(9)))
+    moment = Moment(0.0, STEP_S, *(np.zeros(1) for _ in range(10)))
     moment.velocity_rad_s[0] = 0.4
     travelled, torque = 0.0, []
     while travelled < 0.05:
@@ -232,10 +271,12 @@ def test_bounds_of_dry_friction_never_become_negative(speed: float, load: float,
         ("position-friction", {"amplitude_nm": 4.0, "phase_rad": 0.0}),
         ("warm-up", {"cold_fraction": 1.0, "time_constant_s": 10.0}),
         ("presliding", {"torque_nm": 9.0, "distance_rad": 0.01}),
+        ("temperature-friction", HEATED | {"coulomb_percent_per_k": -1.0}),
     ):
-        moment = Moment(time, STEP_S, *(np.zeros(1) for _ in range(9)))
+        moment = Moment(time, STEP_S, *(np.zeros(1) for _ in range(10)))
         moment.bound_nm[0], moment.load_torque_nm[0] = 1.0, load
         moment.velocity_rad_s[0], moment.position_rad[0] = speed, angle
+        moment.temperature_c[0] = 25.0 + load * load
         effect = build_effect(UndeclaredEffect(name, 0, parameters), 1)
         assert not isinstance(effect, Lag)
         effect(moment)
@@ -255,7 +296,7 @@ def test_unknown_names_and_parameters_are_refused_with_what_exists() -> None:
         build_effect(UndeclaredEffect("coupling", 3, {"other_axis": 4, "coulomb_nm": 0.4, "viscous_nm_s_rad": 0.3}), 6)
     with pytest.raises(SpecInvalid, match="unknown parameter bristle"):
         build_effect(UndeclaredEffect("presliding", 0, {"torque_nm": 1.0, "distance_rad": 0.1, "bristle": 1.0}), 6)
-    assert len(UNDECLARED_EFFECTS) == 15
+    assert len(UNDECLARED_EFFECTS) == 16
 
 
 def test_a_drive_too_stiff_for_the_step_is_refused() -> None:

@@ -30,9 +30,9 @@ from ident.discovery.loop import Evidence, SetAside, find_effects, gather, with_
 from ident.discovery.search import Finding, Gates, effect_key, rank_effects
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
-from ident.effects.friction import NonlinearViscous, Stribeck, WarmUp
+from ident.effects.friction import NonlinearViscous, Stribeck, TemperatureFriction, WarmUp
 from ident.effects.position import Spring
-from ident.effects.signals import Abscissa
+from ident.effects.signals import Abscissa, Signals
 from ident.effects.unnamed import Smooth
 from ident.estimators.identify import identify
 from ident.model.model import Column
@@ -50,6 +50,7 @@ EITHER_SIGN = {
     "cogging",
     "ripple",
     "inertial-coupling",
+    "temperature-friction",
     "lag",
     "time-skew",
 }
@@ -79,6 +80,8 @@ def test_every_family_declares_its_signs() -> None:
     for family in EFFECTS:
         bound = {column.least == 0.0 for column in family[0].coefficients}
         assert bound == {family[0].name not in EITHER_SIGN}, family[0].name
+        falling = {column.name for column in family[0].coefficients if column.largest == 0.0}
+        assert falling == ({"viscous"} if family[0].name == "temperature-friction" else set())
         columns = PlacedEffect(family[0], 0).columns
         assert [column.least for column in columns] == [column.least for column in family[0].coefficients]
 
@@ -87,12 +90,32 @@ def test_a_time_constant_is_no_longer_than_the_data(search_problem: SearchProble
     runs = search_problem.runs
     span_s = max(float(run.time_s[-1]) for run in runs)
     later = [replace(run, session_s=run.time_s + 100.0 * index) for index, run in enumerate(runs)]
-    assert WarmUp(0.99 * span_s, 0).fits_in(runs)
-    assert not WarmUp(1.01 * span_s, 0).fits_in(later)
-    assert WarmUp(300.0, 1).fits_in(later)
-    assert not WarmUp(400.0, 1).fits_in(later)
+    assert WarmUp(0.99 * span_s, 0).fits_in(runs, 0)
+    assert not WarmUp(1.01 * span_s, 0).fits_in(later, 0)
+    assert WarmUp(300.0, 1).fits_in(later, 0)
+    assert not WarmUp(400.0, 1).fits_in(later, 0)
     tried = rank_effects(search_problem, np.random.default_rng(0), GATES, ((WarmUp(900.0, 0),), (Spring(),)))
     assert {finding.effect.name for finding in tried} == {"spring"}
+
+
+def test_friction_against_temperature_is_tried_where_every_run_has_one_that_changes(
+    search_problem: SearchProblem,
+) -> None:
+    effect, runs = TemperatureFriction(), search_problem.runs
+    assert not effect.fits_in(runs, 1)  # no temperatures at all
+
+    def with_temperature(last_c: float) -> list[Signals]:
+        one = np.linspace(30.0, last_c, len(runs[0].time_s))
+        return [replace(run, temperature_c=np.stack((one, one, np.full_like(one, np.nan)))) for run in runs]
+
+    warming = with_temperature(35.0)
+    assert effect.fits_in(warming, 1)
+    assert not effect.fits_in(warming, 2)  # its drive reports none
+    assert not effect.fits_in([*warming[:-1], runs[-1]], 1)  # one run was recorded without
+    assert not effect.fits_in(with_temperature(30.5), 1)
+    # Where it is not known, the friction is that at 40 °C.
+    assert not effect.columns(runs[0], 1).any()
+    assert not effect.columns(warming[0], 2).any()
 
 
 def _sticking(small: Evidence, truth: Truth, amplitude_nm: float) -> Evidence:

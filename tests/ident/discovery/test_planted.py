@@ -58,6 +58,7 @@ class TrueSignals:
     started_s: float
     rate_hz: float
     pulls: Callable[[int], FloatArray]
+    temperatures: FloatArray
 
     @property
     def position(self) -> FloatArray:
@@ -154,6 +155,12 @@ def _cold(t: TrueSignals, clock_s: FloatArray, constant_s: float) -> FloatArray:
     return np.asarray(np.exp2(-clock_s / (constant_s * np.log(2.0))) * (5.0 * np.sign(t.velocity) + 2.0 * t.velocity))
 
 
+def _heated(t: TrueSignals) -> FloatArray:
+    """Dry friction that grows with temperature, and viscous friction that falls."""
+    above_k = t.temperatures[t.axis] - 40.0
+    return np.asarray(above_k * (0.15 * np.sign(t.velocity) - 0.1 * t.velocity))
+
+
 CASES = (
     Planted("spring", 1, lambda t: 9.0 * t.position, (9.0,)),
     Planted("cogging", 0, lambda t: 4.0 * np.cos(t.motor_angle) + 3.0 * np.sin(t.motor_angle), (4.0, 3.0)),
@@ -171,6 +178,7 @@ SMALL_CASES = (
     Planted("position-friction", 2, lambda t: np.sign(t.velocity) * 1.5 * np.cos(t.position + 0.7), (1.147, -0.966)),
     Planted("warm-up", 1, lambda t: _cold(t, t.time_s, 20.0), (5.0, 2.0)),
     Planted("warm-up", 2, lambda t: _cold(t, t.started_s + t.time_s, 80.0), (5.0, 2.0)),
+    Planted("temperature-friction", 1, _heated, (0.15, -0.1)),
     Planted("presliding", 1, lambda t: 9.0 * (_bristle(t, 0.08) - np.sign(t.velocity)), (9.0,)),
     Planted("backlash", 1, lambda t: _pushed(t, 0.004), (0.004,)),
     Planted("elasticity", 1, lambda t: -0.0005 * t.pull() * t.accelerated(t.load), (0.0005,)),
@@ -198,10 +206,19 @@ def arm(truth: Truth, noisy: Evidence) -> Arm:
     return Arm(truth, noisy, {}, {data.name: _true(truth, data) for data in noisy.datasets})
 
 
+def warmth(run: Run, started_s: float) -> FloatArray:
+    """Temperature of each of three drives [°C], shape (k, 3): slow waves between 30 and 50 °C, as loads change."""
+    phase = (started_s + run.time_s[:, None]) / np.array([31.0, 23.0, 41.0]) + np.array([0.3, 2.0, 4.1])
+    return np.asarray(40.0 + 10.0 * np.sin(phase))
+
+
 @pytest.fixture(scope="module")
 def small_arm(small_truth: Truth, small_runs: tuple[Run, ...]) -> Arm:
-    """In a session in which every run began a while after the one before."""
-    runs = tuple(replace(run, started_s=PAUSE_S * index) for index, run in enumerate(small_runs))
+    """In a session in which every run began a while after the one before, with drives that warm up and cool down."""
+    runs = tuple(
+        replace(run, started_s=PAUSE_S * index, temperature_c=warmth(run, PAUSE_S * index))
+        for index, run in enumerate(small_runs)
+    )
     clean = gathered(small_truth, runs)
     return Arm(small_truth, clean, {}, {data.name: _true(small_truth, data) for data in clean.datasets})
 
@@ -239,6 +256,7 @@ def _true(truth: Truth, data: Dataset) -> TrueSignals:
         started_s=data.started_s or 0.0,
         rate_hz=data.rate_hz,
         pulls=pulls,
+        temperatures=np.zeros((0, 0)) if data.temperature_c is None else data.temperature_c.T,
     )
 
 
@@ -355,3 +373,21 @@ def test_the_loop_ends_where_nothing_is_left(small_arm: Arm) -> None:
     start = _with(small_arm, next(case for case in SMALL_CASES if case.family == "load-friction"))
     steps = find_effects(start, np.random.default_rng(1))
     assert [step.accepted is not None for step in steps] == [True, False]
+
+
+def test_friction_against_temperature_is_named_first_and_the_worst_gain_gets_better(small_arm: Arm) -> None:
+    start = _with(small_arm, next(case for case in SMALL_CASES if case.family == "temperature-friction"))
+    steps = find_effects(start, np.random.default_rng(1))
+    first = steps[0].accepted
+    assert first is not None
+    assert (first.effect.name, first.axis) == ("temperature-friction", 1)
+    before, after = (
+        np.abs(evidence.estimate.gains / small_arm.truth.gains - 1.0).max() for evidence in (start, steps[-1].after)
+    )
+    assert after < before
+
+
+def test_drives_that_warm_up_without_an_effect_give_none(small_arm: Arm) -> None:
+    (step,) = find_effects(small_arm.clean, np.random.default_rng(1))
+    assert step.accepted is None
+    assert "temperature-friction" in {finding.effect.name for finding in step.findings}

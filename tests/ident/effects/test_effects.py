@@ -47,6 +47,7 @@ def random_signals(seed: int) -> Signals:
         geared_torque_nm=geared,
         motor_torque_nm=torque,
         current_a=torque / 20.0,
+        temperature_c=45.0 + 5.0 * rng.normal(size=(JOINTS, SAMPLES)),
     )
 
 

@@ -1,0 +1,148 @@
+"""Torque and temperature of the drives, read a few times a second by SDO beside the stream.
+
+Nothing waits for an answer. At most one request is on its way; it is sent in a cycle without set-points, and its answer
+is taken from the frames that the stream reads anyway. SDO has the lowest priority on the bus, so a request or an answer
+delays the frames of a cycle by its own length at most; `daq.config.bus` decides whether a period has room for both. A
+lost answer is a missing reading; its object is read again at its next turn.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+
+import can
+
+from drivers.canopen.link import SDO_REQUEST
+from drivers.canopen.network import CanopenNetwork
+from drivers.errors import ObjectAccessError
+from drivers.profiles.profile import Axis, ObjectEntry
+from drivers.profiles.scale import ScaleReading
+from drivers.stream.sample import Quantity, SlowReading
+from drivers.stream.stream import SyncStream
+
+PERIOD_NS = {Quantity.TORQUE: 200_000_000, Quantity.TEMPERATURE: 1_000_000_000}
+"""Time between two readings of an axis: some hundred torques give a slope to a percent; a motor warms in minutes."""
+GIVEN_UP_NS = 250_000_000  #: Time after which an answer is lost: the SDO servers of drives need some milliseconds
+_INITIATE_UPLOAD, _ABORT = 0x40, 0x80
+_EXPEDITED_UPLOAD = 0x42  #: Response with at most four bytes of data: bits 7 to 5 and bit 1 (CiA 301, SDO upload)
+_HEAD = struct.Struct("<BHB")
+
+
+class _Source:
+    """One object of one drive."""
+
+    def __init__(
+        self, polling: Polling, axis: int, node_id: int, entry: ObjectEntry, quantity: Quantity, per_unit: float
+    ) -> None:
+        self.axis, self.node_id, self.entry = axis, node_id, entry
+        self.quantity, self.per_unit = quantity, per_unit
+        self.due_ns = 0
+        self._polling = polling
+
+    def receive(self, data: bytearray) -> None:
+        """Take an SDO answer of the node, if it is the one that is awaited."""
+        if len(data) == 8 and bytes(data[1:4]) == _HEAD.pack(0, self.entry.index, self.entry.subindex)[1:]:
+            self._polling.answer(self, bytes(data))
+
+
+class Polling:
+    """The slow objects of a prepared network.
+
+    Attributes:
+        remarks: objects of the profiles that the drives do not have, in words.
+    """
+
+    def __init__(self, network: CanopenNetwork, *, beside_stream: bool = True) -> None:
+        """Find the objects that the drives really have.
+
+        Args:
+            network: prepared; no stream of it runs yet.
+            beside_stream: whether the bus has room for requests while a stream runs.
+
+        Raises:
+            ObjectAccessError, BusError: a drive does not answer.
+        """
+        self._network, self._beside_stream = network, beside_stream
+        self._stream: SyncStream | None = None
+        self._keep: Callable[[SlowReading], None] = lambda _: None
+        self._asked: _Source | None = None
+        self._asked_ns = 0
+        self._sources: list[_Source] = []
+        remarks = []
+        for number, (axis, scale) in enumerate(zip(network.axes, network.scales(), strict=True)):
+            for quantity, (entry, per_unit) in slow_objects(axis, scale).items():
+                if network.link.objects(axis.node_id).read_optional(entry, any_abort=True) is None:
+                    remarks.append(f"{axis.name}: the drive has no {quantity.value} in {entry}; it is not logged")
+                    continue
+                source = _Source(self, number, axis.node_id, entry, quantity, per_unit)
+                self._sources.append(source)
+                network.link.listen(axis.node_id, source)
+        self.remarks = tuple(remarks)
+
+    def __bool__(self) -> bool:
+        """Whether any drive has such an object."""
+        return bool(self._sources)
+
+    def temperatures(self, time_ns: int) -> tuple[SlowReading, ...]:
+        """Read every temperature now, while no stream runs; that of a drive which does not answer is missing.
+
+        Args:
+            time_ns: on the clock of the samples [ns].
+
+        Raises:
+            BusError: the bus is lost.
+        """
+        self._asked, found = None, []
+        for source in self._sources:
+            if source.quantity is Quantity.TEMPERATURE:
+                with suppress(ObjectAccessError):
+                    raw = self._network.link.objects(source.node_id).read(source.entry)
+                    found.append(SlowReading(time_ns, source.axis, source.quantity, raw * source.per_unit))
+        return tuple(found)
+
+    def begin(self, stream: SyncStream, keep: Callable[[SlowReading], None]) -> None:
+        """Pass readings on from now on, made beside a stream until it stops the axes, if the bus has room."""
+        if self._beside_stream:
+            self._stream, self._keep, stream.spare = stream, keep, self._request
+
+    def _request(self, now_ns: int) -> Sequence[can.Message]:
+        """Return the request that is due; none while another one waits for its answer."""
+        if self._asked is not None and now_ns - self._asked_ns < GIVEN_UP_NS:
+            return ()
+        self._asked = None
+        source = min(self._sources, key=lambda one: one.due_ns, default=None)
+        if source is None or source.due_ns > now_ns:
+            return ()
+        source.due_ns = now_ns + PERIOD_NS[source.quantity]  # from now on: after a pause nothing is caught up
+        self._asked, self._asked_ns = source, now_ns
+        data = _HEAD.pack(_INITIATE_UPLOAD, source.entry.index, source.entry.subindex) + bytes(4)
+        return (can.Message(arbitration_id=SDO_REQUEST + source.node_id, is_extended_id=False, data=data),)
+
+    def answer(self, source: _Source, data: bytes) -> None:
+        """Keep the value of an answer to the request on its way; other answers are the business of others."""
+        if source is not self._asked or self._stream is None:
+            return
+        self._asked = None
+        if data[0] & 0xE2 == _EXPEDITED_UPLOAD:
+            raw = int.from_bytes(data[4 : 4 + source.entry.bits // 8], "little", signed=source.entry.signed)
+            # The drive read its object somewhere between the request and this answer.
+            time_ns = (self._asked_ns + self._stream.time_ns) // 2
+            self._keep(SlowReading(time_ns, source.axis, source.quantity, raw * source.per_unit))
+        elif data[0] == _ABORT:
+            self._sources.remove(source)
+
+
+def slow_objects(axis: Axis, scale: ScaleReading) -> dict[Quantity, tuple[ObjectEntry, float]]:
+    """Return the slow objects of an axis, each with its unit.
+
+    A torque has a unit only where the drive reports the rated torque: it is in thousandths of it (CiA 402-2, 6077h).
+    """
+    found: dict[Quantity, tuple[ObjectEntry, float]] = {}
+    profile = axis.profile
+    if profile.torque is not None and scale.rated_torque_nm is not None:
+        found[Quantity.TORQUE] = profile.torque, 1e-3 * scale.rated_torque_nm
+    if profile.temperature is not None:
+        found[Quantity.TEMPERATURE] = profile.temperature.entry, profile.temperature.kelvin_per_unit
+    return found

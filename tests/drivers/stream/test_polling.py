@@ -1,0 +1,154 @@
+"""Slow readings beside the stream: they come without a sample that waits, and never in the way of a set-point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+import can
+import pytest
+
+from drivers.canopen.network import CanopenNetwork
+from drivers.motion.execute import execute
+from drivers.motion.move import Move
+from drivers.profiles.profile import ObjectEntry, RatedMotor, Thermometer
+from drivers.stream.polling import GIVEN_UP_NS, PERIOD_NS, Polling
+from drivers.stream.sample import Quantity, SlowReading
+from drivers.stream.stream import SyncStream
+from drivers.stream.sync import LockstepSync
+from tests.drivers import scripted
+from tests.drivers.motion.test_motion import BOUNDS
+from tests.drivers.scripted import PROFILE, ScriptedBus, permission
+
+RATED = RatedMotor(ObjectEntry(0x6075, 0, 32, signed=False), torque=ObjectEntry(0x6076, 0, 32, signed=False))
+TORQUE, TEMPERATURE = ObjectEntry(0x6077, 0, 16, signed=True), ObjectEntry(0x2005, 0, 16, signed=True)
+WARM = replace(PROFILE, rated=RATED, torque=TORQUE, temperature=Thermometer(TEMPERATURE, 0.1))
+CYCLES = 1200  #: More than a second
+
+
+@dataclass
+class Bench:
+    """Two prepared drives of 1.5 Nm, at 31.5 and -4 °C and with −200 and 300 thousandths of torque."""
+
+    network: CanopenNetwork
+    bus: ScriptedBus
+    stream: SyncStream
+    readings: list[SlowReading] = field(default_factory=list)
+    begun: int = 0
+
+    def poll(self, *, beside_stream: bool = True) -> Polling:
+        """Begin."""
+        polling = Polling(self.network, beside_stream=beside_stream)
+        polling.begin(self.stream, self.readings.append)
+        self.begun = len(self.bus.sent)
+        return polling
+
+    def requests(self) -> list[tuple[int, int]]:
+        """Node of each SDO request since the stream began, and the frames sent with it before the next SYNC."""
+        sent, found, since = self.bus.sent, [], 0
+        for frame in sent[self.begun :]:
+            if frame.arbitration_id == 0x80:
+                since = 0
+            elif 0x200 <= frame.arbitration_id < 0x680:
+                since += 1
+                if frame.arbitration_id > 0x600:
+                    found.append((frame.arbitration_id - 0x600, since))
+        return found
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    network, bus = scripted.cell(2)
+    network.axes = tuple(replace(axis, profile=WARM) for axis in network.axes)
+    for node, (torque, temperature) in zip(bus.nodes, ((-200, 315), (300, -40)), strict=True):
+        node.objects |= {(0x6076, 0): (1500, 4), (0x6077, 0): (torque, 2), (0x2005, 0): (temperature, 2)}
+    with network:
+        network.prepare()
+        stream = SyncStream(network, LockstepSync(scripted.PERIOD_NS, 0.005, clock=bus.clock))
+        yield Bench(network, bus, stream)
+        bus.tamper = lambda message: (message,)
+
+
+def test_readings_are_in_si_and_come_at_their_rates(bench: Bench) -> None:
+    bench.poll()
+    samples = [next(bench.stream) for _ in range(CYCLES)]
+    assert all(sample.missing == 0 for sample in samples)
+    values = {(r.axis, r.quantity): r.value for r in bench.readings}
+    assert values == pytest.approx(
+        {
+            (0, Quantity.TORQUE): -0.3, (1, Quantity.TORQUE): 0.45,
+            (0, Quantity.TEMPERATURE): 31.5, (1, Quantity.TEMPERATURE): -4.0,
+        }
+    )  # fmt: skip
+    lasted_ns = CYCLES * scripted.PERIOD_NS
+    for quantity, period_ns in PERIOD_NS.items():
+        own = [r.time_ns for r in bench.readings if (r.axis, r.quantity) == (0, quantity)]
+        assert len(own) == -(-lasted_ns // period_ns)
+        assert all(samples[0].time_ns <= time_ns <= samples[-1].time_ns for time_ns in own)
+    # One request a cycle at most: the drives are read in turn.
+    assert {before for _, before in bench.requests()} == {1}
+
+
+def test_a_lost_answer_delays_nothing_and_its_object_is_read_again(bench: Bench) -> None:
+    bench.poll()
+    lost: list[int] = []
+
+    def lose_one(message: can.Message) -> Iterable[can.Message]:
+        if message.arbitration_id == 0x581 and not lost:
+            lost.append(bench.bus.cycle)
+            return ()
+        return (message,)
+
+    bench.bus.tamper = lose_one
+    samples = [next(bench.stream) for _ in range(CYCLES)]
+    assert lost
+    assert [sample.cycle for sample in samples] == list(range(CYCLES))
+    given_up = GIVEN_UP_NS // scripted.PERIOD_NS
+    waited = [r for r in bench.readings if r.time_ns < samples[given_up].time_ns]
+    assert waited == []
+    assert {(r.axis, r.quantity) for r in bench.readings} == {(a, q) for a in (0, 1) for q in Quantity}
+
+
+def test_no_request_goes_with_a_set_point_and_none_after_the_stop(bench: Bench) -> None:
+    bench.poll()
+    far = Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000), dwell_cycles=200)
+    samples = list(execute(bench.network, bench.stream, (far,), permission(), BOUNDS))
+    assert all(sample.missing == 0 for sample in samples)
+    assert bench.readings
+    beside = [before for node, before in bench.requests() if node <= 2]
+    assert beside
+    assert set(beside) == {1}
+    count = len(bench.readings)
+    for _ in range(CYCLES):
+        bench.stream.advance()
+    assert len(bench.readings) == count
+
+
+def test_an_object_that_a_drive_lacks_is_named_and_one_that_it_refuses_is_left(bench: Bench) -> None:
+    del bench.bus.nodes[1].objects[0x2005, 0]
+    polling = bench.poll()
+    assert polling.remarks == ("J2: the drive has no temperature in 2005h:00; it is not logged",)
+    assert [r.axis for r in polling.temperatures(5)] == [0]
+    del bench.bus.nodes[0].objects[0x6077, 0]
+    for _ in range(CYCLES):
+        next(bench.stream)
+    assert {(r.axis, r.quantity) for r in bench.readings} == {(1, Quantity.TORQUE), (0, Quantity.TEMPERATURE)}
+
+
+def test_a_bus_without_room_is_read_before_and_after_alone(bench: Bench) -> None:
+    polling = bench.poll(beside_stream=False)
+    before = len(bench.bus.sent)
+    for _ in range(CYCLES):
+        next(bench.stream)
+    assert not [frame for frame in bench.bus.sent[before:] if frame.arbitration_id > 0x600]
+    assert [(r.time_ns, r.axis, r.value) for r in polling.temperatures(9)] == [(9, 0, 31.5), (9, 1, -4.0)]
+
+
+def test_a_torque_without_rated_torque_has_no_unit_and_is_not_read(bench: Bench) -> None:
+    for node in bench.bus.nodes:
+        node.objects[0x6076, 0] = (0, 4)
+    bench.network._scales = ()  # read anew
+    bench.poll()
+    for _ in range(CYCLES):
+        next(bench.stream)
+    assert {r.quantity for r in bench.readings} == {Quantity.TEMPERATURE}
