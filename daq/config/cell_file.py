@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -107,6 +108,8 @@ def digest(files: Mapping[str, bytes]) -> str:
 
 _AFTERWARDS = ("policy", "history", "recalibration")
 """Keys for the use of a calibration; no recording and no fit depends on them."""
+_BESIDE = ("torque", "temperature")
+"""Keys of a drive profile for what is read beside the samples; samples and gains do not depend on them."""
 
 
 def _canonical(member: str, content: bytes, name: str) -> bytes:
@@ -115,8 +118,16 @@ def _canonical(member: str, content: bytes, name: str) -> bytes:
         return content
     tree = parse_yaml(content, name).tree
     if member == CELL:
-        tree = {key: value for key, value in tree.items() if key not in _AFTERWARDS}
+        tree = _without(tree, _AFTERWARDS)
+    elif member.startswith(DRIVES) and member.endswith(".yaml"):
+        tree = _without(tree, _BESIDE)
+        if tree.get("facts"):
+            tree["facts"] = _without(tree["facts"], _BESIDE)
     return json.dumps(tree, sort_keys=True, separators=(",", ":")).encode()
+
+
+def _without(tree: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
+    return {key: value for key, value in tree.items() if key not in keys}
 
 
 def _sources(path: Path) -> dict[str, Path]:

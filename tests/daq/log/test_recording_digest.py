@@ -50,6 +50,20 @@ def test_neither_do_comments_and_line_breaks_of_a_drive_profile(configs: Path) -
     assert after.recording_digest == before.recording_digest
 
 
+def test_nor_does_what_a_drive_profile_names_beside_the_samples(configs: Path) -> None:
+    """A profile of an earlier version has neither torque nor temperature: its calibrations stay valid."""
+    before = load_cell(configs / DEMO)
+    profile = configs / "drives" / "generic-cia402.yaml"
+    text = profile.read_text()
+    entry = next(line for line in text.splitlines(keepends=True) if line.startswith("torque:"))
+    earlier, found, _ = text.replace(entry, "").partition("  torque:\n")
+    assert found
+    profile.write_text(earlier)
+    after = load_cell(configs / DEMO)
+    assert after.digest != before.digest
+    assert after.recording_digest == before.recording_digest
+
+
 @pytest.mark.parametrize(
     ("file", "was", "becomes"),
     [
