@@ -8,6 +8,8 @@ STAMP := $(VENV)/.drivegain-stamp
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Linear algebra on all cores at once is slower for matrices of this size, and makes timings wander.
 export OMP_NUM_THREADS ?= 1
+# Compiled modules are kept: without them every program that a test starts would compile all that it imports.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: help setup demo test test-vcan vcan-tools check docs screenshots bench bench-stream ident-study gain-study coverage-study paper planning-study robot-study crash-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study weigh-study words wheel lock clean
 
