@@ -19,15 +19,15 @@ _ptrace.argtypes = (ctypes.c_long, ctypes.c_long, ctypes.c_void_p, ctypes.c_void
 _ptrace.restype = ctypes.c_long
 
 
-def killed_at(number: int, work: Callable[[], object]) -> bool:
-    """Do some work in a child and kill it (SIGKILL) as it asks for its n-th system call, which is not made any more.
+def killed_where(here: Callable[[int], object], work: Callable[[], object]) -> bool:
+    """Do some work in a child and kill it (SIGKILL) as it asks for a system call, which is not made any more.
 
     Args:
-        number: n, from 1; the calls of `work` and the child's own end are counted.
-        work: with nothing left to import or to prepare.
+        here: of the call's number, from 1; where it returns true the child is killed. The child waits for the answer.
+        work: with nothing left to import or to prepare; its calls and the child's own end are counted.
 
     Returns:
-        whether it was killed; False where the child had fewer calls to make and came to its end.
+        whether it was killed; False where it was killed nowhere and came to its end.
     """
     child = os.fork()
     if child == 0:
@@ -51,7 +51,7 @@ def killed_at(number: int, work: Callable[[], object]) -> bool:
                 return False
             assert os.WSTOPSIG(status) == _SYSCALL_STOP
             stops += 1  # one as a call begins, one as it ends
-            if stops == 2 * number - 1:
+            if stops % 2 and here(stops // 2 + 1):
                 return True
     finally:
         if not os.WIFEXITED(status):

@@ -1,4 +1,8 @@
-"""Kill -9 at every system call of the write path: the old file or the new one, whole, and the audit says which."""
+"""Kill -9 at any system call of the write path: the old file or the new one, whole, and the audit says which.
+
+A kill changes no file, so one at a call leaves what the files are as that call begins. One writer is therefore followed
+through all its calls, and another one is killed in each different state that the files have been in.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import pytest
@@ -28,7 +32,7 @@ from daq.writeback.target import apply, propose, rollback
 from ident.estimators.estimate import RelativeError
 from tests.daq import killing
 from tests.daq.calibrations import demo_calibration
-from tests.daq.killing import killed_at
+from tests.daq.killing import killed_where
 
 NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
 OLD = b"# K. has weighed it.\ndrives:\n  J1: {gain: 32.96, kp: 120.0}   # Nm/A\n"
@@ -171,7 +175,8 @@ def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_report
     calls, outcomes, left, states = small.submit(_kill_everywhere, tmp_path, prepare, work).result()
     with capsys.disabled():
         reported = ", ".join(f"{count} × {content.name.lower()}" for content, count in outcomes.items())
-        print(f"\n  killed at each of {calls} system calls: {reported}; left behind: {', '.join(sorted(left))}")  # noqa: T201
+        remains = f"killed in each of them: {reported}; left behind: {', '.join(sorted(left))}"
+        print(f"\n  {states} states of the files at {calls} system calls, {remains}")  # noqa: T201
     assert calls >= MIN_CALLS
     assert states >= MIN_STATES
     assert set(outcomes) == {Content.BEFORE, Content.AFTER}
@@ -180,10 +185,10 @@ def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_report
 
 
 def _kill_everywhere(folder: Path, prepare: Prepare, work: Work) -> tuple[int, Counter[Content], set[str], int]:
-    """Kill one writer at each of its system calls, and check what each leaves.
+    """Kill a writer in each state of the files that its system calls make, and check what each leaves.
 
     Returns:
-        number of calls, outcomes, endings of what was left, and how many different states the next writer met.
+        number of calls, outcomes, endings of what was left, and the number of different states.
     """
     model = prepare(folder / "model")
     before = model.content()
@@ -192,30 +197,31 @@ def _kill_everywhere(folder: Path, prepare: Prepare, work: Work) -> tuple[int, C
     assert before != after
     outcomes: Counter[Content] = Counter()
     left: set[str] = set()
-    written_on: set[State] = set()
     place, kept = prepare(folder / "place"), folder / "kept"
     shutil.copytree(place.folder, kept)
-    number = 0
+    seen: list[State] = []  # at each call of the writer that is followed
     gc.disable()  # of the child: when it collects is not part of the path
     try:
-        while True:
-            number += 1
+        killed_where(lambda _: seen.append(place.state()), work(place))
+        states = dict.fromkeys((*seen, place.state()))
+        for state in states:
             # Copied back, because preparing it takes longer; into the same folder, because the audit names the file.
             shutil.rmtree(place.folder)
             shutil.copytree(kept, place.folder)
-            killed = killed_at(number, work(place))
+            killed_where(partial(_is_reached, place, state), work(place))
+            assert place.state() == state
             outcomes[_check(place, before, after)] += 1
             left |= place.kinds_left()
-            if (state := place.state()) not in written_on:  # most calls change no file: the next writer finds the same
-                written_on.add(state)
-                with pytest.MonkeyPatch.context() as patch:
-                    patch.setattr(os, "fsync", _unflushed)
-                    _check_next_write(place, before, after)
-            if not killed:
-                break
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(os, "fsync", _unflushed)
+                _check_next_write(place, before, after)
     finally:
         gc.enable()
-    return number - 1, outcomes, left, len(written_on)
+    return len(seen), outcomes, left, len(states)
+
+
+def _is_reached(place: Place, state: State, _call: int) -> bool:
+    return place.state() == state
 
 
 @pytest.mark.parametrize(("ci", "ends"), [("", pytest.skip.Exception), ("true", pytest.fail.Exception)])
@@ -225,7 +231,7 @@ def test_where_ptrace_is_not_permitted_it_is_skipped_by_people_and_fails_in_ci(
     monkeypatch.setenv("CI", ci)
     monkeypatch.setattr(killing, "_ptrace", lambda *_: -1)
     with pytest.raises(ends, match="ptrace is not permitted"):
-        killing.killed_at(1, lambda: None)
+        killing.killed_where(lambda _: True, lambda: None)
 
 
 def _check(place: Place, before: bytes | None, after: bytes | None) -> Content:
