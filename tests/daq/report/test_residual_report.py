@@ -171,6 +171,13 @@ def shown(closed: Closed) -> Reader:
     return Reader(closed.page())
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures without content, for tests of the words: to draw those of a page takes longer than all the rest."""
+    for name in ("draw_effect", "draw_torques", "plot_gain_changes", "plot_ranking"):
+        monkeypatch.setattr(residual_page_module, name, lambda *_, **__: b"")
+
+
 def test_the_page_is_self_contained(shown: Reader) -> None:
     page = shown
     tags = {element.tag for element in page.elements}
@@ -306,6 +313,7 @@ def test_a_noise_floor_above_the_error_of_the_model_is_reported_with_its_cause(c
     assert motors[2]["left"] == pytest.approx(left_a[2])
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_silence_is_reported_with_its_size(closed: Closed) -> None:
     last = closed.fitted.steps[-1]
     start = closed.fitted.evidence()
@@ -323,6 +331,7 @@ def test_silence_is_reported_with_its_size(closed: Closed) -> None:
     assert "No candidate could be tried." in Reader(text).text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_what_did_not_join_is_reported_with_the_reason(closed: Closed) -> None:
     first, last = closed.fitted.steps
     aside = SetAside(_finding(PlacedEffect(Smooth(Abscissa.LOAD), 1)), moved=((3, 2.91),))
@@ -337,6 +346,7 @@ def test_what_did_not_join_is_reported_with_the_reason(closed: Closed) -> None:
     assert "Not added: smooth-load on J2: it has no name" in Reader(made.page()).text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_effects_that_held_out_runs_refute_are_not_written(
     closed: Closed, shelved: Shelf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
