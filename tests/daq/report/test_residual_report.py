@@ -166,9 +166,15 @@ class Reader(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def shown(closed: Closed) -> Reader:
+def whole_page(closed: Closed) -> str:
+    """Its page with all pictures."""
+    return closed.page()
+
+
+@pytest.fixture(scope="module")
+def shown(whole_page: str) -> Reader:
     """Its page, taken apart."""
-    return Reader(closed.page())
+    return Reader(whole_page)
 
 
 @pytest.fixture
@@ -437,13 +443,15 @@ def test_what_is_seen_stays_as_it_is() -> None:
 
 
 def test_a_disk_that_fails_leaves_the_old_report(
-    closed: Closed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    closed: Closed, whole_page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calibration = calibration_of(closed.fitted, CREATED)
     save_report(closed.fitted, closed.account, calibration, tmp_path)
     old = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     assert set(old) == {PAGE, DOCUMENT}
+    assert old[PAGE].decode() == whole_page  # drawn a second time
     check_report(tmp_path)
+    monkeypatch.setattr(residual_page_module, "residual_page", lambda *_: whole_page)
     save_report(closed.fitted, closed.account, calibration, tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == old
 
