@@ -30,6 +30,7 @@ LARGEST_TOTAL_PERCENT = 50.0
 LARGEST_AXIS_PERCENT = 100.0
 """Largest relative errors of a fit. A robot with every effect undeclared stays below 15 in total and 40 on an axis; a
 model that explains nothing leaves 100."""
+COLLAPSED_GAIN = 1e-6  #: Share of the largest gain: no two drives differ as much, and the error of nothing is small
 LARGEST_UNKNOWN_PERCENT = 25.0  #: The same, on an axis whose gain is smaller than its own σ
 
 
@@ -142,13 +143,15 @@ def require_plausible(
         idle: of `idle_joints`: a relative error of nothing is nothing, where the gain is known; none when None.
 
     Raises:
-        ModelContradicted: the relative error is above one of the LARGEST_..._PERCENT.
+        ModelContradicted: the relative error is above one of the LARGEST_..._PERCENT, or a gain has collapsed.
         RolesExchanged: dry friction is negative on every joint, on most of them by more than five σ.
     """
     unknown = estimate.gains_std > np.abs(estimate.gains)
     excess = np.array(error.axes) / np.where(unknown, LARGEST_UNKNOWN_PERCENT, LARGEST_AXIS_PERCENT)
     if idle is not None:
         excess[idle & ~unknown] = 0.0
+    size = np.abs(estimate.gains)
+    excess[size < COLLAPSED_GAIN * size.max()] = np.inf
     worst = int(np.nanargmax(excess))
     if error.total > LARGEST_TOTAL_PERCENT or excess[worst] > 1.0:
         raise ModelContradicted(
