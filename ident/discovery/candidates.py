@@ -254,7 +254,7 @@ def _scored_together(folds: Folds, width: int, candidates: Sequence[Felt]) -> tu
     squares = np.diagonal(motor_gram.sum(axis=0), axis1=1, axis2=2)
     new = _is_new(gram.sum(axis=0), squares)
     if not new.all():
-        kept = [candidates[number] for number in np.flatnonzero(new)]
+        kept = [felt for felt, is_new in zip(candidates, new, strict=True) if is_new]
         trials = iter(_scored_together(folds, width, kept) if kept else ())
         return tuple(next(trials) if is_new else None for is_new in new)
     fitted = np.linalg.solve(gram.sum(axis=0), cluster_score.sum(axis=0)[..., None])[..., 0]

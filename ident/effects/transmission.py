@@ -12,6 +12,7 @@ from ident.arrays import FloatArray
 from ident.effects.effect import AxisNumber, Effect, Property, Range, Side, Switch
 from ident.effects.signals import Abscissa, Signals, curvature
 from ident.model.model import Column
+from ident.model.regressor import cos_sin
 
 RESOLVED = 0.9  #: Largest resonance in parts of half the sampling rate
 LEAST_SHARE = 0.02  #: Of the mean, below which an inertia is not one of a link
@@ -254,4 +255,4 @@ class Ripple(Effect):
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k)."""
         angle = (signals.position_rad if self.of_joint else signals.motor_position_rad)[axis]
-        return np.stack((np.cos(self.order * angle), np.sin(self.order * angle)))
+        return np.stack(cos_sin(self.order * angle))

@@ -339,7 +339,7 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
         grams, scores = products[..., :-1], products[..., -1]
         cluster_hessian[np.ix_(own.cluster, seen, seen)] += grams
         cluster_score[np.ix_(own.cluster, seen)] += scores
-        part_hessian[:, i][np.ix_(range(count), seen, seen)] = own.by_fold(grams, count)
+        part_hessian[:, i][:, seen[:, None], seen] = own.by_fold(grams, count)
         motor_score[i, seen] = scores.sum(axis=0)
     by_fold = part_hessian.sum(axis=1)
     hessian, score = by_fold.sum(axis=0), motor_score.sum(axis=0)
