@@ -422,14 +422,18 @@ def _settled(
     return replace(step, accepted=replace(step.accepted, ambiguity=left))
 
 
-def gather(found: Identification, runs: Iterable[Run], holdout: Iterable[Run] = ()) -> Evidence:
-    """Build the rows behind an identification from its runs and held-out runs."""
+def gather(found: Identification, runs: Iterable[Run] = (), holdout: Iterable[Run] = ()) -> Evidence:
+    """Build the rows behind an identification from its runs and held-out runs, unless it has kept them."""
     model, conditioning = found.model, found.conditioning
-    trained = tuple(differentiate(run, model.drive_train, conditioning) for run in runs)
-    unseen = tuple(differentiate(run, model.drive_train, conditioning) for run in holdout)
-    rows = observe(model, (*trained, *unseen), conditioning, found.system)
-    training, rest = _split_holdout(rows, len(unseen))
-    return Evidence(model, conditioning, (*trained, *unseen), len(unseen), rows, training, rest, (), found.estimate)
+    if found.gathered is None:
+        trained = [differentiate(run, model.drive_train, conditioning) for run in runs]
+        datasets = (*trained, *(differentiate(run, model.drive_train, conditioning) for run in holdout))
+        rows, held_out = observe(model, datasets, conditioning, found.system), len(datasets) - len(trained)
+    else:
+        datasets, rows = found.gathered
+        held_out = len(datasets) - len(found.system.runs)
+    training, rest = _split_holdout(rows, held_out)
+    return Evidence(model, conditioning, datasets, held_out, rows, training, rest, (), found.estimate)
 
 
 def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...]) -> Evidence:
@@ -494,5 +498,5 @@ def _split_holdout(observation: Observation, held_out: int) -> tuple[Observation
     """Split rows of all runs into those of the fit and those of the last, held-out runs."""
     if not held_out:
         return observation, None
-    rows = observation.run >= len(observation.runs) - held_out
-    return observation.only(~rows), observation.only(rows)
+    first = int(np.searchsorted(observation.run, len(observation.runs) - held_out))
+    return observation.only(slice(first)), observation.only(slice(first, None))

@@ -5,7 +5,7 @@ An estimate needs their triangles alone (ident/equations/reduction.py); these ar
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -130,6 +130,14 @@ def _part(motion: Motion, rows: slice) -> Motion:
     return Motion(motion.position_rad[rows], motion.velocity_rad_s[rows], motion.acceleration_rad_s2[rows])
 
 
+@dataclass(frozen=True, slots=True)
+class RunRows:
+    """A run with all its rows, for those that need them again."""
+
+    data: Dataset  #: the run
+    pieces: tuple[Rows, ...]  #: its rows, piece by piece
+
+
 OF_ROWS = ("current", "regressor", "effects", "flange", "use", "motor_use", "time_s", "run", "move", "mounting")
 """Fields of an observation that have a row last."""
 
@@ -231,12 +239,15 @@ class Observation(Equations):
         )
 
 
-def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditioning, like: Equations) -> Observation:
+def observe(
+    model: Model, runs: Iterable[Dataset | RunRows], conditioning: Conditioning, like: Equations
+) -> Observation:
     """Build the rows of several runs.
 
     Args:
         model: the declared model.
-        datasets: differentiated runs; each one's payload mounting is among those of ``like``.
+        runs: differentiated runs, or the rows already built of them; each one's payload mounting is among those of
+            ``like``.
         conditioning: the filters; every column and the currents go through the same decimation.
         like: whose base parameters and payload parameters these are.
 
@@ -248,9 +259,14 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
     parts: list[tuple[Rows, FloatArray, FloatArray]] = []
     run, move, mounting = [], [], []
     first_move, shared = 0, ("current", "use", "motor_use", "time_s")
-    for index, data in enumerate(datasets):
+    names: list[str] = []
+    for index, given in enumerate(runs):
+        data, pieces = (
+            (given.data, given.pieces) if isinstance(given, RunRows) else (given, rows_of(model, given, conditioning))
+        )
+        names.append(data.name)
         last, mounted = first_move, -1 if data.payload is None else mountings.index(data.payload.mounting)
-        for rows in rows_of(model, data, conditioning):
+        for rows in pieces:
             parts.append((rows, rows.standard[:, base], np.ascontiguousarray(rows.standard[:, model.flange])))
             move.append(rows.move + first_move)
             last = int(move[-1].max()) + 1
@@ -269,7 +285,7 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
         mounting=np.concatenate(mounting),
         payloads=like.payloads,
         payload_columns=like.payload_columns,
-        runs=tuple(data.name for data in datasets),
+        runs=tuple(names),
         conditioning=conditioning,
         **{name: np.concatenate([getattr(rows, name) for rows, _, _ in parts], axis=-1) for name in shared},
     )
