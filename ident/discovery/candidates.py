@@ -42,7 +42,7 @@ class SearchProblem:
     datasets: Sequence[Dataset]  #: the runs of the fit
     observation: Observation  #: their rows, with the columns of the effects accepted so far
     runs: tuple[Signals, ...]  #: predicted signals of each run, at full rate
-    rows: tuple[Signals, ...]  #: the same at the observation's rows
+    rows: tuple[Signals, ...]  #: the same at the observation's rows, without inertia
     folds: Folds  #: the problem around the estimate, in folds of moves
     #: Noise of each motor's current in a row that no model of motion explains; None where not known.
     floors_a: tuple[float | None, ...]
@@ -153,10 +153,11 @@ def prepare_search(
     rows: list[Signals] = []
     for run, data in zip(runs, datasets, strict=True):
         at_rate = {array.name: getattr(run, array.name) for array in fields(run) if array.name != "rate_hz"}
-        known = {name: array for name, array in at_rate.items() if array is not None}
+        known = {name: array for name, array in at_rate.items() if array is not None and name != "inertia_kg_m2"}
         arrays = {name: decimate_rows(data, observation.conditioning, array) for name, array in known.items()}
-        time_s = arrays["time_s"]
-        rows.append(Signals(rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])), **arrays))
+        time_s, none = arrays["time_s"], run.inertia_kg_m2[..., :0]
+        rate_hz = float((len(time_s) - 1) / (time_s[-1] - time_s[0]))
+        rows.append(Signals(rate_hz=rate_hz, inertia_kg_m2=none, **arrays))
     return SearchProblem(
         model=model,
         datasets=datasets,

@@ -64,7 +64,7 @@ class Signals:
     acceleration_rad_s2: FloatArray  #: acceleration of the joints
     motor_position_rad: FloatArray  #: of the motors, R q
     #: Mass matrix of links and payload: torque at joint i per unit of acceleration of joint j, with a rotor's inertia
-    #: where it is regrouped with theirs, shape (n, n, k).
+    #: where it is regrouped with theirs, shape (n, n, k); (n, n, 0) where it was not asked for.
     inertia_kg_m2: FloatArray
     load_torque_nm: FloatArray  #: torque at each joint for links and payload, without friction and drive chain
     geared_torque_nm: FloatArray  #: torque through the gear of each joint: load and friction
@@ -100,11 +100,17 @@ class Signals:
 
 
 def fitted_signals(
-    model: Model, data: Dataset, observation: Observation, estimate: Estimate, session_began_s: float | None = None
+    model: Model,
+    data: Dataset,
+    observation: Observation,
+    estimate: Estimate,
+    session_began_s: float | None = None,
+    *,
+    inertia: bool = True,
 ) -> Signals:
     """Predict a run's torques with the declared part of an estimate; coefficients of effects are left out.
 
-    The observation, rows of the fit, names the base parameters; for `session_began_s` see `declared_signals`.
+    The observation, rows of the fit, names the base parameters; for the last two see `declared_signals`.
     """
     standard = np.zeros(len(model.columns))
     independent = list(observation.base.independent)
@@ -117,11 +123,17 @@ def fitted_signals(
             identified = {LINK_PARAMETERS[index]: float(value) for index, value in zip(indices, values, strict=True)}
         first += len(indices)
     standard[model.flange] += payload_parameters(data.payload, identified)
-    return declared_signals(model, data, standard, estimate.gains, session_began_s)
+    return declared_signals(model, data, standard, estimate.gains, session_began_s, inertia=inertia)
 
 
 def declared_signals(
-    model: Model, data: Dataset, standard: FloatArray, gains: FloatArray, session_began_s: float | None = None
+    model: Model,
+    data: Dataset,
+    standard: FloatArray,
+    gains: FloatArray,
+    session_began_s: float | None = None,
+    *,
+    inertia: bool = True,
 ) -> Signals:
     """Predict a run's torques with standard parameters.
 
@@ -132,6 +144,7 @@ def declared_signals(
             are as good as the true standard ones (paper §2.1). Shape (c,).
         gains: g of each motor [Nm at the joint per A], shape (n,).
         session_began_s: start of the first run by the clock of `Dataset.started_s`; None if unknown.
+        inertia: whether the mass matrix is needed, by effects through the links.
     """
     # A base parameter is named after its leading standard one; Ia of J1, regrouped into Izz1, thus counts as load.
     load, geared, total = model.torques(data.motion(), standard)
@@ -145,7 +158,7 @@ def declared_signals(
         velocity_rad_s=data.velocity_rad_s.T,
         acceleration_rad_s2=data.acceleration_rad_s2.T,
         motor_position_rad=model.drive_train.ratio @ data.position_rad.T,
-        inertia_kg_m2=_inertia_of_joints(model, data, standard),
+        inertia_kg_m2=_inertia_of_joints(model, data, standard) if inertia else np.empty((len(load), len(load), 0)),
         load_torque_nm=load,
         geared_torque_nm=geared,
         motor_torque_nm=motor,
