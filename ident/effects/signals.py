@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, IntArray
 from ident.data.dataset import Dataset
 from ident.equations.rows import Observation
 from ident.estimators.estimate import Estimate
@@ -64,7 +64,8 @@ class Signals:
     acceleration_rad_s2: FloatArray  #: acceleration of the joints
     motor_position_rad: FloatArray  #: of the motors, R q
     #: Mass matrix of links and payload: torque at joint i per unit of acceleration of joint j, with a rotor's inertia
-    #: where it is regrouped with theirs, shape (n, n, k); (n, n, 0) where it was not asked for.
+    #: where it is regrouped with theirs, in postures spread evenly over the run, shape (n, n, postures); none where it
+    #: was not asked for. See `inertia`.
     inertia_kg_m2: FloatArray
     load_torque_nm: FloatArray  #: torque at each joint for links and payload, without friction and drive chain
     geared_torque_nm: FloatArray  #: torque through the gear of each joint: load and friction
@@ -79,6 +80,18 @@ class Signals:
             return np.full(len(self.time_s), REFERENCE_C)
         recorded = self.temperature_c[axis]
         return np.asarray(np.where(np.isnan(recorded), REFERENCE_C, recorded))
+
+    def inertia(self, joints: int | slice, axis: int) -> FloatArray:
+        """Torque at joints per unit of acceleration of the joint `axis` along the run, shape (…, k).
+
+        It is interpolated between postures, because it changes slowly.
+        """
+        coarse, samples = self.inertia_kg_m2[joints, axis], len(self.time_s)
+        at = _postures(samples, coarse.shape[-1])
+        before = np.append(np.repeat(np.arange(len(at) - 1), np.diff(at)), len(at) - 2)
+        share = (np.arange(samples) - at[before]) / np.diff(at)[before]
+        low = coarse[..., before]
+        return np.asarray(low + share * (coarse[..., before + 1] - low))
 
     def variable(self, abscissa: Abscissa, axis: int, other: int | None = None) -> FloatArray:
         """Return a variable of an axis along the run, shape (k,); `other` is the second axis of OTHER_VELOCITY."""
@@ -186,15 +199,16 @@ def session_began_s(datasets: Sequence[Dataset]) -> float | None:
 
 
 def _inertia_of_joints(model: Model, data: Dataset, standard: FloatArray) -> FloatArray:
-    """Mass matrix of links and payload, shape (n, n, k), interpolated between postures because it changes slowly."""
+    """Mass matrix of links and payload in some postures, shape (n, n, postures)."""
     samples, count = data.position_rad.shape
-    postures = np.linspace(0, samples - 1, max(2, samples // POSTURE_SAMPLES)).round().astype(np.int64)
+    postures = _postures(samples, max(2, samples // POSTURE_SAMPLES))
     links = standard[link_columns(count)]
-    coarse = mass_matrix(model.robot, np.ascontiguousarray(data.position_rad[postures].T), links)
-    mass = np.empty((count, count, samples))
-    for row, joint in zip(*np.tril_indices(count), strict=True):
-        mass[row, joint] = mass[joint, row] = np.interp(np.arange(samples), postures, coarse[row, joint])
-    return mass
+    return mass_matrix(model.robot, np.ascontiguousarray(data.position_rad[postures].T), links)
+
+
+def _postures(samples: int, count: int) -> IntArray:
+    """Index of so many samples spread evenly over a run."""
+    return np.linspace(0, samples - 1, count).round().astype(np.int64)
 
 
 def payload_parameters(payload: Payload | None, identified: Mapping[str, float]) -> FloatArray:

@@ -19,6 +19,8 @@ from ident.equations.rows import Observation
 from ident.equations.system import System
 from ident.errors import TooFewMoves
 
+OF_ROWS = ("jacobian", "residual", "current", "motor", "cluster", "source")
+"""Fields of a linearisation that have a row first."""
 MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter, and each fold holds one
 CORRELATED = 2.0  #: Standard errors of the correlation of neighbouring clusters, above which they are joined
 
@@ -314,8 +316,8 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
     fold_of = move_of % count
     motors, width = len(problem.gamma), problem.jacobian.shape[1]
     order = np.lexsort((problem.cluster, fold_of[problem.cluster], problem.motor))
-    of_rows = ("jacobian", "residual", "current", "motor", "cluster", "source")
-    problem = replace(problem, **{name: getattr(problem, name)[order] for name in of_rows})
+    if np.any(np.diff(order) != 1):  # rows that were cut before keep their order
+        problem = replace(problem, **{name: getattr(problem, name)[order] for name in OF_ROWS})
     change = (np.diff(problem.cluster, prepend=-1) != 0) | (np.diff(problem.motor, prepend=-1) != 0)
     starts = np.flatnonzero(change)
     rows_of = (slice(int(a), int(b)) for a, b in pairwise((*starts, len(problem.motor))))
