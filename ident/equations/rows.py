@@ -160,10 +160,14 @@ class Observation(Equations):
 
     def linear(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
         """[W | W_uL] of some rows, shape (n, p, rows)."""
-        parts = [self.regressor[:, :, rows], self.effects[:, :, rows]]
+        return np.stack([self._of_joint(joint, rows) for joint in range(self.joint_count)])
+
+    def _of_joint(self, joint: int, rows: BoolArray | slice = slice(None)) -> FloatArray:
+        """[W | W_uL] of one joint, shape (p, rows)."""
+        parts = [self.regressor[joint][:, rows], self.effects[joint][:, rows]]
         for index, indices in enumerate(self.payload_columns):
-            parts.append(self.flange[:, list(indices)][:, :, rows] * (self.mounting[rows] == index))
-        return np.concatenate(parts, axis=1)
+            parts.append(self.flange[joint][list(indices)][:, rows] * (self.mounting[rows] == index))
+        return np.concatenate(parts)
 
     def known(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
         """W_kL χ_kL of some rows: the joint torque of what is known of the payloads [Nm], shape (n, rows)."""
@@ -175,12 +179,13 @@ class Observation(Equations):
 
     def motor_columns(self) -> Iterator[FloatArray]:
         """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor in turn, columns first, shape (p + 2, r)."""
-        linear, known = self.linear(), self.known()
+        known = self.known()
         for current, row in zip(self.current, self.drive_train.to_motor, strict=True):
-            columns = np.zeros((linear.shape[1] + 2, linear.shape[2]))
-            columns[0] = current
-            for joint in np.flatnonzero(row):
-                columns[1:-1] += row[joint] * linear[joint]
+            first, *others = np.flatnonzero(row).tolist()  # T is invertible
+            columns = np.concatenate((current[None], self._of_joint(first), known[first][None]))
+            columns[1:] *= row[first]
+            for joint in others:
+                columns[1:-1] += row[joint] * self._of_joint(joint)
                 columns[-1] += row[joint] * known[joint]
             yield columns
 
@@ -212,13 +217,13 @@ class Observation(Equations):
         Args:
             demanded: the same rows and columns for the demanded motion: they become the system's instruments.
         """
-        linear, known = self.linear(), self.known()
-        direction = self.drive_train.direction
+        known, direction = self.known(), self.drive_train.direction
         joints = []
         for joint, used in enumerate(self.use):
             current = direction[:, joint, None] * self.current[:, used]
-            joints.append(triangle_of(np.concatenate((current, -linear[joint][:, used], -known[joint, used][None]))))
-        del linear  # a copy of all rows; the motors' is another
+            joints.append(
+                triangle_of(np.concatenate((current, -self._of_joint(joint, used), -known[joint, used][None])))
+            )
         clusters, runs = self._by_move(), []
         motors = [triangle_of(np.concatenate(rows).T) for rows in zip(*clusters, strict=True)]
         for move in np.unique(self.move[self.motor_use.any(axis=0)]):
