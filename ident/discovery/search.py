@@ -286,14 +286,19 @@ def _drawn_wald(trial: Trial, signs: FloatArray) -> FloatArray:
     s_m x_m − G_m β (the studentised wild bootstrap of Cameron, Gelbach & Miller, 2008).
     """
     x, gram = trial.scatter, trial.gram
-    p, sums = x.shape[1], signs @ x
+    (moves, p), (row, column) = x.shape, np.tril_indices(x.shape[1])
+    sums = signs @ x
     fitted = sums @ np.linalg.pinv(gram.sum(axis=0))
-    crossed = (signs @ np.einsum("ma,mbc->mabc", x, gram).reshape(len(x), -1)).reshape(-1, p * p, p)
-    mixed = np.matmul(crossed, fitted[:, :, None]).reshape(-1, p, p)
+    # Symmetric matrices by their lower triangle. First Σ_m s_m (x_m (G_m β)ᵀ + (G_m β) x_mᵀ), linear in β.
+    mixed = gram[:, column] * x[:, row, None] + gram[:, row] * x[:, column, None]
+    crossed = (signs @ mixed.reshape(moves, -1)).reshape(-1, len(row), p) @ fitted[:, :, None]
     # Σ_m (G_m β)(G_m β)ᵀ, linear in ββᵀ: one matrix for all draws.
-    squares = np.einsum("mab,mcd->bdac", gram, gram).reshape(p * p, p * p)
-    pairs = (fitted[:, :, None] * fitted[:, None, :]).reshape(-1, p * p)
-    left = x.T @ x - mixed - np.swapaxes(mixed, 1, 2) + (pairs @ squares).reshape(-1, p, p)
+    products = (gram.reshape(moves, -1).T @ gram.reshape(moves, -1)).reshape(p, p, p, p)
+    squares = products[row[:, None], row, column[:, None], column]
+    squares += np.where(row == column, 0.0, products[row[:, None], column, column[:, None], row])
+    left = np.empty((len(signs), p, p))
+    left[:, row, column] = (x.T @ x)[row, column] - crossed[:, :, 0] + (fitted[:, row] * fitted[:, column]) @ squares.T
+    left[:, column, row] = left[:, row, column]
     left += 1e-12 * np.trace(left, axis1=1, axis2=2)[:, None, None] * np.eye(p)  # a coefficient that no draw scatters
     return np.asarray(np.sum(sums * np.linalg.solve(left, sums[:, :, None])[:, :, 0], axis=1))
 
