@@ -438,7 +438,9 @@ def gather(found: Identification, runs: Iterable[Run] = (), holdout: Iterable[Ru
         datasets, rows = found.gathered
         held_out = len(datasets) - len(found.system.runs)
     training, rest = _split_holdout(rows, held_out)
-    return Evidence(model, conditioning, datasets, held_out, rows, training, rest, (), found.estimate)
+    evidence = Evidence(model, conditioning, datasets, held_out, rows, training, rest, (), found.estimate)
+    evidence._identification.append(found)
+    return evidence
 
 
 def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals] = ()) -> Evidence:

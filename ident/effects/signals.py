@@ -86,12 +86,14 @@ class Signals:
 
         It is interpolated between postures, because it changes slowly.
         """
-        coarse, samples = self.inertia_kg_m2[joints, axis], len(self.time_s)
-        at = _postures(samples, coarse.shape[-1])
-        before = np.append(np.repeat(np.arange(len(at) - 1), np.diff(at)), len(at) - 2)
-        share = (np.arange(samples) - at[before]) / np.diff(at)[before]
-        low = coarse[..., before]
-        return np.asarray(low + share * (coarse[..., before + 1] - low))
+        coarse = self.inertia_kg_m2[joints, axis]
+        at = _postures(len(self.time_s), coarse.shape[-1])
+        step = np.diff(at)
+        following = step + (np.arange(len(step)) == len(step) - 1)  # the last sample is a posture, too
+        out = np.repeat(np.diff(coarse, axis=-1) / step, following, axis=-1)
+        out *= np.arange(len(self.time_s)) - np.repeat(at[:-1], following)
+        out += np.repeat(coarse[..., :-1], following, axis=-1)
+        return np.asarray(out)
 
     def variable(self, abscissa: Abscissa, axis: int, other: int | None = None) -> FloatArray:
         """Return a variable of an axis along the run, shape (k,); `other` is the second axis of OTHER_VELOCITY."""
