@@ -48,6 +48,7 @@ from ident.effects.signals import Signals, fitted_signals, session_began_s
 from ident.effects.transmission import Ripple
 from ident.effects.unnamed import is_unnamed
 from ident.equations.rows import Observation, observe, on_demanded_motion
+from ident.equations.system import System
 from ident.errors import NotConverged, RankDeficient
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.identify import Identification, estimate_with
@@ -476,7 +477,14 @@ def by_instruments(evidence: Evidence) -> Estimate | None:
 
     Load and current of the effects' columns are predictions of the estimate by ``ml``, in the instruments too.
     """
-    model, conditioning, estimate = evidence.model, evidence.conditioning, evidence.estimate
+    system, estimate = _with_instruments(evidence), evidence.estimate
+    if system is None:
+        return None
+    return estimate_with(Method.IV, system, estimate.gains if estimate.gains_fixed else None)
+
+
+def _with_instruments(evidence: Evidence) -> System | None:
+    model, conditioning = evidence.model, evidence.conditioning
     asked = tuple(with_demand(data, model.drive_train, conditioning) for data in evidence.trained)
     if all(data.demanded is None for data in asked):
         return None
@@ -484,9 +492,9 @@ def by_instruments(evidence: Evidence) -> Estimate | None:
     if evidence.effects:
         datasets, began_s = tuple(map(as_demanded, asked)), session_began_s(evidence.trained)
         demanded = replace(demanded, effects=_torques(evidence.effects, evidence, datasets, began_s))
-    return estimate_with(
-        Method.IV, evidence.training.system(demanded), estimate.gains if estimate.gains_fixed else None
-    )
+        del datasets
+    del asked  # one more copy of all runs, while the equations are built
+    return evidence.training.system(demanded)
 
 
 def _torques(
