@@ -351,7 +351,8 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
         before = replace(before, estimate=estimate_with(Method.ML, before.system, fixed))
         evidence = replace(evidence, estimate=before.estimate)
     steps = find_effects(evidence, np.random.default_rng(seed), progress=progress)
-    return with_diagnoses(replace(start, identification=before, steps=steps))
+    closed = replace(start, identification=before, steps=steps)
+    return closed if closed.estimate is start.estimate else with_diagnoses(closed)
 
 
 def check_holdout(fitted: Fit) -> None:
