@@ -200,6 +200,7 @@ def residual_verb(
             gains_fixed=gains is Gains.FIXED,
             cell=None if cell is None else load_cell(cell),
             lossy=LossyLogs.ACCEPTED if accept_losses else LossyLogs.REFUSED,
+            keep_rows=True,
         )
         closed = replace(close_loop(fitted, seed, report_step), accept_worse_holdout=accept_worse_holdout)
         calibration = calibration_of(closed, datetime.now(UTC))

@@ -102,7 +102,7 @@ def fit_cell(
                     ) from error
                 paths[at_hand(seen.log, Path(folder))] = seen.log
             logs = list(paths)
-            fitted = fit(logs[: len(cell.fit)], holdout=logs[len(cell.fit) :])
+            fitted = fit(logs[: len(cell.fit)], holdout=logs[len(cell.fit) :], keep_rows=loop is Loop.CLOSED)
             if loop is Loop.CLOSED:
                 fitted = close_loop(fitted, SEED)
                 check_holdout(fitted)

@@ -106,7 +106,7 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     plans = tuple(_plan(settings, cell, index, reporter) for index in range(len(PLANS)))
     recorded = tuple(_record_valid(settings, cell_file, cell, plans, index, reporter) for index in range(len(RUNS)))
     reporter.step("identify all gains and parameters")
-    fitted = fit(logs[:-1], holdout=logs[-1:])
+    fitted = fit(logs[:-1], holdout=logs[-1:], keep_rows=True)
     reporter.step("detect missing effects")
     fitted = close_loop(fitted, settings.seed, lambda step: reporter.progress(0, 0, step))
     calibration = calibration_of(fitted, now())

@@ -86,7 +86,9 @@ class Fit:
         return self.steps[-1].after.identification if self.steps else self.identification
 
     def evidence(self) -> Evidence:
-        """The rows behind the identification, without effects; the logs are read again."""
+        """The rows behind the identification, without effects; the logs are read again unless it has kept them."""
+        if self.identification.gathered is not None:
+            return gather(self.identification)
         used, unseen = ((load_run(log, self.cell, self.lossy)[0] for log in logs) for logs in (self.logs, self.holdout))
         return gather(self.identification, used, unseen)
 
@@ -170,7 +172,7 @@ def fit_logs(
         ConfigurationError: the description of the cell is inconsistent.
         ident.IdentificationError: the runs do not identify the gains.
     """
-    fitted = fit(list(map(Path, logs)), holdout=list(map(Path, holdout)), cell=cell)
+    fitted = fit(list(map(Path, logs)), holdout=list(map(Path, holdout)), cell=cell, keep_rows=effects)
     if effects:
         fitted = close_loop(fitted, BOOTSTRAP_SEED, progress)
         check_holdout(fitted)
@@ -185,6 +187,7 @@ def fit(
     gains_fixed: bool = False,
     cell: Cell | None = None,
     lossy: LossyLogs = LossyLogs.REFUSED,
+    keep_rows: bool = False,
 ) -> Fit:
     """Identify gains and parameters.
 
@@ -195,6 +198,7 @@ def fit(
         gains_fixed: hold the gains at their nameplate values.
         cell: another description of the cell than the one in the logs.
         lossy: how to handle logs with losses.
+        keep_rows: keep all rows for a search for effects, which then need not read the logs again.
 
     Raises:
         DataError, ConfigurationError, IdentificationError: see daq/errors.py and ident/errors.py.
@@ -211,6 +215,7 @@ def fit(
             holdout=reading.runs(unseen, "holdout"),
             method=method,
             fixed_gains=nameplate if gains_fixed else None,
+            keep_rows=keep_rows,
         )
         if not gains_fixed:
             check_signs(result.estimate, nameplate)
@@ -346,7 +351,8 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
         before = replace(before, estimate=estimate_with(Method.ML, before.system, fixed))
         evidence = replace(evidence, estimate=before.estimate)
     steps = find_effects(evidence, np.random.default_rng(seed), progress=progress)
-    return with_diagnoses(replace(start, identification=before, steps=steps))
+    closed = replace(start, identification=before, steps=steps)
+    return closed if closed.estimate is start.estimate else with_diagnoses(closed)
 
 
 def check_holdout(fitted: Fit) -> None:

@@ -7,7 +7,7 @@ directions, gains included, and measures what they explain of the residual: in-s
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -18,12 +18,13 @@ from ident.data.dataset import Dataset
 from ident.discovery.noise_floor import noise_floors
 from ident.effects.effect import Effect, at_joints, is_placeable
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
-from ident.equations.linearisation import Folds, cut_into_folds, linearise
+from ident.equations.linearisation import Folds, MotorRows, cut_into_folds, linearise
 from ident.equations.rows import Observation, decimate_rows
 from ident.estimators.estimate import Estimate
 from ident.model.model import Model
 
 ColumnCache = dict[tuple[Effect, int], FloatArray]
+Felt = Mapping[int, FloatArray]  #: Whitened columns of a candidate on the rows of each motor that feels it, (p, rows)
 
 BATCH_COLUMNS = 48  #: Columns tested together: enough for fast products, few enough to keep memory small
 MOVES_WANTED = 60
@@ -41,7 +42,7 @@ class SearchProblem:
     datasets: Sequence[Dataset]  #: the runs of the fit
     observation: Observation  #: their rows, with the columns of the effects accepted so far
     runs: tuple[Signals, ...]  #: predicted signals of each run, at full rate
-    rows: tuple[Signals, ...]  #: the same at the observation's rows
+    rows: tuple[Signals, ...]  #: the same at the observation's rows, without inertia
     folds: Folds  #: the problem around the estimate, in folds of moves
     #: Noise of each motor's current in a row that no model of motion explains; None where not known.
     floors_a: tuple[float | None, ...]
@@ -77,14 +78,7 @@ class SearchProblem:
     def trials(self, torques: Iterable[FloatArray]) -> tuple[Trial | None, ...]:
         """Test candidates given by their joint torques (n, p, r); None where the model contains them already."""
         problem, to_motor = self.folds.problem, self.model.drive_train.to_motor
-        trials: list[Trial | None] = []
-        parts: list[FloatArray] = []
-        for torque in torques:
-            parts.append(problem.whitened(torque, to_motor))
-            if sum(part.shape[1] for part in parts) >= BATCH_COLUMNS:
-                trials += _scored(self.folds, parts)
-                parts = []
-        return (*trials, *_scored(self.folds, parts))
+        return _scored(self.folds, ((torque.shape[1], problem.felt(torque, to_motor)) for torque in torques))
 
     def torque(self, effect: Effect, axis: int) -> FloatArray:
         """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (n, p, r)."""
@@ -159,10 +153,11 @@ def prepare_search(
     rows: list[Signals] = []
     for run, data in zip(runs, datasets, strict=True):
         at_rate = {array.name: getattr(run, array.name) for array in fields(run) if array.name != "rate_hz"}
-        known = {name: array for name, array in at_rate.items() if array is not None}
+        known = {name: array for name, array in at_rate.items() if array is not None and name != "inertia_kg_m2"}
         arrays = {name: decimate_rows(data, observation.conditioning, array) for name, array in known.items()}
-        time_s = arrays["time_s"]
-        rows.append(Signals(rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])), **arrays))
+        time_s, none = arrays["time_s"], run.inertia_kg_m2[..., :0]
+        rate_hz = float((len(time_s) - 1) / (time_s[-1] - time_s[0]))
+        rows.append(Signals(rate_hz=rate_hz, inertia_kg_m2=none, **arrays))
     return SearchProblem(
         model=model,
         datasets=datasets,
@@ -195,20 +190,8 @@ def _pieces(observation: Observation) -> tuple[IntArray, IntArray]:
     return pieces, move[used[at]]
 
 
-def _scored(folds: Folds, parts: Sequence[FloatArray]) -> tuple[Trial | None, ...]:
-    """Test the candidates of one batch, each with whitened columns of shape (rows, p)."""
-    if not parts:
-        return ()
-    ends = np.cumsum([part.shape[1] for part in parts]).tolist()
-    candidates = [slice(end - part.shape[1], end) for end, part in zip(ends, parts, strict=True)]
-    return score_candidates(folds, np.concatenate(parts, axis=1), candidates)
-
-
 def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[slice]) -> tuple[Trial | None, ...]:
     """Project columns off all declared directions, gains included, and measure what they explain.
-
-    Everything is computed from products that are summed block by block, so that no candidate needs a pass over the rows
-    of its own; candidates with the same number of columns p are computed together.
 
     Args:
         folds: the problem in folds.
@@ -218,64 +201,118 @@ def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[sli
     Returns:
         one trial a candidate; None where the declared model contains it already.
     """
-    made = _products(folds, columns)
-    motor_jacobian, fold_jacobian = made.part_jacobian.sum(axis=0), made.part_jacobian.sum(axis=1)
-    motor_gram, squares = made.part_gram.sum(axis=0), np.diag(made.part_gram.sum(axis=(0, 1)))
-    whole_jacobian = motor_jacobian.sum(axis=0)
-    # Φ⊥ = Φ − J H⁻¹ JᵀΦ, of each move and of each motor.
-    along = linalg.cho_solve(folds.full_factor, whole_jacobian.T).T
-    all_pushed, motor_pushed = along @ folds.cluster_hessian, along @ folds.part_hessian.sum(axis=0)
-    cluster_score = made.cluster_score - folds.cluster_score @ along.T
-    motor_score = made.part_score.sum(axis=0) - folds.motor_score @ along.T
+    parts = [columns.T[chosen] for chosen in candidates]
+    felt = ({own.motor: part[:, own.rows] for own in folds.motors if part[:, own.rows].any()} for part in parts)
+    return _scored(folds, zip(map(len, parts), felt, strict=True))
+
+
+def _scored(folds: Folds, candidates: Iterable[tuple[int, Felt]]) -> tuple[Trial | None, ...]:
+    """Test candidates, each given by its number of columns and these, in batches of equal numbers."""
+    trials: dict[int, Trial | None] = {}
+    waiting: dict[int, dict[int, Felt]] = {}
+
+    def score(width: int) -> None:
+        batch = waiting.pop(width)
+        trials.update(zip(batch, _scored_together(folds, width, list(batch.values())), strict=True))
+
+    for number, (width, felt) in enumerate(candidates):
+        waiting.setdefault(width, {})[number] = felt
+        if len(waiting[width]) * width >= BATCH_COLUMNS:
+            score(width)
+    for width in tuple(waiting):
+        score(width)
+    return tuple(trials[number] for number in range(len(trials)))
+
+
+def _scored_together(folds: Folds, width: int, candidates: Sequence[Felt]) -> tuple[Trial | None, ...]:
+    """Test c candidates with the same number of columns p.
+
+    Everything is computed from products that are summed block by block, so that no candidate needs a pass over the rows
+    of its own.
+    """
+    made = [_products(own, candidates) for own in folds.motors if any(own.motor in felt for felt in candidates)]
+    shape, unknowns = (len(candidates), width), folds.problem.jacobian.shape[1]
+    # ΦᵀJ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor.
+    parts = (folds.count, len(folds.problem.gamma), *shape)
+    part_jacobian, part_gram = np.zeros((*parts, unknowns)), np.zeros((*parts, width))
+    part_score, part_held = np.zeros(parts), np.zeros(parts)
+    for one in made:
+        place = np.s_[:, one.own.motor, one.felt]
+        spread = np.zeros((folds.count, len(one.felt), width, unknowns))
+        spread[..., one.own.seen] = one.own.by_fold(one.jacobian, folds.count)
+        part_jacobian[place], part_gram[place] = spread, one.own.by_fold(one.gram, folds.count)
+        part_score[place], part_held[place] = (one.own.by_fold(part, folds.count) for part in (one.score, one.held))
+    motor_jacobian, fold_jacobian = part_jacobian.sum(axis=0), part_jacobian.sum(axis=1)
+    motor_gram, whole_jacobian = part_gram.sum(axis=0), fold_jacobian.sum(axis=0)
+    # Φ⊥ = Φ − J H⁻¹ JᵀΦ, of each cluster and of each motor.
+    along = _solved(folds.full_factor, whole_jacobian)
+    gram = _crossed(_pushed(along, folds.cluster_hessian), along)
+    cluster_score = -_scored_along(along, folds.cluster_score)
+    for one in made:
+        at, crossed = np.ix_(one.own.cluster, one.felt), _crossed(one.jacobian, along[one.felt][..., one.own.seen])
+        gram[at] += one.gram - crossed - np.swapaxes(crossed, -1, -2)
+        cluster_score[at] += one.score
+    squares = np.diagonal(motor_gram.sum(axis=0), axis1=1, axis2=2)
+    new = _is_new(gram.sum(axis=0), squares)
+    if not new.all():
+        kept = [felt for felt, is_new in zip(candidates, new, strict=True) if is_new]
+        trials = iter(_scored_together(folds, width, kept) if kept else ())
+        return tuple(next(trials) if is_new else None for is_new in new)
+    fitted = np.linalg.solve(gram.sum(axis=0), cluster_score.sum(axis=0)[..., None])[..., 0]
+    motor_score = part_score.sum(axis=0) - _scored_along(along, folds.motor_score)
+    own = _projected_gram(motor_gram, motor_jacobian, along, _pushed(along, folds.part_hessian.sum(axis=0)))
+    fallen = 2.0 * np.einsum("ncp,cp->cn", motor_score, fitted) - np.einsum("cp,ncpq,cq->cn", fitted, own, fitted)
+    scatter = cluster_score - (gram @ fitted[..., None])[..., 0]
     # The same with J and Φ of the other folds, for each fold k: Φ − J w_k.
     coupling = whole_jacobian - fold_jacobian
-    steps = np.stack([linalg.cho_solve(factor, c.T).T for factor, c in zip(folds.factors, coupling, strict=True)])
-    pushed = steps[:, None] @ folds.part_hessian
-    drive = (
-        made.part_score.sum(axis=(0, 1)) - made.part_score.sum(axis=1) - np.einsum("kqf,kf->kq", steps, folds.scores)
+    steps = np.stack([_solved(factor, part) for factor, part in zip(folds.factors, coupling, strict=True)])
+    drive = part_score.sum(axis=(0, 1)) - part_score.sum(axis=1)
+    drive -= (steps @ folds.scores[:, None, :, None])[..., 0]
+    shown = part_held - (steps[:, None] @ folds.part_score[:, :, None, :, None])[..., 0]
+    # What the other folds do not show at all is left as it is: in its own unit, the shortest of all solutions.
+    unit = np.sqrt(squares)
+    schur = motor_gram.sum(axis=0) - part_gram.sum(axis=1) - _crossed(coupling, steps)
+    inverse = np.linalg.pinv(schur / (unit[:, :, None] * unit[:, None, :]), rcond=UNSEEN)
+    without = (inverse @ (drive / unit)[..., None])[..., 0] / unit
+    # r − (Φ − J w_k) fitted, squared motor by motor.
+    pushed = np.stack([_pushed(step, hessian) for step, hessian in zip(steps, folds.part_hessian, strict=True)])
+    inside = _projected_gram(part_gram, part_jacobian, steps[:, None], pushed)
+    held_out = folds.square_sum(folds.residual)[:, :, None] - 2.0 * np.einsum("kncp,kcp->knc", shown, without)
+    held_out += np.einsum("kcp,kncpq,kcq->knc", without, inside, without)
+    training = np.sum(drive * without, axis=-1)
+    score = cluster_score.sum(axis=0)
+    return tuple(
+        Trial(
+            coefficients=fitted[place],
+            fallen=fallen[place],
+            training_fall=training[:, place],
+            held_out=held_out[:, :, place],
+            score=score[place],
+            scatter=scatter[:, place],
+            gram=gram[:, place],
+        )
+        for place in range(len(candidates))
     )
-    shown = made.part_held - np.einsum("kqf,knf->knq", steps, folds.part_score)
-    before = folds.square_sum(folds.residual)
-    trials: list[Trial | None] = [None] * len(candidates)
-    starts, stops = np.array([(chosen.start, chosen.stop) for chosen in candidates]).T
-    for width in np.unique(stops - starts):
-        numbers = np.flatnonzero(stops - starts == width)
-        at = starts[numbers, None] + np.arange(width)  # shape (c, p)
-        pair = at[:, :, None], at[:, None, :]
-        gram = _projected_gram(made.cluster_gram[:, *pair], made.cluster_jacobian[:, at], along[at], all_pushed[:, at])
-        kept = _is_new(gram.sum(axis=0), squares[at])
-        numbers, at, gram = numbers[kept], at[kept], gram[:, kept]
-        pair = at[:, :, None], at[:, None, :]
-        score = cluster_score[:, at].sum(axis=0)
-        fitted = np.linalg.solve(gram.sum(axis=0), score[..., None])[..., 0]
-        own = _projected_gram(motor_gram[:, *pair], motor_jacobian[:, at], along[at], motor_pushed[:, at])
-        fallen = 2.0 * np.einsum("ncp,cp->cn", motor_score[:, at], fitted)
-        fallen -= np.einsum("cp,ncpq,cq->cn", fitted, own, fitted)
-        scatter = cluster_score[:, at] - (gram @ fitted[..., None])[..., 0]
-        # Without fold k; what the other folds do not show at all is left as it is: in its own unit, the shortest of
-        # all solutions.
-        unit, step = np.sqrt(squares[at]), steps[:, at]
-        part_gram = made.part_gram[:, :, *pair]
-        rest = motor_gram[:, *pair].sum(axis=0) - part_gram.sum(axis=1)
-        schur = rest - coupling[:, at] @ np.swapaxes(step, -1, -2)
-        inverse = np.linalg.pinv(schur / (unit[:, :, None] * unit[:, None, :]), rcond=UNSEEN)
-        without = (inverse @ (drive[:, at] / unit)[..., None])[..., 0] / unit
-        # r − (Φ − J w_k) fitted, squared motor by motor.
-        inside = _projected_gram(part_gram, made.part_jacobian[:, :, at], step[:, None], pushed[:, :, at])
-        held_out = before[:, :, None] - 2.0 * np.einsum("kncp,kcp->knc", shown[:, :, at], without)
-        held_out += np.einsum("kcp,kncpq,kcq->knc", without, inside, without)
-        training = np.sum(drive[:, at] * without, axis=-1)
-        for place, number in enumerate(numbers):
-            trials[number] = Trial(
-                coefficients=fitted[place],
-                fallen=fallen[place],
-                training_fall=training[:, place],
-                held_out=held_out[:, :, place],
-                score=score[place],
-                scatter=scatter[:, place],
-                gram=gram[:, place],
-            )
-    return tuple(trials)
+
+
+@dataclass(frozen=True, slots=True)
+class _Products:
+    """Products of the candidates that one motor feels with its rows, block by block, and of these with J, e and r."""
+
+    own: MotorRows  #: the motor's rows
+    felt: IntArray  #: these candidates, among those of the batch
+    jacobian: FloatArray  #: ΦᵀJ, shape (blocks, c, p, s)
+    gram: FloatArray  #: ΦᵀΦ, shape (blocks, c, p, p)
+    score: FloatArray  #: Φᵀe, shape (blocks, c, p)
+    held: FloatArray  #: Φᵀr, shape (blocks, c, p)
+
+
+def _products(own: MotorRows, candidates: Sequence[Felt]) -> _Products:
+    felt = np.array([number for number, columns in enumerate(candidates) if own.motor in columns])
+    inside = np.stack([candidates[number][own.motor] for number in felt])
+    flat = own.sums(inside.reshape(-1, inside.shape[-1]), own.equations)
+    beside = flat.reshape(len(flat), *inside.shape[:2], -1)
+    return _Products(own, felt, beside[..., :-2], own.sums(inside, inside), beside[..., -2], beside[..., -1])
 
 
 def _is_new(gram: FloatArray, squares: FloatArray) -> BoolArray:
@@ -287,46 +324,27 @@ def _is_new(gram: FloatArray, squares: FloatArray) -> BoolArray:
     return new
 
 
+def _solved(factor: tuple[FloatArray, bool], right: FloatArray) -> FloatArray:
+    """H⁻¹JᵀΦ of each candidate, transposed, from ΦᵀJ, both of shape (c, p, f)."""
+    return np.asarray(linalg.cho_solve(factor, right.reshape(-1, right.shape[-1]).T).T.reshape(right.shape))
+
+
+def _pushed(along: FloatArray, hessian: FloatArray) -> FloatArray:
+    """w H of each part, shape (…, c, p, f), from w, shape (c, p, f), and H, shape (…, f, f)."""
+    return (along.reshape(-1, along.shape[-1]) @ hessian).reshape(*hessian.shape[:-2], *along.shape)
+
+
+def _scored_along(along: FloatArray, scores: FloatArray) -> FloatArray:
+    """w s of each part, shape (parts, c, p), from w, shape (c, p, f), and s, shape (parts, f)."""
+    return (scores @ along.reshape(-1, along.shape[-1]).T).reshape(-1, *along.shape[:-1])
+
+
+def _crossed(first: FloatArray, second: FloatArray) -> FloatArray:
+    """A Bᵀ of each candidate, shape (…, p, p), from A and B, shape (…, p, f)."""
+    return np.asarray(first @ np.swapaxes(second, -1, -2))
+
+
 def _projected_gram(gram: FloatArray, jacobian: FloatArray, along: FloatArray, pushed: FloatArray) -> FloatArray:
     """(Φ − J w)ᵀ(Φ − J w) of each part, shape (…, p, p), from ΦᵀΦ, ΦᵀJ, wᵀ and wᵀJᵀJ, the last three (…, p, f)."""
-    crossed = jacobian @ np.swapaxes(along, -1, -2)
-    return np.asarray(gram - crossed - np.swapaxes(crossed, -1, -2) + pushed @ np.swapaxes(along, -1, -2))
-
-
-@dataclass(frozen=True, slots=True)
-class _Products:
-    """Products of q candidate columns Φ (many candidates side by side) with the problem."""
-
-    cluster_jacobian: FloatArray  #: ΦᵀJ of each cluster, shape (clusters, q, f)
-    cluster_gram: FloatArray  #: ΦᵀΦ of each cluster, shape (clusters, q, q)
-    cluster_score: FloatArray  #: Φᵀe of each cluster, shape (clusters, q)
-    part_jacobian: FloatArray  #: ΦᵀJ of each fold and motor, shape (folds, n, q, f)
-    part_gram: FloatArray  #: ΦᵀΦ of each fold and motor, shape (folds, n, q, q)
-    part_score: FloatArray  #: Φᵀe of each fold and motor, shape (folds, n, q)
-    part_held: FloatArray  #: Φᵀr of each fold and motor, shape (folds, n, q)
-
-
-def _products(folds: Folds, columns: FloatArray) -> _Products:
-    problem, n = folds.problem, len(folds.problem.gamma)
-    f, q = problem.jacobian.shape[1], columns.shape[1]
-    clusters, count = problem.cluster_count, folds.count
-    shapes = [(*parts, *shape) for parts in ((clusters,), (count, n)) for shape in ((q, f), (q, q), (q,))]
-    made = _Products(*map(np.zeros, (*shapes, shapes[-1])))
-    for own in folds.motors:
-        # Most candidates act on one motor: only columns that this one feels, and unknowns that it holds, take part.
-        inside, motor = columns[own.rows].T, problem.motor[own.rows.start]
-        felt = np.flatnonzero(inside.any(axis=1))
-        inside = inside[felt]
-        products = own.sums(inside, np.concatenate((own.jacobian, inside)))
-        scores = own.sums(inside, np.stack((problem.residual[own.rows], folds.residual[own.rows])))
-        jacobian, gram = np.split(products, [len(own.seen)], axis=2)
-        made.cluster_jacobian[np.ix_(own.cluster, felt, own.seen)] += jacobian
-        made.cluster_gram[np.ix_(own.cluster, felt, felt)] += gram
-        made.cluster_score[np.ix_(own.cluster, felt)] += scores[:, :, 0]
-        (present, products), (_, scores) = own.by_fold(products), own.by_fold(scores)
-        jacobian, gram = np.split(products, [len(own.seen)], axis=2)
-        made.part_jacobian[:, motor][np.ix_(present, felt, own.seen)] = jacobian
-        made.part_gram[:, motor][np.ix_(present, felt, felt)] = gram
-        made.part_score[:, motor][np.ix_(present, felt)] = scores[:, :, 0]
-        made.part_held[:, motor][np.ix_(present, felt)] = scores[:, :, 1]
-    return made
+    crossed = _crossed(jacobian, along)
+    return gram - crossed - np.swapaxes(crossed, -1, -2) + _crossed(pushed, along)

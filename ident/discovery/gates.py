@@ -92,7 +92,6 @@ class _Run:
 
     rows: IntArray  #: indices among those of the problem, shape (k,)
     move: IntArray  #: of each row, shape (k,)
-    jacobian: FloatArray  #: J of the rows, shape (k, f)
     residual: FloatArray  #: e of the rows, shape (k,)
     #: Cholesky factor of JᵀJ of the other runs, and their Jᵀe; None for a run that cannot be left out.
     others: tuple[tuple[FloatArray, bool], FloatArray] | None
@@ -123,7 +122,6 @@ class RunsLeftOut:
                 _Run(
                     rows,
                     observation.move[problem.source[rows]],
-                    problem.jacobian[rows],
                     problem.residual[rows],
                     (_factor(gram - own_gram), score - own_score) if run in left_out else None,
                 )
@@ -133,12 +131,13 @@ class RunsLeftOut:
 
     def change(self, columns: FloatArray) -> PairedChange:
         """Change of the error on runs left out when whitened columns, shape (rows, p), join the model."""
-        inside = [columns[run.rows] for run in self.runs]
-        crossed = [run.jacobian.T @ own for run, own in zip(self.runs, inside, strict=True)]
-        gram, score = columns.T @ columns, columns.T @ self.search_problem.folds.problem.residual
+        problem = self.search_problem.folds.problem
+        inside, jacobian = ([array[run.rows] for run in self.runs] for array in (columns, problem.jacobian))
+        crossed = [of_run.T @ own for of_run, own in zip(jacobian, inside, strict=True)]
+        gram, score = columns.T @ columns, columns.T @ problem.residual
         unit = np.sqrt(np.maximum(np.diag(gram), np.finfo(np.float64).tiny))
         changes, moves = [], []
-        for run, own, own_crossed in zip(self.runs, inside, crossed, strict=True):
+        for run, of_run, own, own_crossed in zip(self.runs, jacobian, inside, crossed, strict=True):
             if run.others is None:
                 continue
             factor, pull = run.others
@@ -147,8 +146,8 @@ class RunsLeftOut:
             left = gram - own.T @ own - along.T @ rest
             drive = score - own.T @ run.residual - along.T @ pull
             fitted = np.linalg.pinv(left / np.outer(unit, unit), rcond=UNSEEN) @ (drive / unit) / unit
-            before = run.residual - run.jacobian @ linalg.cho_solve(factor, pull)
-            changes.append((before - (own - run.jacobian @ along) @ fitted) ** 2 - before**2)
+            before = run.residual - of_run @ linalg.cho_solve(factor, pull)
+            changes.append((before - (own - of_run @ along) @ fitted) ** 2 - before**2)
             moves.append(run.move)
         return compare_by_move(np.concatenate(changes), np.concatenate(moves))
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -43,11 +43,12 @@ from ident.discovery.search import (
     refine_setting,
 )
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import Effect, PlacedEffect, effect_torque
-from ident.effects.signals import fitted_signals, session_began_s
+from ident.effects.effect import Effect, PlacedEffect, Side, effect_torque
+from ident.effects.signals import Signals, fitted_signals, session_began_s
 from ident.effects.transmission import Ripple
 from ident.effects.unnamed import is_unnamed
 from ident.equations.rows import Observation, observe, on_demanded_motion
+from ident.equations.system import System
 from ident.errors import NotConverged, RankDeficient
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.identify import Identification, estimate_with
@@ -72,6 +73,7 @@ class Evidence:
     holdout: Observation | None  #: rows of the held-out runs, None without any
     effects: tuple[PlacedEffect, ...]  #: in the model, in the order of their columns
     estimate: Estimate  #: of the training rows
+    _identification: list[Identification] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
     def trained(self) -> tuple[Dataset, ...]:
@@ -80,9 +82,12 @@ class Evidence:
 
     @property
     def identification(self) -> Identification:
-        """The estimate with its equations reduced, effects among them."""
-        holdout = None if self.holdout is None else self.holdout.system()
-        return Identification(self.model, self.conditioning, self.training.system(), holdout, self.estimate)
+        """The estimate with its equations reduced, effects among them; kept, because reducing takes long."""
+        if not self._identification:
+            training, holdout = self.training.system(), None if self.holdout is None else self.holdout.system()
+            found = Identification(self.model, self.conditioning, training, holdout, self.estimate)
+            self._identification.append(found)
+        return self._identification[0]
 
     @property
     def holdout_error(self) -> RelativeError | None:
@@ -307,7 +312,7 @@ def _join(
         if moved := moved_gains(gain_shifts(problem.folds, torque), gains_std):
             return SetAside(accepted, moved=moved)
     try:
-        joined = _linearised(with_effects(evidence, (*evidence.effects, last)), problem.cache)
+        joined = _linearised(with_effects(evidence, (*evidence.effects, last), problem.runs), problem.cache)
     except UNFITTED as error:
         # The linearised problem distinguished the effect from the model, the whole one does not.
         return SetAside(accepted, f"it cannot be fitted: {error}")
@@ -372,7 +377,8 @@ def _pruned(model: _Model, accepted: Finding, rng: np.random.Generator, gates: G
         if worst == last:
             return SetAside(accepted, f"in the joint fit it no longer passes: {why}")
         try:
-            rest = with_effects(evidence, tuple(placed for placed in evidence.effects if placed != worst))
+            kept = tuple(placed for placed in evidence.effects if placed != worst)
+            rest = with_effects(evidence, kept, model.search_problem.runs)
             model = _linearised(rest, model.search_problem.cache)
         except UNFITTED:
             needed.add(worst)  # the data cannot be fitted without it
@@ -422,36 +428,48 @@ def _settled(
     return replace(step, accepted=replace(step.accepted, ambiguity=left))
 
 
-def gather(found: Identification, runs: Iterable[Run], holdout: Iterable[Run] = ()) -> Evidence:
-    """Build the rows behind an identification from its runs and held-out runs."""
+def gather(found: Identification, runs: Iterable[Run] = (), holdout: Iterable[Run] = ()) -> Evidence:
+    """Build the rows behind an identification from its runs and held-out runs, unless it has kept them."""
     model, conditioning = found.model, found.conditioning
-    trained = tuple(differentiate(run, model.drive_train, conditioning) for run in runs)
-    unseen = tuple(differentiate(run, model.drive_train, conditioning) for run in holdout)
-    rows = observe(model, (*trained, *unseen), conditioning, found.system)
-    training, rest = _split_holdout(rows, len(unseen))
-    return Evidence(model, conditioning, (*trained, *unseen), len(unseen), rows, training, rest, (), found.estimate)
+    if found.gathered is None:
+        trained = [differentiate(run, model.drive_train, conditioning) for run in runs]
+        datasets = (*trained, *(differentiate(run, model.drive_train, conditioning) for run in holdout))
+        rows, held_out = observe(model, datasets, conditioning, found.system), len(datasets) - len(trained)
+    else:
+        datasets, rows = found.gathered
+        held_out = len(datasets) - len(found.system.runs)
+    training, rest = _split_holdout(rows, held_out)
+    evidence = Evidence(model, conditioning, datasets, held_out, rows, training, rest, (), found.estimate)
+    evidence._identification.append(found)
+    return evidence
 
 
-def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...]) -> Evidence:
+def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals] = ()) -> Evidence:
     """Refit the same data with these effects in the model, gains included.
 
     Load and current are the model's predictions, so columns of them are built twice: with the estimate before, and
     with the estimate that they led to.
+
+    Args:
+        before: the same data.
+        effects: of the model.
+        runs: signals of the runs of the fit around the estimate before, where they are at hand.
     """
-    current, began_s = before, session_began_s(before.trained)  # held-out runs must not affect the fit
+    around, current, began_s = before, before, session_began_s(before.trained)  # held-out runs must not affect the fit
     fixed = before.estimate.gains if before.estimate.gains_fixed else None
-    passes = 1 if all(placed.effect.abscissa.is_kinematic for placed in effects) else 2
-    for _ in range(passes):
-        rows = before.rows_without_effects
+    joints = before.model.robot.joints
+    columns = tuple(column.at(joints[placed.axis].kind) for placed in effects for column in placed.columns)
+    bare, unseen = _split_holdout(before.rows_without_effects, before.held_out)
+    for signals in (runs,) if all(placed.effect.abscissa.is_kinematic for placed in effects) else (runs, ()):
+        around, training = current, bare
         if effects:
-            torque = _torques(effects, current, before.datasets, began_s)
-            joints = before.model.robot.joints
-            columns = (column.at(joints[placed.axis].kind) for placed in effects for column in placed.columns)
-            rows = rows.extended(tuple(columns), torque)
-        training, rest = _split_holdout(rows, before.held_out)
+            training = bare.extended(columns, _torques(effects, around, before.trained, began_s, signals))
         estimate = estimate_with(before.estimate.method, training.system(), fixed)
-        current = replace(before, training=training, holdout=rest, effects=effects, estimate=estimate)
-    return current
+        current = replace(before, training=training, holdout=unseen, effects=effects, estimate=estimate)
+    if unseen is None or not effects:
+        return current
+    held_out = before.datasets[len(before.trained) :]
+    return replace(current, holdout=unseen.extended(columns, _torques(effects, around, held_out, began_s)))
 
 
 def by_instruments(evidence: Evidence) -> Estimate | None:
@@ -459,7 +477,14 @@ def by_instruments(evidence: Evidence) -> Estimate | None:
 
     Load and current of the effects' columns are predictions of the estimate by ``ml``, in the instruments too.
     """
-    model, conditioning, estimate = evidence.model, evidence.conditioning, evidence.estimate
+    system, estimate = _with_instruments(evidence), evidence.estimate
+    if system is None:
+        return None
+    return estimate_with(Method.IV, system, estimate.gains if estimate.gains_fixed else None)
+
+
+def _with_instruments(evidence: Evidence) -> System | None:
+    model, conditioning = evidence.model, evidence.conditioning
     asked = tuple(with_demand(data, model.drive_train, conditioning) for data in evidence.trained)
     if all(data.demanded is None for data in asked):
         return None
@@ -467,18 +492,26 @@ def by_instruments(evidence: Evidence) -> Estimate | None:
     if evidence.effects:
         datasets, began_s = tuple(map(as_demanded, asked)), session_began_s(evidence.trained)
         demanded = replace(demanded, effects=_torques(evidence.effects, evidence, datasets, began_s))
-    return estimate_with(
-        Method.IV, evidence.training.system(demanded), estimate.gains if estimate.gains_fixed else None
-    )
+        del datasets
+    del asked  # one more copy of all runs, while the equations are built
+    return evidence.training.system(demanded)
 
 
 def _torques(
-    effects: Sequence[PlacedEffect], around: Evidence, datasets: Sequence[Dataset], began_s: float | None
+    effects: Sequence[PlacedEffect],
+    around: Evidence,
+    datasets: Sequence[Dataset],
+    began_s: float | None,
+    runs: Sequence[Signals] = (),
 ) -> FloatArray:
     """Columns of effects on the rows of runs, load and current predicted by an estimate, shape (n, p, r)."""
-    parts = []
-    for data in datasets:  # one after the other: signals at full rate are the largest arrays of a search
-        run = fitted_signals(around.model, data, around.training, around.estimate, began_s)
+    parts, through_links = [], any(placed.effect.side is Side.ALL_JOINTS for placed in effects)
+    for index, data in enumerate(datasets):  # one by one: signals at full rate are the largest arrays of a search
+        if runs:
+            run = runs[index]
+        else:
+            model, rows, estimate = around.model, around.training, around.estimate
+            run = fitted_signals(model, data, rows, estimate, began_s, inertia=through_links)
         given = (run,), (data,), around.conditioning, around.model
         parts.append(np.concatenate([effect_torque(placed.effect, placed.axis, *given) for placed in effects], axis=1))
     return np.concatenate(parts, axis=2)
@@ -494,5 +527,5 @@ def _split_holdout(observation: Observation, held_out: int) -> tuple[Observation
     """Split rows of all runs into those of the fit and those of the last, held-out runs."""
     if not held_out:
         return observation, None
-    rows = observation.run >= len(observation.runs) - held_out
-    return observation.only(~rows), observation.only(rows)
+    first = int(np.searchsorted(observation.run, len(observation.runs) - held_out))
+    return observation.only(slice(first)), observation.only(slice(first, None))

@@ -44,7 +44,7 @@ def propose_resonances(
     proposed: dict[int, Families] = {}
     least = SCREENED * gates.smallest_share
     for axis in range(search_problem.axes):
-        inertia = float(np.mean([np.mean(run.inertia_kg_m2[axis, axis]) for run in search_problem.runs]))
+        inertia = float(np.mean([np.mean(run.inertia(axis, axis)) for run in search_problem.runs]))
         if inertia > 0.0:
             found = (make(search_problem, axis, inertia, least) for kind, make in makers.items() if kind in kinds)
             proposed[axis] = tuple(family for family in found if family)
@@ -55,7 +55,7 @@ def _elastic(search_problem: SearchProblem, axis: int, inertia: float, least: fl
     compliances = _compliances(inertia, FREQUENCIES_HZ)
 
     def bent(run: Signals) -> FloatArray:
-        own, torque = run.inertia_kg_m2[axis, axis], run.load_torque_nm[axis]
+        own, torque = run.inertia(axis, axis), run.load_torque_nm[axis]
         passed = [spring_torque(torque, own, run.rate_hz, one, DAMPING_RATIOS[-1]) for one in compliances[::2]]
         return np.stack([curvature(one, run.rate_hz) for one in passed])
 
@@ -71,7 +71,7 @@ def _with_gap(search_problem: SearchProblem, axis: int, inertia: float, least: f
     gaps, compliances = (np.array(values) for values in zip(*pairs, strict=True))
 
     def bent(run: Signals) -> FloatArray:
-        own, torque = run.inertia_kg_m2[axis, axis], run.geared_torque_nm[axis]
+        own, torque = run.inertia(axis, axis), run.geared_torque_nm[axis]
         return twist_acceleration(torque, own, run.rate_hz, gaps, compliances, FLANK_DAMPING)
 
     shares = _shares(search_problem, _tried(search_problem, axis, bent))
@@ -115,7 +115,7 @@ def _tried(search_problem: SearchProblem, axis: int, bent: Callable[[Signals], F
     """Test twists by their torque on the joint itself, −M_jj δ̈: a sixth of the work of all joints on a six-axis arm."""
     conditioning, runs = search_problem.observation.conditioning, search_problem.runs
     rows = [
-        decimate_rows(data, conditioning, -run.inertia_kg_m2[axis, axis] * bent(run))
+        decimate_rows(data, conditioning, -run.inertia(axis, axis) * bent(run))
         for run, data in zip(runs, search_problem.datasets, strict=True)
     ]
     columns = np.concatenate(rows, axis=-1)

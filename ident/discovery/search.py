@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
@@ -253,18 +254,23 @@ def _sigma(trial: Trial) -> FloatArray:
 
 def _max_t(trials: tuple[Trial, ...], rng: np.random.Generator, draws: int) -> FloatArray:
     """Probability of each candidate's Wald statistic under random signs of the moves, for the largest of all."""
-    clusters = trials[0].scatter.shape[0]
+    clusters, widths = len(trials[0].scatter), np.array([len(trial.score) for trial in trials])
     signs = rng.choice((-1.0, 1.0), size=(draws, clusters))
-    observed, largest = np.empty(len(trials)), dict[int, FloatArray]()
-    for index, trial in enumerate(trials):
+    observed, surprise = np.empty(len(trials)), np.zeros(draws)
+    for freedom in np.unique(widths).tolist():
+        numbers = np.flatnonzero(widths == freedom)
+        alike = [trials[number] for number in numbers]
+        score, scatter = (np.stack(parts) for parts in zip(*((one.score, one.scatter) for one in alike), strict=True))
         # The candidate is in the fit here: else its own torque would count as noise, and the strongest would hide best.
-        inverse = np.linalg.pinv(trial.scatter.T @ trial.scatter)
-        freedom = len(trial.score)
+        inverse = np.linalg.pinv(np.swapaxes(scatter, 1, 2) @ scatter)
+        wald = (score[:, None] @ inverse @ score[:, :, None])[:, 0, 0]
+        if freedom == 1:
+            drawn = _drawn_numbers(scatter[:, :, 0].T, np.stack([one.gram[:, 0, 0] for one in alike], axis=1), signs)
+        else:
+            drawn = reduce(np.maximum, (_drawn_wald(one, signs) for one in alike))
         # On the scale of −log p, so that candidates with one and with two coefficients compete alike.
-        observed[index] = _surprise(trial.score @ inverse @ trial.score, freedom)
-        drawn = _drawn_wald(trial, signs)
-        largest[freedom] = np.maximum(largest.get(freedom, drawn), drawn)
-    surprise = np.max([_surprise(wald, freedom) for freedom, wald in largest.items()], axis=0)
+        observed[numbers] = _surprise(wald, freedom)
+        surprise = np.maximum(surprise, _surprise(drawn, freedom))
     return np.asarray((1.0 + np.sum(surprise[None] >= observed[:, None], axis=1)) / (draws + 1.0))
 
 
@@ -280,21 +286,29 @@ def _drawn_wald(trial: Trial, signs: FloatArray) -> FloatArray:
     s_m x_m − G_m β (the studentised wild bootstrap of Cameron, Gelbach & Miller, 2008).
     """
     x, gram = trial.scatter, trial.gram
-    p = x.shape[1]
+    (moves, p), (row, column) = x.shape, np.tril_indices(x.shape[1])
     sums = signs @ x
-    if p == 1:  # the same with numbers for matrices: most candidates, in a tenth of the time
-        fitted = sums / gram.sum()
-        left = x.T @ x - 2.0 * fitted * (signs @ (x * gram[:, 0])) + fitted**2 * np.sum(gram**2)
-        return np.asarray(sums**2 / left)[:, 0]
     fitted = sums @ np.linalg.pinv(gram.sum(axis=0))
-    crossed = (signs @ np.einsum("ma,mbc->mabc", x, gram).reshape(len(x), -1)).reshape(-1, p * p, p)
-    mixed = np.matmul(crossed, fitted[:, :, None]).reshape(-1, p, p)
+    # Symmetric matrices by their lower triangle. First Σ_m s_m (x_m (G_m β)ᵀ + (G_m β) x_mᵀ), linear in β.
+    mixed = gram[:, column] * x[:, row, None] + gram[:, row] * x[:, column, None]
+    crossed = (signs @ mixed.reshape(moves, -1)).reshape(-1, len(row), p) @ fitted[:, :, None]
     # Σ_m (G_m β)(G_m β)ᵀ, linear in ββᵀ: one matrix for all draws.
-    squares = np.einsum("mab,mcd->bdac", gram, gram).reshape(p * p, p * p)
-    pairs = (fitted[:, :, None] * fitted[:, None, :]).reshape(-1, p * p)
-    left = x.T @ x - mixed - np.swapaxes(mixed, 1, 2) + (pairs @ squares).reshape(-1, p, p)
+    products = (gram.reshape(moves, -1).T @ gram.reshape(moves, -1)).reshape(p, p, p, p)
+    squares = products[row[:, None], row, column[:, None], column]
+    squares += np.where(row == column, 0.0, products[row[:, None], column, column[:, None], row])
+    left = np.empty((len(signs), p, p))
+    left[:, row, column] = (x.T @ x)[row, column] - crossed[:, :, 0] + (fitted[:, row] * fitted[:, column]) @ squares.T
+    left[:, column, row] = left[:, row, column]
     left += 1e-12 * np.trace(left, axis1=1, axis2=2)[:, None, None] * np.eye(p)  # a coefficient that no draw scatters
     return np.asarray(np.sum(sums * np.linalg.solve(left, sums[:, :, None])[:, :, 0], axis=1))
+
+
+def _drawn_numbers(x: FloatArray, gram: FloatArray, signs: FloatArray) -> FloatArray:
+    """The same for candidates with one coefficient each, the largest of all; x_m and G_m of shape (moves, c)."""
+    sums = signs @ x
+    fitted = sums / gram.sum(axis=0)
+    left = np.sum(x**2, axis=0) - 2.0 * fitted * (signs @ (x * gram)) + fitted**2 * np.sum(gram**2, axis=0)
+    return np.asarray(np.max(sums**2 / left, axis=1))
 
 
 def _golden_section(

@@ -11,6 +11,7 @@ from ident.arrays import FloatArray
 from ident.effects.effect import Effect, Property, Range, Side
 from ident.effects.signals import Abscissa, Signals
 from ident.model.model import Column
+from ident.model.regressor import cos_sin
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +51,7 @@ class Cogging(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k)."""
-        angle = self.order * signals.motor_position_rad[axis]
-        return np.stack((np.cos(angle), np.sin(angle)))
+        return np.stack(cos_sin(self.order * signals.motor_position_rad[axis]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from ident.arrays import FloatArray
 from ident.effects.effect import AxisNumber, Effect, Property, Range, Sense, Side, Switch
 from ident.effects.signals import REFERENCE_C, Abscissa, Signals, distance_since_reversal
 from ident.model.model import Column
+from ident.model.regressor import cos_sin
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +122,7 @@ class PositionFriction(Effect):
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k)."""
         q, s = signals.position_rad[axis], np.sign(signals.velocity_rad_s[axis])
-        return np.stack((s * np.cos(q), s * np.sin(q)))
+        return np.asarray(np.stack(cos_sin(q)) * s)
 
 
 @dataclass(frozen=True, slots=True)

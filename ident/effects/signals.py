@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, IntArray
 from ident.data.dataset import Dataset
 from ident.equations.rows import Observation
 from ident.estimators.estimate import Estimate
@@ -64,7 +64,8 @@ class Signals:
     acceleration_rad_s2: FloatArray  #: acceleration of the joints
     motor_position_rad: FloatArray  #: of the motors, R q
     #: Mass matrix of links and payload: torque at joint i per unit of acceleration of joint j, with a rotor's inertia
-    #: where it is regrouped with theirs, shape (n, n, k).
+    #: where it is regrouped with theirs, in postures spread evenly over the run, shape (n, n, postures); none where it
+    #: was not asked for. See `inertia`.
     inertia_kg_m2: FloatArray
     load_torque_nm: FloatArray  #: torque at each joint for links and payload, without friction and drive chain
     geared_torque_nm: FloatArray  #: torque through the gear of each joint: load and friction
@@ -79,6 +80,20 @@ class Signals:
             return np.full(len(self.time_s), REFERENCE_C)
         recorded = self.temperature_c[axis]
         return np.asarray(np.where(np.isnan(recorded), REFERENCE_C, recorded))
+
+    def inertia(self, joints: int | slice, axis: int) -> FloatArray:
+        """Torque at joints per unit of acceleration of the joint `axis` along the run, shape (…, k).
+
+        It is interpolated between postures, because it changes slowly.
+        """
+        coarse = self.inertia_kg_m2[joints, axis]
+        at = _postures(len(self.time_s), coarse.shape[-1])
+        step = np.diff(at)
+        following = step + (np.arange(len(step)) == len(step) - 1)  # the last sample is a posture, too
+        out = np.repeat(np.diff(coarse, axis=-1) / step, following, axis=-1)
+        out *= np.arange(len(self.time_s)) - np.repeat(at[:-1], following)
+        out += np.repeat(coarse[..., :-1], following, axis=-1)
+        return np.asarray(out)
 
     def variable(self, abscissa: Abscissa, axis: int, other: int | None = None) -> FloatArray:
         """Return a variable of an axis along the run, shape (k,); `other` is the second axis of OTHER_VELOCITY."""
@@ -100,11 +115,17 @@ class Signals:
 
 
 def fitted_signals(
-    model: Model, data: Dataset, observation: Observation, estimate: Estimate, session_began_s: float | None = None
+    model: Model,
+    data: Dataset,
+    observation: Observation,
+    estimate: Estimate,
+    session_began_s: float | None = None,
+    *,
+    inertia: bool = True,
 ) -> Signals:
     """Predict a run's torques with the declared part of an estimate; coefficients of effects are left out.
 
-    The observation, rows of the fit, names the base parameters; for `session_began_s` see `declared_signals`.
+    The observation, rows of the fit, names the base parameters; for the last two see `declared_signals`.
     """
     standard = np.zeros(len(model.columns))
     independent = list(observation.base.independent)
@@ -117,11 +138,17 @@ def fitted_signals(
             identified = {LINK_PARAMETERS[index]: float(value) for index, value in zip(indices, values, strict=True)}
         first += len(indices)
     standard[model.flange] += payload_parameters(data.payload, identified)
-    return declared_signals(model, data, standard, estimate.gains, session_began_s)
+    return declared_signals(model, data, standard, estimate.gains, session_began_s, inertia=inertia)
 
 
 def declared_signals(
-    model: Model, data: Dataset, standard: FloatArray, gains: FloatArray, session_began_s: float | None = None
+    model: Model,
+    data: Dataset,
+    standard: FloatArray,
+    gains: FloatArray,
+    session_began_s: float | None = None,
+    *,
+    inertia: bool = True,
 ) -> Signals:
     """Predict a run's torques with standard parameters.
 
@@ -132,6 +159,7 @@ def declared_signals(
             are as good as the true standard ones (paper §2.1). Shape (c,).
         gains: g of each motor [Nm at the joint per A], shape (n,).
         session_began_s: start of the first run by the clock of `Dataset.started_s`; None if unknown.
+        inertia: whether the mass matrix is needed, by effects through the links.
     """
     # A base parameter is named after its leading standard one; Ia of J1, regrouped into Izz1, thus counts as load.
     load, geared, total = model.torques(data.motion(), standard)
@@ -145,7 +173,7 @@ def declared_signals(
         velocity_rad_s=data.velocity_rad_s.T,
         acceleration_rad_s2=data.acceleration_rad_s2.T,
         motor_position_rad=model.drive_train.ratio @ data.position_rad.T,
-        inertia_kg_m2=_inertia_of_joints(model, data, standard),
+        inertia_kg_m2=_inertia_of_joints(model, data, standard) if inertia else np.empty((len(load), len(load), 0)),
         load_torque_nm=load,
         geared_torque_nm=geared,
         motor_torque_nm=motor,
@@ -173,15 +201,16 @@ def session_began_s(datasets: Sequence[Dataset]) -> float | None:
 
 
 def _inertia_of_joints(model: Model, data: Dataset, standard: FloatArray) -> FloatArray:
-    """Mass matrix of links and payload, shape (n, n, k), interpolated between postures because it changes slowly."""
+    """Mass matrix of links and payload in some postures, shape (n, n, postures)."""
     samples, count = data.position_rad.shape
-    postures = np.linspace(0, samples - 1, max(2, samples // POSTURE_SAMPLES)).round().astype(np.int64)
+    postures = _postures(samples, max(2, samples // POSTURE_SAMPLES))
     links = standard[link_columns(count)]
-    coarse = mass_matrix(model.robot, np.ascontiguousarray(data.position_rad[postures].T), links)
-    mass = np.empty((count, count, samples))
-    for row, joint in zip(*np.tril_indices(count), strict=True):
-        mass[row, joint] = mass[joint, row] = np.interp(np.arange(samples), postures, coarse[row, joint])
-    return mass
+    return mass_matrix(model.robot, np.ascontiguousarray(data.position_rad[postures].T), links)
+
+
+def _postures(samples: int, count: int) -> IntArray:
+    """Index of so many samples spread evenly over a run."""
+    return np.linspace(0, samples - 1, count).round().astype(np.int64)
 
 
 def payload_parameters(payload: Payload | None, identified: Mapping[str, float]) -> FloatArray:

@@ -12,6 +12,7 @@ from ident.arrays import FloatArray
 from ident.effects.effect import AxisNumber, Effect, Property, Range, Side, Switch
 from ident.effects.signals import Abscissa, Signals, curvature
 from ident.model.model import Column
+from ident.model.regressor import cos_sin
 
 RESOLVED = 0.9  #: Largest resonance in parts of half the sampling rate
 LEAST_SHARE = 0.02  #: Of the mean, below which an inertia is not one of a link
@@ -46,7 +47,7 @@ class Backlash(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (n, 1, k)."""
-        torque, inertia = signals.geared_torque_nm[axis], signals.inertia_kg_m2[:, axis]
+        torque, inertia = signals.geared_torque_nm[axis], signals.inertia(slice(None), axis)
         if self.half_gap_rad > 0.0 and self.resonant_rad_nm > 0.0:
             gap = (np.array([self.half_gap_rad]), np.array([self.resonant_rad_nm]), self.damping_ratio)
             crossing = twist_acceleration(torque, inertia[axis], signals.rate_hz, *gap)[0] / self.half_gap_rad
@@ -144,7 +145,7 @@ class Elasticity(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (n, 1, k)."""
-        inertia, torque = signals.inertia_kg_m2[:, axis], signals.load_torque_nm[axis]
+        inertia, torque = signals.inertia(slice(None), axis), signals.load_torque_nm[axis]
         passed = spring_torque(torque, inertia[axis], signals.rate_hz, self.resonant_rad_nm, self.damping_ratio)
         return np.asarray(-inertia * curvature(passed, signals.rate_hz))[:, None]
 
@@ -254,4 +255,4 @@ class Ripple(Effect):
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k)."""
         angle = (signals.position_rad if self.of_joint else signals.motor_position_rad)[axis]
-        return np.stack((np.cos(self.order * angle), np.sin(self.order * angle)))
+        return np.stack(cos_sin(self.order * angle))

@@ -14,6 +14,7 @@ from ident.arrays import FloatArray
 from ident.effects.effect import AxisNumber, Effect, Property, Range, Side, Switch
 from ident.effects.signals import Abscissa, Signals
 from ident.model.model import Column
+from ident.model.regressor import cos_sin
 
 INTERVALS = 6
 """Intervals that the variable's range is divided into; cubic B-splines over them have three more coefficients."""
@@ -101,7 +102,7 @@ class Periodic(Effect):
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2 · orders, k)."""
         angle = signals.motor_position_rad[axis]
-        waves = np.stack([wave(order * angle) for order in PERIODIC_ORDERS for wave in (np.cos, np.sin)])
+        waves = np.stack([wave for order in PERIODIC_ORDERS for wave in cos_sin(order * angle)])
         return np.asarray(waves * np.sign(signals.velocity_rad_s[axis]) if self.signed else waves)
 
 

@@ -19,6 +19,8 @@ from ident.equations.rows import Observation
 from ident.equations.system import System
 from ident.errors import TooFewMoves
 
+OF_ROWS = ("jacobian", "residual", "current", "motor", "cluster", "source")
+"""Fields of a linearisation that have a row first."""
 MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter, and each fold holds one
 CORRELATED = 2.0  #: Standard errors of the correlation of neighbouring clusters, above which they are joined
 
@@ -44,19 +46,31 @@ class Linearisation:
         """Number of clusters."""
         return int(self.cluster.max()) + 1
 
-    def whitened(self, torque_nm: FloatArray, to_motor: FloatArray) -> FloatArray:
-        """Joint torque columns, shape (n, extra, r), as columns beside the Jacobian, shape (rows, extra).
+    def rows_of(self, motor: int) -> slice:
+        """Rows of one motor."""
+        first, last = np.searchsorted(self.motor, (motor, motor + 1))
+        return slice(int(first), int(last))
+
+    def felt(self, torque_nm: FloatArray, to_motor: FloatArray) -> dict[int, FloatArray]:
+        """Joint torque columns, shape (n, extra, r), whitened, on the rows of each motor that feels any: (extra, rows).
 
         Args:
             torque_nm: per unit of each column.
             to_motor: T (DriveTrain.to_motor).
         """
-        columns = np.zeros((torque_nm.shape[1], len(self.motor)))
+        felt: dict[int, FloatArray] = {}
         for joint in np.flatnonzero(torque_nm.any(axis=(1, 2))):
-            for motor in np.flatnonzero(to_motor[:, joint]):
-                rows = np.flatnonzero(self.motor == motor)
-                weight = to_motor[motor, joint] * self.gamma[motor] / self.noise[motor]
-                columns[:, rows] += weight * torque_nm[joint][:, self.source[rows]]
+            for motor in np.flatnonzero(to_motor[:, joint]).tolist():
+                own = torque_nm[joint].take(self.source[self.rows_of(motor)], axis=1)
+                own *= to_motor[motor, joint] * self.gamma[motor] / self.noise[motor]
+                felt[motor] = felt[motor] + own if motor in felt else own
+        return felt
+
+    def whitened(self, torque_nm: FloatArray, to_motor: FloatArray) -> FloatArray:
+        """The same as columns beside the Jacobian, shape (rows, extra)."""
+        columns = np.zeros((torque_nm.shape[1], len(self.motor)))
+        for motor, own in self.felt(torque_nm, to_motor).items():
+            columns[:, self.rows_of(motor)] = own
         return columns.T
 
 
@@ -222,28 +236,31 @@ def jackknife_covariance(
 class MotorRows:
     """Rows of one motor in a problem cut into folds: they follow each other, sorted by fold and cluster."""
 
+    motor: int  #: index
     rows: slice  #: among those of the problem
     starts: IntArray  #: first row of each block, counted from the motor's first, shape (blocks,)
     fold: IntArray  #: of each block, ascending, shape (blocks,)
     cluster: IntArray  #: of each block, shape (blocks,)
     seen: IntArray  #: unknowns that the motor's equation holds, shape (s,)
-    jacobian: FloatArray  #: J of these, columns first, shape (s, rows)
+    equations: FloatArray  #: J of these, e and r, columns first, shape (s + 2, rows)
 
     def sums(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        """Products A_b B_bᵀ of two sets of columns over the rows of each block, shape (blocks, a, b).
+        """Products A_b B_bᵀ of two sets of columns over the rows of each block, shape (blocks, …, a, b).
 
         Args:
-            first, second: columns first, shapes (a, rows) and (b, rows).
+            first, second: columns first, shapes (…, a, rows) and (…, b, rows).
         """
-        out = np.empty((len(self.starts), len(first), len(second)))
-        for product, start, stop in zip(out, self.starts, (*self.starts[1:], first.shape[1]), strict=True):
-            np.matmul(first[:, start:stop], second[:, start:stop].T, out=product)
+        out = np.empty((len(self.starts), *first.shape[:-1], second.shape[-2]))
+        for product, start, stop in zip(out, self.starts, (*self.starts[1:], first.shape[-1]), strict=True):
+            np.matmul(first[..., start:stop], np.swapaxes(second[..., start:stop], -1, -2), out=product)
         return out
 
-    def by_fold(self, products: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Folds that the motor has rows in, and the products of each block summed over each of them."""
+    def by_fold(self, products: FloatArray, count: int) -> FloatArray:
+        """Products of each block, shape (blocks, …), summed over each of so many folds, shape (count, …)."""
         folds, first = np.unique(self.fold, return_index=True)
-        return folds, np.add.reduceat(products, first, axis=0)
+        out = np.zeros((count, *products.shape[1:]))
+        out[folds] = np.add.reduceat(products, first, axis=0)
+        return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,8 +316,8 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
     fold_of = move_of % count
     motors, width = len(problem.gamma), problem.jacobian.shape[1]
     order = np.lexsort((problem.cluster, fold_of[problem.cluster], problem.motor))
-    of_rows = ("jacobian", "residual", "current", "motor", "cluster", "source")
-    problem = replace(problem, **{name: getattr(problem, name)[order] for name in of_rows})
+    if np.any(np.diff(order) != 1):  # rows that were cut before keep their order
+        problem = replace(problem, **{name: getattr(problem, name)[order] for name in OF_ROWS})
     change = (np.diff(problem.cluster, prepend=-1) != 0) | (np.diff(problem.motor, prepend=-1) != 0)
     starts = np.flatnonzero(change)
     rows_of = (slice(int(a), int(b)) for a, b in pairwise((*starts, len(problem.motor))))
@@ -314,14 +331,17 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
         here = motor == i
         whole = slice(int(starts[here][0]), int(np.searchsorted(problem.motor, i, side="right")))
         seen = np.flatnonzero(problem.jacobian[whole].any(axis=0))
-        inside = np.ascontiguousarray(problem.jacobian[whole, seen].T)
-        own = MotorRows(whole, starts[here] - whole.start, fold_of[cluster[here]], cluster[here], seen, inside)
+        equations = np.empty((len(seen) + 2, whole.stop - whole.start))
+        equations[:-2], equations[-2] = problem.jacobian[whole, seen].T, problem.residual[whole]
+        own = MotorRows(
+            int(i), whole, starts[here] - whole.start, fold_of[cluster[here]], cluster[here], seen, equations
+        )
         by_motor.append(own)
-        grams, scores = own.sums(inside, inside), own.sums(inside, problem.residual[None, whole])[:, :, 0]
+        products = own.sums(equations[:-2], equations[:-1])
+        grams, scores = products[..., :-1], products[..., -1]
         cluster_hessian[np.ix_(own.cluster, seen, seen)] += grams
         cluster_score[np.ix_(own.cluster, seen)] += scores
-        folds, parts = own.by_fold(grams)
-        part_hessian[:, i][np.ix_(folds, seen, seen)] = parts
+        part_hessian[:, i][:, seen[:, None], seen] = own.by_fold(grams, count)
         motor_score[i, seen] = scores.sum(axis=0)
     by_fold = part_hessian.sum(axis=1)
     hessian, score = by_fold.sum(axis=0), motor_score.sum(axis=0)
@@ -338,11 +358,13 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
     residual = problem.residual.copy()
     part_score = np.zeros((count, motors, width))
     for own in by_motor:
-        left = residual[own.rows]
+        left = own.equations[-1]
+        left[:] = residual[own.rows]
         for first, last, k in zip(own.starts, (*own.starts[1:], len(left)), own.fold, strict=True):
-            left[first:last] -= steps[k][own.seen] @ own.jacobian[:, first:last]
-        folds, parts = own.by_fold(own.sums(own.jacobian, left[None])[:, :, 0])
-        part_score[:, problem.motor[own.rows.start]][np.ix_(folds, own.seen)] = parts
+            left[first:last] -= steps[k][own.seen] @ own.equations[:-2, first:last]
+        residual[own.rows] = left
+        parts = own.by_fold(own.sums(own.equations[:-2], left[None])[..., 0], count)
+        part_score[:, own.motor][:, own.seen] = parts
     return Folds(
         problem=problem,
         moves=moves,

@@ -17,7 +17,7 @@ from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.demand import with_demand
 from ident.data.run import Run
-from ident.equations.rows import CHUNK_ROWS, Rows, rows_of
+from ident.equations.rows import CHUNK_ROWS, Rows, RunRows, rows_of
 from ident.equations.system import System, Triangles, qr_update, triangle
 from ident.errors import DataUnfit
 from ident.model.base import BaseParameters, base_parameters
@@ -61,6 +61,7 @@ class Reduction:
     motor_rows: IntArray  #: equations of each motor, shape (n,)
     clusters: tuple[Cluster, ...]  #: in the order of the runs
     instrumented: bool = False  #: the clusters hold instruments, made of the demanded motion
+    kept: tuple[RunRows, ...] = ()  #: the runs with all their rows, where they were asked for
 
     def base(self) -> BaseParameters:
         """The base parameters that these rows show.
@@ -167,9 +168,10 @@ def reduce_runs(
     *,
     payloads: Sequence[Payload] = (),
     instruments: bool = False,
+    keep_rows: bool = False,
     chunk_rows: int = CHUNK_ROWS,
 ) -> Reduction:
-    """Reduce runs one after the other; no more than one of them is held.
+    """Reduce runs one after the other; no more than one of them is held, unless their rows are asked for.
 
     Args:
         model: the declared model.
@@ -177,6 +179,7 @@ def reduce_runs(
         conditioning: the filters.
         payloads: known beforehand; others are added as runs bring them.
         instruments: keep those of the demanded motion beside the rows; a run of which none is known is its own.
+        keep_rows: keep all runs and their rows, for `observe`.
         chunk_rows: rows built at once; the result does not depend on it.
 
     Raises:
@@ -189,6 +192,7 @@ def reduce_runs(
     joint_rows, motor_rows = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
     names: list[str] = []
     clusters: list[Cluster] = []
+    kept: list[RunRows] = []
     known = False
     for run in runs:
         mounting = mounting_index(run.payload, seen_payloads, run.name)
@@ -198,7 +202,11 @@ def reduce_runs(
             data = with_demand(data, model.drive_train, conditioning)
             known |= data.demanded is not None
         moves: dict[int, list[list[FloatArray]]] = {}
-        for rows in rows_of(model, data, conditioning, chunk_rows):
+        built: Iterable[Rows] = rows_of(model, data, conditioning, chunk_rows)
+        if keep_rows:
+            kept.append(RunRows(data, tuple(built)))
+            built = kept[-1].pieces
+        for rows in built:
             for joint, used in enumerate(rows.use):
                 own = plan.joint[joint][plan.joint[joint] < count]
                 current = model.drive_train.direction[own, joint, None] * rows.current[own][:, used]
@@ -226,6 +234,7 @@ def reduce_runs(
         motor_rows=motor_rows,
         clusters=tuple(clusters),
         instrumented=known,
+        kept=tuple(kept),
     )
 
 

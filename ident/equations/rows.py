@@ -5,7 +5,7 @@ An estimate needs their triangles alone (ident/equations/reduction.py); these ar
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -130,6 +130,14 @@ def _part(motion: Motion, rows: slice) -> Motion:
     return Motion(motion.position_rad[rows], motion.velocity_rad_s[rows], motion.acceleration_rad_s2[rows])
 
 
+@dataclass(frozen=True, slots=True)
+class RunRows:
+    """A run with all its rows, for those that need them again."""
+
+    data: Dataset  #: the run
+    pieces: tuple[Rows, ...]  #: its rows, piece by piece
+
+
 OF_ROWS = ("current", "regressor", "effects", "flange", "use", "motor_use", "time_s", "run", "move", "mounting")
 """Fields of an observation that have a row last."""
 
@@ -152,10 +160,14 @@ class Observation(Equations):
 
     def linear(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
         """[W | W_uL] of some rows, shape (n, p, rows)."""
-        parts = [self.regressor[:, :, rows], self.effects[:, :, rows]]
+        return np.stack([self._of_joint(joint, rows) for joint in range(self.joint_count)])
+
+    def _of_joint(self, joint: int, rows: BoolArray | slice = slice(None)) -> FloatArray:
+        """[W | W_uL] of one joint, shape (p, rows)."""
+        parts = [self.regressor[joint][:, rows], self.effects[joint][:, rows]]
         for index, indices in enumerate(self.payload_columns):
-            parts.append(self.flange[:, list(indices)][:, :, rows] * (self.mounting[rows] == index))
-        return np.concatenate(parts, axis=1)
+            parts.append(self.flange[joint][list(indices)][:, rows] * (self.mounting[rows] == index))
+        return np.concatenate(parts)
 
     def known(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
         """W_kL χ_kL of some rows: the joint torque of what is known of the payloads [Nm], shape (n, rows)."""
@@ -167,12 +179,13 @@ class Observation(Equations):
 
     def motor_columns(self) -> Iterator[FloatArray]:
         """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor in turn, columns first, shape (p + 2, r)."""
-        linear, known = self.linear(), self.known()
+        known = self.known()
         for current, row in zip(self.current, self.drive_train.to_motor, strict=True):
-            columns = np.zeros((linear.shape[1] + 2, linear.shape[2]))
-            columns[0] = current
-            for joint in np.flatnonzero(row):
-                columns[1:-1] += row[joint] * linear[joint]
+            first, *others = np.flatnonzero(row).tolist()  # T is invertible
+            columns = np.concatenate((current[None], self._of_joint(first), known[first][None]))
+            columns[1:] *= row[first]
+            for joint in others:
+                columns[1:-1] += row[joint] * self._of_joint(joint)
                 columns[-1] += row[joint] * known[joint]
             yield columns
 
@@ -204,13 +217,13 @@ class Observation(Equations):
         Args:
             demanded: the same rows and columns for the demanded motion: they become the system's instruments.
         """
-        linear, known = self.linear(), self.known()
-        direction = self.drive_train.direction
+        known, direction = self.known(), self.drive_train.direction
         joints = []
         for joint, used in enumerate(self.use):
             current = direction[:, joint, None] * self.current[:, used]
-            joints.append(triangle_of(np.concatenate((current, -linear[joint][:, used], -known[joint, used][None]))))
-        del linear  # a copy of all rows; the motors' is another
+            joints.append(
+                triangle_of(np.concatenate((current, -self._of_joint(joint, used), -known[joint, used][None])))
+            )
         clusters, runs = self._by_move(), []
         motors = [triangle_of(np.concatenate(rows).T) for rows in zip(*clusters, strict=True)]
         for move in np.unique(self.move[self.motor_use.any(axis=0)]):
@@ -231,12 +244,15 @@ class Observation(Equations):
         )
 
 
-def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditioning, like: Equations) -> Observation:
+def observe(
+    model: Model, runs: Iterable[Dataset | RunRows], conditioning: Conditioning, like: Equations
+) -> Observation:
     """Build the rows of several runs.
 
     Args:
         model: the declared model.
-        datasets: differentiated runs; each one's payload mounting is among those of ``like``.
+        runs: differentiated runs, or the rows already built of them; each one's payload mounting is among those of
+            ``like``.
         conditioning: the filters; every column and the currents go through the same decimation.
         like: whose base parameters and payload parameters these are.
 
@@ -248,9 +264,14 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
     parts: list[tuple[Rows, FloatArray, FloatArray]] = []
     run, move, mounting = [], [], []
     first_move, shared = 0, ("current", "use", "motor_use", "time_s")
-    for index, data in enumerate(datasets):
+    names: list[str] = []
+    for index, given in enumerate(runs):
+        data, pieces = (
+            (given.data, given.pieces) if isinstance(given, RunRows) else (given, rows_of(model, given, conditioning))
+        )
+        names.append(data.name)
         last, mounted = first_move, -1 if data.payload is None else mountings.index(data.payload.mounting)
-        for rows in rows_of(model, data, conditioning):
+        for rows in pieces:
             parts.append((rows, rows.standard[:, base], np.ascontiguousarray(rows.standard[:, model.flange])))
             move.append(rows.move + first_move)
             last = int(move[-1].max()) + 1
@@ -269,7 +290,7 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
         mounting=np.concatenate(mounting),
         payloads=like.payloads,
         payload_columns=like.payload_columns,
-        runs=tuple(data.name for data in datasets),
+        runs=tuple(names),
         conditioning=conditioning,
         **{name: np.concatenate([getattr(rows, name) for rows, _, _ in parts], axis=-1) for name in shared},
     )

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, as_array, require_kind
 from ident.data.conditioning import Conditioning
+from ident.data.dataset import Dataset
 from ident.data.run import Run
 from ident.equations.reduction import reduce_runs
+from ident.equations.rows import Observation, observe
 from ident.equations.system import System, require_distinct
 from ident.errors import DataUnfit, IdentificationError, ModelContradicted, ModelError, PayloadUnseen, RolesExchanged
 from ident.estimators.diagnosis import idle_joints, joint_torques, require_signs, require_weight
@@ -43,6 +45,8 @@ class Identification:
     system: System  #: of the fit
     holdout: System | None  #: of the runs that were held out, with the unknowns of the fit; None without any
     estimate: Estimate  #: from ``system`` alone
+    #: All runs, held-out runs last, and their rows; none unless they were asked for.
+    gathered: tuple[tuple[Dataset, ...], Observation] | None = None
 
     @property
     def training_error(self) -> RelativeError:
@@ -63,8 +67,9 @@ def identify(
     holdout: Iterable[Run] = (),
     method: Method | str = Method.ML,
     fixed_gains: FloatArray | None = None,
+    keep_rows: bool = False,
 ) -> Identification:
-    """Identify all gains and parameters in one global step; runs are read one after the other and none is kept.
+    """Identify all gains and parameters in one global step; runs are read one after the other.
 
     Args:
         model: the declared model.
@@ -73,6 +78,7 @@ def identify(
         holdout: runs that the fit must not see; their payload mountings must be among those of ``runs``.
         method: estimator, or its name.
         fixed_gains: known gains, shape (n,).
+        keep_rows: keep all runs and their rows, for a search for effects by ``ml``; otherwise no run is kept.
 
     Raises:
         ModelError: an argument is of another type, there is no such method, or no gain for each motor.
@@ -87,7 +93,7 @@ def identify(
         fixed_gains = as_array("fixed_gains", fixed_gains, (model.robot.joint_count,), "one per motor")
         if not fixed_gains.all():
             raise ModelError(f"fixed_gains is {fixed_gains.tolist()}; expected no zero: such a motor moves nothing")
-    reduction = reduce_runs(model, each_run(runs), conditioning, instruments=method is Method.IV)
+    reduction = reduce_runs(model, each_run(runs), conditioning, instruments=method is Method.IV, keep_rows=keep_rows)
     if not reduction.runs:
         raise DataUnfit("", "no run was given; expected one without load and one with a weighed payload")
     system = reduction.system(reduction.base(), reduction.payload_columns())
@@ -106,9 +112,15 @@ def identify(
         require_signs(system, estimate, axes)
     idle = idle_joints(model, *joint_torques(system, estimate))
     require_plausible(jackknifed, estimate.relative_error(system), axes, idle)
-    rest = reduce_runs(model, each_run(holdout, system.payloads), conditioning, payloads=system.payloads)
+    rest = reduce_runs(
+        model, each_run(holdout, system.payloads), conditioning, payloads=system.payloads, keep_rows=keep_rows
+    )
     unseen = rest.system(system.base, system.payload_columns) if rest.runs else None
-    return Identification(model, conditioning, system, unseen, estimate)
+    found = Identification(model, conditioning, system, unseen, estimate)
+    if not keep_rows:
+        return found
+    kept = (*reduction.kept, *rest.kept)
+    return replace(found, gathered=(tuple(run.data for run in kept), observe(model, kept, conditioning, system)))
 
 
 def require_seen_payload(estimate: Estimate, system: System) -> None:

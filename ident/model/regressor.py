@@ -126,7 +126,7 @@ def _add_cross(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
         out[i] += a[j] * b[k] - a[k] * b[j]
 
 
-def _cos_sin(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
+def cos_sin(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Cosine and sine to the last digit of one, by the half-angle: numpy has a vector tangent, four times as fast."""
     tangent = np.tan(0.5 * angle)
     square = tangent * tangent
@@ -207,7 +207,7 @@ def _move(
     v, a = parts[:2]
     # S × S is nothing: V may be that before S q̇ is added.
     if link.revolute:
-        cosine, sine = _cos_sin(position)
+        cosine, sine = cos_sin(position)
         turned = np.multiply(parts[:, :, 1::-1], sine, out=work.products[: len(here)])
         parts[:, :, :2] *= cosine
         parts[:, :, 0] += turned[:, :, 0]
@@ -230,7 +230,7 @@ def _borne(link: _Link, wrench: FloatArray, position: FloatArray) -> FloatArray:
     """What a link's wrench is at its parent, shape (6, k): the transpose of `_move`."""
     n, f = (wrench if link.back is None else link.back.T @ wrench).reshape(2, 3, -1)
     if link.revolute:
-        c, s = _cos_sin(position)
+        c, s = cos_sin(position)
         n, f = (np.stack((c * x - s * y, s * x + c * y, z)) for x, y, z in (n, f))
     else:
         n = np.stack((n[0] - position * f[1], n[1] + position * f[0], n[2]))

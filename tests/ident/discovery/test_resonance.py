@@ -55,7 +55,7 @@ def _stepped(
 def _on_a_spring(small: Evidence, truth: Truth, compliance: float, half_gap: float) -> Evidence:
     def torque(data: Dataset) -> FloatArray:
         run = fitted_signals(small.model, data, small.training, small.estimate)
-        inertia = run.inertia_kg_m2[:, AXIS]
+        inertia = run.inertia(slice(None), AXIS)
         through = (run.geared_torque_nm if half_gap else run.load_torque_nm)[AXIS]
         return np.asarray(-inertia * _stepped(through, inertia[AXIS], run.rate_hz, compliance, half_gap))
 

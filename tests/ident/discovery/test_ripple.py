@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
 from ident.discovery.loop import Evidence, find_effects
-from ident.discovery.ripple import Periodogram, periodogram, propose_orders
+from ident.discovery.ripple import Periodogram, _fast_length, periodogram, propose_orders
 from ident.discovery.search import Gates
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
@@ -88,3 +88,8 @@ def test_signs_leave_the_noise_as_it_is() -> None:
     same = made.statistic(np.ones((1, 40)))
     assert made.statistic(-np.ones((1, 40))) == pytest.approx(same)
     assert np.mean(made.statistic(rng.choice((-1.0, 1.0), (500, 40)))) == pytest.approx(2.0, rel=0.1)
+
+
+@pytest.mark.parametrize(("least", "length"), [(16.0, 16), (1499.5, 1536), (19997.0, 20480)])
+def test_bins_have_a_length_of_small_factors(least: float, length: int) -> None:
+    assert _fast_length(least) == length

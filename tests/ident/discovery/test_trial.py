@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ident.discovery.candidates import Trial, score_candidates
+from ident.discovery.search import _drawn_numbers, _drawn_wald
 from ident.equations.linearisation import Linearisation, cut_into_folds
 
 FloatArray = NDArray[np.float64]
@@ -148,3 +149,20 @@ def test_the_unit_of_a_candidate_does_not_matter() -> None:
     assert other is not None
     _agree(replace(other, score=one.score, scatter=one.scatter, gram=one.gram,
                    coefficients=other.coefficients * np.array([1e5, 1e-4])), one)  # fmt: skip
+
+
+@pytest.mark.parametrize("width", [1, 3])
+def test_a_draws_statistic_is_that_of_its_moves_one_by_one(width: int) -> None:
+    rng = np.random.default_rng(5)
+    folds = cut_into_folds(_problem(rng))
+    (trial,) = score_candidates(folds, rng.normal(size=(len(folds.problem.motor), width)), [slice(0, width)])
+    assert trial is not None
+    signs = rng.choice((-1.0, 1.0), size=(5, MOVES))
+    expected = []
+    for drawn in signs:
+        total = drawn @ trial.scatter
+        fitted = np.linalg.solve(trial.gram.sum(axis=0), total)
+        left = drawn[:, None] * trial.scatter - trial.gram @ fitted
+        expected.append(total @ np.linalg.solve(left.T @ left, total))
+    found = _drawn_wald(trial, signs) if width > 1 else _drawn_numbers(trial.scatter, trial.gram[:, :, 0], signs)
+    assert found == pytest.approx(np.array(expected), rel=1e-9)

@@ -63,6 +63,10 @@ def test_torques_are_of_the_load_through_the_gear_and_of_the_motor(small_truth: 
     assert made.motor_position_rad == pytest.approx(np.diag([40.0, 50.0, -45.0]) @ data.position_rad.T)
 
 
+def _inertia(signals: Signals) -> FloatArray:
+    return np.stack([signals.inertia(slice(None), axis) for axis in range(len(signals.position_rad))], axis=1)
+
+
 def test_inertia_is_torque_per_acceleration_at_every_sample(small_truth: Truth, data: Dataset) -> None:
     """Mass matrix of links and payload; interpolated between postures, so it follows to a hundredth."""
     parameters = _without(small_truth, "Ia", "fv", "fs", "off")
@@ -73,7 +77,7 @@ def test_inertia_is_torque_per_acceleration_at_every_sample(small_truth: Truth, 
         np.einsum("jck,c->jk", small_truth.model.regressor(Motion(data.position_rad, still, a)), parameters)
         for a in (acceleration, still)
     )
-    inertia = _made(small_truth, data).inertia_kg_m2
+    inertia = _inertia(_made(small_truth, data))
     found = np.einsum("ijk,kj->ik", inertia, acceleration)
     assert np.max(np.abs(found - (moved - held))) < 0.01 * np.max(np.abs(moved - held))
     assert inertia == pytest.approx(np.swapaxes(inertia, 0, 1), abs=1e-9)
@@ -85,8 +89,8 @@ def test_of_an_estimate_the_rotor_of_a_regrouped_axis_counts_as_link(
     small: Evidence, small_truth: Truth, data: Dataset
 ) -> None:
     """Ia of joints 1 and 2 cannot be distinguished from their links; that of joint 3 is a parameter of its own."""
-    found = fitted_signals(small.model, data, small.training, small.estimate).inertia_kg_m2
-    true = _made(small_truth, data).inertia_kg_m2
+    found = _inertia(fitted_signals(small.model, data, small.training, small.estimate))
+    true = _inertia(_made(small_truth, data))
     rotors = np.array([0.03, 0.03, 0.0])
     expected = true + np.diag(rotors)[:, :, None]
     assert np.max(np.abs(found - expected)) < 0.05 * np.max(np.abs(true))

@@ -11,11 +11,13 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from ident.data.run import Run
-from ident.discovery.loop import Evidence
+from ident.discovery.loop import Evidence, gather
 from ident.equations import reduction as reduction_module
 from ident.equations.reduction import Reduction, layout, reduce_runs
+from ident.equations.rows import OF_ROWS
 from ident.equations.system import System, triangle
 from ident.estimators.estimate import Estimate
+from ident.estimators.identify import identify
 from ident.estimators.maximum_likelihood import ml
 from ident.model.model import DriveTrain, Model
 from ident.model.robot import Motion
@@ -82,6 +84,17 @@ def test_runs_are_read_one_after_the_other(small_truth: Truth, small_runs: tuple
 
     found = reduce_runs(small_truth.model, (reading() for _ in small_runs), SMALL)
     assert found.runs == tuple(run.name for run in small_runs)
+
+
+def test_rows_kept_by_a_fit_are_those_built_of_its_runs(small_truth: Truth, small_runs: tuple[Run, ...]) -> None:
+    given, unseen = small_runs[:2], small_runs[2:3]
+    found = identify(small_truth.model, given, SMALL, holdout=unseen, keep_rows=True)
+    kept, built = gather(found), gather(replace(found, gathered=None), given, unseen)
+    assert kept.rows_without_effects.runs == tuple(run.name for run in (*given, *unseen))
+    for one, other in ((kept.training, built.training), (kept.holdout, built.holdout)):
+        assert one is not None
+        assert other is not None
+        assert all(np.array_equal(getattr(one, name), getattr(other, name)) for name in OF_ROWS)
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4, 5), (5, 4, 3, 2, 1, 0)])
