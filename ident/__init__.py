@@ -37,10 +37,10 @@ if TYPE_CHECKING:
     from ident.data.dataset import differentiate as differentiate
     from ident.data.dataset import planned as planned
     from ident.data.run import Run as Run
-    from ident.discovery.loop import Evidence as Evidence
+    from ident.discovery.evidence import Evidence as Evidence
+    from ident.discovery.evidence import gather as gather
     from ident.discovery.loop import Step as Step
     from ident.discovery.loop import find_effects as find_effects
-    from ident.discovery.loop import gather as gather
     from ident.errors import DataUnfit as DataUnfit
     from ident.errors import Diagnosis as Diagnosis
     from ident.errors import EffectRefused as EffectRefused
@@ -78,7 +78,8 @@ _HOMES = {
     "ident.data.conditioning": "Conditioning",
     "ident.data.dataset": "Dataset differentiate planned",
     "ident.data.run": "Run",
-    "ident.discovery.loop": "Evidence Step find_effects gather",
+    "ident.discovery.evidence": "Evidence gather",
+    "ident.discovery.loop": "Step find_effects",
     "ident.errors": "DataUnfit Diagnosis EffectRefused IdentificationError ModelContradicted ModelError "
     "NotConverged PayloadUnseen RankDeficient RolesExchanged TooFewMoves",
     "ident.estimators.diagnosis": "diagnose exchanged_channels",

@@ -18,7 +18,7 @@ from daq.workflow.cases import CASES, CaseFit
 from daq.workflow.fit import DOUBTFUL_PERCENT, Fit, needed_verdicts
 from ident.arrays import FloatArray
 from ident.calibration import Calibration, Parameter
-from ident.discovery.loop import Evidence, without_effects
+from ident.discovery.evidence import Evidence, without_effects
 from ident.effects.effect import PlacedEffect
 from ident.estimators.comparison import Comparison, EstimatorTrial
 from ident.estimators.estimate import RelativeError

@@ -31,7 +31,7 @@ from daq.report.picture import (
 from daq.workflow.fit import Fit
 from ident.arrays import FloatArray
 from ident.calibration import Calibration
-from ident.discovery.loop import Evidence
+from ident.discovery.evidence import Evidence
 from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect
 from ident.effects.signals import Abscissa, fitted_signals, session_began_s

@@ -19,7 +19,8 @@ from daq.report.text import json_text, percent_text
 from daq.workflow.fit import Fit
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account, BeforeAfter
-from ident.discovery.loop import Evidence, Step
+from ident.discovery.evidence import Evidence
+from ident.discovery.loop import Step
 from ident.effects.effect import PlacedEffect
 
 PAGE, DOCUMENT = "report.html", "residual.json"

@@ -25,7 +25,8 @@ from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
 from ident.discovery.before_after import error_on, holdout_change
-from ident.discovery.loop import Evidence, Step, find_effects, gather, without_effects
+from ident.discovery.evidence import Evidence, gather, without_effects
+from ident.discovery.loop import Step, find_effects
 from ident.errors import (
     ChannelsExchanged,
     Diagnosis,

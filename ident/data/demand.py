@@ -75,7 +75,7 @@ def demanded_positions(data: Dataset, drive_train: DriveTrain) -> FloatArray | N
         None where the motion of a motor is not made of trapezoids between rests.
     """
     recorded = drive_train.direction @ data.position_rad.T
-    demanded = np.empty_like(recorded)
+    demanded = recorded.copy()
     for motor, position in enumerate(recorded):
         left = np.inf
         for slow in SLOW:
@@ -97,7 +97,7 @@ def _trapezoids(position: FloatArray, rate_hz: float, slow: float) -> FloatArray
     ahead, behind = (np.clip(np.arange(len(position)) + step, 0, len(position) - 1) for step in (half, -half))
     speed = np.abs(position[ahead] - position[behind]) / (ahead - behind)
     rests = _rests(position, speed <= slow * float(np.quantile(speed, 0.95)), 2 * half)
-    stops = [((first + last) // 2, float(np.median(position[first:last]))) for first, last in rests]
+    stops = [((first + last) // 2, level) for first, last, level in rests]
     share = np.linspace(0.0, 1.0, POINTS)
     while True:
         out = np.repeat(stops[0][1], len(position))
@@ -131,21 +131,22 @@ def _misfit(position: FloatArray, demanded: FloatArray) -> float:
     return float(np.sum((velocity - np.diff(demanded)) ** 2) / max(float(velocity @ velocity), 1e-300))
 
 
-def _rests(position: FloatArray, slow: BoolArray, shortest: int) -> list[tuple[int, int]]:
-    """First sample and end of each rest; a recording that begins or ends in motion rests there for one sample."""
+def _rests(position: FloatArray, slow: BoolArray, shortest: int) -> list[tuple[int, int, float]]:
+    """First sample, end and position of each rest; a recording that begins or ends in motion rests there for one."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], slow, [False])).astype(np.int8)))
     found = [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= shortest]
     if not found or found[0][0] > 0:
         found.insert(0, (0, 1))
     if found[-1][1] < len(slow):
         found.append((len(slow) - 1, len(slow)))
-    rests, smallest = found[:1], SMALLEST_WAY * float(np.ptp(position))
-    for first, last in found[1:]:
-        before = rests[-1]
-        if abs(float(np.median(position[first:last])) - float(np.median(position[slice(*before)]))) <= smallest:
-            rests[-1] = (before[0], last)
+    rests, smallest = list[tuple[int, int, float]](), SMALLEST_WAY * float(np.ptp(position))
+    for first, last in found:
+        level = float(np.median(position[first:last]))
+        if rests and abs(level - rests[-1][2]) <= smallest:
+            begun, _, level = rests.pop()
+            rests.append((begun, last, level))
         else:
-            rests.append((first, last))
+            rests.append((first, last, level))
     return rests
 
 

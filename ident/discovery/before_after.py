@@ -19,8 +19,8 @@ in ε, as Table 6 would; its ε_i are not affected. The four ways differ in the 
 - hold-out: neither fit nor choice has seen these runs.
 
 Estimates before and after share their noise, so the σ of a change is neither one's σ nor the root of both squared. It
-is the jackknife of the change itself: leaving out move c shifts g by d_c = −(H − G_c)⁻¹ s_c
-(ident/equations/linearisation.py), and
+is the jackknife of the change itself: leaving out block c of moves shifts g by d_c = −(H − G_c)⁻¹ s_c
+(ident/equations/linearisation.py; the longer blocks of the two models serve both), and
 
     σ_Δ² = (m − 1)/m Σ_c (Δd_c − mean)²,        Δd_c = d_c after − d_c before.
 
@@ -38,11 +38,12 @@ import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
 
 from ident.arrays import FloatArray, IntArray
+from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import PairedChange, compare_by_move
-from ident.discovery.loop import Evidence, Step, with_effects
+from ident.discovery.loop import Step
 from ident.discovery.noise_floor import NoiseFloor, noise_floors
 from ident.effects.effect import PlacedEffect
-from ident.equations.linearisation import Folds, cut_into_folds, left_out_shifts, linearise
+from ident.equations.linearisation import Folds, cut_into_folds, independent_blocks, left_out_shifts, linearise
 from ident.equations.rows import Observation
 from ident.errors import IdentificationError
 from ident.estimators.estimate import Estimate, RelativeError, of_squares
@@ -185,6 +186,25 @@ class Errors:
 
 
 @dataclass(frozen=True, slots=True)
+class Moves:
+    """The linearised problem by move: what leaving moves out needs."""
+
+    grams: FloatArray  #: G_c of each move, shape (m, f, f)
+    scores: FloatArray  #: s_c of each move, shape (m, f)
+    scale: FloatArray  #: unit of each unknown, shape (f,); the gains are the first
+    runs: IntArray  #: run of each move, shape (m,)
+
+    def blocks(self) -> IntArray:
+        """First move of each block of moves that is independent of the others."""
+        return independent_blocks(self.grams, self.scores, self.runs)
+
+    def shifts(self, starts: IntArray) -> FloatArray:
+        """Shift of the unknowns when each block is left out, shape (blocks, f)."""
+        grams, scores = (np.add.reduceat(parts, starts) for parts in (self.grams, self.scores))
+        return left_out_shifts(grams, scores) * self.scale
+
+
+@dataclass(frozen=True, slots=True)
 class Assessment:
     """One model on its data."""
 
@@ -193,7 +213,7 @@ class Assessment:
     gains: FloatArray  #: drive gains [Nm at the joint per A], shape (n,)
     gains_std: FloatArray  #: their σ, shape (n,)
     choice_std: FloatArray  #: the part of it that comes from the choice of the effects, shape (n,)
-    shifts: FloatArray  #: of the gains when each move is left out, shape (m, n); zero for fixed gains
+    moves: Moves | None  #: what each move says of the gains; None for fixed gains
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,10 +330,11 @@ def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns |
             gains_fixed=estimate.gains_fixed,
         )
     )
-    held, count = evidence.holdout, len(estimate.gains)
-    shifts = np.zeros((folds.problem.cluster_count, count))
+    held, problem, moves = evidence.holdout, folds.problem, None
     if not estimate.gains_fixed:
-        shifts = (left_out_shifts(folds.cluster_hessian, folds.cluster_score) * folds.problem.scale)[:, :count]
+        _, first = np.unique(problem.cluster, return_index=True)
+        runs = evidence.training.run[problem.source[first]]
+        moves = Moves(folds.cluster_hessian, folds.cluster_score, problem.scale, runs)
     return Assessment(
         effects=evidence.effects,
         errors=Errors(
@@ -324,16 +345,19 @@ def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns |
         ),
         gains=estimate.gains,
         gains_std=estimate.gains_std,
-        choice_std=np.zeros(count),
-        shifts=shifts,
+        choice_std=np.zeros(len(estimate.gains)),
+        moves=moves,
     )
 
 
 def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
     """Compare two models of the same rows."""
-    clusters, count = before.shifts.shape
-    shifts = after.shifts - before.shifts
-    change_std = np.sqrt((clusters - 1) / clusters * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
+    count = len(before.gains)
+    change_std = np.zeros(count)
+    if before.moves is not None and after.moves is not None:
+        starts = min(before.moves.blocks(), after.moves.blocks(), key=len)
+        shifts = after.moves.shifts(starts)[:, :count] - before.moves.shifts(starts)[:, :count]
+        change_std = np.sqrt((len(starts) - 1) / len(starts) * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
     limit = float(-scipy.special.ndtri(FALSE_ALARM / (2 * count)))
     return BeforeAfter(
         added=tuple(placed for placed in after.effects if placed not in before.effects),

@@ -1,22 +1,19 @@
 """Find missing effects: add what the residual calls for, refit everything, and examine the new residual.
 
-`find_effects` is the entry; `gather` prepares the rows behind an identification for it.
+`find_effects` is the entry; `ident.discovery.evidence.gather` prepares the rows behind an identification for it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ident.arrays import FloatArray, IntArray
-from ident.data.conditioning import Conditioning
-from ident.data.dataset import Dataset, differentiate
-from ident.data.demand import as_demanded, with_demand
-from ident.data.run import Run
 from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, prepare_search, score_candidates
 from ident.discovery.choice import choice_covariance, is_small
+from ident.discovery.evidence import Evidence, by_instruments, with_effects
 from ident.discovery.gates import (
     RunsLeftOut,
     gain_shifts,
@@ -43,56 +40,15 @@ from ident.discovery.search import (
     refine_setting,
 )
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import Effect, PlacedEffect, Side, effect_torque
-from ident.effects.signals import Signals, fitted_signals, session_began_s
+from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.transmission import Ripple
 from ident.effects.unnamed import is_unnamed
-from ident.equations.rows import Observation, observe, on_demanded_motion
-from ident.equations.system import System
 from ident.errors import NotConverged, RankDeficient
-from ident.estimators.estimate import Estimate, RelativeError
-from ident.estimators.identify import Identification, estimate_with
-from ident.estimators.method import Method
-from ident.model.model import Model
+from ident.estimators.estimate import Estimate
 
 UNFITTED = (NotConverged, RankDeficient, np.linalg.LinAlgError)
 MAX_EFFECTS = 12  #: More effects than this on one robot mean that the declared model is wrong
 PIECES_PER_EFFECT = 3  #: Fewer pieces of moves than this for each effect cannot show that all of them are there
-
-
-@dataclass(frozen=True, slots=True)
-class Evidence:
-    """An estimate with its rows at hand, for searches and plots."""
-
-    model: Model  #: the declared model
-    conditioning: Conditioning  #: the filters
-    datasets: tuple[Dataset, ...]  #: all runs, held-out runs last
-    held_out: int  #: number of held-out runs
-    rows_without_effects: Observation  #: rows of all runs, without effects
-    training: Observation  #: rows of the fit, with the columns of the effects
-    holdout: Observation | None  #: rows of the held-out runs, None without any
-    effects: tuple[PlacedEffect, ...]  #: in the model, in the order of their columns
-    estimate: Estimate  #: of the training rows
-    _identification: list[Identification] = field(default_factory=list, init=False, repr=False, compare=False)
-
-    @property
-    def trained(self) -> tuple[Dataset, ...]:
-        """Runs of the fit."""
-        return self.datasets[: len(self.datasets) - self.held_out]
-
-    @property
-    def identification(self) -> Identification:
-        """The estimate with its equations reduced, effects among them; kept, because reducing takes long."""
-        if not self._identification:
-            training, holdout = self.training.system(), None if self.holdout is None else self.holdout.system()
-            found = Identification(self.model, self.conditioning, training, holdout, self.estimate)
-            self._identification.append(found)
-        return self._identification[0]
-
-    @property
-    def holdout_error(self) -> RelativeError | None:
-        """Error on held-out rows [%]."""
-        return None if self.holdout is None else self.estimate.relative_error(self.holdout.system())
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +109,8 @@ def find_effects(
     5. refines its setting (`refine_setting`), adds it, and refits gains, parameters and effects together;
     6. linearises the problem around the joint fit and deals whole moves to folds (`prepare_search`); every effect in
        the model must still pass, beside all the others, or it leaves (`without_effects_of`). A term without a name may
-       not make a named effect leave: then it does not join.
+       not make a named effect leave: then it does not join;
+    7. asks instruments from the demanded motion whether the effect is a disturbance in the position loop.
 
     What a gate of the joint fit refuses is in `Step.set_aside`, and the next best is tried. The ambiguity of an
     accepted effect holds what could not be distinguished from it, passed before, and does not pass beside it.
@@ -191,19 +148,21 @@ def find_effects(
 
 def _with_choice(steps: Sequence[Step], model: _Model, gates: Gates) -> Step:
     """Return the last step, what the choice of its effects adds to the covariance of its estimate included."""
-    estimate, accepted = model.evidence.estimate, list[tuple[Finding, tuple[Finding, ...]]]()
-    for step in steps:
+    estimate, accepted = model.evidence.estimate, dict[PlacedEffect, tuple[Finding, tuple[Finding, ...]]]()
+    for step in steps:  # an effect that left and joined again counts by its last turn
         found = step.accepted
-        if found is not None and PlacedEffect(found.effect, found.axis) in model.evidence.effects:
-            accepted.append((found, (*step.findings, *step.structures)))
-    last = steps[-1]
-    left = [aside.finding for aside in last.set_aside if aside.moved]
-    if last.accepted is None:
+        if found is not None and (placed := PlacedEffect(found.effect, found.axis)) in model.evidence.effects:
+            accepted[placed] = found, (*step.findings, *step.structures)
+    last, left = steps[-1], list[Finding]()
+    if last.accepted is None:  # its findings are of the last model
+        left += [aside.finding for aside in last.set_aside if aside.moved]
         left += [found for found in (*last.findings, *last.structures) if is_small(found, gates)]
-    choice = choice_covariance(model.search_problem, estimate, accepted, left)
-    std = np.sqrt(np.diag(choice)[: len(estimate.gains)])
+    choice = choice_covariance(model.search_problem, estimate, tuple(accepted.values()), left)
+    last = replace(last, choice_std=np.sqrt(np.diag(choice)[: len(estimate.gains)]))
+    if not choice.any():
+        return last
     chosen = replace(estimate, covariance=estimate.covariance + choice)
-    return replace(last, after=replace(model.evidence, estimate=chosen), choice_std=std)
+    return replace(last, after=replace(model.evidence, estimate=chosen))
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,8 +198,7 @@ def _turn(
     proposed = _proposals(problem, evidence.effects, rng, gates, families)
     findings, structures = rank_effects(problem, rng, gates, families, proposed), tuple[Finding, ...]()
     limits_nm, runs = detection_limits_nm(problem, gates), RunsLeftOut.of(problem)
-    taken, searched, aside = set(_keys(evidence)), range(0), list[SetAside]()
-    reasons = []
+    taken, searched, aside, ended = set(_keys(evidence)), range(0), list[SetAside](), ""
     while True:
         named = choose_effect(findings, taken)
         if named is not None and (why := runs.refusal(whitened_columns(problem, named.effect, named.axis))):
@@ -276,10 +234,11 @@ def _turn(
         others = structures if is_unnamed(effect) else ()
         taken |= {effect_key(one.effect, one.axis) for one in (accepted, *others) if one.axis == accepted.axis}
     if accepted is not None:
-        reasons.append(f"{moves} moves allow no more than {most} effects")
+        pieces = problem.folds.problem.cluster_count
+        ended = f"{pieces} pieces of {moves} moves allow no more than {most} effects"
     elif moves < MIN_MOVES_FOR_STRUCTURE:
-        reasons.append(f"structure without a name needs {MIN_MOVES_FOR_STRUCTURE} moves, found {moves}")
-    return Step(findings, structures, limits_nm, None, evidence, tuple(aside), "; ".join(reasons)), None
+        ended = f"structure without a name needs {MIN_MOVES_FOR_STRUCTURE} moves, found {moves}"
+    return Step(findings, structures, limits_nm, None, evidence, tuple(aside), ended), None
 
 
 def _proposals(
@@ -334,7 +293,8 @@ def _refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
 
     A torque that disturbs the arm moves it, and comes back in the current: columns of the recorded motion then explain
     a part of it, which those of the demanded motion do not. Their coefficients may be zero, and are nearer to zero than
-    to those of the fit. Instruments that would not show an effect of that size refute no named one.
+    to those of the fit. Instruments that would not show an effect of that size refute no named one; nor do those by
+    which nothing can be fitted.
     """
     try:
         estimate = by_instruments(evidence)
@@ -426,106 +386,3 @@ def _settled(
     now |= {effect_key(one.effect, one.axis): one.passed for one in rank_families(problem, again, rng, gates)}
     left = tuple(one for key, one in rivals.items() if key != own and not now.get(key, False))
     return replace(step, accepted=replace(step.accepted, ambiguity=left))
-
-
-def gather(found: Identification, runs: Iterable[Run] = (), holdout: Iterable[Run] = ()) -> Evidence:
-    """Build the rows behind an identification from its runs and held-out runs, unless it has kept them."""
-    model, conditioning = found.model, found.conditioning
-    if found.gathered is None:
-        trained = [differentiate(run, model.drive_train, conditioning) for run in runs]
-        datasets = (*trained, *(differentiate(run, model.drive_train, conditioning) for run in holdout))
-        rows, held_out = observe(model, datasets, conditioning, found.system), len(datasets) - len(trained)
-    else:
-        datasets, rows = found.gathered
-        held_out = len(datasets) - len(found.system.runs)
-    training, rest = _split_holdout(rows, held_out)
-    evidence = Evidence(model, conditioning, datasets, held_out, rows, training, rest, (), found.estimate)
-    evidence._identification.append(found)
-    return evidence
-
-
-def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals] = ()) -> Evidence:
-    """Refit the same data with these effects in the model, gains included.
-
-    Load and current are the model's predictions, so columns of them are built twice: with the estimate before, and
-    with the estimate that they led to.
-
-    Args:
-        before: the same data.
-        effects: of the model.
-        runs: signals of the runs of the fit around the estimate before, where they are at hand.
-    """
-    around, current, began_s = before, before, session_began_s(before.trained)  # held-out runs must not affect the fit
-    fixed = before.estimate.gains if before.estimate.gains_fixed else None
-    joints = before.model.robot.joints
-    columns = tuple(column.at(joints[placed.axis].kind) for placed in effects for column in placed.columns)
-    bare, unseen = _split_holdout(before.rows_without_effects, before.held_out)
-    for signals in (runs,) if all(placed.effect.abscissa.is_kinematic for placed in effects) else (runs, ()):
-        around, training = current, bare
-        if effects:
-            training = bare.extended(columns, _torques(effects, around, before.trained, began_s, signals))
-        estimate = estimate_with(before.estimate.method, training.system(), fixed)
-        current = replace(before, training=training, holdout=unseen, effects=effects, estimate=estimate)
-    if unseen is None or not effects:
-        return current
-    held_out = before.datasets[len(before.trained) :]
-    return replace(current, holdout=unseen.extended(columns, _torques(effects, around, held_out, began_s)))
-
-
-def by_instruments(evidence: Evidence) -> Estimate | None:
-    """Estimate the same model of the same runs by ``iv``; None where the demanded motion of no run is known.
-
-    Load and current of the effects' columns are predictions of the estimate by ``ml``, in the instruments too.
-    """
-    system, estimate = _with_instruments(evidence), evidence.estimate
-    if system is None:
-        return None
-    return estimate_with(Method.IV, system, estimate.gains if estimate.gains_fixed else None)
-
-
-def _with_instruments(evidence: Evidence) -> System | None:
-    model, conditioning = evidence.model, evidence.conditioning
-    asked = tuple(with_demand(data, model.drive_train, conditioning) for data in evidence.trained)
-    if all(data.demanded is None for data in asked):
-        return None
-    demanded = on_demanded_motion(model, asked, evidence.training)
-    if evidence.effects:
-        datasets, began_s = tuple(map(as_demanded, asked)), session_began_s(evidence.trained)
-        demanded = replace(demanded, effects=_torques(evidence.effects, evidence, datasets, began_s))
-        del datasets
-    del asked  # one more copy of all runs, while the equations are built
-    return evidence.training.system(demanded)
-
-
-def _torques(
-    effects: Sequence[PlacedEffect],
-    around: Evidence,
-    datasets: Sequence[Dataset],
-    began_s: float | None,
-    runs: Sequence[Signals] = (),
-) -> FloatArray:
-    """Columns of effects on the rows of runs, load and current predicted by an estimate, shape (n, p, r)."""
-    parts, through_links = [], any(placed.effect.side is Side.ALL_JOINTS for placed in effects)
-    for index, data in enumerate(datasets):  # one by one: signals at full rate are the largest arrays of a search
-        if runs:
-            run = runs[index]
-        else:
-            model, rows, estimate = around.model, around.training, around.estimate
-            run = fitted_signals(model, data, rows, estimate, began_s, inertia=through_links)
-        given = (run,), (data,), around.conditioning, around.model
-        parts.append(np.concatenate([effect_torque(placed.effect, placed.axis, *given) for placed in effects], axis=1))
-    return np.concatenate(parts, axis=2)
-
-
-def without_effects(evidence: Evidence, estimate: Estimate) -> Evidence:
-    """Return the same data under the declared model alone, with its estimate by ``ml``."""
-    training, rest = _split_holdout(evidence.rows_without_effects, evidence.held_out)
-    return replace(evidence, training=training, holdout=rest, effects=(), estimate=estimate)
-
-
-def _split_holdout(observation: Observation, held_out: int) -> tuple[Observation, Observation | None]:
-    """Split rows of all runs into those of the fit and those of the last, held-out runs."""
-    if not held_out:
-        return observation, None
-    first = int(np.searchsorted(observation.run, len(observation.runs) - held_out))
-    return observation.only(slice(first)), observation.only(slice(first, None))

@@ -241,14 +241,3 @@ def is_placeable(effect: Effect, axis: int, robot: Robot) -> bool:
     if effect.side is Side.ALL_MOTORS:
         return axis == 0
     return effect.side is not Side.TWO_JOINTS or axis + 1 < int(effect.settings["other_axis"]) <= robot.joint_count
-
-
-def joints_of(effect: Effect, axis: int, drive_train: DriveTrain) -> frozenset[int]:
-    """Joints whose own torque an effect changes; elasticity and backlash act through the links, and belong to one."""
-    if effect.side in (Side.ALL_JOINTS, Side.JOINT):
-        return frozenset({axis})
-    if effect.side is Side.TWO_JOINTS:
-        return frozenset({axis, int(effect.settings["other_axis"]) - 1})
-    if effect.side is Side.MOTOR:
-        return frozenset(np.flatnonzero(drive_train.direction[axis]).tolist())
-    return frozenset(range(len(drive_train.ratio)))

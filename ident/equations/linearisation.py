@@ -146,7 +146,7 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0])
 
 
-def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) -> tuple[FloatArray, FloatArray]:
+def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) -> IntArray:
     """Join neighbouring clusters of a run in pairs, again and again, until they are independent of each other.
 
     Clusters are moves, and pieces of 2 s of longer moves: long beside the noise of drives, but not beside every misfit
@@ -164,8 +164,9 @@ def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) ->
         runs: run of each cluster, shape (m,).
 
     Returns:
-        G_c and s_c of the blocks, at least MIN_MOVES_TO_LEAVE_OUT where there are as many clusters.
+        first cluster of each block, ascending; at least MIN_MOVES_TO_LEAVE_OUT where there are as many clusters.
     """
+    starts = np.arange(len(grams))
     hessian = grams.sum(axis=0)
     unit = 1.0 / np.sqrt(np.where(np.diag(hessian) > 0.0, np.diag(hessian), 1.0))
     scaled = hessian * np.outer(unit, unit)
@@ -175,13 +176,11 @@ def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) ->
         z = linalg.solve_triangular(lower, (scores * unit).T, lower=True).T
         products = np.sum(z[1:] * z[:-1], axis=1)[runs[1:] == runs[:-1]]
         if float(products.sum()) <= CORRELATED * float(np.linalg.norm(products)):
-            return grams, scores
-        first = np.concatenate([np.flatnonzero(runs == run)[::2] for run in np.unique(runs)])
+            return starts
+        first = np.sort(np.concatenate([np.flatnonzero(runs == run)[::2] for run in np.unique(runs)]))
         if len(first) < MIN_MOVES_TO_LEAVE_OUT:
-            return grams, scores
-        first.sort()
-        grams, scores = np.add.reduceat(grams, first), np.add.reduceat(scores, first)
-        runs = runs[first]
+            return starts
+        starts, scores, runs = starts[first], np.add.reduceat(scores, first), runs[first]
 
 
 def jackknife_covariance(
@@ -225,7 +224,9 @@ def jackknife_covariance(
             grams[index] += jacobian.T @ jacobian
             scores[index] += jacobian.T @ residual
     runs = np.array([run for run, _ in system.cluster_runs])
-    shifts = left_out_shifts(*independent_blocks(grams[:, free, free], scores[:, free], runs))
+    grams, scores = grams[:, free, free], scores[:, free]
+    starts = independent_blocks(grams, scores, runs)
+    shifts = left_out_shifts(np.add.reduceat(grams, starts), np.add.reduceat(scores, starts))
     blocks, centred = len(shifts), shifts - shifts.mean(axis=0)
     covariance = np.zeros((size, size))
     covariance[free, free] = (blocks - 1) / blocks * (centred.T @ centred)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ident.data.run import Run
-from ident.discovery.loop import Evidence, gather
+from ident.discovery.evidence import Evidence, gather
 from ident.estimators.identify import Identification, identify
 from tests.ident.recordings import CONDITIONING, MOUNTED, Truth, gathered, record, three_axes_truth, tx40_truth
 

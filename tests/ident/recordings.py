@@ -14,7 +14,7 @@ from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.discovery.candidates import ColumnCache, SearchProblem, prepare_search
-from ident.discovery.loop import Evidence, gather
+from ident.discovery.evidence import Evidence, gather
 from ident.effects.signals import session_began_s
 from ident.equations.rows import decimate_rows
 from ident.estimators.estimate import RelativeError, relative_error

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 from ident.calibration import AcceptedEffect, Parameter
 from ident.data.dataset import Dataset, differentiate, planned
 from ident.data.run import Run
-from ident.discovery.loop import Evidence, gather, with_effects
+from ident.discovery.evidence import Evidence, gather, with_effects
 from ident.effects.dictionary import EFFECTS, UNNAMED
 from ident.effects.effect import PlacedEffect, check_settings
 from ident.effects.electrical import Cogging

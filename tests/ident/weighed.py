@@ -11,7 +11,7 @@ from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
-from ident.discovery.loop import gather, with_effects
+from ident.discovery.evidence import gather, with_effects
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import LoadFriction
 from ident.estimators.identify import identify

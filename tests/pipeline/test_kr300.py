@@ -10,8 +10,9 @@ from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from ident.data.run import Run
 from ident.discovery.before_after import holdout_change, left_on
+from ident.discovery.evidence import gather
 from ident.discovery.gates import impossible
-from ident.discovery.loop import find_effects, gather
+from ident.discovery.loop import find_effects
 from ident.discovery.noise_floor import FloorSource, noise_floors
 from ident.estimators.identify import identify
 from ident.estimators.method import Method

@@ -31,7 +31,8 @@ from daq.config.cell_file import load_cell
 from daq.files import replace_file
 from drivers.simulation.spec import UndeclaredEffect
 from ident.arrays import FloatArray
-from ident.discovery.loop import find_effects, gather
+from ident.discovery.evidence import gather
+from ident.discovery.loop import find_effects
 from ident.effects.effect import PlacedEffect
 from ident.estimators.identify import identify
 from ident.estimators.method import Method

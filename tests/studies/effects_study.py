@@ -29,7 +29,8 @@ from daq.config.cell_file import load_cell
 from daq.files import replace_file
 from drivers.simulation.spec import UndeclaredEffect
 from ident.arrays import FloatArray
-from ident.discovery.loop import Evidence, by_instruments, find_effects, gather
+from ident.discovery.evidence import Evidence, by_instruments, gather
+from ident.discovery.loop import find_effects
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect, Side
 from ident.estimators.estimate import Estimate

@@ -25,7 +25,7 @@ from daq.log.conversion import load_run
 from daq.workflow.plan import plan
 from ident.data.run import Run
 from ident.discovery.before_after import left_on
-from ident.discovery.loop import gather
+from ident.discovery.evidence import gather
 from ident.discovery.noise_floor import FloorSource, noise_floors
 from ident.estimators.identify import identify
 from ident.estimators.method import Method

@@ -20,7 +20,8 @@ from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.workflow.fit import Fit, calibration_of
 from ident.data.run import Run
-from ident.discovery.loop import find_effects, gather
+from ident.discovery.evidence import gather
+from ident.discovery.loop import find_effects
 from ident.estimators.identify import estimate_with, identify
 from ident.estimators.method import Method
 from tests.ident.recordings import GAINS, MOUNTED, record, tx40_truth

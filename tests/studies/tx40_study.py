@@ -21,7 +21,8 @@ from daq.cli.app import main as drivegain
 from daq.config.cell import model_of
 from daq.environment import shipped_configurations
 from daq.log.conversion import load_run
-from ident.discovery.loop import find_effects, gather
+from ident.discovery.evidence import gather
+from ident.discovery.loop import find_effects
 from ident.equations.rows import Observation
 from ident.estimators.estimate import Estimate, RelativeError, of_squares
 from ident.estimators.identify import identify

@@ -30,9 +30,10 @@ from daq.workflow import fit as fit_module
 from daq.workflow.fit import Fit, calibration_of, fit
 from ident.discovery import before_after as before_after_module
 from ident.discovery.before_after import Account, account
+from ident.discovery.evidence import with_effects
 from ident.discovery.gates import PairedChange
 from ident.discovery.gear_loss import GearLoss
-from ident.discovery.loop import SetAside, Step, with_effects
+from ident.discovery.loop import SetAside, Step
 from ident.discovery.noise_floor import FloorSource, NoiseFloor
 from ident.discovery.search import Finding
 from ident.effects.dictionary import EFFECTS

@@ -33,7 +33,8 @@ from daq.writeback.gates.table import check_gates
 from daq.writeback.request import Edit, Request
 from ident.calibration import Calibration
 from ident.data.run import Recording, Run
-from ident.discovery.loop import find_effects, with_effects
+from ident.discovery.evidence import with_effects
+from ident.discovery.loop import find_effects
 from ident.effects.effect import ALL_AXES, PlacedEffect
 from ident.effects.electrical import Lag, TimeSkew
 from ident.effects.friction import Stribeck

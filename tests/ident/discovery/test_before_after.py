@@ -23,7 +23,8 @@ from ident.discovery.before_after import (
     left_on,
     left_out_runs,
 )
-from ident.discovery.loop import Evidence, Step, gather, with_effects, without_effects
+from ident.discovery.evidence import Evidence, gather, with_effects, without_effects
+from ident.discovery.loop import Step
 from ident.discovery.noise_floor import FloorSource, NoiseFloor
 from ident.effects.effect import PlacedEffect
 from ident.effects.electrical import Saturation
@@ -178,9 +179,11 @@ def test_gains_carry_their_own_sigma(start: Evidence, after: Evidence, compared:
 
 def test_the_jackknife_of_a_gain_is_that_of_its_estimate(start: Evidence) -> None:
     """The shifts behind σ_Δ are those behind σ."""
-    shifts = assess(start, start.estimate.gains).shifts
-    moves = len(shifts)
-    std = np.sqrt((moves - 1) / moves * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
+    moves = assess(start, start.estimate.gains).moves
+    assert moves is not None
+    shifts = moves.shifts(moves.blocks())[:, : len(start.estimate.gains)]
+    blocks = len(shifts)
+    std = np.sqrt((blocks - 1) / blocks * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
     assert std == pytest.approx(start.estimate.gains_std, rel=0.02)
 
 
@@ -254,3 +257,19 @@ def test_fixed_gains_do_not_change(truth: Truth, noisy_runs: tuple[Run, ...]) ->
     start = gather(found, runs)
     changed = before_after(assess(start, GAINS), assess(with_effects(start, (SPRING,)), GAINS))
     assert all(gain.change_std == 0.0 and not gain.significant for gain in changed.gains)
+
+
+def test_a_change_and_its_estimates_leave_out_the_same_blocks(start: Evidence, after: Evidence) -> None:
+    """Where the moves of one model are correlated, the change is judged by its longer blocks."""
+    weights = start.estimate.gains
+    first, last = assess(start, weights), assess(after, weights)
+    assert first.moves is not None
+    assert last.moves is not None
+    slow = (np.arange(len(first.moves.runs)) // 8 % 2)[:, None] * 2.0 - 1.0
+    correlated = replace(first, moves=replace(first.moves, scores=np.abs(first.moves.scores) * slow))
+    assert correlated.moves is not None
+    starts = correlated.moves.blocks()
+    assert len(starts) < len(last.moves.blocks())
+    shifts = (last.moves.shifts(starts) - correlated.moves.shifts(starts)[:, :1])[:, 0]
+    expected = np.sqrt((len(starts) - 1) / len(starts) * np.sum((shifts - shifts.mean()) ** 2))
+    assert before_after(correlated, last).gains[0].change_std == pytest.approx(expected)

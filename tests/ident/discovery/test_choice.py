@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
 from ident.discovery.choice import choice_covariance, is_small
-from ident.discovery.loop import Evidence, with_effects
+from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.search import Finding, Gates
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.friction import NonlinearViscous, Stribeck

@@ -14,6 +14,7 @@ from ident.data.dataset import Dataset
 from ident.data.run import Run
 from ident.discovery import loop
 from ident.discovery.candidates import SearchProblem, score_candidates
+from ident.discovery.evidence import Evidence, gather, with_effects
 from ident.discovery.gates import (
     MIN_RUNS,
     RunsLeftOut,
@@ -26,7 +27,7 @@ from ident.discovery.gates import (
     whitened_columns,
     without_effects_of,
 )
-from ident.discovery.loop import Evidence, SetAside, find_effects, gather, with_effects
+from ident.discovery.loop import SetAside, find_effects
 from ident.discovery.search import Finding, Gates, effect_key, rank_effects
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect

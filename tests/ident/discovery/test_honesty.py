@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial, score_candidates
-from ident.discovery.loop import Evidence
+from ident.discovery.evidence import Evidence
 from ident.discovery.search import Gates, rank_effects, rank_families
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect

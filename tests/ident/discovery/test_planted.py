@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from ident.data.dataset import Dataset
 from ident.data.run import Run
 from ident.discovery.candidates import ColumnCache
-from ident.discovery.loop import Evidence, find_effects, with_effects
+from ident.discovery.evidence import Evidence, with_effects
+from ident.discovery.loop import find_effects
 from ident.discovery.search import Gates, rank_effects
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect, Side

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
-from ident.discovery.loop import Evidence, find_effects
+from ident.discovery.evidence import Evidence
+from ident.discovery.loop import find_effects
 from ident.discovery.resonance import propose_resonances
 from ident.discovery.search import Gates
 from ident.effects.dictionary import EFFECTS

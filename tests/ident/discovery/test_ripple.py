@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
-from ident.discovery.loop import Evidence, find_effects
+from ident.discovery.evidence import Evidence
+from ident.discovery.loop import find_effects
 from ident.discovery.ripple import Periodogram, _fast_length, periodogram, propose_orders
 from ident.discovery.search import Gates
 from ident.effects.dictionary import EFFECTS

@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.data.run import Run
-from ident.discovery.loop import Evidence, find_effects
+from ident.discovery.evidence import Evidence
+from ident.discovery.loop import find_effects
 from tests.ident.recordings import GAINS, Truth, gathered
 
 FloatArray = NDArray[np.float64]

@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
-from ident.discovery.loop import Evidence, find_effects, with_effects
+from ident.discovery.evidence import Evidence, with_effects
+from ident.discovery.loop import find_effects
 from ident.discovery.search import Finding, Gates, choose_effect, rank_effects, refine_setting
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
 from ident.discovery import loop
-from ident.discovery.loop import Evidence, Step, find_effects, with_effects
+from ident.discovery.evidence import Evidence, with_effects
+from ident.discovery.loop import Step, find_effects
 from ident.discovery.search import Gates, choose_effect, detection_limits_nm, rank_effects
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
-from ident.discovery.loop import Evidence
+from ident.discovery.evidence import Evidence
 from ident.effects.signals import Signals, declared_signals, fitted_signals, session_began_s
 from ident.model.robot import Motion
 from tests.ident.recordings import PAYLOAD_TRUTH, Truth

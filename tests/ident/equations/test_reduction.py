@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from ident.data.run import Run
-from ident.discovery.loop import Evidence, gather
+from ident.discovery.evidence import Evidence, gather
 from ident.equations import reduction as reduction_module
 from ident.equations.reduction import Reduction, layout, reduce_runs
 from ident.equations.rows import OF_ROWS

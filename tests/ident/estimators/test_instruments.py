@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.discovery.loop import by_instruments, gather, with_effects
+from ident.discovery.evidence import by_instruments, gather, with_effects
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import LoadFriction
 from ident.errors import DataUnfit

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ident.discovery.loop import Evidence
+from ident.discovery.evidence import Evidence
 from ident.equations.system import System, Triangles, triangle
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import Scaling, ls, tls, wls

@@ -1,0 +1,163 @@
+"""An estimate with the rows that it rests on, and its refits: with effects, without, and by instruments.
+
+`gather` makes it. The search (`ident.discovery.loop`) and the comparison of errors (`before_after`) work on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ident.arrays import FloatArray
+from ident.data.conditioning import Conditioning
+from ident.data.dataset import Dataset, differentiate
+from ident.data.demand import as_demanded, with_demand
+from ident.data.run import Run
+from ident.effects.effect import PlacedEffect, Side, effect_torque
+from ident.effects.signals import Signals, fitted_signals, session_began_s
+from ident.equations.rows import Observation, observe, on_demanded_motion
+from ident.equations.system import System
+from ident.estimators.estimate import Estimate, RelativeError
+from ident.estimators.identify import Identification, estimate_with
+from ident.estimators.method import Method
+from ident.model.model import Model
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """An estimate with its rows at hand, for searches and plots."""
+
+    model: Model  #: the declared model
+    conditioning: Conditioning  #: the filters
+    datasets: tuple[Dataset, ...]  #: all runs, held-out runs last
+    held_out: int  #: number of held-out runs
+    rows_without_effects: Observation  #: rows of all runs, without effects
+    training: Observation  #: rows of the fit, with the columns of the effects
+    holdout: Observation | None  #: rows of the held-out runs, None without any
+    effects: tuple[PlacedEffect, ...]  #: in the model, in the order of their columns
+    estimate: Estimate  #: of the training rows
+    _identification: list[Identification] = field(default_factory=list, init=False, repr=False, compare=False)
+
+    @property
+    def trained(self) -> tuple[Dataset, ...]:
+        """Runs of the fit."""
+        return self.datasets[: len(self.datasets) - self.held_out]
+
+    @property
+    def identification(self) -> Identification:
+        """The estimate with its equations reduced, effects among them; kept, because reducing takes long."""
+        if not self._identification:
+            training, holdout = self.training.system(), None if self.holdout is None else self.holdout.system()
+            found = Identification(self.model, self.conditioning, training, holdout, self.estimate)
+            self._identification.append(found)
+        return self._identification[0]
+
+    @property
+    def holdout_error(self) -> RelativeError | None:
+        """Error on held-out rows [%]."""
+        return None if self.holdout is None else self.estimate.relative_error(self.holdout.system())
+
+
+def gather(found: Identification, runs: Iterable[Run] = (), holdout: Iterable[Run] = ()) -> Evidence:
+    """Build the rows behind an identification from its runs and held-out runs, unless it has kept them."""
+    model, conditioning = found.model, found.conditioning
+    if found.gathered is None:
+        trained = [differentiate(run, model.drive_train, conditioning) for run in runs]
+        datasets = (*trained, *(differentiate(run, model.drive_train, conditioning) for run in holdout))
+        rows, held_out = observe(model, datasets, conditioning, found.system), len(datasets) - len(trained)
+    else:
+        datasets, rows = found.gathered
+        held_out = len(datasets) - len(found.system.runs)
+    training, rest = _split_holdout(rows, held_out)
+    evidence = Evidence(model, conditioning, datasets, held_out, rows, training, rest, (), found.estimate)
+    evidence._identification.append(found)
+    return evidence
+
+
+def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals] = ()) -> Evidence:
+    """Refit the same data with these effects in the model, gains included.
+
+    Load and current are the model's predictions, so columns of them are built twice: with the estimate before, and
+    with the estimate that they led to.
+
+    Args:
+        before: the same data.
+        effects: of the model.
+        runs: signals of the runs of the fit around the estimate before, where they are at hand.
+    """
+    around, current, began_s = before, before, session_began_s(before.trained)  # held-out runs must not affect the fit
+    fixed = before.estimate.gains if before.estimate.gains_fixed else None
+    joints = before.model.robot.joints
+    columns = tuple(column.at(joints[placed.axis].kind) for placed in effects for column in placed.columns)
+    bare, unseen = _split_holdout(before.rows_without_effects, before.held_out)
+    for signals in (runs,) if all(placed.effect.abscissa.is_kinematic for placed in effects) else (runs, ()):
+        around, training = current, bare
+        if effects:
+            training = bare.extended(columns, _torques(effects, around, before.trained, began_s, signals))
+        estimate = estimate_with(before.estimate.method, training.system(), fixed)
+        current = replace(before, training=training, holdout=unseen, effects=effects, estimate=estimate)
+    if unseen is None or not effects:
+        return current
+    held_out = before.datasets[len(before.trained) :]
+    return replace(current, holdout=unseen.extended(columns, _torques(effects, around, held_out, began_s)))
+
+
+def by_instruments(evidence: Evidence) -> Estimate | None:
+    """Estimate the same model of the same runs by ``iv``; None where the demanded motion of no run is known.
+
+    Load and current of the effects' columns are predictions of the estimate by ``ml``, in the instruments too.
+    """
+    system, estimate = _with_instruments(evidence), evidence.estimate
+    if system is None:
+        return None
+    return estimate_with(Method.IV, system, estimate.gains if estimate.gains_fixed else None)
+
+
+def _with_instruments(evidence: Evidence) -> System | None:
+    model, conditioning = evidence.model, evidence.conditioning
+    asked = tuple(with_demand(data, model.drive_train, conditioning) for data in evidence.trained)
+    if all(data.demanded is None for data in asked):
+        return None
+    demanded = on_demanded_motion(model, asked, evidence.training)
+    if evidence.effects:
+        datasets, began_s = tuple(map(as_demanded, asked)), session_began_s(evidence.trained)
+        demanded = replace(demanded, effects=_torques(evidence.effects, evidence, datasets, began_s))
+        del datasets
+    del asked  # one more copy of all runs, while the equations are built
+    return evidence.training.system(demanded)
+
+
+def _torques(
+    effects: Sequence[PlacedEffect],
+    around: Evidence,
+    datasets: Sequence[Dataset],
+    began_s: float | None,
+    runs: Sequence[Signals] = (),
+) -> FloatArray:
+    """Columns of effects on the rows of runs, load and current predicted by an estimate, shape (n, p, r)."""
+    parts, through_links = [], any(placed.effect.side is Side.ALL_JOINTS for placed in effects)
+    for index, data in enumerate(datasets):  # one by one: signals at full rate are the largest arrays of a search
+        if runs:
+            run = runs[index]
+        else:
+            model, rows, estimate = around.model, around.training, around.estimate
+            run = fitted_signals(model, data, rows, estimate, began_s, inertia=through_links)
+        given = (run,), (data,), around.conditioning, around.model
+        parts.append(np.concatenate([effect_torque(placed.effect, placed.axis, *given) for placed in effects], axis=1))
+    return np.concatenate(parts, axis=2)
+
+
+def without_effects(evidence: Evidence, estimate: Estimate) -> Evidence:
+    """Return the same data under the declared model alone, with its estimate by ``ml``."""
+    training, rest = _split_holdout(evidence.rows_without_effects, evidence.held_out)
+    return replace(evidence, training=training, holdout=rest, effects=(), estimate=estimate)
+
+
+def _split_holdout(observation: Observation, held_out: int) -> tuple[Observation, Observation | None]:
+    """Split rows of all runs into those of the fit and those of the last, held-out runs."""
+    if not held_out:
+        return observation, None
+    first = int(np.searchsorted(observation.run, len(observation.runs) - held_out))
+    return observation.only(slice(first)), observation.only(slice(first, None))
