@@ -48,11 +48,11 @@ def impossible(columns: Sequence[Column], values: FloatArray, deviations: FloatA
     return ", ".join(found)
 
 
-def in_noise(values: FloatArray, covariance: FloatArray) -> str:
-    """Why coefficients, shape (p,), may all be zero by Wald's test with CONFIDENCE; empty where they may not."""
+def in_noise(values: FloatArray, covariance: FloatArray, confidence: float = CONFIDENCE) -> str:
+    """Why coefficients, shape (p,), may all be zero by Wald's test; empty where they may not."""
     wald = float(values @ np.linalg.pinv(covariance, hermitian=True) @ values)
     probability = float(scipy.special.chdtrc(len(values), wald))
-    return "" if probability <= 1.0 - CONFIDENCE else f"its coefficients may all be zero (p = {probability:.2f})"
+    return "" if probability <= 1.0 - confidence else f"its coefficients may all be zero (p = {probability:.2f})"
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,6 +48,7 @@ from ident.estimators.estimate import Estimate
 
 UNFITTED = (NotConverged, RankDeficient, np.linalg.LinAlgError)
 MAX_EFFECTS = 12  #: More effects than this on one robot mean that the declared model is wrong
+SHOWN = 0.999  #: Confidence of what instruments show: a dozen effects may ask them in one search
 PIECES_PER_EFFECT = 3  #: Fewer pieces of moves than this for each effect cannot show that all of them are there
 
 
@@ -305,7 +306,7 @@ def _refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
     own = _own_unknowns(estimate, placed)
     place, values, fitted = len(estimate.gains) + own, estimate.parameters[own], evidence.estimate.parameters[own]
     covariance = estimate.covariance[np.ix_(place, place)]
-    if not (why := in_noise(values, covariance)):
+    if not (why := in_noise(values, covariance, SHOWN)):
         return ""
     precision = np.linalg.pinv(covariance, hermitian=True)
     nearer = float(fitted @ precision @ (fitted - 2.0 * values)) > 0.0  # |values − fitted|² > |values|²
