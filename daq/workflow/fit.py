@@ -27,6 +27,7 @@ from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
 from ident.discovery.before_after import error_on, holdout_change
 from ident.discovery.evidence import Evidence, gather, without_effects
 from ident.discovery.loop import Step, find_effects
+from ident.effects.friction import TemperatureFriction
 from ident.errors import (
     ChannelsExchanged,
     Diagnosis,
@@ -375,9 +376,13 @@ def check_holdout(fitted: Fit) -> None:
         for one in (before, after)
         if (rows := one.holdout) is not None
     )
+    unseen = after.datasets[len(after.trained) :]
+    cold = [one.name for one in unseen if one.temperature_c is None]
+    needed = cold and any(placed.effect.name == TemperatureFriction.name for placed in after.effects)
     raise EffectsRefuted(
         ", ".join(placed.name_among(fitted.cell.axis_names) for placed in after.effects),
-        found=f"an error of held-out runs of {last:.2f} %, {first:.2f} % without",
+        found=f"an error of held-out runs of {last:.2f} %, {first:.2f} % without"
+        + (f"; {', '.join(cold)} has no temperature, on which an effect depends" if needed else ""),
         expected=f"no rise by more than its noise over their {change.moves} moves",
         remedy="no calibration was written: take `drivegain fit`, which adds no effects, or record more runs for "
         "the fit (or pass --accept-worse-holdout to `drivegain residual`)",

@@ -191,16 +191,12 @@ def predicted(
 def as_calibrated(calibration: Calibration, run: Run) -> Run:
     """Leave out of a run's payload what the calibration itself says of it, given or identified.
 
-    Warns of a run without the temperatures that an effect of the calibration depends on.
+    Warns as `warn_without_temperature`.
 
     Raises:
         DataUnfit: the calibration was given another mass on this mounting.
     """
-    for effect in calibration.effects:
-        if effect.name == TemperatureFriction.name and not _has_temperature(calibration, run, effect.axis):
-            _LOG.warning(
-                "%s has no temperature of %s: its friction is predicted at %g °C", run.name, effect.axis, REFERENCE_C
-            )
+    warn_without_temperature(calibration, run)
     payload = run.payload
     if payload is None:
         return run
@@ -214,6 +210,15 @@ def as_calibrated(calibration: Calibration, run: Run) -> Run:
         )
     left = {name: value for name, value in payload.known.items() if name not in own}
     return replace(run, payload=replace(payload, known=left))
+
+
+def warn_without_temperature(calibration: Calibration, run: Run) -> None:
+    """Warn of a run without the temperatures that an effect of the calibration depends on."""
+    for effect in calibration.effects:
+        if effect.name == TemperatureFriction.name and not _has_temperature(calibration, run, effect.axis):
+            _LOG.warning(
+                "%s has no temperature of %s: its friction is predicted at %g °C", run.name, effect.axis, REFERENCE_C
+            )
 
 
 def _has_temperature(calibration: Calibration, run: Run, axis: str) -> bool:

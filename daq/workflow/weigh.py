@@ -11,7 +11,13 @@ from daq.config.cell import Cell, model_of
 from daq.errors import ConfigurationError, LogRepeated, LogsDiffer
 from daq.log.conversion import load_run
 from daq.workflow.experiment import experiment_of, extra_moves
-from daq.workflow.validate import as_calibrated, check_cell, conditioning_of, unpredictable
+from daq.workflow.validate import (
+    as_calibrated,
+    check_cell,
+    conditioning_of,
+    unpredictable,
+    warn_without_temperature,
+)
 from ident.calibration import Calibration
 from ident.contact import ExternalTorque, external_torque, prediction_band
 from ident.data.run import Run
@@ -59,10 +65,9 @@ def weigh_logs(
                 remedy="give --bare logs that were recorded without a payload",
             )
         without.append(run)
-    digests = [run.digest for run in (*loaded, *without)]
-    for log, digest in zip((*logs, *bare), digests, strict=True):
-        if digests.count(digest) > 1:
-            raise LogRepeated(str(log), found="the same log twice", expected="every log once", remedy="name other logs")
+    for run in (*loaded, *without):
+        warn_without_temperature(calibration, run)
+    _require_once((*logs, *bare), (*loaded, *without))
     described: Cell = cells[0]
     body = weigh(calibration, model_of(described), loaded, conditioning_of(calibration), bare=without)
     help_: tuple[Help, ...] = ()
@@ -81,6 +86,7 @@ def contact_in(
     Raises:
         DataError, ConfigurationError: a log cannot be used.
         LogsDiffer: a log is of another cell.
+        LogRepeated: a log was given twice: a contact in it would count as quiet motion.
         IdentificationError: see `ident.external_torque`.
     """
     conditioning = conditioning_of(calibration)
@@ -88,9 +94,18 @@ def contact_in(
     model = model_of(described)
     band = None
     if quiet:
-        calm = (_predictable(calibration, one, _loaded(calibration, one, cell)[0]) for one in quiet)
-        band = prediction_band(calibration, model, calm, conditioning)
+        calm = [_loaded(calibration, one, cell)[0] for one in quiet]
+        _require_once((log, *quiet), (run, *calm))
+        known = (_predictable(calibration, one, other) for one, other in zip(quiet, calm, strict=True))
+        band = prediction_band(calibration, model, known, conditioning)
     return external_torque(calibration, model, _predictable(calibration, log, run), conditioning, band), described
+
+
+def _require_once(logs: Sequence[Path], runs: Sequence[Run]) -> None:
+    digests = [run.digest for run in runs]
+    for log, digest in zip(logs, digests, strict=True):
+        if digests.count(digest) > 1:
+            raise LogRepeated(str(log), found="the same log twice", expected="every log once", remedy="name other logs")
 
 
 def _loaded(calibration: Calibration, log: Path, cell: Cell | None) -> tuple[Run, Cell]:

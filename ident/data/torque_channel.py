@@ -53,7 +53,8 @@ def torque_slope(channels: Sequence[TorqueChannel]) -> TorqueSlope | None:
         channels: of one axis, one a run.
 
     Returns:
-        the slope; None with readings of fewer than FEWEST_BLOCKS seconds, or where the current hardly changes.
+        the slope; None with readings of fewer than FEWEST_BLOCKS seconds, or where the current hardly changes or the
+        torque not at all.
     """
     runs = [channel for channel in channels if len(channel.time_s) > 1]
     if not runs:
@@ -65,7 +66,7 @@ def torque_slope(channels: Sequence[TorqueChannel]) -> TorqueSlope | None:
     size = np.sqrt(np.mean(np.concatenate([run.current_a for run in runs]) ** 2))
     blocks = _blocks(runs)
     count = len(np.unique(blocks))
-    if count < FEWEST_BLOCKS or not np.std(current) > SMALLEST_SHARE * size:
+    if count < FEWEST_BLOCKS or not np.std(current) > SMALLEST_SHARE * size or not torque.any():
         return None
     gram = float(nearby @ current)
     slope = float(nearby @ torque) / gram

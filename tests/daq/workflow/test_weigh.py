@@ -14,6 +14,7 @@ from rich.console import Console, RenderableType
 
 from daq.cli import main
 from daq.config.cell_file import load_cell
+from daq.errors import ExitCode
 from daq.report.weighing import contact_document, contact_view, weighed_document, weighed_view
 from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.weigh import Weighed
@@ -28,15 +29,21 @@ def test_a_real_robot_that_touched_nothing(
     real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, log = real
-    options = ["--calibration", str(file), "--quiet", str(log), "--pictures", str(tmp_path / "new")]
+    options = ["--calibration", str(file), "--pictures", str(tmp_path / "new")]
     assert main(["contact", str(log), *options, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert not found["band_from_this_log"]
+    assert found["band_from_this_log"]
     assert [axis["axis"] for axis in found["axes"]] == ["J1", "J2", "J3", "J4", "J5", "J6"]
     for axis in found["axes"]:
         assert 0.0 < axis["band"] < axis["threshold"]
     assert found["contacts"] == []
     assert Path(found["picture"]).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_log_is_not_its_own_quiet_motion(real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    file, log = real
+    assert main(["contact", str(log), "--calibration", str(file), "--quiet", str(log)]) == ExitCode.DATA_UNFIT
+    assert "the same log twice" in capsys.readouterr().err
 
 
 def test_a_real_flange_without_a_body_weighs_nothing(

@@ -46,3 +46,8 @@ def test_a_constant_current_has_no_slope() -> None:
     made = channel(np.random.default_rng(2))
     held = replace(made, current_a=3.0 + 0.01 * made.current_a)
     assert torque_slope([held]) is None
+
+
+def test_a_constant_torque_has_no_slope() -> None:
+    made = channel(np.random.default_rng(2))
+    assert torque_slope([replace(made, torque_nm=np.full_like(made.torque_nm, 3.0))]) is None
