@@ -75,7 +75,7 @@ def fit_verb(
     from dataclasses import replace
     from datetime import UTC, datetime
 
-    from daq.cli.terminal import at_most_one, check_output, print_view, status
+    from daq.cli.terminal import at_most_one, check_folder, check_output, print_view, status
     from daq.config.cell_file import load_cell
     from daq.log.reader import LossyLogs
     from daq.report.fit import fit_document, fit_view
@@ -88,6 +88,7 @@ def fit_verb(
         at_most_one(cases=cases, method=method, **other, out=out, pictures=pictures)
         _fit_cases(logs, holdout or (), None if cell is None else load_cell(cell), essential, cases, json=json)
         return
+    check_folder(out)
     check_output(out, (*logs, *(holdout or ()), cell), CALIBRATION)
     with status("identifying"):
         described = None if cell is None else load_cell(cell)
@@ -180,7 +181,7 @@ def residual_verb(
     from dataclasses import replace
     from datetime import UTC, datetime
 
-    from daq.cli.terminal import check_output, print_view, status
+    from daq.cli.terminal import check_folder, check_output, print_view, status
     from daq.config.cell_file import load_cell
     from daq.log.reader import LossyLogs
     from daq.report.fit import start_of
@@ -190,6 +191,7 @@ def residual_verb(
     from ident.discovery.before_after import account
     from ident.estimators.method import Method
 
+    check_folder(out)
     check_output(out, (*logs, *(holdout or ()), cell), CALIBRATION)
     check_report(report)
     with status("identifying") as report_step:

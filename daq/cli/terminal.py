@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console, RenderableType
 
-from daq.errors import UsageError, writing
+from daq.errors import OutputFailed, UsageError, writing
 from daq.report.text import terminal_text
 
 if TYPE_CHECKING:
@@ -44,6 +44,14 @@ def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) 
             str(out), found="one of the input files", expected="a file of its own", remedy="choose another name"
         )
     check_replaceable(out, f"format: {format_}", format_)
+
+
+def check_folder(out: Path | None) -> None:
+    """Refuse, before the work is done, an output file in a folder that does not exist."""
+    if out is not None and not out.parent.is_dir():
+        raise OutputFailed(
+            str(out), found="no such folder", expected="a folder that exists", remedy="create it, or choose another"
+        )
 
 
 def check_replaceable(out: Path, mark: str, kind: str) -> None:

@@ -162,3 +162,11 @@ def test_an_unwritable_standard_output_is_no_traceback(
     code = main(["import", "x.yaml", "--data", ".", "--out", "y.mcap"])
     assert code == ExitCode.UNEXPECTED
     assert "no space left" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", ["fit", "residual"])
+def test_a_missing_folder_is_named_before_any_log_is_read(
+    verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([verb, str(tmp_path / "no.mcap"), "--out", str(tmp_path / "missing/c.yaml")]) == ExitCode.UNEXPECTED
+    assert "no such folder" in capsys.readouterr().err
