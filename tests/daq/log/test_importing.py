@@ -644,16 +644,23 @@ def test_torque_columns_give_a_slope_and_temperature_columns_a_temperature(bench
 def test_a_torque_column_too_few_and_a_factor_of_zero_are_refused(bench: Bench) -> None:
     for torque, said in (
         ({"columns": ["i1", "i2"], "side": "motor"}, "2 columns"),
-        ({"columns": NAMES[6:], "side": "motor", "factor": 0.0}, "factor"),
-        ({"columns": NAMES[6:], "side": "motor", "factor": [1.0, 2.0]}, "torque.factor"),
+        ({"columns": SPEEDS, "side": "motor", "factor": 0.0}, "factor"),
+        ({"columns": SPEEDS, "side": "motor", "factor": [1.0, 2.0]}, "torque.factor"),
     ):
         bench.describe(torque={"file": "run.csv", **torque})
         with pytest.raises(ConfigurationInconsistent, match=said):
             import_csv(bench.description, bench.data, bench.out, software="test")
     # Every section is checked, whatever comes after it.
     current = {"file": "run.csv", "columns": NAMES[6:], "unit": "A", "factor": [1.0, 2.0]}
-    bench.describe(current=current, torque={"file": "run.csv", "columns": NAMES[6:], "side": "motor"})
+    bench.describe(current=current, torque={"file": "run.csv", "columns": SPEEDS, "side": "motor"})
     with pytest.raises(ConfigurationInconsistent, match=r"current\.factor"):
+        import_csv(bench.description, bench.data, bench.out, software="test")
+
+
+def test_a_column_is_not_both_current_and_torque(bench: Bench) -> None:
+    columns = [*SPEEDS[:3], "i4", *SPEEDS[4:]]
+    bench.describe(torque={"file": "./run.csv", "columns": columns, "side": "motor"})
+    with pytest.raises(ConfigurationInconsistent, match=r"torque\.columns: found i4 of .*, which current is read from"):
         import_csv(bench.description, bench.data, bench.out, software="test")
 
 
