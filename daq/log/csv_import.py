@@ -107,7 +107,8 @@ def import_csv(description: Path, data: Path, out: Path, *, software: str, cell_
         )
     )
     scale = scaling(cell, readback)
-    joint_rad = scale.joint_position(counts)
+    # As a fit reads them: the log keeps an encoder's counts as the counter had them, with its wraps.
+    joint_rad = scale.joint_position(unwrapped(counts.astype(np.int32)) if count_rad is None else counts)
     check_limits(str(table.path), joint_rad, cell)
     _check_motion(str(table.path), joint_rad, cell)
     _check_speed(str(table.path), joint_rad, rate_hz, cell)

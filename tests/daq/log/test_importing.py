@@ -393,17 +393,36 @@ def test_jittered_stamps_are_the_sample_times(bench: Bench, capsys: pytest.Captu
     np.testing.assert_allclose(run.current_a, np.cos(at_ms / 280.0 + np.arange(6)), atol=(5.0 / 280.0) ** 2 / 8)
 
 
-def test_resampled_counts_go_on_over_a_wrap_and_are_finer_than_a_count(bench: Bench) -> None:
-    """An encoder of 30 bits on the first motor wraps after two turns; those of the others have 10 bits."""
+TURN_WITH_WRAPS = np.array([2**30, *[1024] * 5])
+
+
+def _with_counts_that_wrap(bench: Bench, joint_rad: FloatArray) -> None:
+    """Write counts of an encoder of 30 bits on the first motor, which wraps after two turns, and 10 bits elsewhere."""
     cell = bench.folder / "configs/cells/demo.yaml"
     text = cell.read_text(encoding="utf-8").replace("revolution: 65536", f"revolution: {2**30}", 1)
     cell.write_text(text.replace("revolution: 65536", "revolution: 1024"), encoding="utf-8")
-    turn = np.array([2**30, *[1024] * 5])
-    ratio = load_run_of(bench)
-    joint_rad = np.radians(30.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6)))
-    counts = np.rint(joint_rad @ ratio.T / (2 * pi) * turn).astype(np.int64).astype(np.int32).astype(np.float64)
+    turns = joint_rad @ load_run_of(bench).T / (2 * pi)
+    counts = np.rint(turns * TURN_WITH_WRAPS).astype(np.int64).astype(np.int32).astype(np.float64)
     assert np.abs(np.diff(counts[:, 0])).max() > 2**31
     bench.write_csv(np.hstack((counts, bench.current_a)))
+
+
+def test_counts_at_a_rate_go_on_over_a_wrap(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    """The checks see the motion, not the jumps of the counter; what is too fast is so still."""
+    joint_rad = np.radians(30.0 * np.sin(np.arange(300)[:, None] / 160.0 + np.arange(6)))
+    _with_counts_that_wrap(bench, joint_rad)
+    counted = {"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
+    bench.describe(position=counted, rate_hz=10_000)
+    _refused(bench, capsys, 4, "deg/s", "rate_hz is too high")
+    bench.describe(position=counted)
+    assert bench.run() == 0
+    run = load_run(bench.out)[0]
+    np.testing.assert_allclose(run.position_rad[:, 0], joint_rad[:, 0], atol=1e-8)
+
+
+def test_resampled_counts_go_on_over_a_wrap_and_are_finer_than_a_count(bench: Bench) -> None:
+    turn, ratio = TURN_WITH_WRAPS, load_run_of(bench)
+    _with_counts_that_wrap(bench, np.radians(30.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))))
     _with_time(bench, UNEVEN_MS)
     counted = {"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
     bench.describe(rate_hz=None, position=counted, time={"file": "run.csv", "column": "t", "unit": "ms"})
