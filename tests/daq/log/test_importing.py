@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
+from dataclasses import fields
 from math import pi
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from daq.cli import main
-from daq.config.yaml_file import parse_yaml
+from daq.config.import_description import ImportDescription
+from daq.config.yaml_file import parse_yaml, read_model
 from daq.errors import ConfigurationInconsistent, OutputFailed, TableUnfit, UsageError
 from daq.log.conversion import load_run
 from daq.log.csv_import import import_csv, quantise
@@ -681,6 +684,18 @@ def test_a_column_is_not_both_current_and_torque(bench: Bench) -> None:
     bench.describe(torque={"file": "./run.csv", "columns": columns, "side": "motor"})
     with pytest.raises(ConfigurationInconsistent, match=r"torque\.columns: found i4 of .*, which current is read from"):
         import_csv(bench.description, bench.data, bench.out, software="test")
+
+
+def test_the_shipped_description_shows_every_setting(checkout: Path) -> None:
+    """Its lines that are commented out are valid, and with them nothing is missing."""
+    text = (checkout / "configs/imports/tx40.yaml").read_text(encoding="utf-8")
+    document = parse_yaml(re.sub(r"(?m)^# ( *[a-z_]+:)", r"\1", text).encode(), "tx40.yaml")
+    wanted = read_model(document, ImportDescription)
+    assert document.tree.keys() == ImportDescription.model_fields.keys()
+    sections = {"table": wanted.table, "time": wanted.time, **dict(wanted.sections())}
+    for key, section in sections.items():
+        assert section is not None
+        assert document.tree[key].keys() == {field.name for field in fields(section)}, key
 
 
 def test_an_import_without_them_has_neither(bench: Bench) -> None:
