@@ -70,7 +70,7 @@ def import_csv(description: Path, data: Path, out: Path, *, software: str, cell_
 
     Args:
         description: the import description.
-        data: folder of the CSV files.
+        data: folder of the files (CSV, MATLAB or bags) that the description names.
         out: the log to write; it does not exist after an error.
         software: name and version to put into the log.
         cell_path: cell file to use instead of the description's.
@@ -194,7 +194,7 @@ def _slow(
 
 
 def _readings(slow: list[tuple[Quantity, int, FloatArray]], cycle: int, time_ns: int) -> Iterator[SlowReading]:
-    """Return the slow readings of a sample."""
+    """Yield the slow readings of a sample, where one of their periods begins."""
     for quantity, every, values in slow:
         if cycle % every == 0:
             for axis, value in enumerate(values[cycle].tolist()):
