@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 from math import pi
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
@@ -193,6 +193,8 @@ class PolicyModel(StrictModel):
 
 class CellModel(StrictModel):
     """A whole cell file."""
+
+    reference: ClassVar[str] = "cell-file.md"
 
     name: Name
     robot: RobotModel

@@ -7,7 +7,7 @@ depend on its form.
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -173,6 +173,8 @@ class FactsModel(StrictModel):
 
 class DriveModel(StrictModel):
     """A whole drive profile file."""
+
+    reference: ClassVar[str] = "schemas.md"
 
     name: Annotated[str, Field(min_length=1)]
     position: SignalModel

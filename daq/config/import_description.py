@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
@@ -161,6 +161,8 @@ Section = PositionColumns | ScaledColumns | VelocityColumns | TemperatureColumns
 
 class ImportDescription(StrictModel):
     """A whole import description."""
+
+    reference: ClassVar[str] = "schemas.md"
 
     name: Name  #: name of the recording
     cell: FileName  #: cell file, relative to this one

@@ -15,7 +15,7 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, get_args, get_type_hints
 
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
@@ -55,6 +55,7 @@ class StrictModel(BaseModel):
     """
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
+    reference: ClassVar[str] = ""  #: page of docs/reference with every key, for a file that people write
 
 
 Model = TypeVar("Model", bound=StrictModel)
@@ -245,7 +246,7 @@ def read_model(document: Document, model: type[Model], folder: Path | None = Non
         faults = [_fault(item, model) for item in items[:MAX_EXPLAINED]]
         # A list counts as empty when its items are wrong; the faults inside say enough.
         outer = {fault.path[:length] for fault in faults for length in range(len(fault.path))}
-        remedy = "correct the file; `drivegain init` shows every key"
+        remedy = "correct the file" + (f"; docs/reference/{model.reference} has every key" if model.reference else "")
         if len(items) > len(faults):
             remedy += f" ({len(items) - len(faults)} more faults are not listed)"
         inner = [fault for fault in faults if fault.path not in outer]

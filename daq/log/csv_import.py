@@ -70,7 +70,7 @@ def import_csv(description: Path, data: Path, out: Path, *, software: str, cell_
 
     Args:
         description: the import description.
-        data: folder of the CSV files.
+        data: folder of the files (CSV, MATLAB or bags) that the description names.
         out: the log to write; it does not exist after an error.
         software: name and version to put into the log.
         cell_path: cell file to use instead of the description's.
@@ -107,7 +107,8 @@ def import_csv(description: Path, data: Path, out: Path, *, software: str, cell_
         )
     )
     scale = scaling(cell, readback)
-    joint_rad = scale.joint_position(counts)
+    # As a fit reads them: the log keeps an encoder's counts as the counter had them, with its wraps.
+    joint_rad = scale.joint_position(unwrapped(counts.astype(np.int32)) if count_rad is None else counts)
     check_limits(str(table.path), joint_rad, cell)
     _check_motion(str(table.path), joint_rad, cell)
     _check_speed(str(table.path), joint_rad, rate_hz, cell)
@@ -193,7 +194,7 @@ def _slow(
 
 
 def _readings(slow: list[tuple[Quantity, int, FloatArray]], cycle: int, time_ns: int) -> Iterator[SlowReading]:
-    """Return the slow readings of a sample."""
+    """Yield the slow readings of a sample, where one of their periods begins."""
     for quantity, every, values in slow:
         if cycle % every == 0:
             for axis, value in enumerate(values[cycle].tolist()):

@@ -258,13 +258,20 @@ def read_log(path: Path | str) -> Log:
         raise LogIncomplete(
             str(path), found="no samples", expected=f"some on {SAMPLES_TOPIC}", remedy="record or import the run again"
         )
+    axes = len(head.readback.axes)
     widths = {block.position_counts.shape[1] for block in blocks}
-    widths |= {reading.axis + 1 for reading in reader.readings if reading.axis >= len(head.readback.axes)}
-    if widths != {len(head.readback.axes)}:
+    if widths != {axes}:
         raise LogIncomplete(
             str(path),
             found=f"samples of {', '.join(map(str, sorted(widths)))} axes",
-            expected=f"{len(head.readback.axes)}, as in its readback",
+            expected=f"{axes}, as in its readback",
+            remedy="record or import the run again",
+        )
+    if foreign := {reading.axis for reading in reader.readings} - set(range(axes)):
+        raise LogIncomplete(
+            str(path),
+            found=f"a torque or temperature of axis {max(foreign)}, counted from 0",
+            expected=f"those of {axes} axes, as in its readback",
             remedy="record or import the run again",
         )
     count = sum(len(block.cycle) for block in blocks)

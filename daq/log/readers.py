@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from daq.config.import_description import ImportDescription
-from daq.errors import TableUnfit
+from daq.config.import_description import ImportDescription, Section, TemperatureColumns
+from daq.errors import ConfigurationInconsistent, TableUnfit
 from daq.files import open_regular
 from daq.log.bag_table import FIELDS, read_bag
 from daq.log.container import MAGIC
@@ -51,13 +51,23 @@ def with_columns(wanted: ImportDescription, data: Path, axis_names: Sequence[str
     (`position`: its joints are called as the axes) or a whole matrix of a MATLAB file (`q`: a column for each axis).
 
     Raises:
-        TableUnfit: a file is of a format that is not read.
+        TableUnfit: a file is of a format that is not read, or a temperature is sought in a bag.
+        ConfigurationInconsistent: torques are to be read from where the currents are.
     """
-    changed = {}
+    changed: dict[str, Section] = {}
+    bags = set[str]()
     for key, section in wanted.sections():
-        field = key if key in FIELDS else "effort"  # a bag of joint states has no temperature
         reader = reader_of(data / section.file)
         if reader is read_bag:
+            if isinstance(section, TemperatureColumns):
+                raise TableUnfit(
+                    str(data / section.file),
+                    found="`temperature` from a ROS 2 bag",
+                    expected=f"a file with temperatures; joint states have {', '.join(FIELDS)} alone",
+                    remedy="leave `temperature` out of the import description, or name a CSV or MATLAB file with it",
+                )
+            bags.add(section.file)
+            field = key if key in FIELDS else "effort"
             names = [str(column) for column in section.columns]
             if len(names) == 1 and names[0] in FIELDS:
                 names = [f"{names[0]}.{axis}" for axis in axis_names]
@@ -66,4 +76,24 @@ def with_columns(wanted: ImportDescription, data: Path, axis_names: Sequence[str
         elif reader is read_mat and len(section.columns) == 1 < len(axis_names):
             columns = [f"{section.columns[0]}.{number + 1}" for number in range(len(axis_names))]
             changed[key] = replace(section, columns=tuple(columns))
-    return wanted.model_copy(update=changed)
+    whole = wanted.model_copy(update=changed)
+    _check_torque(whole, bags)
+    return whole
+
+
+def _check_torque(wanted: ImportDescription, bags: Set[str]) -> None:
+    """Refuse torques from the columns, or from the field of a bag, of the currents: their slope would be made up."""
+    torque, current = wanted.torque, wanted.current
+    if torque is None or Path(torque.file) != Path(current.file):
+        return
+    found, read = (
+        [str(column).partition(".")[0] if torque.file in bags else column for column in section.columns]
+        for section in (torque, current)
+    )
+    if shared := [str(column) for column in dict.fromkeys(found) if column in read]:
+        raise ConfigurationInconsistent(
+            f"import description {wanted.name!r}: torque.columns",
+            found=f"{', '.join(shared)} of {torque.file}, which current is read from",
+            expected="the controller's own torque, in columns (of a bag: in a field) of its own",
+            remedy="name those columns, or leave `torque` out; no fit needs it",
+        )

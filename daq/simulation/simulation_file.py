@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -102,6 +102,8 @@ class EffectModel(StrictModel):
 
 class SimulationModel(StrictModel):
     """A whole simulation file."""
+
+    reference: ClassVar[str] = "schemas.md"
 
     urdf: Annotated[str, Field(min_length=1)]
     gravity_m_s2: tuple[float, float, float]

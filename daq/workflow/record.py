@@ -150,7 +150,7 @@ def record(
         network.prepare()
         polling = Polling(network, beside_stream=polling_fits(cell))
         warnings = (
-            *(*load_warnings(cell), *check_currents(cell, network.scales()), *network.unguarded(), *polling.remarks),
+            *(*load_warnings(cell), *check_currents(cell, network.scales()), *network.unguarded()),
             *(polling_warnings(cell) if polling else ()),
         )
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
@@ -215,7 +215,7 @@ def record(
             log.conclude(*verdict, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns())
         if short is not None:
             raise short
-        return Recorded(out, log.statistics, stream.statistics, warnings)
+        return Recorded(out, log.statistics, stream.statistics, (*warnings, *polling.remarks))
 
 
 def controller_digest(cell: Cell) -> str | None:

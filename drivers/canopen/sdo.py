@@ -15,8 +15,8 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 from drivers.errors import ObjectAccessError
 from drivers.profiles.profile import ObjectEntry
 
-ABORT_DOES_NOT_EXIST = 0x0602_0000
-ABORT_NO_SUBINDEX = 0x0609_0011
+NO_SUCH_OBJECT = frozenset((0x0602_0000, 0x0609_0011))
+"""Aborts of a drive that lacks the object or its sub-index (CiA 301); any other may be gone at the next request."""
 _ABORT_TIMED_OUT = 0x0504_0000
 _ABORT = 0x80
 _INITIATE_DOWNLOAD, _INITIATE_UPLOAD = 1, 2
@@ -60,8 +60,7 @@ class ObjectAccess:
         try:
             return self.read(entry)
         except ObjectAccessError as error:
-            missing = error.abort_code in (ABORT_DOES_NOT_EXIST, ABORT_NO_SUBINDEX)
-            if missing or (any_abort and error.abort_code is not None):
+            if error.abort_code in NO_SUCH_OBJECT or (any_abort and error.abort_code is not None):
                 return None
             raise
 

@@ -120,12 +120,16 @@ def _name_plate(access: ObjectAccess, profile: DriveProfile) -> tuple[float | No
         return None, None, (f"profile {profile.name} has no rated current; the ampere cannot be checked",)
     rated = profile.rated
     current = access.read_optional(rated.current)
+    # The drive's torque is in thousandths of its rated torque.
+    unlogged = "" if profile.torque is None else f", and its torque ({profile.torque}) is not logged"
     if not current:  # 0 is "not entered"
-        return None, None, (f"drive reports no rated current ({rated.current}); the ampere cannot be checked",)
+        found = f"drive reports no rated current ({rated.current}); the ampere cannot be checked{unlogged}"
+        return None, None, (found,)
     torque = None if rated.torque is None else access.read_optional(rated.torque)
     if not torque:
         missing = "no rated torque" if rated.torque is None else f"drive reports no rated torque ({rated.torque})"
-        return current * rated.ampere_per_unit, None, (f"{missing}; the torque constant cannot be checked",)
+        found = f"{missing}; the torque constant cannot be checked{unlogged}"
+        return current * rated.ampere_per_unit, None, (found,)
     return current * rated.ampere_per_unit, torque * rated.newton_metre_per_unit, ()
 
 

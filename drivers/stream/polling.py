@@ -3,7 +3,8 @@
 Nothing waits for an answer. At most one request is on its way; it is sent in a cycle without set-points, and its answer
 is taken from the frames that the stream reads anyway. SDO has the lowest priority on the bus, so a request or an answer
 delays the frames of a cycle by its own length at most; `daq.config.bus` decides whether a period has room for both. A
-lost answer is a missing reading; its object is read again at its next turn.
+lost answer is a missing reading, and so is an abort: the object is read again at its next turn, unless the drive says
+that it has none.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ import can
 
 from drivers.canopen.link import SDO_REQUEST
 from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.sdo import NO_SUCH_OBJECT
 from drivers.errors import ObjectAccessError
 from drivers.profiles.profile import Axis, ObjectEntry
 from drivers.profiles.scale import ScaleReading
-from drivers.stream.sample import Quantity, SlowReading
+from drivers.stream.sample import CellEvent, EventKind, Quantity, SlowReading
 from drivers.stream.stream import SyncStream
 
 PERIOD_NS = {Quantity.TORQUE: 200_000_000, Quantity.TEMPERATURE: 1_000_000_000}
@@ -48,11 +50,7 @@ class _Source:
 
 
 class Polling:
-    """The slow objects of a prepared network.
-
-    Attributes:
-        remarks: objects of the profiles that the drives do not have, in words.
-    """
+    """The slow objects of a prepared network."""
 
     def __init__(self, network: CanopenNetwork, *, beside_stream: bool = True) -> None:
         """Find the objects that the drives really have.
@@ -70,16 +68,31 @@ class Polling:
         self._asked: _Source | None = None
         self._asked_ns = 0
         self._sources: list[_Source] = []
-        remarks = []
+        self._remarks: list[str] = []
         for number, (axis, scale) in enumerate(zip(network.axes, network.scales(), strict=True)):
             for quantity, (entry, per_unit) in slow_objects(axis, scale).items():
-                if network.link.objects(axis.node_id).read_optional(entry, any_abort=True) is None:
-                    remarks.append(f"{axis.name}: the drive has no {quantity.value} in {entry}; it is not logged")
-                    continue
+                try:
+                    network.link.objects(axis.node_id).read(entry)
+                except ObjectAccessError as error:
+                    if error.abort_code is None:
+                        raise
+                    if error.abort_code in NO_SUCH_OBJECT:
+                        self._remarks.append(
+                            f"{axis.name}: the drive has no {quantity.value} in {entry}; it is not logged"
+                        )
+                        continue
+                    self._remarks.append(
+                        f"{axis.name}: the drive refused its {quantity.value} in {entry} at first "
+                        f"({error.reason}); it is asked again in the run"
+                    )
                 source = _Source(self, number, axis.node_id, entry, quantity, per_unit)
                 self._sources.append(source)
                 network.link.listen(axis.node_id, source)
-        self.remarks = tuple(remarks)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Objects that were refused or are not there, in words; the recording may add some."""
+        return tuple(self._remarks)
 
     def __bool__(self) -> bool:
         """Whether any drive has such an object."""
@@ -130,8 +143,12 @@ class Polling:
             # The drive read its object somewhere between the request and this answer.
             time_ns = (self._asked_ns + self._stream.time_ns) // 2
             self._keep(SlowReading(time_ns, source.axis, source.quantity, raw * source.per_unit))
-        elif data[0] == _ABORT:
+        elif data[0] == _ABORT and int.from_bytes(data[4:], "little") in NO_SUCH_OBJECT:
             self._sources.remove(source)
+            name = self._network.axes[source.axis].name
+            text = f"{name}: the drive has no {source.quantity.value} in {source.entry} any more; it is not logged"
+            self._remarks.append(text)
+            self._stream.emit(CellEvent(self._stream.time_ns, source.axis, EventKind.CAPTURE, source.entry.index, text))
 
 
 def slow_objects(axis: Axis, scale: ScaleReading) -> dict[Quantity, tuple[ObjectEntry, float]]:

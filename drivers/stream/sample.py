@@ -60,7 +60,7 @@ class CellEvent:
     axis: int | None  #: index of the axis from 0, or None for the whole cell
     kind: EventKind  #: of the event
     #: By kind: EMCY error code, NMT state, statusword, identifier of a frame, number of the move or of the cycle, bits
-    #: of the controller's state, number of frames.
+    #: of the controller's state, number of frames, index of an object that is not logged any more.
     code: int
     text: str  #: for the operator
 

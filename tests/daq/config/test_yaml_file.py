@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -11,8 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field
 
+from daq.config.cell_schema import CellModel
+from daq.config.drive import DriveModel
+from daq.config.import_description import ImportDescription
 from daq.config.yaml_file import MAX_BYTES, StrictModel, parse_yaml, read_bytes, read_model
 from daq.errors import ConfigurationError, ConfigurationMissing, SchemaMismatch, YamlInvalid
+from daq.simulation.simulation_file import SimulationModel
 
 
 class _Limits(StrictModel):
@@ -85,6 +90,16 @@ def test_all_mistakes_come_at_once_with_their_lines() -> None:
         _read("axes:\n  - name: J1\n    limits:\n      velocity_deg_s: x\n      colour: red\n")
     assert "file.yaml:4: axes[0].limits.velocity_deg_s" in str(caught.value)
     assert "file.yaml:5: axes[0].limits.colour" in str(caught.value)
+
+
+@pytest.mark.parametrize("model", [CellModel, DriveModel, ImportDescription, SimulationModel])
+def test_the_remedy_names_a_page_with_every_key(model: type[StrictModel], checkout: Path) -> None:
+    """The page is made from the schema: its keys, or a link to it."""
+    with pytest.raises(SchemaMismatch) as caught:
+        read_model(parse_yaml(b"colour: red\n", "file.yaml"), model)
+    page = checkout / "docs/reference" / model.reference
+    assert f"docs/reference/{page.name} has every key" in caught.value.remedy
+    assert re.search("^<!-- generated: (cell file|schemas) -->$", page.read_text(encoding="utf-8"), re.MULTILINE)
 
 
 @pytest.mark.parametrize(

@@ -19,9 +19,10 @@ from mcap_ros2.writer import Writer as Ros2Writer
 
 from daq.cli import main
 from daq.config.import_description import ImportDescription, TimeColumn, TimeUnit
-from daq.errors import DataError, LogForeign, LogTruncated, TableUnfit
+from daq.errors import ConfigurationInconsistent, DataError, LogForeign, LogTruncated, TableUnfit
 from daq.log.bag_table import STAMP, joint_state_from_cdr, read_bag
 from daq.log.conversion import load_run
+from daq.log.csv_import import import_csv
 from daq.log.message import DEFINITIONS, JOINTS_SCHEMA
 from daq.log.reader import read_log
 from daq.log.table import Table
@@ -192,16 +193,21 @@ def test_what_a_bag_lacks_is_named(
         read(bag, columns)
 
 
-def test_a_bag_is_imported_with_its_joints_as_axes(checkout: Path, tmp_path: Path) -> None:
-    write_bag(tmp_path / "run.mcap", whole())
-    description = tmp_path / "run.yaml"
-    document = {
+def _document(checkout: Path) -> dict[str, object]:
+    """An import description of the bag `run.mcap`."""
+    return {
         "name": "run",
         "cell": str(checkout / "configs/cells/demo.yaml"),
         "position": {"file": "run.mcap", "columns": ["position"], "unit": "rad", "side": "joint"},
         "current": {"file": "run.mcap", "columns": ["effort"], "unit": "A"},
         "time": {"file": "run.mcap", "column": STAMP, "unit": "ns"},
     }
+
+
+def test_a_bag_is_imported_with_its_joints_as_axes(checkout: Path, tmp_path: Path) -> None:
+    write_bag(tmp_path / "run.mcap", whole())
+    description = tmp_path / "run.yaml"
+    document = _document(checkout)
     description.write_text(json.dumps(document))
     out = tmp_path / "log.mcap"
     assert main(["import", str(description), "--data", str(tmp_path), "--out", str(out)]) == 0
@@ -218,6 +224,32 @@ def test_a_bag_is_imported_with_its_joints_as_axes(checkout: Path, tmp_path: Pat
     time = {"file": "run.mcap", "column": "stamp", "unit": "s"}
     description.write_text(json.dumps({**document, "time": time}))
     assert main(["import", str(description), "--data", str(tmp_path), "--out", str(tmp_path / "x.mcap")]) == 4
+
+
+@pytest.mark.parametrize("columns", [list(JOINTS), ["effort"], [f"position.{name}" for name in JOINTS]])
+def test_a_bag_has_no_temperature(checkout: Path, tmp_path: Path, columns: list[str]) -> None:
+    write_bag(tmp_path / "run.mcap", whole()[:1])
+    description, out = tmp_path / "run.yaml", tmp_path / "log.mcap"
+    document = {**_document(checkout), "temperature": {"file": "run.mcap", "columns": columns}}
+    description.write_text(json.dumps(document))
+    with pytest.raises(TableUnfit, match="found `temperature` from a ROS 2 bag; expected a file with temperatures"):
+        import_csv(description, tmp_path, out, software="test")
+    assert not out.exists()
+
+
+def test_torques_of_a_bag_come_from_another_field_than_the_currents(checkout: Path, tmp_path: Path) -> None:
+    write_bag(tmp_path / "run.mcap", [(topic, {**one, "velocity": one["effort"]}) for topic, one in whole()])
+    description, out = tmp_path / "run.yaml", tmp_path / "log.mcap"
+    # The field counts: the effort of other joints is no torque either where that of the axes is a current.
+    for columns in (list(JOINTS), ["effort"], [f"effort.{name}" for name in JOINTS], [f"K{k}" for k in range(6)]):
+        torque = {"file": "run.mcap", "columns": columns, "side": "joint"}
+        description.write_text(json.dumps({**_document(checkout), "torque": torque}))
+        with pytest.raises(ConfigurationInconsistent, match=r"found effort of run\.mcap, which current is read from"):
+            import_csv(description, tmp_path, out, software="test")
+    torque = {"file": "run.mcap", "columns": ["velocity"], "side": "joint"}
+    description.write_text(json.dumps({**_document(checkout), "torque": torque}))
+    import_csv(description, tmp_path, out, software="test")
+    assert load_run(out)[0].torque_channels
 
 
 def test_a_healthy_bag_is_called_a_bag(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
+from dataclasses import fields
 from math import pi
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from daq.cli import main
-from daq.config.yaml_file import parse_yaml
+from daq.config.import_description import ImportDescription
+from daq.config.yaml_file import parse_yaml, read_model
 from daq.errors import ConfigurationInconsistent, OutputFailed, TableUnfit, UsageError
 from daq.log.conversion import load_run
 from daq.log.csv_import import import_csv, quantise
@@ -393,17 +396,36 @@ def test_jittered_stamps_are_the_sample_times(bench: Bench, capsys: pytest.Captu
     np.testing.assert_allclose(run.current_a, np.cos(at_ms / 280.0 + np.arange(6)), atol=(5.0 / 280.0) ** 2 / 8)
 
 
-def test_resampled_counts_go_on_over_a_wrap_and_are_finer_than_a_count(bench: Bench) -> None:
-    """An encoder of 30 bits on the first motor wraps after two turns; those of the others have 10 bits."""
+TURN_WITH_WRAPS = np.array([2**30, *[1024] * 5])
+
+
+def _with_counts_that_wrap(bench: Bench, joint_rad: FloatArray) -> None:
+    """Write counts of an encoder of 30 bits on the first motor, which wraps after two turns, and 10 bits elsewhere."""
     cell = bench.folder / "configs/cells/demo.yaml"
     text = cell.read_text(encoding="utf-8").replace("revolution: 65536", f"revolution: {2**30}", 1)
     cell.write_text(text.replace("revolution: 65536", "revolution: 1024"), encoding="utf-8")
-    turn = np.array([2**30, *[1024] * 5])
-    ratio = load_run_of(bench)
-    joint_rad = np.radians(30.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6)))
-    counts = np.rint(joint_rad @ ratio.T / (2 * pi) * turn).astype(np.int64).astype(np.int32).astype(np.float64)
+    turns = joint_rad @ load_run_of(bench).T / (2 * pi)
+    counts = np.rint(turns * TURN_WITH_WRAPS).astype(np.int64).astype(np.int32).astype(np.float64)
     assert np.abs(np.diff(counts[:, 0])).max() > 2**31
     bench.write_csv(np.hstack((counts, bench.current_a)))
+
+
+def test_counts_at_a_rate_go_on_over_a_wrap(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    """The checks see the motion, not the jumps of the counter; what is too fast is so still."""
+    joint_rad = np.radians(30.0 * np.sin(np.arange(300)[:, None] / 160.0 + np.arange(6)))
+    _with_counts_that_wrap(bench, joint_rad)
+    counted = {"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
+    bench.describe(position=counted, rate_hz=10_000)
+    _refused(bench, capsys, 4, "deg/s", "rate_hz is too high")
+    bench.describe(position=counted)
+    assert bench.run() == 0
+    run = load_run(bench.out)[0]
+    np.testing.assert_allclose(run.position_rad[:, 0], joint_rad[:, 0], atol=1e-8)
+
+
+def test_resampled_counts_go_on_over_a_wrap_and_are_finer_than_a_count(bench: Bench) -> None:
+    turn, ratio = TURN_WITH_WRAPS, load_run_of(bench)
+    _with_counts_that_wrap(bench, np.radians(30.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))))
     _with_time(bench, UNEVEN_MS)
     counted = {"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
     bench.describe(rate_hz=None, position=counted, time={"file": "run.csv", "column": "t", "unit": "ms"})
@@ -644,17 +666,36 @@ def test_torque_columns_give_a_slope_and_temperature_columns_a_temperature(bench
 def test_a_torque_column_too_few_and_a_factor_of_zero_are_refused(bench: Bench) -> None:
     for torque, said in (
         ({"columns": ["i1", "i2"], "side": "motor"}, "2 columns"),
-        ({"columns": NAMES[6:], "side": "motor", "factor": 0.0}, "factor"),
-        ({"columns": NAMES[6:], "side": "motor", "factor": [1.0, 2.0]}, "torque.factor"),
+        ({"columns": SPEEDS, "side": "motor", "factor": 0.0}, "factor"),
+        ({"columns": SPEEDS, "side": "motor", "factor": [1.0, 2.0]}, "torque.factor"),
     ):
         bench.describe(torque={"file": "run.csv", **torque})
         with pytest.raises(ConfigurationInconsistent, match=said):
             import_csv(bench.description, bench.data, bench.out, software="test")
     # Every section is checked, whatever comes after it.
     current = {"file": "run.csv", "columns": NAMES[6:], "unit": "A", "factor": [1.0, 2.0]}
-    bench.describe(current=current, torque={"file": "run.csv", "columns": NAMES[6:], "side": "motor"})
+    bench.describe(current=current, torque={"file": "run.csv", "columns": SPEEDS, "side": "motor"})
     with pytest.raises(ConfigurationInconsistent, match=r"current\.factor"):
         import_csv(bench.description, bench.data, bench.out, software="test")
+
+
+def test_a_column_is_not_both_current_and_torque(bench: Bench) -> None:
+    columns = [*SPEEDS[:3], "i4", *SPEEDS[4:]]
+    bench.describe(torque={"file": "./run.csv", "columns": columns, "side": "motor"})
+    with pytest.raises(ConfigurationInconsistent, match=r"torque\.columns: found i4 of .*, which current is read from"):
+        import_csv(bench.description, bench.data, bench.out, software="test")
+
+
+def test_the_shipped_description_shows_every_setting(checkout: Path) -> None:
+    """Its lines that are commented out are valid, and with them nothing is missing."""
+    text = (checkout / "configs/imports/tx40.yaml").read_text(encoding="utf-8")
+    document = parse_yaml(re.sub(r"(?m)^# ( *[a-z_]+:)", r"\1", text).encode(), "tx40.yaml")
+    wanted = read_model(document, ImportDescription)
+    assert document.tree.keys() == ImportDescription.model_fields.keys()
+    sections = {"table": wanted.table, "time": wanted.time, **dict(wanted.sections())}
+    for key, section in sections.items():
+        assert section is not None
+        assert document.tree[key].keys() == {field.name for field in fields(section)}, key
 
 
 def test_an_import_without_them_has_neither(bench: Bench) -> None:

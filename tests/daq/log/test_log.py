@@ -99,7 +99,7 @@ def test_a_reading_of_an_axis_that_the_log_lacks_is_refused(tmp_path: Path) -> N
         for sample in samples([(1, 2), (3, 4)]):
             log.write(sample)
         log.conclude(valid=True)
-    with pytest.raises(LogIncomplete, match="3 axes"):
+    with pytest.raises(LogIncomplete, match="temperature of axis 2, counted from 0; expected those of 2 axes"):
         read_log(tmp_path / "a.mcap")
 
 

@@ -53,6 +53,18 @@ def test_a_drive_without_rated_torque_says_that_nothing_was_checked(torque: int 
     assert "no rated torque (6076h:00); the torque constant cannot be checked" in found.warnings[0]
 
 
+@pytest.mark.parametrize("lacking", [0x6075, 0x6076])
+def test_a_torque_without_a_unit_is_said_not_to_be_logged(lacking: int) -> None:
+    fixed = replace(PROFILE.current_scale, factor=0.002, objects=())  # it needs no rated current
+    profile = replace(RATED, current_scale=fixed, torque=ObjectEntry(0x6077, 0, 16, signed=True))
+    with drive() as (access, node):
+        node.objects[0x6076, 0] = (1500, 4)
+        node.objects[lacking, 0] = (0, 4)
+        (warning,) = read_scale(access, profile).warnings
+        (without,) = read_scale(access, replace(profile, torque=None)).warnings
+    assert warning == f"{without}, and its torque (6077h:00) is not logged"
+
+
 def test_a_profile_without_name_plate_says_so() -> None:
     with drive() as (access, _):
         found = read_scale(access, PROFILE)

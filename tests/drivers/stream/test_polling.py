@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
@@ -13,7 +14,7 @@ from drivers.motion.execute import execute
 from drivers.motion.move import Move
 from drivers.profiles.profile import ObjectEntry, RatedMotor, Thermometer
 from drivers.stream.polling import GIVEN_UP_NS, PERIOD_NS, Polling
-from drivers.stream.sample import Quantity, SlowReading
+from drivers.stream.sample import CellEvent, EventKind, Quantity, SlowReading
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync
 from tests.drivers import scripted
@@ -124,7 +125,9 @@ def test_no_request_goes_with_a_set_point_and_none_after_the_stop(bench: Bench) 
     assert len(bench.readings) == count
 
 
-def test_an_object_that_a_drive_lacks_is_named_and_one_that_it_refuses_is_left(bench: Bench) -> None:
+def test_an_object_that_a_drive_lacks_is_named_and_left_also_in_the_run(bench: Bench) -> None:
+    events: list[CellEvent] = []
+    bench.stream.emit = events.append
     del bench.bus.nodes[1].objects[0x2005, 0]
     polling = bench.poll()
     assert polling.remarks == ("J2: the drive has no temperature in 2005h:00; it is not logged",)
@@ -133,6 +136,41 @@ def test_an_object_that_a_drive_lacks_is_named_and_one_that_it_refuses_is_left(b
     for _ in range(CYCLES):
         next(bench.stream)
     assert {(r.axis, r.quantity) for r in bench.readings} == {(1, Quantity.TORQUE), (0, Quantity.TEMPERATURE)}
+    gone = "J1: the drive has no torque in 6077h:00 any more; it is not logged"
+    assert [(e.axis, e.kind, e.code, e.text) for e in events] == [(0, EventKind.CAPTURE, 0x6077, gone)]
+    assert polling.remarks[-1] == gone
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_an_object_that_a_drive_refuses_once_is_read_again(bench: Bench, begun: bool) -> None:
+    """Abort 0800 0022h: because of the present device state."""
+    events: list[CellEvent] = []
+    bench.stream.emit = events.append
+    refused: list[bytes] = []
+
+    def refuse_one(message: can.Message) -> Iterable[can.Message]:
+        if message.arbitration_id != 0x581 or refused or bytes(message.data[1:3]) != b"\x77\x60":
+            return (message,)
+        refused.append(struct.pack("<B3sL", 0x80, bytes(message.data[1:4]), 0x0800_0022))
+        return (can.Message(arbitration_id=0x581, is_extended_id=False, data=refused[0]),)
+
+    if begun:
+        polling = bench.poll()
+        bench.bus.tamper = refuse_one
+    else:
+        bench.bus.tamper = refuse_one
+        polling = bench.poll()
+    for _ in range(CYCLES):
+        next(bench.stream)
+    assert refused
+    count = -(-CYCLES * scripted.PERIOD_NS // PERIOD_NS[Quantity.TORQUE]) - begun
+    assert len([r for r in bench.readings if (r.axis, r.quantity) == (0, Quantity.TORQUE)]) == count
+    assert events == []
+    if begun:
+        assert polling.remarks == ()
+    else:
+        (remark,) = polling.remarks
+        assert remark.startswith("J1: the drive refused its torque in 6077h:00 at first (aborted, Code 0x08000022")
 
 
 def test_a_bus_without_room_is_read_before_and_after_alone(bench: Bench) -> None:
