@@ -17,6 +17,7 @@ Column = Annotated[str, Field(min_length=1)] | Annotated[int, Field(ge=1)]
 """Name in the header, or number counted from 1."""
 Rate = Annotated[float, Field(ge=1.0, le=1e6)]
 Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
+SMALLEST_FACTOR = 1e-9
 SomeColumns = Annotated[tuple[Column, ...], Field(min_length=1)]
 
 
@@ -213,8 +214,10 @@ def load_import(path: Path) -> ImportDescription:
     axes = len(wanted.position.columns)
     for name, section in wanted.sections():
         factor = section.factor if isinstance(section, ScaledColumns) else 1.0
-        if 0.0 in ((factor,) if isinstance(factor, float) else factor.values() if isinstance(factor, dict) else factor):
-            faults.append(Fault((name, "factor"), "0", "the unit of the log for each unit in the file"))
+        factors = (factor,) if isinstance(factor, float) else factor.values() if isinstance(factor, dict) else factor
+        if any(abs(one) < SMALLEST_FACTOR for one in factors):
+            expected = f"the unit of the log for each unit in the file, at least {SMALLEST_FACTOR:g}"
+            faults.append(Fault((name, "factor"), f"{min(factors, key=abs):g}", expected))
         # One name may be a whole matrix or field (daq.log.readers.with_columns); then the import counts.
         if len(section.columns) != axes and 1 not in {axes, len(section.columns)}:
             found = f"{len(section.columns)} columns"

@@ -23,6 +23,7 @@ from daq.config.import_description import (
     PositionUnit,
     ScaledColumns,
     Side,
+    TemperatureColumns,
     VelocityUnit,
     load_import,
 )
@@ -50,6 +51,8 @@ SLOW_SHARE = 0.1
 """Share of the velocity limits; if no joint is ever faster, the real rate may be ten times the declared one."""
 TORQUE_HZ, TEMPERATURE_HZ = 20.0, 1.0
 """Rates at which the controller's own torque and temperatures are kept: enough for a slope and for a warm-up."""
+LARGEST_NUMBER = 1e12  #: Of a position, speed, current or torque in any unit
+TEMPERATURES_C = (-60.0, 250.0)  #: Of a drive or a motor; kelvin above -23 °C are more
 VELOCITY_WINDOW_S = 0.1  #: Time over which the ways by velocities and by positions are compared
 STILL = 1e-3  #: Difference of speed that is no contradiction, as a share of the velocity limit
 UNIX_NS = range(10**18, 3 * 10**18)  #: Stamps from 2001 to 2065 are since 1970; any others since some start
@@ -86,6 +89,7 @@ def import_csv(description: Path, data: Path, out: Path, *, software: str, cell_
     wanted = with_columns(wanted, data, cell.axis_names)
     _check_cell(wanted, cell, description)
     files = _read_tables(wanted, data)
+    _check_sizes(wanted, cell, files)
     table = files[wanted.position.file]
     position = table.take(wanted.position.columns)
     current = files[wanted.current.file].take(wanted.current.columns)
@@ -238,6 +242,27 @@ def quantise(values: FloatArray) -> tuple[IntArray, FloatArray]:
     exponent = [ceil(log2(top / LARGEST_RAW)) if top > 1e-200 else -30 for top in largest.tolist()]
     quantum = np.ldexp(1.0, np.array(exponent))
     return np.rint(values / quantum).astype(np.int64), quantum
+
+
+def _check_sizes(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) -> None:
+    """Refuse numbers that no robot has in any unit: the file is damaged, or a column is another."""
+    for key, section in wanted.sections():
+        table, size = files[section.file], LARGEST_NUMBER
+        values, least, largest = table.take(section.columns), -size, size
+        if isinstance(section, TemperatureColumns):
+            least, largest = TEMPERATURES_C
+        if isinstance(section, ScaledColumns):
+            with np.errstate(over="ignore"):
+                values = values * np.array(section.factors(cell.axis_names))
+        wrong = np.argwhere(~((least <= values) & (values <= largest)))
+        if wrong.size:
+            row, column = wrong[0].tolist()
+            raise TableUnfit(
+                table.place(row, section.columns[column]),
+                found=f"{values[row, column]:g}, as {key}",
+                expected=f"from {least:g} to {largest:g}",
+                remedy="correct the number, or the columns or the factor of that section in the import description",
+            )
 
 
 def _check_counts(position: FloatArray, wanted: ImportDescription, file: Table) -> None:

@@ -77,3 +77,46 @@ def test_metres_of_an_axis_that_turns(slide: Path, capsys: pytest.CaptureFixture
     (slide / "cell.yaml").write_text(turning)
     assert _import(slide, "m") == ExitCode.CONFIGURATION
     assert "m, while axis X turns" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("section", "number", "factor"), [("position", 1.5e308, 1.0), ("current", 1e305, 1e9), ("torque", 1e305, 1e9)]
+)
+def test_a_number_that_no_robot_has(
+    section: str, number: float, factor: float, slide: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first was a traceback, the last a log that nothing could read."""
+    table = np.loadtxt(slide / "run.csv", delimiter=",", skiprows=1)
+    table[5000, {"position": 1, "current": 3, "torque": 2}[section]] = number
+    np.savetxt(slide / "run.csv", table, delimiter=",", header="t,m,mm,V", comments="", fmt="%.9g")
+    description = {
+        "name": "run",
+        "cell": "cell.yaml",
+        "position": {"file": "run.csv", "columns": ["m"], "unit": "m", "side": "joint"},
+        "current": {"file": "run.csv", "columns": ["V"], "unit": "V", "factor": factor if section == "current" else 1},
+        "torque": {"file": "run.csv", "columns": ["mm"], "side": "joint", "factor": factor},
+        "rate_hz": 500,
+    }
+    (slide / "run.yaml").write_text(json.dumps(description))
+    code = main(["import", str(slide / "run.yaml"), "--data", str(slide), "--out", str(slide / "run.mcap")])
+    assert code == ExitCode.DATA_UNFIT
+    assert f"as {section}" in capsys.readouterr().err
+    assert not list(slide.glob("run.mcap*"))
+
+
+def test_kelvin_are_no_celsius(slide: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = np.loadtxt(slide / "run.csv", delimiter=",", skiprows=1)
+    table[:, 2] = 310.0
+    np.savetxt(slide / "run.csv", table, delimiter=",", header="t,m,mm,V", comments="", fmt="%.9g")
+    description = {
+        "name": "run",
+        "cell": "cell.yaml",
+        "position": {"file": "run.csv", "columns": ["m"], "unit": "m", "side": "joint"},
+        "current": {"file": "run.csv", "columns": ["V"], "unit": "V"},
+        "temperature": {"file": "run.csv", "columns": ["mm"]},
+        "rate_hz": 500,
+    }
+    (slide / "run.yaml").write_text(json.dumps(description))
+    code = main(["import", str(slide / "run.yaml"), "--data", str(slide), "--out", str(slide / "run.mcap")])
+    assert code == ExitCode.DATA_UNFIT
+    assert "from -60 to 250" in capsys.readouterr().err
