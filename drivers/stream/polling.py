@@ -18,7 +18,7 @@ import can
 from drivers.canopen.link import SDO_REQUEST
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.sdo import NO_SUCH_OBJECT
-from drivers.errors import ObjectAccessError
+from drivers.errors import BusError, ObjectAccessError
 from drivers.profiles.profile import Axis, ObjectEntry
 from drivers.profiles.scale import ScaleReading
 from drivers.stream.sample import CellEvent, EventKind, Quantity, SlowReading
@@ -28,6 +28,7 @@ PERIOD_NS = {Quantity.TORQUE: 200_000_000, Quantity.TEMPERATURE: 1_000_000_000}
 """Time between two readings of an axis: some hundred torques give a slope to a percent; a motor warms in minutes."""
 GIVEN_UP_NS = 250_000_000  #: Time after which an answer is lost: the SDO servers of drives need some milliseconds
 _INITIATE_UPLOAD, _ABORT = 0x40, 0x80
+_SIZE_INDICATED = 0x01  #: Bit of a response that says how many of its bytes are data, in bits 3 and 2
 _EXPEDITED_UPLOAD = 0x42  #: Response with at most four bytes of data: bits 7 to 5 and bit 1 (CiA 301, SDO upload)
 _HEAD = struct.Struct("<BHB")
 
@@ -60,7 +61,7 @@ class Polling:
             beside_stream: whether the bus has room for requests while a stream runs.
 
         Raises:
-            ObjectAccessError, BusError: a drive does not answer.
+            BusError: the bus is lost.
         """
         self._network, self._beside_stream = network, beside_stream
         self._stream: SyncStream | None = None
@@ -74,11 +75,10 @@ class Polling:
                 try:
                     network.link.objects(axis.node_id).read(entry)
                 except ObjectAccessError as error:
-                    if error.abort_code is None:
-                        raise
-                    if error.abort_code in NO_SUCH_OBJECT:
+                    if error.abort_code is None or error.abort_code in NO_SUCH_OBJECT:
+                        why = "" if error.abort_code is not None else f" that can be read ({error.reason})"
                         self._remarks.append(
-                            f"{axis.name}: the drive has no {quantity.value} in {entry}; it is not logged"
+                            f"{axis.name}: the drive has no {quantity.value} in {entry}{why}; it is not logged"
                         )
                         continue
                     self._remarks.append(
@@ -99,18 +99,17 @@ class Polling:
         return bool(self._sources)
 
     def temperatures(self, time_ns: int) -> tuple[SlowReading, ...]:
-        """Read every temperature now, while no stream runs; that of a drive which does not answer is missing.
+        """Read every temperature now, while no stream runs; what cannot be read is missing, a lost bus included.
+
+        After a run all samples are there: a temperature must not cost them.
 
         Args:
             time_ns: on the clock of the samples [ns].
-
-        Raises:
-            BusError: the bus is lost.
         """
         self._asked, found = None, []
         for source in self._sources:
             if source.quantity is Quantity.TEMPERATURE:
-                with suppress(ObjectAccessError):
+                with suppress(ObjectAccessError, BusError):
                     raw = self._network.link.objects(source.node_id).read(source.entry)
                     found.append(SlowReading(time_ns, source.axis, source.quantity, raw * source.per_unit))
         return tuple(found)
@@ -138,17 +137,25 @@ class Polling:
         if source is not self._asked or self._stream is None:
             return
         self._asked = None
-        if data[0] & 0xE2 == _EXPEDITED_UPLOAD:
+        size = 8 * (4 - (data[0] >> 2 & 0x03)) if data[0] & _SIZE_INDICATED else source.entry.bits
+        if data[0] & 0xE2 == _EXPEDITED_UPLOAD and size != source.entry.bits:
+            self._drop(source, f"answers with {size} bits, expected {source.entry.bits}: correct the drive profile")
+        elif data[0] & 0xE2 == _EXPEDITED_UPLOAD:
             raw = int.from_bytes(data[4 : 4 + source.entry.bits // 8], "little", signed=source.entry.signed)
             # The drive read its object somewhere between the request and this answer.
             time_ns = (self._asked_ns + self._stream.time_ns) // 2
             self._keep(SlowReading(time_ns, source.axis, source.quantity, raw * source.per_unit))
         elif data[0] == _ABORT and int.from_bytes(data[4:], "little") in NO_SUCH_OBJECT:
-            self._sources.remove(source)
-            name = self._network.axes[source.axis].name
-            text = f"{name}: the drive has no {source.quantity.value} in {source.entry} any more; it is not logged"
-            self._remarks.append(text)
-            self._stream.emit(CellEvent(self._stream.time_ns, source.axis, EventKind.CAPTURE, source.entry.index, text))
+            self._drop(source, "is no longer there")
+
+    def _drop(self, source: _Source, why: str) -> None:
+        """Ask no more for an object, and say so in the log and in the remarks."""
+        self._sources.remove(source)
+        name, entry = self._network.axes[source.axis].name, source.entry
+        text = f"{name}: the {source.quantity.value} in {entry} {why}; it is not logged"
+        self._remarks.append(text)
+        if self._stream is not None:
+            self._stream.emit(CellEvent(self._stream.time_ns, source.axis, EventKind.CAPTURE, entry.index, text))
 
 
 def slow_objects(axis: Axis, scale: ScaleReading) -> dict[Quantity, tuple[ObjectEntry, float]]:

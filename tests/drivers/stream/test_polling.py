@@ -136,9 +136,26 @@ def test_an_object_that_a_drive_lacks_is_named_and_left_also_in_the_run(bench: B
     for _ in range(CYCLES):
         next(bench.stream)
     assert {(r.axis, r.quantity) for r in bench.readings} == {(1, Quantity.TORQUE), (0, Quantity.TEMPERATURE)}
-    gone = "J1: the drive has no torque in 6077h:00 any more; it is not logged"
+    gone = "J1: the torque in 6077h:00 is no longer there; it is not logged"
     assert [(e.axis, e.kind, e.code, e.text) for e in events] == [(0, EventKind.CAPTURE, 0x6077, gone)]
     assert polling.remarks[-1] == gone
+
+
+def test_an_answer_of_another_size_is_no_reading(bench: Bench) -> None:
+    polling = bench.poll()
+    bench.bus.nodes[0].objects[0x6077, 0] = (-2, 1)
+    for _ in range(CYCLES):
+        next(bench.stream)
+    assert (0, Quantity.TORQUE) not in {(r.axis, r.quantity) for r in bench.readings}
+    assert polling.remarks == (
+        "J1: the torque in 6077h:00 answers with 8 bits, expected 16: correct the drive profile; it is not logged",
+    )
+
+
+def test_an_object_of_another_type_costs_no_recording(bench: Bench) -> None:
+    bench.bus.nodes[0].objects[0x2005, 0] = (31, 1)
+    (remark,) = bench.poll().remarks
+    assert remark.startswith("J1: the drive has no temperature in 2005h:00 that can be read")
 
 
 @pytest.mark.parametrize("begun", [False, True])
