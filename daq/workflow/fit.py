@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -148,6 +149,7 @@ class Reading:
 
 
 BOOTSTRAP_SEED = 0
+_LOG = logging.getLogger("drivegain")
 
 
 def fit_logs(
@@ -347,6 +349,9 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
         IdentificationError: a refit failed.
     """
     evidence = start.evidence()
+    cold = [data.name for data in evidence.trained if data.temperature_c is None]
+    if 0 < len(cold) < len(evidence.trained):
+        _LOG.warning("%s without temperatures: %s is not looked for", ", ".join(cold), TemperatureFriction.name)
     before = start.identification
     if before.estimate.method is not Method.ML:
         fixed = before.estimate.gains if before.estimate.gains_fixed else None
