@@ -21,6 +21,8 @@ from ident.contact import ExternalTorque
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, pseudo_inertia
 
 LISTED = 20  #: Contacts shown in a terminal; `--json` has all
+NOISE_ROWS = 4.0
+"""Longest correlation of noise, in rows. The simulated cell has 1; an undeclared plate of 1.7 kg makes it 6 to 90."""
 
 
 def weighed_view(found: Weighed) -> Iterator[RenderableType]:
@@ -40,17 +42,15 @@ def weighed_view(found: Weighed) -> Iterator[RenderableType]:
     within = "moves, gains, robot and effects" if body.complete else "moves and gains"
     how = "robot and body together, beside runs without load" if found.bare else "on the robot of the calibration"
     yield f"Found {how}; σ from {body.moves} moves, with the errors of {within}; it leaves {body.error.total:.3g} %."
-    advice = {one.name: f"add {one.seconds:.0f} s of {one.words} (σ {one.std:.2g})" for one in found.help}
-    ten = plain_table(
-        ("parameter", "value ± σ", "unit", "identifiable", ""),
-        title="The ten about the joint's frame",
-        left=(0, 2, 3, 4),
-    )
+    headings = ("parameter", "value ± σ", "unit", "identifiable")
+    ten = plain_table(headings, title="The ten about the joint's frame", left=(0, 2, 3))
     rows = zip(LINK_PARAMETERS, LINK_UNITS, body.values, body.std, body.identifiable, strict=True)
     for name, unit, value, std, identifiable in rows:
-        ten.add_row(name, _with_std(value, std), unit, "yes" if identifiable else "no", advice.get(name, ""))
+        ten.add_row(name, _with_std(value, std), unit, "yes" if identifiable else "no")
     yield ""
     yield ten
+    # Below the table: beside the rows they would push σ and unit off a terminal of 80 columns.
+    yield from (f"{one.name}: add {one.seconds:.0f} s of {one.words} (σ {one.std:.2g})" for one in found.help)
     yield from (Text(doubt, style="bold") for doubt in _doubts(found))
 
 
@@ -118,18 +118,20 @@ def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
         seconds = f"{found.band.quiet_s[index]:.0f}"
         table.add_row(axis.name, seconds, _digits(band), _digits(threshold), _digits(largest), axis.unit.force)
     yield table
-    source = f"this log less {found.left_out} stretches that are far out" if found.from_itself else "the quiet logs"
+    stretches = "1 stretch that is" if found.left_out == 1 else f"{found.left_out} stretches that are"
+    itself = f"this log less {stretches} far out" if found.left_out else "this log"
+    source = itself if found.from_itself else "the quiet logs"
     yield (
         f"Band (95 %) and threshold from {source}; less than {found.band.alarms_per_hour:g} false alarm in an hour of "
         "motion like that, all axes together. Standstill is not judged."
     )
-    lost = [axis.name for axis, level in zip(cell.axes, found.band.threshold, strict=True) if not np.isfinite(level)]
-    if lost:
-        yield Text(f"Too little quiet motion for a threshold: {', '.join(lost)}. Record longer.", style="bold")
-    contacts = found.contacts
+    contacts, missing = found.contacts, not_judged(found, cell)
     yield ""
+    if not contacts and len(missing) < len(cell.axes):
+        judged = ", ".join(name for name in cell.axis_names if name not in missing)
+        yield f"No contact on {judged}." if missing else "No contact."
+    yield from (Text(f"{name} not judged: {reason}.", style="bold") for name, reason in missing.items())
     if not contacts:
-        yield "No contact."
         return
     listed = plain_table(("axis", "from s", "to s", "peak", "unit", "× threshold"), title="Contacts", left=(0, 4))
     for one in contacts[:LISTED]:
@@ -139,6 +141,27 @@ def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
     yield listed
     if len(contacts) > LISTED:
         yield f"… and {len(contacts) - LISTED} more; --json lists all."
+
+
+def not_judged(found: ExternalTorque, cell: Cell) -> dict[str, str]:
+    """Say why an axis cannot show a contact, by its name; only axes without a threshold or without motion."""
+    reasons = {}
+    band, row_s = found.band, float(np.median(np.diff(found.time_s)))
+    for axis, level, use, quiet_s, correlation_s in zip(
+        cell.axis_names, band.threshold, found.use, band.quiet_s, band.correlation_s, strict=True
+    ):
+        if not use.any():
+            reasons[axis] = "it does not move in this log"
+        elif np.isfinite(level):
+            continue
+        elif correlation_s <= NOISE_ROWS * row_s:
+            reasons[axis] = f"{quiet_s:.0f} s of quiet motion have too few separate peaks; record longer"
+        else:
+            reasons[axis] = (
+                f"its residual stays on one side for {correlation_s:.2g} s at a time, with too few separate peaks; "
+                "a temperature may be missing, or a body undeclared"
+            )
+    return reasons
 
 
 def contact_document(found: ExternalTorque, cell: Cell, log: Path, picture: Path | None) -> dict[str, Any]:
@@ -174,6 +197,7 @@ def contact_document(found: ExternalTorque, cell: Cell, log: Path, picture: Path
             }
             for one in found.contacts
         ],
+        "not_judged": [{"axis": axis, "reason": reason} for axis, reason in not_judged(found, cell).items()],
         "picture": None if picture is None else str(picture),
     }
 

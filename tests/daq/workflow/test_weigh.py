@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable
 from dataclasses import replace
 from io import StringIO
@@ -75,8 +76,8 @@ def test_a_log_that_declares_a_payload_is_not_bare(
     assert "nothing is known of mounting 'flange-a'" in capsys.readouterr().err
 
 
-def _text(parts: Iterable[RenderableType]) -> str:
-    console = Console(width=160, file=StringIO())
+def _text(parts: Iterable[RenderableType], width: int = 160) -> str:
+    console = Console(width=width, file=StringIO())
     with console.capture() as printed:
         for part in parts:
             console.print(part)
@@ -96,8 +97,11 @@ def test_a_weighed_body_is_shown_with_what_would_help(checkout: Path) -> None:
     text = _text(weighed_view(found))
     assert "4.600 ± 0.010" in text
     assert "+0.22 %" in text
-    assert "add 5 s of fast moves of all axes (σ 0.004)" in text
+    assert "mz: add 5 s of fast moves of all axes (σ 0.004)" in text
     assert "no covariance" in text
+    narrow = _text(weighed_view(found), width=80)
+    assert re.search(r"Ixx +0\.070 ± 0\.010 +kg m² +yes", narrow)
+    assert "…" not in narrow
     document = weighed_document(found)
     assert document["mass_kg"] == {"value": 4.6, "std": pytest.approx(0.01)}
     assert [one["name"] for one in document["parameters"]] == list(LINK_PARAMETERS)
@@ -117,8 +121,32 @@ def test_contacts_are_listed(checkout: Path) -> None:
     text = _text(contact_view(found, cell))
     assert "J3" in text
     assert "1.80" in text
-    assert "Too little quiet motion for a threshold: J6" in text
+    assert "this log less 1 stretch that is far out" in text
+    assert "J6 not judged: 40 s of quiet motion have too few separate peaks; record longer." in text
     document = contact_document(found, cell, Path("a.mcap"), None)
     (contact,) = document["contacts"]
     assert (contact["axis"], contact["peak"], contact["peak_over_threshold"]) == ("J3", -9.0, 1.8)
     assert (contact["start_s"], contact["end_s"]) == pytest.approx((2.0, 2.78))
+    assert [one["axis"] for one in document["not_judged"]] == ["J6"]
+
+
+def test_no_contact_is_said_of_judged_axes_alone(checkout: Path) -> None:
+    cell = load_cell(checkout / "configs/cells/demo.yaml")
+    one, even = np.ones(6), np.ones((6, 500))
+    threshold = np.array([5.0, np.nan, np.nan, 5.0, 5.0, 5.0])
+    correlation_s, quiet_s = np.where(np.arange(6) == 1, 1.5, 0.02), np.array([40.0, 11.0, 8.0, 40.0, 40.0, 40.0])
+    band = Band(np.ones((6, 4)), 2.0 * one, threshold, correlation_s, quiet_s, 1.0)
+    use = even > 0.0
+    use[3] = False
+    found = ExternalTorque(np.linspace(0.0, 9.98, 500), even, even, use, band, False, 0)
+    text = _text(contact_view(found, cell))
+    assert "No contact on J1, J5, J6." in text
+    assert "J2 not judged: its residual stays on one side for 1.5 s at a time" in text
+    assert "J3 not judged: 8 s of quiet motion have too few separate peaks; record longer." in text
+    assert "J4 not judged: it does not move in this log." in text
+    listed = contact_document(found, cell, Path("a.mcap"), None)["not_judged"]
+    assert [entry["axis"] for entry in listed] == ["J2", "J3", "J4"]
+    blind = replace(found, use=np.zeros_like(use))
+    assert "No contact" not in _text(contact_view(blind, cell))
+    judged = replace(found, use=even > 0.0, band=replace(band, threshold=5.0 * one))
+    assert "No contact.\n" in _text(contact_view(judged, cell))
