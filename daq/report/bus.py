@@ -30,7 +30,11 @@ FAULTY = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 
 def scan_view(cell: Cell, rows: list[dict[str, Any]], reset: Sequence[str], width: int) -> Iterator[RenderableType]:
     """Table of the nodes on all buses, and what needs attention; at most `width` columns wide."""
-    yield scan_table(rows, width, several=len({row["bus"] for row in rows}) > 1)
+    table = scan_table(rows, width, several=len({row["bus"] for row in rows}) > 1)
+    yield table
+    shown = {str(column.header).lower() for column in table.columns}
+    if left_out := [heading for heading in _DISPENSABLE if heading not in shown]:
+        yield f"No room for {', '.join(left_out)}; --json has all columns."
     for row in rows:
         if row["enabled"]:
             name = f"node {row['node_id']}" + (f" ({printable(row['axis'])})" if row["axis"] else "")

@@ -15,7 +15,7 @@ from daq.config.bus import bus_address
 from daq.config.cell import Cell
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.errors import ExitCode
-from daq.report.bus import scan_rows, scan_table
+from daq.report.bus import scan_rows, scan_table, scan_view
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from drivers.canopen.bus import open_bus
 from drivers.canopen.scan import FoundNode
@@ -74,6 +74,10 @@ def test_a_narrow_terminal_gets_fewer_columns_and_whole_words(cell: Cell) -> Non
         lines = _shown(cell, nodes, width).splitlines()
         assert max(cell_len(line.rstrip()) for line in lines) <= width
         assert sum("ENABLED" in line for line in lines) == 6
+    rows = scan_rows(cell, nodes, "demo")
+    said = {width: [str(part) for part in scan_view(cell, rows, (), width)] for width in (80, 200)}
+    assert "No room for nmt; --json has all columns." in said[80]
+    assert not any("No room" in part for part in said[200])
 
 
 def test_identity_and_power_are_distinguished(cell: Cell) -> None:
