@@ -256,7 +256,8 @@ class Account:
 
     floors: tuple[NoiseFloor | None, ...]  #: noise of each motor's current, None where it is not known
     left_a: FloatArray  #: `left_on` the rows of the fit after the last turn [A]
-    #: Error that this noise alone would leave on the rows of the fit [%]; NaN where it is not known or refuted.
+    #: Error that this noise alone would leave on the rows of the fit [%], at most that of either model; NaN where it
+    #: is not known or refuted.
     floor: RelativeError
     holdout_floor: RelativeError | None  #: the same on held-out rows, None without any
     turns: tuple[BeforeAfter | None, ...]  #: change by each turn of the loop, None where it added nothing
@@ -303,11 +304,17 @@ def account(
     bounds = tuple(
         None if floor is None or floor.is_refuted(left) else floor for floor, left in zip(floors, left_a, strict=True)
     )
+
+    def floor_below(before: Observation, after: Observation) -> RelativeError:
+        """Floor of some rows: where a model leaves less, within the floor's own σ, the model is at the floor."""
+        left = np.fmin(left_on(before, start.estimate), left_on(after, end.after.estimate))
+        return floor_on(before, capped(bounds, left)).relative(weights_nm_a)
+
     return Account(
         floors=floors,
         left_a=left_a,
-        floor=floor_on(start.training, bounds).relative(weights_nm_a),
-        holdout_floor=None if start.holdout is None else floor_on(start.holdout, bounds).relative(weights_nm_a),
+        floor=floor_below(start.training, end.after.training),
+        holdout_floor=None if start.holdout is None else floor_below(start.holdout, end.after.holdout or start.holdout),
         turns=tuple(turns),
         total=before_after(first, last),
         holdout_change=holdout_change(start, end.after),
@@ -376,6 +383,14 @@ def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
             )
             for motor in range(count)
         ),
+    )
+
+
+def capped(floors: Sequence[NoiseFloor | None], left_a: FloatArray) -> tuple[NoiseFloor | None, ...]:
+    """Lower each floor to what a model leaves on the rows it is shown for [A, root mean square], shape (n,)."""
+    return tuple(
+        None if floor is None else replace(floor, noise_a=float(np.fmin(floor.noise_a, left)))
+        for floor, left in zip(floors, left_a, strict=True)
     )
 
 

@@ -32,9 +32,9 @@ The smaller estimate is taken: either can be too high, standstill where an axis 
 the load over in most dwells, repeated moves where the robot warms up or the paths differ a little.
 
 Limits. It is a lower bound: standstill does not show ripple, commutation error and the differentiated noise of the
-encoder; noise slower than a part is subtracted with the parabola. A floor above the error of a model on rows in motion
-is refuted (`NoiseFloor.is_refuted`). Parts with one constant number (power stage off, brake on, one run given twice)
-are no measurement and are left out.
+encoder; noise slower than a part is subtracted with the parabola. A floor far above the error of a model on rows in
+motion is refuted (`NoiseFloor.is_refuted`); one that its own σ may have put there is shown as that error. Parts with
+one constant number (power stage off, brake on, one run given twice) are no measurement and are left out.
 """
 
 from __future__ import annotations

@@ -246,9 +246,28 @@ def test_a_refuted_floor_bounds_no_error(start: Evidence, after: Evidence, monke
     assert made.left_a == pytest.approx(left_a)
     assert np.isnan(made.floor.axes).tolist() == [False, False, True] * 2
     ratio = np.array(made.floor.axes) / made.total.after.in_sample.axes
-    assert ratio[[0, 1]] == pytest.approx(factors[[0, 1]])
+    assert ratio[[0, 3]] == pytest.approx(factors[[0, 3]])
     assert made.holdout_floor is not None
     assert np.isnan(made.holdout_floor.axes).tolist() == [False, False, True] * 2
+
+
+def test_no_floor_exceeds_the_error_on_the_same_rows(
+    start: Evidence, after: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The floors are a tenth above what the model leaves, and known to 9 %: the model is at the floor."""
+    left_a = left_on(after.training, after.estimate)
+    floors = tuple(NoiseFloor(1.1 * float(left), FloorSource.STANDSTILL, 20, 100.0) for left in left_a)
+    monkeypatch.setattr(before_after_module, "noise_floors", lambda *_: floors)
+    made = account(start, [Step((), (), np.zeros(6), None, after)])
+    before, last = made.total.before, made.total.after
+    pairs = ((made.floor, before.in_sample, last.in_sample), (made.holdout_floor, before.holdout, last.holdout))
+    for floor, *errors in pairs:
+        for error in errors:
+            assert floor is not None
+            assert error is not None
+            assert np.all(np.array((*floor.axes, floor.total)) <= np.array((*error.axes, error.total)) * (1.0 + 1e-9))
+    assert made.floor.axes[2] == pytest.approx(last.in_sample.axes[2])
+    assert made.floors == floors  # as measured
 
 
 def test_fixed_gains_do_not_change(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
