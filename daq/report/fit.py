@@ -11,7 +11,7 @@ from rich.text import Text
 
 from daq.report import paper_tables
 from daq.report.bus import actual_current_note
-from daq.report.gains import diagnosis_texts, gain_table, partial_note, torque_document, torque_table
+from daq.report.gains import diagnosis_texts, gain_table, partial_note, torque_document, torque_sentences, torque_table
 from daq.report.text import percent_text, picked, plain_table, printable
 from daq.workflow.calibration_file import as_document
 from daq.workflow.cases import CASES, CaseFit
@@ -37,6 +37,7 @@ def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | 
         yield note
     if fitted.torque_slopes:
         yield torque_table(fitted.torque_slopes, calibration.gains)
+        yield from map(printable, torque_sentences(fitted.torque_slopes, calibration.gains))
     if fitted.paper is not None:
         values = ", ".join(f"{value:.4g}" for value in fitted.paper.gains)
         yield f"For comparison, the paper's total least squares on the same rows: {values}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # `history` needs no effects
     from ident.discovery.before_after import GainShift
 
 _SIGMAS = 2.0
+CERTAIN_SIGMAS = 3.0  #: Of the ratio of a drive's own torque to the gain, before a difference is said
 _BESIDE = 0.12  #: Offset of the points before and after, in units of the distance between axes
 
 
@@ -82,6 +83,20 @@ def torque_table(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]) ->
             row = (with_deviation(slope.value, slope.std), row[1], ratio, str(slope.readings))
         table.add_row(terminal_text(gain.axis), *row, terminal_text(gain.unit))
     return table
+
+
+def torque_sentences(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]) -> Iterator[str]:
+    """Say what a slope means that differs from its gain by more than CERTAIN_SIGMAS of their ratio."""
+    far = [
+        f"{gain.axis} ({100.0 * (slope.value / gain.value - 1.0):+.1f} %)"
+        for slope, gain in zip(slopes, gains, strict=True)
+        if slope is not None and abs(slope.value / gain.value - 1.0) > CERTAIN_SIGMAS * _ratio_std(slope, gain)
+    ]
+    if far:
+        yield (
+            f"The drive's own torque differs from the gain by more than {CERTAIN_SIGMAS:g} σ on {', '.join(far)}: a "
+            "wrong torque constant was entered in the drive, or the gear has losses, which the drive does not see."
+        )
 
 
 def torque_document(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]) -> list[dict[str, Any]]:

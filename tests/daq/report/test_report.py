@@ -12,9 +12,11 @@ import pytest
 from numpy.typing import NDArray
 from rich.console import Console
 
-from daq.report.gains import gain_table, plot_gains, with_deviation
+from daq.report.gains import gain_table, plot_gains, torque_sentences, with_deviation
 from daq.report.picture import ORANGE, grid, render
 from daq.report.plots import plot_residual, plot_torques
+from ident.calibration import Gain
+from ident.data.torque_channel import TorqueSlope
 from tests.daq.calibrations import AXES, demo_calibration
 
 FloatArray = NDArray[np.float64]
@@ -116,6 +118,15 @@ def test_the_table_says_error_and_truth_within_80_columns() -> None:
 )
 def test_a_value_is_rounded_by_its_uncertainty(value: float, std: float, text: str) -> None:
     assert with_deviation(value, std) == text
+
+
+def test_a_torque_of_the_drive_is_questioned_only_beyond_its_noise() -> None:
+    """σ of the ratio is √2 %: 6 % are said, 4 % are not, whatever the sign of the gain."""
+    gains = [Gain(name, sign * 10.0, 0.1, "Nm/A", sign * 10.0) for name, sign in (("J1", 1), ("J2", -1), ("J3", 1))]
+    slopes = [TorqueSlope(10.4, 0.1, 90), TorqueSlope(-10.6, 0.1, 90), None]
+    (sentence,) = torque_sentences(slopes, gains)
+    assert "by more than 3 σ on J2 (+6.0 %): a wrong torque constant" in sentence
+    assert list(torque_sentences(slopes[:1], gains[:1])) == []
 
 
 def test_pictures_need_no_screen_and_no_global_state() -> None:
