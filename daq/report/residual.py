@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.report.effect_names import effect_text
-from daq.report.fit import coefficients, error_document, error_table
+from daq.report.fit import coefficients, error_document, error_table, identifiability_notes
 from daq.report.gains import diagnosis_texts, gain_table, partial_note, with_deviation
 from daq.report.text import picked, plain_table
 from daq.workflow.calibration_file import as_document
@@ -51,7 +51,7 @@ WHEN = ("before", "after")
 
 
 def residual_view(fitted: Fit, account: Account, calibration: Calibration) -> Iterator[RenderableType]:
-    """Turns of the loop, the effects with their coefficients, the summary, errors and gains."""
+    """Turns of the loop, the effects with their coefficients, the summary, errors, gains, and what σ lacks."""
     yield from turns_view(fitted)
     for effect in calibration.effects:
         sizes = ", ".join(f"{c.name} {with_deviation(c.value, c.std)} {c.unit}" for c in effect.coefficients)
@@ -64,6 +64,7 @@ def residual_view(fitted: Fit, account: Account, calibration: Calibration) -> It
     yield before_after_table(account, fitted.cell.axis_names)
     yield ""
     yield gain_table(calibration.gains, title="Drive gains with the effects in the model")
+    yield from identifiability_notes(fitted)
     if (note := partial_note(calibration)) is not None:
         yield Text(note, style="bold")
 
@@ -114,7 +115,7 @@ def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
     floor = _floor(account).total
     noise = f" (noise floor {floor:.1f} %)" if math.isfinite(floor) else ""
     ending = [*_choice_sentence(fitted, account), _silence(fitted)]
-    if (skew := time_skew(fitted)) is not None:
+    if (skew := time_skew(fitted)) is not None and abs(skew[0]) > CERTAIN * skew[1]:
         beside = " beside the effects found" if kept else ""
         ending.append(
             f"Currents were sampled {1e3 * abs(skew[0]):.2f} ± {1e3 * skew[1]:.2f} ms "
@@ -125,8 +126,8 @@ def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
     ending += _holdout_verdict(fitted, account)
     if kept and not runs_to_leave_out(fitted.steps[-1].after.training):
         ending.append(
-            "Effects were accepted on moves left out: with three runs or more, each payload in two, runs left out "
-            "judge them too."
+            "Effects were accepted on moves left out alone. Record two runs without load and two with each payload: "
+            "runs left out then judge them too."
         )
     ending[:0] = [sentence for step in fitted.steps for sentence in _set_aside(fitted, step)]
     if not found:
@@ -139,8 +140,8 @@ def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
         for axis, change in zip(fitted.cell.axis_names, account.total.gains, strict=True)
         if change.significant
     ]
-    gains = f"Drive gains that change by more than noise: {', '.join(changed)}."
-    return (*first, *found, whole, gains if changed else "No drive gain changes by more than noise.", *ending)
+    gains = f"The effects change gains by more than noise: {', '.join(changed)}."
+    return (*first, *found, whole, gains if changed else "The effects change no gain by more than noise.", *ending)
 
 
 def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:

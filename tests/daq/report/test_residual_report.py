@@ -38,6 +38,7 @@ from ident.discovery.noise_floor import FloorSource, NoiseFloor
 from ident.discovery.search import Finding
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect
+from ident.effects.electrical import TimeSkew
 from ident.effects.friction import Coupling, LoadFriction
 from ident.effects.position import Spring
 from ident.effects.signals import Abscissa
@@ -320,6 +321,34 @@ def test_a_noise_floor_above_the_error_of_the_model_is_reported_with_its_cause(c
     assert motors[2]["left"] == pytest.approx(left_a[2])
 
 
+def test_a_skew_of_time_within_its_noise_is_not_said(closed: Closed) -> None:
+    first, last = closed.fitted.steps
+    for seconds, said in ((4e-5, False), (-4e-4, True)):
+        skew = replace(
+            _finding(PlacedEffect(TimeSkew(), 0), passed=False),
+            coefficients=np.array([seconds]),
+            deviations=np.array([6e-5]),
+        )
+        skewed = replace(closed.fitted, steps=(first, replace(last, findings=(skew,))))
+        sentence = "Currents were sampled 0.40 ± 0.06 ms before the positions"
+        assert any(text.startswith(sentence) for text in summary(skewed, closed.account)) is said
+        assert residual_document(skewed, closed.account, calibration_of(skewed, CREATED))["time_skew"] == {
+            "seconds": seconds,
+            "std": 6e-5,
+        }
+
+
+def test_the_summary_says_what_the_effects_change(closed: Closed) -> None:
+    gains = closed.account.total.gains
+    for significant, sentence in (
+        (False, "The effects change no gain by more than noise."),
+        (True, f"The effects change gains by more than noise: J1 by {gains[0].change_percent:+.1f} %."),
+    ):
+        marked = (replace(gains[0], significant=significant), *(replace(gain, significant=False) for gain in gains[1:]))
+        told = replace(closed.account, total=replace(closed.account.total, gains=marked))
+        assert sentence in summary(closed.fitted, told)
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_silence_is_reported_with_its_size(closed: Closed) -> None:
     last = closed.fitted.steps[-1]
@@ -506,6 +535,7 @@ def test_the_verb_writes_the_report_and_says_the_same(
             assert [float(value) for value in rows[f"{name}, {when}"]] == pytest.approx(
                 [*error["axes"], error["total"]], abs=0.005
             )
+    assert "scales all gains alike" in text
     assert text.splitlines()[-1] == f"Written: {folder}/"
     assert document["noise_floor"]["relative_error_percent"]["total"] is None or math.isfinite(
         document["noise_floor"]["relative_error_percent"]["total"]
