@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -357,7 +358,13 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
         fixed = before.estimate.gains if before.estimate.gains_fixed else None
         before = replace(before, estimate=estimate_with(Method.ML, before.system, fixed))
         evidence = replace(evidence, estimate=before.estimate)
-    steps = find_effects(evidence, np.random.default_rng(seed), progress=progress)
+    names = start.cell.axis_names
+
+    def named(text: str) -> None:
+        """Report progress with the cell's names: the search has numbers alone."""
+        progress(re.sub(r"\baxis (\d+)\b", lambda found: names[int(found[1]) - 1], text))
+
+    steps = find_effects(evidence, np.random.default_rng(seed), progress=named)
     closed = replace(start, identification=before, steps=steps)
     return closed if closed.estimate is start.estimate else with_diagnoses(closed)
 

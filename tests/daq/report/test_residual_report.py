@@ -521,7 +521,8 @@ def test_the_verb_writes_the_report_and_says_the_same(
     folder = tmp_path / "report"
     command = ["residual", *NAMES[:3], "--holdout", NAMES[3], "--report", str(folder)]
     assert main(command) == ExitCode.OK
-    text = capsys.readouterr().out
+    text, progress = capsys.readouterr()
+    assert "adding spring on J3" in progress
     document = json.loads((folder / DOCUMENT).read_text(encoding="utf-8"))
     assert (document["format"], document["version"]) == ("drivegain-residual", 1)
     assert "axis 3" not in text
