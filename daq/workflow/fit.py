@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -358,13 +357,8 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
         fixed = before.estimate.gains if before.estimate.gains_fixed else None
         before = replace(before, estimate=estimate_with(Method.ML, before.system, fixed))
         evidence = replace(evidence, estimate=before.estimate)
-    names = start.cell.axis_names
-
-    def named(text: str) -> None:
-        """Report progress with the cell's names: the search has numbers alone."""
-        progress(re.sub(r"\baxis (\d+)\b", lambda found: names[int(found[1]) - 1], text))
-
-    steps = find_effects(evidence, np.random.default_rng(seed), progress=named)
+    rng = np.random.default_rng(seed)
+    steps = find_effects(evidence, rng, progress=progress, axes=start.cell.axis_names)
     closed = replace(start, identification=before, steps=steps)
     return closed if closed.estimate is start.estimate else with_diagnoses(closed)
 

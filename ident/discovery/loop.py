@@ -92,6 +92,7 @@ def find_effects(
     gates: Gates | None = None,
     families: tuple[tuple[Effect, ...], ...] = EFFECTS,
     progress: Callable[[str], None] = lambda _: None,
+    axes: Sequence[str] = (),
 ) -> tuple[Step, ...]:
     """Find effects that the model lacks, add them one by one, and refit everything after each.
 
@@ -125,16 +126,18 @@ def find_effects(
         gates: limits for a candidate.
         families: the dictionary.
         progress: called with a description of each step.
+        axes: their names in it; those of the robot's joints when empty.
 
     Returns:
         the turns taken; the last one has accepted nothing, unless MAX_EFFECTS was reached.
     """
     gates, cache = gates or Gates(), ColumnCache()
     model = _linearised(start, cache)
+    names = axes or [joint.name for joint in start.model.robot.joints]
     steps: list[Step] = []
     seen = {_keys(start)}
     for _ in range(MAX_EFFECTS):
-        step, joined = _turn(model, rng, gates, families, seen, progress)
+        step, joined = _turn(model, rng, gates, families, seen, progress, names)
         if steps:
             steps[-1] = _settled(steps[-1], model.search_problem, (*step.findings, *step.structures), rng, gates)
         steps.append(step)
@@ -190,6 +193,7 @@ def _turn(
     families: tuple[tuple[Effect, ...], ...],
     seen: set[frozenset[EffectKey]],
     progress: Callable[[str], None],
+    names: Sequence[str],
 ) -> tuple[Step, _Model | None]:
     """Take one turn: the step, and the model with what was accepted; None where nothing was."""
     evidence, problem = model.evidence, model.search_problem
@@ -221,15 +225,14 @@ def _turn(
         near = (*proposed.get(accepted.axis, ()), *families)
         effect = refine_setting(problem, accepted.effect, accepted.axis, near)
         accepted = replace(accepted, effect=effect)
-        progress(f"adding {effect.name} on axis {accepted.axis + 1}")
+        progress(f"adding {effect.name} on {names[accepted.axis]}")
         joined = _join(model, accepted, rng, gates, seen)
         if isinstance(joined, _Model):
             if named is not None and is_unnamed(effect):
                 rival = PlacedEffect(effect, accepted.axis)
                 aside.append(SetAside(named, "{rival} explains clearly more of the same residual", rival))
             return Step(findings, structures, limits_nm, accepted, joined.evidence, tuple(aside)), joined
-        reason = joined.reason([f"axis {number}" for number in range(1, problem.axes + 1)])
-        progress(f"{effect.name} on axis {accepted.axis + 1} does not join the model: {reason}")
+        progress(f"{effect.name} on {names[accepted.axis]} does not join the model: {joined.reason(names)}")
         aside.append(joined)
         # The variables of an axis go together: if its best term may not join, no other one stands in for it.
         others = structures if is_unnamed(effect) else ()
