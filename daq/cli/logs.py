@@ -39,11 +39,11 @@ def import_files(
 
     from daq.cli.terminal import WRITTEN
     from daq.environment import software
-    from daq.log.csv_import import import_csv
+    from daq.log.importing import import_recording
     from daq.report.log import timing_text
     from daq.report.text import printable
 
-    imported = import_csv(description, data, out, software=software(), cell_path=cell)
+    imported = import_recording(description, data, out, software=software(), cell_path=cell)
     WRITTEN.append(out)
     statistics, timing = imported.statistics, imported.timing
     if json:

@@ -72,9 +72,9 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     current = as_array("current_a", run.current_a, shape, each, refuse)
     usable = None if run.valid is None else as_array("valid", run.valid, shape, each, refuse)
     logged = None if run.move is None else as_array("move", run.move, shape[:1], "one entry per sample", refuse)
-    warmth = None if run.temperature_c is None else np.asarray(run.temperature_c, dtype=np.float64)
-    if warmth is not None and warmth.shape != shape:
-        raise refuse(f"temperature_c has shape {warmth.shape}; expected {shape}, {each}")
+    temperature_c = None if run.temperature_c is None else np.asarray(run.temperature_c, dtype=np.float64)
+    if temperature_c is not None and temperature_c.shape != shape:
+        raise refuse(f"temperature_c has shape {temperature_c.shape}; expected {shape}, {each}")
     run = replace(run, time_s=time_s)
     _check(run, shape[1], conditioning, refuse)
     rate = run.rate_hz
@@ -111,7 +111,7 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
         move=move,
         payload=run.payload,
         started_s=run.started_s,
-        temperature_c=None if warmth is None else np.asfortranarray(warmth[1:-1]),
+        temperature_c=None if temperature_c is None else np.asfortranarray(temperature_c[1:-1]),
     )
 
 

@@ -43,7 +43,14 @@ from ident.discovery.gates import PairedChange, compare_by_move
 from ident.discovery.loop import Step
 from ident.discovery.noise_floor import NoiseFloor, noise_floors
 from ident.effects.effect import PlacedEffect
-from ident.equations.linearisation import Folds, cut_into_folds, independent_blocks, left_out_shifts, linearise
+from ident.equations.linearisation import (
+    Folds,
+    cut_into_folds,
+    independent_blocks,
+    left_out_shifts,
+    linearise,
+    scatter_of,
+)
 from ident.equations.rows import Observation
 from ident.errors import IdentificationError
 from ident.estimators.estimate import Estimate, RelativeError, of_squares
@@ -364,7 +371,7 @@ def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
     if before.moves is not None and after.moves is not None:
         starts = min(before.moves.blocks(), after.moves.blocks(), key=len)
         shifts = after.moves.shifts(starts)[:, :count] - before.moves.shifts(starts)[:, :count]
-        change_std = np.sqrt((len(starts) - 1) / len(starts) * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
+        change_std = np.sqrt(np.diag(scatter_of(shifts)))
     limit = float(-scipy.special.ndtri(FALSE_ALARM / (2 * count)))
     return BeforeAfter(
         added=tuple(placed for placed in after.effects if placed not in before.effects),

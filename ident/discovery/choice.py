@@ -28,7 +28,7 @@ import scipy  # loads scipy.special when it is first used: a fit needs none of i
 from ident.arrays import FloatArray
 from ident.discovery.candidates import SearchProblem, score_candidates
 from ident.discovery.gates import impossible, shifts_by, whitened_columns, without_effects_of
-from ident.discovery.search import Finding, Gates
+from ident.discovery.search import Finding, Gates, paired_t
 from ident.effects.effect import PlacedEffect
 from ident.estimators.estimate import Estimate
 
@@ -66,7 +66,7 @@ def choice_covariance(
 
 
 def is_small(finding: Finding, gates: Gates) -> bool:
-    """Whether a finding is no noise and possible, but failed a gate of size; runs left out may refute larger ones."""
+    """Whether a finding is no noise and possible, but too small for the other gates."""
     if finding.probability > gates.false_alarm:
         return False
     if impossible(finding.effect.coefficients, finding.coefficients, finding.deviations):
@@ -91,9 +91,7 @@ def _by_rivals(
         size: n + p.
     """
     gain = fold_errors - np.stack([one.fold_errors for one in rivals])
-    folds = gain.shape[1]
-    error = np.maximum(gain.std(axis=1, ddof=1), np.finfo(np.float64).tiny) * np.sqrt(folds)
-    better = scipy.special.stdtr(folds - 1, gain.sum(axis=1) / error)
+    better = scipy.special.stdtr(gain.shape[1] - 1, paired_t(gain))
     odds = better / np.maximum(1.0 - better, np.finfo(np.float64).eps)
     shifts = []
     for rival, weight in zip(rivals, odds / (1.0 + odds.sum()), strict=True):

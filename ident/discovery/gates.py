@@ -178,6 +178,12 @@ class Reduced:
         return gain_shifts(self.search_problem.folds, self.torque)
 
 
+def own_unknowns(estimate: Estimate, effects: Sequence[PlacedEffect]) -> IntArray:
+    """Places of the coefficients of effects among the parameters of an estimate, shape (p,)."""
+    names = {column.name for placed in effects for column in placed.columns}
+    return np.array([index for index, column in enumerate(estimate.unknowns) if column.name in names])
+
+
 def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effects: Sequence[PlacedEffect]) -> Reduced:
     """Take effects out of a joint fit, to first order, without a refit.
 
@@ -186,10 +192,9 @@ def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effect
         estimate: the joint fit.
         effects: in the fit.
     """
-    names = {column.name for placed in effects for column in placed.columns}
-    own = [index for index, column in enumerate(estimate.unknowns) if column.name in names]
+    own = own_unknowns(estimate, effects)
     problem, observation = search_problem.folds.problem, search_problem.observation
-    taken = np.isin(problem.free, len(estimate.gains) + np.array(own))
+    taken = np.isin(problem.free, len(estimate.gains) + own)
     columns = problem.jacobian[:, taken] / problem.scale[taken]
     torque = columns @ estimate.parameters[own]
     rest = problem.jacobian[:, ~taken]

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.arrays import FloatArray, IntArray
+from ident.arrays import FloatArray
 from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, prepare_search, score_candidates
 from ident.discovery.choice import choice_covariance, is_small
 from ident.discovery.evidence import Evidence, by_instruments, with_effects
@@ -20,6 +20,7 @@ from ident.discovery.gates import (
     impossible,
     in_noise,
     moved_gains,
+    own_unknowns,
     whitened_columns,
     without_effects_of,
 )
@@ -44,7 +45,6 @@ from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.transmission import Ripple
 from ident.effects.unnamed import is_unnamed
 from ident.errors import NotConverged, RankDeficient
-from ident.estimators.estimate import Estimate
 
 UNFITTED = (NotConverged, RankDeficient, np.linalg.LinAlgError)
 MAX_EFFECTS = 12  #: More effects than this on one robot mean that the declared model is wrong
@@ -306,7 +306,7 @@ def _refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
         return ""
     if estimate is None:
         return ""
-    own = _own_unknowns(estimate, placed)
+    own = own_unknowns(estimate, (placed,))
     place, values, fitted = len(estimate.gains) + own, estimate.parameters[own], evidence.estimate.parameters[own]
     covariance = estimate.covariance[np.ix_(place, place)]
     if not (why := in_noise(values, covariance, SHOWN)):
@@ -316,12 +316,6 @@ def _refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
     if not is_unnamed(placed.effect) and (not nearer or in_noise(fitted, covariance)):
         return ""
     return f"with instruments from the demanded motion, {why}"
-
-
-def _own_unknowns(estimate: Estimate, placed: PlacedEffect) -> IntArray:
-    """Places of an effect's coefficients among the parameters of an estimate, shape (p,)."""
-    names = {column.name for column in placed.columns}
-    return np.array([index for index, column in enumerate(estimate.unknowns) if column.name in names])
 
 
 def _pruned(model: _Model, accepted: Finding, rng: np.random.Generator, gates: Gates) -> _Model | SetAside:
@@ -357,7 +351,7 @@ def _beside_others(model: _Model, placed: PlacedEffect, rng: np.random.Generator
     if trial is None:
         return 0.0, "the model contains it already"
     (finding,) = rank_families(problem, (FamilyTrials(placed.axis, ((placed.effect, trial),)),), rng, gates)
-    own = _own_unknowns(estimate, placed)
+    own = own_unknowns(estimate, (placed,))
     values, place = estimate.parameters[own], len(estimate.gains) + own
     joint = in_noise(values, estimate.covariance[np.ix_(place, place)])
     physics = impossible(placed.effect.coefficients, values, estimate.parameters_std[own])
@@ -368,7 +362,7 @@ def _beside_others(model: _Model, placed: PlacedEffect, rng: np.random.Generator
 def _settled(
     step: Step, problem: SearchProblem, tested: Sequence[Finding], rng: np.random.Generator, gates: Gates
 ) -> Step:
-    """Keep of an accepted effect's ambiguity what passed before and does not pass beside it.
+    """Limit the ambiguity of an accepted effect to rivals that passed before it joined and no longer do.
 
     Args:
         step: with what was accepted.

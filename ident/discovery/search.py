@@ -10,7 +10,7 @@ The lag-one correlation of a residual is about 0.67, so textbook tests are wrong
 5. its coefficients are possible: none is outside what physics allows by more than 2 σ, and no time constant is longer
    than the data.
 
-The loop asks those that may join for more: see `ident.discovery.gates`.
+Effects that are to join must pass further gates: see `ident.discovery.gates`.
 
 Candidates are ranked by held-out moves, and the setting of a family (its exponent, its speed) is chosen anew inside
 each fold, by the other folds alone: the score of a family has not seen what it is scored on.
@@ -163,9 +163,13 @@ def effect_key(effect: Effect, axis: int) -> EffectKey:
 def _better(one: FloatArray, other: FloatArray) -> BoolArray:
     """Whether one ‖e‖² is less than the other by a paired comparison over folds, folds last."""
     gain = other - one
-    count = gain.shape[-1]
-    error = np.std(gain, axis=-1, ddof=1) * np.sqrt(count)
-    return np.asarray(gain.sum(axis=-1) > scipy.special.stdtrit(count - 1, 0.5 + CLEARLY / 2.0) * error)
+    return np.asarray(paired_t(gain) > scipy.special.stdtrit(gain.shape[-1] - 1, 0.5 + CLEARLY / 2.0))
+
+
+def paired_t(gain: FloatArray) -> FloatArray:
+    """Student's t of the fall of ‖e‖² on each fold, folds last."""
+    error = np.std(gain, axis=-1, ddof=1) * np.sqrt(gain.shape[-1])
+    return np.asarray(gain.sum(axis=-1) / np.maximum(error, np.finfo(np.float64).tiny))
 
 
 def refine_setting(

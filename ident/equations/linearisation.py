@@ -146,6 +146,12 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0])
 
 
+def scatter_of(shifts: FloatArray) -> FloatArray:
+    """Jackknife covariance (m − 1)/m Σ (d_c − mean)(d_c − mean)ᵀ, shape (f, f), of shifts d_c, shape (m, f)."""
+    centred = shifts - shifts.mean(axis=0)
+    return np.asarray((len(shifts) - 1) / len(shifts) * (centred.T @ centred))
+
+
 def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) -> IntArray:
     """Join neighbouring clusters of a run in pairs, again and again, until they are independent of each other.
 
@@ -226,10 +232,10 @@ def jackknife_covariance(
     runs = np.array([run for run, _ in system.cluster_runs])
     grams, scores = grams[:, free, free], scores[:, free]
     starts = independent_blocks(grams, scores, runs)
-    shifts = left_out_shifts(np.add.reduceat(grams, starts), np.add.reduceat(scores, starts))
-    blocks, centred = len(shifts), shifts - shifts.mean(axis=0)
     covariance = np.zeros((size, size))
-    covariance[free, free] = (blocks - 1) / blocks * (centred.T @ centred)
+    covariance[free, free] = scatter_of(
+        left_out_shifts(np.add.reduceat(grams, starts), np.add.reduceat(scores, starts))
+    )
     return covariance
 
 

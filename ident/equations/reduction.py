@@ -178,7 +178,7 @@ def reduce_runs(
         runs: read while they are reduced; a mounting that several share has one set of unknowns.
         conditioning: the filters.
         payloads: known beforehand; others are added as runs bring them.
-        instruments: keep those of the demanded motion beside the rows; a run of which none is known is its own.
+        instruments: keep those of the demanded motion beside the rows; where it is not known, the recorded one serves.
         keep_rows: keep all runs and their rows, for `observe`.
         chunk_rows: rows built at once; the result does not depend on it.
 

@@ -132,7 +132,7 @@ def _part(motion: Motion, rows: slice) -> Motion:
 
 @dataclass(frozen=True, slots=True)
 class RunRows:
-    """A run with all its rows, for those that need them again."""
+    """A run with all its rows, for a search: it needs them after the fit."""
 
     data: Dataset  #: the run
     pieces: tuple[Rows, ...]  #: its rows, piece by piece
@@ -149,7 +149,7 @@ class Observation(Equations):
     current: FloatArray  #: decimated current references of the motors [A], shape (n, r)
     regressor: FloatArray  #: torque at each joint per unit of each base parameter: W without effects, shape (n, b, r)
     effects: FloatArray  #: the same of each effect, the other columns of W, shape (n, e, r)
-    flange: FloatArray  #: the last link's ten columns; a payload's are these where it was mounted, shape (n, 10, r)
+    flange: FloatArray  #: the last link's ten columns, also a payload's while it was mounted, shape (n, 10, r)
     use: BoolArray  #: rows of each joint that count: moving and valid, shape (n, r)
     motor_use: BoolArray  #: rows of each motor that count: all joints it turns with, and itself, moving, shape (n, r)
     time_s: FloatArray  #: of each row, since the start of its run, shape (r,)
@@ -297,7 +297,7 @@ def observe(
 
 
 def on_demanded_motion(model: Model, datasets: Sequence[Dataset], rows: Observation) -> Observation:
-    """Replace the columns of rows without effects by those of the demanded motion, where a run's is known.
+    """Replace the declared columns by those of the demanded motion, where a run's is known; effects' columns stay.
 
     Args:
         model: the declared model.

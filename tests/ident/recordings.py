@@ -204,7 +204,7 @@ def calibrated(evidence: Evidence) -> Calibration:
 def a_calibration(
     gains: FloatArray, parameters: tuple[Parameter, ...], gains_std: FloatArray | None = None
 ) -> Calibration:
-    """A calibration of these gains and parameters, exact unless told otherwise."""
+    """A calibration of these gains and parameters, exact unless deviations are given."""
     std = np.zeros(len(gains)) if gains_std is None else gains_std
     return Calibration(
         cell="test",

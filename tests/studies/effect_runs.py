@@ -17,7 +17,7 @@ import numpy as np
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.log.conversion import load_run
-from daq.log.csv_import import import_csv
+from daq.log.importing import import_recording
 from ident.data.run import Run
 from tests.studies.direct_cell import MOVING, RawRun, run_of, simulate_run
 from tests.studies.effect_cells import EffectCase
@@ -156,6 +156,6 @@ def imported_runs(raw: tuple[RawRun, ...], cell: Cell) -> tuple[Run, ...]:
             )
             description.write_text(text, encoding="utf-8")
             log = folder / f"{one.name}.mcap"
-            import_csv(description, folder, log, software="effects study", cell_path=CELL)
+            import_recording(description, folder, log, software="effects study", cell_path=CELL)
             runs.append(load_run(log)[0])
     return tuple(runs)

@@ -202,7 +202,7 @@ def with_floors(rows: Sequence[Row]) -> tuple[Row, ...]:
 def _work(task: _Task) -> tuple[str, ...]:
     """Simulate and search one case as far as that was not done."""
     simulation_s = make_case(task.runs)
-    searching = digest_of_source("ident.discovery.loop"), digest_of_source("daq.log.csv_import")
+    searching = digest_of_source("ident.discovery.loop"), digest_of_source("daq.log.importing")
     lines = []
     for part in task.parts:
         path = task.path(part)

@@ -158,7 +158,7 @@ def test_an_unwritable_standard_output_is_no_traceback(
     def full(_: object) -> None:
         raise OSError(28, os.strerror(28))
 
-    monkeypatch.setattr("daq.log.csv_import.import_csv", lambda *_, **__: full(None))
+    monkeypatch.setattr("daq.log.importing.import_recording", lambda *_, **__: full(None))
     code = main(["import", "x.yaml", "--data", ".", "--out", "y.mcap"])
     assert code == ExitCode.UNEXPECTED
     assert "no space left" in capsys.readouterr().err

@@ -22,7 +22,7 @@ from daq.config.import_description import ImportDescription, TimeColumn, TimeUni
 from daq.errors import ConfigurationInconsistent, DataError, LogForeign, LogTruncated, TableUnfit
 from daq.log.bag_table import STAMP, joint_state_from_cdr, read_bag
 from daq.log.conversion import load_run
-from daq.log.csv_import import import_csv
+from daq.log.importing import import_recording
 from daq.log.message import DEFINITIONS, JOINTS_SCHEMA
 from daq.log.reader import read_log
 from daq.log.table import Table
@@ -233,7 +233,7 @@ def test_a_bag_has_no_temperature(checkout: Path, tmp_path: Path, columns: list[
     document = {**_document(checkout), "temperature": {"file": "run.mcap", "columns": columns}}
     description.write_text(json.dumps(document))
     with pytest.raises(TableUnfit, match="found `temperature` from a ROS 2 bag; expected a file with temperatures"):
-        import_csv(description, tmp_path, out, software="test")
+        import_recording(description, tmp_path, out, software="test")
     assert not out.exists()
 
 
@@ -245,10 +245,10 @@ def test_torques_of_a_bag_come_from_another_field_than_the_currents(checkout: Pa
         torque = {"file": "run.mcap", "columns": columns, "side": "joint"}
         description.write_text(json.dumps({**_document(checkout), "torque": torque}))
         with pytest.raises(ConfigurationInconsistent, match=r"found effort of run\.mcap, which current is read from"):
-            import_csv(description, tmp_path, out, software="test")
+            import_recording(description, tmp_path, out, software="test")
     torque = {"file": "run.mcap", "columns": ["velocity"], "side": "joint"}
     description.write_text(json.dumps({**_document(checkout), "torque": torque}))
-    import_csv(description, tmp_path, out, software="test")
+    import_recording(description, tmp_path, out, software="test")
     assert load_run(out)[0].torque_channels
 
 

@@ -22,7 +22,7 @@ from daq.config.import_description import ImportDescription
 from daq.config.yaml_file import parse_yaml, read_model
 from daq.errors import ConfigurationInconsistent, OutputFailed, TableUnfit, UsageError
 from daq.log.conversion import load_run
-from daq.log.csv_import import import_csv, quantise
+from daq.log.importing import import_recording, quantise
 from daq.log.reader import read_log
 from daq.report.log import describe_log
 from ident.data.torque_channel import torque_slope
@@ -284,7 +284,7 @@ def test_a_missing_description(bench: Bench, capsys: pytest.CaptureFixture[str])
 def test_an_existing_log_stays(bench: Bench) -> None:
     bench.out.write_bytes(b"precious")
     with pytest.raises(UsageError, match="a file of that name"):
-        import_csv(bench.description, bench.data, bench.out, software="x")
+        import_recording(bench.description, bench.data, bench.out, software="x")
     assert bench.out.read_bytes() == b"precious"
     assert bench.left == ["run.mcap"]
 
@@ -362,7 +362,7 @@ def test_the_rate_of_a_time_column(bench: Bench) -> None:
 def test_a_jump_in_the_time_column(bench: Bench, index: int, shift: float) -> None:
     _with_time(bench, 4.0 * np.arange(300) + shift * (np.arange(300) >= index))
     with pytest.raises(TableUnfit, match=rf"run\.csv:{index + 2}, column t"):
-        import_csv(bench.description, bench.data, bench.out, software="x")
+        import_recording(bench.description, bench.data, bench.out, software="x")
     assert bench.left == []
 
 
@@ -577,7 +577,7 @@ def test_counts_need_an_encoder(bench: Bench) -> None:
         current={"file": "run.csv", "columns": NAMES[6:], "unit": "Nm(motor, a priori)"},
     )
     with pytest.raises(ConfigurationInconsistent, match="counts_per_revolution"):
-        import_csv(bench.description, bench.data, bench.out, software="x")
+        import_recording(bench.description, bench.data, bench.out, software="x")
 
 
 def test_the_real_tx40(checkout: Path, shared_data: Path, tmp_path: Path) -> None:
@@ -608,14 +608,14 @@ def test_a_recording_that_is_no_regular_file_is_refused(bench: Bench, what: str)
     else:
         os.mkfifo(recording)
     with pytest.raises(TableUnfit, match="no regular file"):
-        import_csv(bench.description, bench.data, bench.out, software="test")
+        import_recording(bench.description, bench.data, bench.out, software="test")
     assert not bench.out.exists()
 
 
 def test_a_payload_that_is_not_the_cells_is_named_as_it_was_given(bench: Bench) -> None:
     bench.describe(payload="brick")
     with pytest.raises(ConfigurationInconsistent, match="'brick'") as caught:
-        import_csv(bench.description, bench.data, bench.out, software="test")
+        import_recording(bench.description, bench.data, bench.out, software="test")
     assert "None" not in str(caught.value)
     assert "payload: NAME" in str(caught.value)
 
@@ -623,7 +623,7 @@ def test_a_payload_that_is_not_the_cells_is_named_as_it_was_given(bench: Bench) 
 def test_a_full_disk_is_not_reported_as_a_recording(bench: Bench) -> None:
     bench.out.parent.rmdir()
     with pytest.raises(OutputFailed) as caught:
-        import_csv(bench.description, bench.data, bench.out, software="test")
+        import_recording(bench.description, bench.data, bench.out, software="test")
     assert "nothing was written" in str(caught.value)
     assert "record" not in str(caught.value)
 
@@ -671,19 +671,19 @@ def test_a_torque_column_too_few_and_a_factor_of_zero_are_refused(bench: Bench) 
     ):
         bench.describe(torque={"file": "run.csv", **torque})
         with pytest.raises(ConfigurationInconsistent, match=said):
-            import_csv(bench.description, bench.data, bench.out, software="test")
+            import_recording(bench.description, bench.data, bench.out, software="test")
     # Every section is checked, whatever comes after it.
     current = {"file": "run.csv", "columns": NAMES[6:], "unit": "A", "factor": [1.0, 2.0]}
     bench.describe(current=current, torque={"file": "run.csv", "columns": SPEEDS, "side": "motor"})
     with pytest.raises(ConfigurationInconsistent, match=r"current\.factor"):
-        import_csv(bench.description, bench.data, bench.out, software="test")
+        import_recording(bench.description, bench.data, bench.out, software="test")
 
 
 def test_a_column_is_not_both_current_and_torque(bench: Bench) -> None:
     columns = [*SPEEDS[:3], "i4", *SPEEDS[4:]]
     bench.describe(torque={"file": "./run.csv", "columns": columns, "side": "motor"})
     with pytest.raises(ConfigurationInconsistent, match=r"torque\.columns: found i4 of .*, which current is read from"):
-        import_csv(bench.description, bench.data, bench.out, software="test")
+        import_recording(bench.description, bench.data, bench.out, software="test")
 
 
 def test_the_shipped_description_shows_every_setting(checkout: Path) -> None:

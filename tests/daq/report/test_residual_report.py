@@ -274,11 +274,11 @@ def test_what_the_choice_of_effects_adds_to_sigma_is_said_where_it_counts(closed
         replace(gain, choice_std=share * gain.after_std)
         for gain, share in zip(gains, (0.1, 0.5, 0.1, 0.1, 0.1, 0.1), strict=True)
     )
-    told = replace(closed.account, total=replace(closed.account.total, gains=chosen))
+    changed = replace(closed.account, total=replace(closed.account.total, gains=chosen))
     sentence = "σ of the gains includes the choice of the effects (squares add): 50 % of it on J2."
-    assert sentence in summary(closed.fitted, told)
+    assert sentence in summary(closed.fitted, changed)
     assert not any("choice of the effects" in text for text in summary(closed.fitted, closed.account))
-    document = Closed(closed.fitted, told).document()
+    document = Closed(closed.fitted, changed).document()
     assert document["gain_changes"][1]["choice_std"] == chosen[1].choice_std
 
 
@@ -345,8 +345,8 @@ def test_the_summary_says_what_the_effects_change(closed: Closed) -> None:
         (True, f"The effects change gains by more than noise: J1 by {gains[0].change_percent:+.1f} %."),
     ):
         marked = (replace(gains[0], significant=significant), *(replace(gain, significant=False) for gain in gains[1:]))
-        told = replace(closed.account, total=replace(closed.account.total, gains=marked))
-        assert sentence in summary(closed.fitted, told)
+        changed = replace(closed.account, total=replace(closed.account.total, gains=marked))
+        assert sentence in summary(closed.fitted, changed)
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from daq.log.csv_import import import_csv
+from daq.log.importing import import_recording
 from daq.workflow.calibration_file import save_calibration
 from daq.workflow.fit import calibration_of, fit
 
@@ -17,6 +17,6 @@ def real(checkout: Path, shared_data: Path, tmp_path_factory: pytest.TempPathFac
     """A calibration file of the real TX-40 with its gains fixed, and the log that it rests on."""
     folder = tmp_path_factory.mktemp("tx40")
     log, file = folder / "tx40.mcap", folder / "calibration.yaml"
-    import_csv(checkout / "configs/imports/tx40.yaml", shared_data / "tx40", log, software="test")
+    import_recording(checkout / "configs/imports/tx40.yaml", shared_data / "tx40", log, software="test")
     save_calibration(calibration_of(fit([log], gains_fixed=True), datetime(2025, 1, 2, tzinfo=UTC)), file)
     return file, log

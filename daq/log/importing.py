@@ -29,8 +29,8 @@ from daq.config.import_description import (
 )
 from daq.errors import ConfigurationInconsistent, PositionImplausible, TableUnfit
 from daq.log.conversion import check_limits, scaling, unwrapped
+from daq.log.formats import reader_of, with_columns
 from daq.log.metadata import AxisReadback, Readback, RunInfo, RunStatistics, Timing
-from daq.log.readers import reader_of, with_columns
 from daq.log.resampling import Clock, clock_of
 from daq.log.table import Table
 from daq.log.writer import NOTHING_KEPT, LogContent, LogWriter
@@ -68,7 +68,9 @@ class Imported:
     remarks: tuple[str, ...]  #: oddities of the files that were mended
 
 
-def import_csv(description: Path, data: Path, out: Path, *, software: str, cell_path: Path | None = None) -> Imported:
+def import_recording(
+    description: Path, data: Path, out: Path, *, software: str, cell_path: Path | None = None
+) -> Imported:
     """Convert the files that a description names to a log. The same input gives the same bytes: no clock is read.
 
     Args:

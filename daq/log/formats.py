@@ -45,7 +45,7 @@ def reader_of(path: Path) -> Reader:
 
 
 def with_columns(wanted: ImportDescription, data: Path, axis_names: Sequence[str]) -> ImportDescription:
-    """Return a description whose columns are those of its readers, where it has a shorter form.
+    """Return a description with a column for each axis, where it names all of them at once.
 
     The columns of a bag may be joints; the section says which field is meant. A single column may be a whole field
     (`position`: its joints are called as the axes) or a whole matrix of a MATLAB file (`q`: a column for each axis).
