@@ -346,8 +346,7 @@ def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns |
     )
     held, problem, moves = evidence.holdout, folds.problem, None
     if not estimate.gains_fixed:
-        _, first = np.unique(problem.cluster, return_index=True)
-        runs = evidence.training.run[problem.source[first]]
+        runs = problem.of_clusters(evidence.training.run)
         moves = Moves(folds.cluster_hessian, folds.cluster_score, problem.scale, runs)
     return Assessment(
         effects=evidence.effects,

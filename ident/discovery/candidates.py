@@ -231,7 +231,7 @@ def _scored_together(folds: Folds, width: int, candidates: Sequence[Felt]) -> tu
     of its own.
     """
     made = [_products(own, candidates) for own in folds.motors if any(own.motor in felt for felt in candidates)]
-    shape, unknowns = (len(candidates), width), folds.problem.jacobian.shape[1]
+    shape, unknowns = (len(candidates), width), folds.problem.jacobian.width
     # ΦᵀJ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor.
     parts = (folds.count, len(folds.problem.gamma), *shape)
     part_jacobian, part_gram = np.zeros((*parts, unknowns)), np.zeros((*parts, width))

@@ -87,14 +87,11 @@ def runs_to_leave_out(observation: Observation) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Run:
-    """Rows of one run, and what a fit of all other runs predicts of them."""
+class _Others:
+    """A fit of all runs but one."""
 
-    rows: IntArray  #: indices among those of the problem, shape (k,)
-    move: IntArray  #: of each row, shape (k,)
-    residual: FloatArray  #: e of the rows, shape (k,)
-    #: Cholesky factor of JᵀJ of the other runs, and their Jᵀe; None for a run that cannot be left out.
-    others: tuple[tuple[FloatArray, bool], FloatArray] | None
+    factor: tuple[FloatArray, bool]  #: Cholesky factor of JᵀJ
+    score: FloatArray  #: Jᵀe, shape (f,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,58 +99,65 @@ class RunsLeftOut:
     """A linearised problem cut into runs: each is predicted by a fit of the others."""
 
     search_problem: SearchProblem  #: the problem
-    runs: tuple[_Run, ...]  #: its runs; none where no run can be left out
+    run_of: IntArray  #: run of each of its clusters, shape (clusters,)
+    others: tuple[_Others | None, ...]  #: of each run, None for one that stays; empty where none can be left out
 
     @classmethod
     def of(cls, search_problem: SearchProblem) -> RunsLeftOut:
         """Cut a search problem into its runs."""
-        problem, observation = search_problem.folds.problem, search_problem.observation
-        left_out = runs_to_leave_out(observation)
+        folds, observation = search_problem.folds, search_problem.observation
+        left_out, run_of = runs_to_leave_out(observation), folds.problem.of_clusters(observation.run)
         if not left_out:
-            return cls(search_problem, ())
-        run_of = observation.run[problem.source]
-        parts = [(run, np.flatnonzero(run_of == run)) for run in np.unique(run_of)]
-        grams = [problem.jacobian[rows].T @ problem.jacobian[rows] for _, rows in parts]
-        scores = [problem.residual[rows] @ problem.jacobian[rows] for _, rows in parts]
-        gram, score = sum(grams[1:], grams[0]), sum(scores[1:], scores[0])
-        return cls(
-            search_problem,
-            tuple(
-                _Run(
-                    rows,
-                    observation.move[problem.source[rows]],
-                    problem.residual[rows],
-                    (_factor(gram - own_gram), score - own_score) if run in left_out else None,
-                )
-                for (run, rows), own_gram, own_score in zip(parts, grams, scores, strict=True)
-            ),
-        )
+            return cls(search_problem, run_of, ())
+        hessian, score = folds.cluster_hessian, folds.cluster_score
+
+        def others(run: int) -> _Others | None:
+            if run not in left_out:
+                return None
+            rest = run_of != run
+            return _Others(_factor(hessian[rest].sum(axis=0)), score[rest].sum(axis=0))
+
+        return cls(search_problem, run_of, tuple(map(others, range(len(observation.runs)))))
 
     def change(self, columns: FloatArray) -> PairedChange:
         """Change of the error on runs left out when whitened columns, shape (rows, p), join the model."""
-        problem = self.search_problem.folds.problem
-        inside, jacobian = ([array[run.rows] for run in self.runs] for array in (columns, problem.jacobian))
-        crossed = [of_run.T @ own for of_run, own in zip(jacobian, inside, strict=True)]
-        gram, score = columns.T @ columns, columns.T @ problem.residual
-        unit = np.sqrt(np.maximum(np.diag(gram), np.finfo(np.float64).tiny))
-        changes, moves = [], []
-        for run, of_run, own, own_crossed in zip(self.runs, jacobian, inside, crossed, strict=True):
-            if run.others is None:
+        folds = self.search_problem.folds
+        problem, observation, phi = folds.problem, self.search_problem.observation, columns.T
+        count, width, unknowns = len(self.others), len(phi), problem.jacobian.width
+        # ΦᵀΦ, Φᵀe and ΦᵀJ of each run.
+        grams, scores = np.zeros((count, width, width)), np.zeros((count, width))
+        crossed = np.zeros((count, width, unknowns))
+        for motor in folds.motors:
+            run_of, own = self.run_of[motor.cluster], phi[:, motor.rows]
+            np.add.at(grams, run_of, motor.sums(own, own))
+            beside = motor.sums(own, motor.equations)
+            np.add.at(scores, run_of, beside[..., -2])
+            for run in np.unique(run_of):
+                crossed[run][:, motor.seen] += beside[run_of == run][..., :-2].sum(axis=0)
+        unit = np.sqrt(np.maximum(np.diag(grams.sum(axis=0)), np.finfo(np.float64).tiny))
+        # What the fit of the others predicts of each run, without the columns, and what these change of it.
+        steps, coefficients = np.zeros((count, 2, unknowns)), np.zeros((count, width))
+        for run, fit in enumerate(self.others):
+            if fit is None:
                 continue
-            factor, pull = run.others
-            rest = sum(crossed[1:], crossed[0]) - own_crossed
-            along = linalg.cho_solve(factor, rest)
-            left = gram - own.T @ own - along.T @ rest
-            drive = score - own.T @ run.residual - along.T @ pull
-            fitted = np.linalg.pinv(left / np.outer(unit, unit), rcond=UNSEEN) @ (drive / unit) / unit
-            before = run.residual - of_run @ linalg.cho_solve(factor, pull)
-            changes.append((before - (own - of_run @ along) @ fitted) ** 2 - before**2)
-            moves.append(run.move)
-        return compare_by_move(np.concatenate(changes), np.concatenate(moves))
+            rest = crossed.sum(axis=0) - crossed[run]
+            along = linalg.cho_solve(fit.factor, rest.T).T
+            left = grams.sum(axis=0) - grams[run] - rest @ along.T
+            drive = scores.sum(axis=0) - scores[run] - along @ fit.score
+            coefficients[run] = np.linalg.pinv(left / np.outer(unit, unit), rcond=UNSEEN) @ (drive / unit) / unit
+            steps[run] = linalg.cho_solve(fit.factor, fit.score), coefficients[run] @ along
+        without, turned = np.concatenate(
+            [motor.predicted(list(steps[self.run_of[motor.cluster]])) for motor in folds.motors], axis=1
+        )
+        run_of_row = self.run_of[problem.cluster]
+        before = problem.residual - without
+        after = before + turned - np.einsum("rp,rp->r", columns, coefficients[run_of_row])
+        shown = np.array([fit is not None for fit in self.others])[run_of_row]
+        return compare_by_move((after**2 - before**2)[shown], observation.move[problem.source[shown]])
 
     def refusal(self, columns: FloatArray) -> str:
         """Why whitened columns may not join; empty where they may, or where no run can be left out."""
-        if not self.runs or not (change := self.change(columns)).is_rise:
+        if not self.others or not (change := self.change(columns)).is_rise:
             return ""
         return f"the squared error on runs left out rises by {change.rise:.3g} ± {change.std:.2g} noise variances"
 
@@ -193,16 +197,19 @@ def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effect
         effects: in the fit.
     """
     own = own_unknowns(estimate, effects)
-    problem, observation = search_problem.folds.problem, search_problem.observation
+    problem = search_problem.folds.problem
     taken = np.isin(problem.free, len(estimate.gains) + own)
-    columns = problem.jacobian[:, taken] / problem.scale[taken]
+    columns = problem.jacobian.columns(np.flatnonzero(taken)) / problem.scale[taken]
     torque = columns @ estimate.parameters[own]
-    rest = problem.jacobian[:, ~taken]
+    rest = problem.jacobian.only(np.flatnonzero(~taken))
     for place, motor in enumerate(problem.free[problem.free < len(estimate.gains)]):
         # ∂(γ τ)/∂g = −γ² τ, and τ loses these effects.
-        rows = problem.motor == motor
-        rest[rows, place] += torque[rows] * problem.gamma[motor] * problem.scale[place]
-    absorbed = linalg.cho_solve(_factor(rest.T @ rest), rest.T @ torque)
+        slope = torque[problem.rows_of(motor)] * problem.gamma[motor] * problem.scale[place]
+        rest.parts[motor][rest.seen[motor] == place] += slope
+    hessian = np.zeros((rest.width, rest.width))
+    for part, seen in zip(rest.parts, rest.seen, strict=True):
+        hessian[np.ix_(seen, seen)] += part @ part.T
+    absorbed = linalg.cho_solve(_factor(hessian), rest.on_columns(torque))
     reduced = replace(
         problem,
         jacobian=rest,
@@ -210,9 +217,8 @@ def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effect
         free=problem.free[~taken],
         scale=problem.scale[~taken],
     )
-    _, first = np.unique(problem.cluster, return_index=True)
     # The rows keep their order: they are dealt to the same folds again.
-    folds = cut_into_folds(reduced, move_of=observation.move[problem.source[first]])
+    folds = cut_into_folds(reduced, move_of=problem.of_clusters(search_problem.observation.move))
     return Reduced(replace(search_problem, folds=folds), columns, torque)
 
 
@@ -228,7 +234,7 @@ def shifts_by(folds: Folds, torque: FloatArray, size: int) -> FloatArray:
     It is zero for what is fixed and for what the problem does not hold.
     """
     problem, shifts = folds.problem, np.zeros(size)
-    shifts[problem.free] = -linalg.cho_solve(folds.full_factor, problem.jacobian.T @ torque) * problem.scale
+    shifts[problem.free] = -linalg.cho_solve(folds.full_factor, problem.jacobian.on_columns(torque)) * problem.scale
     return shifts
 
 

@@ -8,6 +8,7 @@ time (`left_out_shifts`); the search for effects leaves out folds of moves (`cut
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -19,17 +20,59 @@ from ident.equations.rows import Observation
 from ident.equations.system import System
 from ident.errors import TooFewMoves
 
-OF_ROWS = ("jacobian", "residual", "current", "motor", "cluster", "source")
-"""Fields of a linearisation that have a row first."""
+OF_ROWS = ("residual", "current", "motor", "cluster", "source")
+"""Fields of a linearisation that have a number a row."""
 MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter, and each fold holds one
 CORRELATED = 2.0  #: Standard errors of the correlation of neighbouring clusters, above which they are joined
+
+
+@dataclass(frozen=True, slots=True)
+class Jacobian:
+    """A matrix with the rows of all motors below each other, of which each holds the unknowns of its motor alone.
+
+    The equation of a motor near the flange has few of them: less than half of the numbers of the whole matrix are kept.
+    """
+
+    parts: tuple[FloatArray, ...]  #: of each motor's rows, columns first, shapes (s_i, rows_i)
+    seen: tuple[IntArray, ...]  #: unknowns that each motor's equation holds, shapes (s_i,)
+    width: int  #: number of unknowns, f
+
+    def __matmul__(self, step: FloatArray) -> FloatArray:
+        """J x, shape (rows,), from x, shape (f,)."""
+        return np.concatenate([step[seen] @ part for part, seen in zip(self.parts, self.seen, strict=True)])
+
+    def columns(self, chosen: IntArray) -> FloatArray:
+        """Some of its columns, shape (rows, k)."""
+        own = self.only(chosen)
+        parts = []
+        for part, seen in zip(own.parts, own.seen, strict=True):
+            parts.append(np.zeros((part.shape[1], own.width)))
+            parts[-1][:, seen] = part.T
+        return np.concatenate(parts)
+
+    def only(self, chosen: IntArray) -> Jacobian:
+        """A copy with some of its columns."""
+        kept = [np.isin(seen, chosen) for seen in self.seen]
+        return Jacobian(
+            tuple(part[keep] for part, keep in zip(self.parts, kept, strict=True)),
+            tuple(np.searchsorted(chosen, seen[keep]) for seen, keep in zip(self.seen, kept, strict=True)),
+            len(chosen),
+        )
+
+    def on_columns(self, columns: FloatArray) -> FloatArray:
+        """JᵀΦ, shape (f, …), from columns on all rows, shape (rows, …)."""
+        out = np.zeros((self.width, *columns.shape[1:]))
+        ends = np.cumsum([part.shape[1] for part in self.parts])
+        for part, seen, own in zip(self.parts, self.seen, np.split(columns, ends[:-1]), strict=True):
+            out[seen] += part @ own
+        return out
 
 
 @dataclass(frozen=True, slots=True)
 class Linearisation:
     """Rows of all motors below each other, motor 1 first."""
 
-    jacobian: FloatArray  #: ∂(γ (T τ)/σ) per unit of each free unknown in its own scale, shape (rows, f)
+    jacobian: Jacobian  #: ∂(γ (T τ)/σ) per unit of each free unknown in its own scale
     residual: FloatArray  #: whitened, shape (rows,)
     current: FloatArray  #: measured, whitened: what the residual is relative to, shape (rows,)
     motor: IntArray  #: of each row, shape (rows,)
@@ -45,6 +88,10 @@ class Linearisation:
     def cluster_count(self) -> int:
         """Number of clusters."""
         return int(self.cluster.max()) + 1
+
+    def of_clusters(self, per_row: IntArray) -> IntArray:
+        """Each cluster's number, shape (clusters,), of numbers of the observation's rows that clusters do not part."""
+        return per_row[self.source[np.unique(self.cluster, return_index=True)[1]]]
 
     def rows_of(self, motor: int) -> slice:
         """Rows of one motor."""
@@ -79,29 +126,35 @@ def linearise(
 ) -> Linearisation:
     """Linearise around given gains [Nm/A], parameters and current noise [A] of each motor."""
     count, width = len(gains), len(gains) + len(parameters)
+    first = count if gains_fixed else 0
     used = [np.flatnonzero(use) for use in observation.motor_use]
-    ends = np.cumsum([len(rows) for rows in used])
-    jacobian, residual, current = np.empty((ends[-1], width)), np.empty(ends[-1]), np.empty(ends[-1])
-    for motor, (columns, rows, end) in enumerate(zip(observation.motor_columns(), used, ends, strict=True)):
-        here = slice(end - len(rows), end)
-        jacobian[here], residual[here] = motor_jacobian(columns[:, rows].T, motor, gains, parameters, noise)
-        current[here] = columns[0, rows] / noise[motor]
-    source, free = np.concatenate(used), slice(count if gains_fixed else 0, width)
-    norms = np.sqrt(np.einsum("rf,rf->f", jacobian, jacobian))
-    unit = np.concatenate((gains, np.divide(1.0, norms[count:], where=norms[count:] > 0, out=np.ones(len(parameters)))))
-    jacobian = jacobian[:, free]
-    jacobian *= unit[free]
+    parts: list[FloatArray] = []
+    seen: list[IntArray] = []
+    residual, current, squares = [], [], np.zeros(width)
+    for motor, (columns, rows) in enumerate(zip(observation.motor_columns(), used, strict=True)):
+        own = columns[:, rows]
+        whole, left = motor_jacobian(own.T, motor, gains, parameters, noise)
+        squares += np.einsum("rf,rf->f", whole, whole)
+        seen.append(np.flatnonzero(whole[:, first:].any(axis=0)))
+        parts.append(np.ascontiguousarray(whole[:, first + seen[-1]].T))
+        residual.append(left)
+        current.append(own[0] / noise[motor])
+    norms = np.sqrt(squares[count:])
+    unit = np.concatenate((gains, np.divide(1.0, norms, where=norms > 0, out=np.ones(len(parameters)))))[first:]
+    for part, held in zip(parts, seen, strict=True):
+        np.multiply(part, unit[held, None], out=part)
+    source = np.concatenate(used)
     return Linearisation(
-        jacobian=jacobian,
-        residual=residual,
-        current=current,
+        jacobian=Jacobian(tuple(parts), tuple(seen), width - first),
+        residual=np.concatenate(residual),
+        current=np.concatenate(current),
         motor=np.repeat(np.arange(count), [len(rows) for rows in used]),
         cluster=np.unique(observation.move[source], return_inverse=True)[1].astype(np.int64),
         source=source,
         gamma=1.0 / gains,
         noise=noise,
-        free=np.arange(width)[free],
-        scale=unit[free],
+        free=np.arange(first, width),
+        scale=unit,
     )
 
 
@@ -262,6 +315,12 @@ class MotorRows:
             np.matmul(first[..., start:stop], np.swapaxes(second[..., start:stop], -1, -2), out=product)
         return out
 
+    def predicted(self, steps: Sequence[FloatArray]) -> FloatArray:
+        """J x of the motor's rows, shape (rows,) or (p, rows), with an x of each block, shape (f,) or (p, f)."""
+        ends = (*self.starts[1:], self.equations.shape[1])
+        blocks = zip(steps, self.starts, ends, strict=True)
+        return np.concatenate([x[..., self.seen] @ self.equations[:-2, a:b] for x, a, b in blocks], axis=-1)
+
     def by_fold(self, products: FloatArray, count: int) -> FloatArray:
         """Products of each block, shape (blocks, …), summed over each of so many folds, shape (count, …)."""
         folds, first = np.unique(self.fold, return_index=True)
@@ -321,10 +380,9 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
         raise TooFewMoves(moves, MIN_MOVES_TO_LEAVE_OUT)
     count = min(count, moves)
     fold_of = move_of % count
-    motors, width = len(problem.gamma), problem.jacobian.shape[1]
+    motors, jacobian, width = len(problem.gamma), problem.jacobian, problem.jacobian.width
     order = np.lexsort((problem.cluster, fold_of[problem.cluster], problem.motor))
-    if np.any(np.diff(order) != 1):  # rows that were cut before keep their order
-        problem = replace(problem, **{name: getattr(problem, name)[order] for name in OF_ROWS})
+    problem = replace(problem, **{name: getattr(problem, name)[order] for name in OF_ROWS})
     change = (np.diff(problem.cluster, prepend=-1) != 0) | (np.diff(problem.motor, prepend=-1) != 0)
     starts = np.flatnonzero(change)
     rows_of = (slice(int(a), int(b)) for a, b in pairwise((*starts, len(problem.motor))))
@@ -333,13 +391,12 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
     cluster_hessian = np.zeros((problem.cluster_count, width, width))
     cluster_score = np.zeros((problem.cluster_count, width))
     part_hessian, motor_score = np.zeros((count, motors, width, width)), np.zeros((motors, width))
-    by_motor = []
+    by_motor, sorted_parts = [], list(jacobian.parts)
     for i in np.unique(motor):
-        here = motor == i
-        whole = slice(int(starts[here][0]), int(np.searchsorted(problem.motor, i, side="right")))
-        seen = np.flatnonzero(problem.jacobian[whole].any(axis=0))
+        here, whole, seen = motor == i, problem.rows_of(int(i)), jacobian.seen[i]
         equations = np.empty((len(seen) + 2, whole.stop - whole.start))
-        equations[:-2], equations[-2] = problem.jacobian[whole, seen].T, problem.residual[whole]
+        np.take(jacobian.parts[i], order[whole] - whole.start, axis=1, out=equations[:-2], mode="clip")
+        sorted_parts[i], equations[-2] = equations[:-2], problem.residual[whole]
         own = MotorRows(
             int(i), whole, starts[here] - whole.start, fold_of[cluster[here]], cluster[here], seen, equations
         )
@@ -362,18 +419,16 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
         factors.append(linalg.cho_factor(rest, lower=True))
         scores_without.append(score - cluster_score[fold_of == k].sum(axis=0))
     steps = [linalg.cho_solve(factor, part) for factor, part in zip(factors, scores_without, strict=True)]
-    residual = problem.residual.copy()
+    residual = np.empty_like(problem.residual)
     part_score = np.zeros((count, motors, width))
     for own in by_motor:
         left = own.equations[-1]
-        left[:] = residual[own.rows]
-        for first, last, k in zip(own.starts, (*own.starts[1:], len(left)), own.fold, strict=True):
-            left[first:last] -= steps[k][own.seen] @ own.equations[:-2, first:last]
+        left[:] = problem.residual[own.rows] - own.predicted([steps[k] for k in own.fold])
         residual[own.rows] = left
         parts = own.by_fold(own.sums(own.equations[:-2], left[None])[..., 0], count)
         part_score[:, own.motor][:, own.seen] = parts
     return Folds(
-        problem=problem,
+        problem=replace(problem, jacobian=replace(jacobian, parts=tuple(sorted_parts))),  # held once, by MotorRows
         moves=moves,
         blocks=blocks,
         motors=tuple(by_motor),

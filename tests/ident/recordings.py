@@ -16,6 +16,7 @@ from ident.data.run import Run
 from ident.discovery.candidates import ColumnCache, SearchProblem, prepare_search
 from ident.discovery.evidence import Evidence, gather
 from ident.effects.signals import session_began_s
+from ident.equations.linearisation import Jacobian
 from ident.equations.rows import decimate_rows
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.estimators.identify import identify
@@ -170,6 +171,11 @@ def acting_on(axis: int, count: int, torque_nm: FloatArray) -> FloatArray:
 def search_problem_of(evidence: Evidence, cache: ColumnCache | None = None) -> SearchProblem:
     """The residual of the runs of the fit."""
     return prepare_search(evidence.model, evidence.trained, evidence.training, evidence.estimate, cache)
+
+
+def whole(jacobian: Jacobian) -> FloatArray:
+    """Write a Jacobian out with its zeros, shape (rows, f)."""
+    return jacobian.columns(np.arange(jacobian.width))
 
 
 def training_error(evidence: Evidence) -> RelativeError:

@@ -72,7 +72,7 @@ def test_a_planted_leak_is_seen(problem: Linearisation, monkeypatch: pytest.Monk
     assert _shows_its_own(folds, changed) == pytest.approx(3.0)
 
     def of_all_rows(fold: Folds) -> FloatArray:
-        step = linalg.cho_solve(fold.full_factor, fold.problem.jacobian.T @ fold.problem.residual)
+        step = linalg.cho_solve(fold.full_factor, fold.problem.jacobian.on_columns(fold.problem.residual))
         return np.asarray(fold.problem.residual - fold.problem.jacobian @ step)
 
     leaking = [replace(one, residual=of_all_rows(one)) for one in (folds, changed)]

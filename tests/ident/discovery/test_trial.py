@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from ident.discovery.candidates import Trial, score_candidates
 from ident.discovery.search import _drawn_numbers, _drawn_wald
-from ident.equations.linearisation import Linearisation, cut_into_folds
+from ident.equations.linearisation import Jacobian, Linearisation, cut_into_folds
+from tests.ident.recordings import whole
 
 FloatArray = NDArray[np.float64]
 
@@ -20,13 +21,20 @@ MOTORS, MOVES, WIDTH = 3, 16, 5
 
 
 def _problem(rng: np.random.Generator) -> Linearisation:
-    """Rows of three motors in sixteen moves of uneven length; the residual is what a fit leaves."""
+    """Rows of three motors in sixteen moves of uneven length; the residual is what a fit leaves.
+
+    The last motor's equation lacks the first two unknowns, as those near the flange do.
+    """
     parts = [(motor, move) for motor in range(MOTORS) for move in range(MOVES) for _ in range(rng.integers(8, 20))]
     motor, cluster = (np.array(part, dtype=np.int64) for part in zip(*parts, strict=True))
     jacobian = rng.normal(size=(len(motor), WIDTH)) * (1.0 + motor[:, None])
+    jacobian[motor == MOTORS - 1, :2] = 0.0
     raw = rng.normal(size=len(motor)) + 0.3 * np.sin(np.arange(len(motor)))
+    rows = [jacobian[motor == one].T for one in range(MOTORS)]
+    seen = [np.flatnonzero(own.any(axis=1)) for own in rows]
+    held = tuple(own[here] for own, here in zip(rows, seen, strict=True))
     return Linearisation(
-        jacobian=jacobian,
+        jacobian=Jacobian(held, tuple(seen), WIDTH),
         residual=raw - jacobian @ np.linalg.lstsq(jacobian, raw, rcond=None)[0],
         current=5.0 * rng.normal(size=len(motor)),
         motor=motor,
@@ -45,7 +53,7 @@ def _fit(columns: FloatArray, target: FloatArray) -> FloatArray:
 
 def _written_out(problem: Linearisation, columns: FloatArray, count: int = 8) -> Trial:
     """The same by projection and by one whole refit a fold."""
-    j, e = problem.jacobian, problem.residual
+    j, e = whole(problem.jacobian), problem.residual
     left = columns - j @ _fit(j, columns)
     coefficients = _fit(left, e)
     after = e - left @ coefficients
@@ -91,7 +99,7 @@ def test_blocks_say_what_whole_rows_say(seed: int, widths: list[int]) -> None:
     problem = folds.problem
     columns = rng.normal(size=(len(problem.motor), sum(widths)))
     columns[:, 0] *= problem.motor == 1
-    columns += 0.4 * problem.jacobian[:, :1] + 0.2 * problem.residual[:, None]
+    columns += 0.4 * whole(problem.jacobian)[:, :1] + 0.2 * problem.residual[:, None]
     ends = np.cumsum(widths)
     slices = [slice(int(end) - width, int(end)) for end, width in zip(ends, widths, strict=True)]
     for trial, chosen in zip(score_candidates(folds, columns, slices), slices, strict=True):
@@ -101,7 +109,7 @@ def test_blocks_say_what_whole_rows_say(seed: int, widths: list[int]) -> None:
 def test_what_the_model_says_already_is_no_candidate() -> None:
     rng = np.random.default_rng(1)
     folds = cut_into_folds(_problem(rng))
-    j = folds.problem.jacobian
+    j = whole(folds.problem.jacobian)
     own = rng.normal(size=len(j))
     said = j @ rng.normal(size=WIDTH)
     columns = np.stack((said, own, said + own, own, 2.0 * own, said + 1e-2 * own), axis=1)

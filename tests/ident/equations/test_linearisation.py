@@ -12,6 +12,7 @@ from ident.data.run import Run
 from ident.discovery.evidence import gather
 from ident.equations.linearisation import (
     MIN_MOVES_TO_LEAVE_OUT,
+    Jacobian,
     independent_blocks,
     left_out_shifts,
     linearise,
@@ -35,7 +36,24 @@ def test_jacobian_is_the_slope_of_the_residual(clean_found: Identification, clea
         step = np.zeros(6 + len(parameters))
         step[around.free] = scaled * around.scale
         slope = (problem(step) - problem(-step)) / 2.0
-        assert_allclose(slope, -around.jacobian @ scaled, rtol=0.0, atol=1e-4 * np.max(np.abs(slope)))
+        assert_allclose(-slope, around.jacobian @ scaled, rtol=0.0, atol=1e-4 * np.max(np.abs(slope)))
+
+
+def test_a_jacobian_in_parts_is_the_whole_one() -> None:
+    """Products, some of its columns, and all of them; each motor holds unknowns of its own."""
+    rng = np.random.default_rng(7)
+    seen = (np.array([0, 2, 3, 4]), np.array([1, 4]), np.array([], dtype=np.int64))
+    parts = tuple(rng.normal(size=(len(held), rows)) for held, rows in zip(seen, (6, 9, 3), strict=True))
+    jacobian = Jacobian(parts, seen, 5)
+    whole = np.zeros((18, 5))
+    whole[:6, seen[0]], whole[6:15, seen[1]] = parts[0].T, parts[1].T
+    step, columns = rng.normal(size=5), rng.normal(size=(18, 2))
+    assert jacobian @ step == pytest.approx(whole @ step)
+    assert jacobian.on_columns(columns) == pytest.approx(whole.T @ columns)
+    assert jacobian.on_columns(columns[:, 0]) == pytest.approx(whole.T @ columns[:, 0])
+    chosen = np.array([1, 3, 4])
+    assert np.array_equal(jacobian.columns(chosen), whole[:, chosen])
+    assert jacobian.only(chosen) @ step[chosen] == pytest.approx(whole[:, chosen] @ step[chosen])
 
 
 def test_a_shift_is_that_of_the_fit_without_the_cluster() -> None:
