@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
+import numpy.typing as npt
 from scipy import linalg
 
 from ident.arrays import BoolArray, FloatArray, IntArray
@@ -23,7 +24,8 @@ from ident.equations.rows import Observation, decimate_rows
 from ident.estimators.estimate import Estimate
 from ident.model.model import Model
 
-ColumnCache = dict[tuple[Effect, int], FloatArray]
+ColumnCache = dict[tuple[Effect, int], npt.NDArray[np.float32]]
+"""Columns that are tested turn after turn: half as long as those of a fit, of which there are few."""
 Felt = Mapping[int, FloatArray]  #: Whitened columns of a candidate on the rows of each motor that feels it, (p, rows)
 
 BATCH_COLUMNS = 48  #: Columns tested together: enough for fast products, few enough to keep memory small
@@ -82,14 +84,15 @@ class SearchProblem:
 
     def torque(self, effect: Effect, axis: int) -> FloatArray:
         """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (n, p, r)."""
-        columns = self.cache.get((effect, axis))
-        if columns is None:
+        kept = self.cache.get((effect, axis))
+        if kept is None:
             conditioning = self.observation.conditioning
             pairs = zip(self.datasets, self.runs, strict=True)
             parts = [decimate_rows(data, conditioning, effect.columns(run, axis)) for data, run in pairs]
-            columns = np.concatenate(parts, axis=-1)
+            kept = np.concatenate(parts, axis=-1, dtype=np.float32)
             if effect.abscissa.is_kinematic:
-                self.cache[effect, axis] = columns
+                self.cache[effect, axis] = kept
+        columns = kept.astype(np.float64)
         return at_joints(effect, axis, columns, self.model.drive_train)
 
     def _torque_at_rows(self, effect: Effect, axis: int) -> FloatArray:

@@ -82,20 +82,20 @@ def driving_shares(observation: Observation, estimate: Estimate) -> tuple[tuple[
     """
     count = observation.joint_count
     standard = np.array(observation.base.independent)
-    linear = observation.linear()
     # Payload columns follow those of the effects, which follow the base parameters.
-    is_load = np.ones(linear.shape[1], dtype=np.bool_)
+    is_load = np.ones(len(estimate.parameters), dtype=np.bool_)
     is_load[: len(observation.columns)] = False
     is_load[: len(standard)] = np.isin(standard, link_columns(count))
-    load = np.einsum("jpr,p->jr", linear[:, is_load], estimate.parameters[is_load]) + observation.known()
+    known = observation.known()
     shares: list[tuple[float, float]] = []
     for joint, (used, friction) in enumerate(zip(observation.use, dry_friction_columns(count), strict=True)):
         dry = np.flatnonzero(standard == friction)
         if not len(dry) or not used.any():
             shares.append((float("nan"), float("nan")))
             continue
-        torque = load[joint, used]
-        drives = torque * linear[joint, dry[0], used] > 0.0
+        linear = observation.of_joint(joint, used)
+        torque = estimate.parameters[is_load] @ linear[is_load] + known[joint, used]
+        drives = torque * linear[dry[0]] > 0.0
         size = float(np.sum(torque**2))
         shares.append((float(np.mean(drives)), float(np.sum(torque[drives] ** 2)) / size if size else float("nan")))
     return tuple(shares)

@@ -109,10 +109,10 @@ def find_effects(
        passed; one that explains much more replaces the named effect (`find_structure`, `is_inadequate`), but not if it
        moves a gain by more than its σ;
     5. refines its setting (`refine_setting`), adds it, and refits gains, parameters and effects together;
-    6. linearises the problem around the joint fit and deals whole moves to folds (`prepare_search`); every effect in
+    6. asks instruments from the demanded motion whether the effect is a disturbance in the position loop;
+    7. linearises the problem around the joint fit and deals whole moves to folds (`prepare_search`); every effect in
        the model must still pass, beside all the others, or it leaves (`without_effects_of`). A term without a name may
-       not make a named effect leave: then it does not join;
-    7. asks instruments from the demanded motion whether the effect is a disturbance in the position loop.
+       not make a named effect leave: then it does not join.
 
     What a gate of the joint fit refuses is in `Step.set_aside`, and the next best is tried. The ambiguity of an
     accepted effect holds what could not be distinguished from it, passed before, and does not pass beside it.
@@ -268,6 +268,19 @@ def _join(
     model: _Model, accepted: Finding, rng: np.random.Generator, gates: Gates, seen: set[frozenset[EffectKey]]
 ) -> _Model | SetAside:
     """Refit with a finding in the model and drop what no longer passes; or say why it may not join."""
+    joined = _refit(model, accepted)
+    pruned = joined if isinstance(joined, SetAside) else _pruned(joined, accepted, rng, gates)
+    if isinstance(pruned, SetAside):
+        return pruned
+    if _keys(pruned.evidence) in seen:
+        return SetAside(accepted, "it would only exchange places with an effect that it replaces")
+    last = PlacedEffect(accepted.effect, accepted.axis)
+    why = "" if pruned is joined else _refuted_by_instruments(pruned.evidence, last)
+    return SetAside(accepted, why) if why else pruned
+
+
+def _refit(model: _Model, accepted: Finding) -> _Model | SetAside:
+    """Refit with a finding in the model; or say why it may not join, whatever else is in the model."""
     evidence, problem = model.evidence, model.search_problem
     last, gains_std = PlacedEffect(accepted.effect, accepted.axis), evidence.estimate.gains_std
     if is_unnamed(last.effect):  # before the refit, which takes longer
@@ -275,21 +288,20 @@ def _join(
         if moved := moved_gains(gain_shifts(problem.folds, torque), gains_std):
             return SetAside(accepted, moved=moved)
     try:
-        joined = _linearised(with_effects(evidence, (*evidence.effects, last), problem.runs), problem.cache)
+        refitted = with_effects(evidence, (*evidence.effects, last), problem.runs)
+        # Asked here: after it, the linearised problem would take memory beside the instruments.
+        if why := _refuted_by_instruments(refitted, last):
+            return SetAside(accepted, why)
+        joined = _linearised(refitted, problem.cache)
     except UNFITTED as error:
         # The linearised problem distinguished the effect from the model, the whole one does not.
         return SetAside(accepted, f"it cannot be fitted: {error}")
-    terms = [placed for placed in joined.evidence.effects if is_unnamed(placed.effect)]
+    terms = [placed for placed in refitted.effects if is_unnamed(placed.effect)]
     if last in terms:
-        together = without_effects_of(joined.search_problem, joined.evidence.estimate, terms)
+        together = without_effects_of(joined.search_problem, refitted.estimate, terms)
         if moved := moved_gains(together.gain_shifts, gains_std):
             return SetAside(accepted, moved=moved)
-    pruned = _pruned(joined, accepted, rng, gates)
-    if isinstance(pruned, SetAside):
-        return pruned
-    exchanged = "it would only exchange places with an effect that it replaces"
-    why = exchanged if _keys(pruned.evidence) in seen else _refuted_by_instruments(pruned.evidence, last)
-    return SetAside(accepted, why) if why else pruned
+    return joined
 
 
 def _refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:

@@ -158,12 +158,8 @@ class Observation(Equations):
     mounting: IntArray  #: index into payloads, −1 without load, shape (r,)
     conditioning: Conditioning  #: the filters these rows went through
 
-    def linear(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
-        """[W | W_uL] of some rows, shape (n, p, rows)."""
-        return np.stack([self._of_joint(joint, rows) for joint in range(self.joint_count)])
-
-    def _of_joint(self, joint: int, rows: BoolArray | slice = slice(None)) -> FloatArray:
-        """[W | W_uL] of one joint, shape (p, rows)."""
+    def of_joint(self, joint: int, rows: BoolArray | slice = slice(None)) -> FloatArray:
+        """[W | W_uL] of some rows of a joint, shape (p, rows)."""
         parts = [self.regressor[joint][:, rows], self.effects[joint][:, rows]]
         for index, indices in enumerate(self.payload_columns):
             parts.append(self.flange[joint][list(indices)][:, rows] * (self.mounting[rows] == index))
@@ -182,10 +178,10 @@ class Observation(Equations):
         known = self.known()
         for current, row in zip(self.current, self.drive_train.to_motor, strict=True):
             first, *others = np.flatnonzero(row).tolist()  # T is invertible
-            columns = np.concatenate((current[None], self._of_joint(first), known[first][None]))
+            columns = np.concatenate((current[None], self.of_joint(first), known[first][None]))
             columns[1:] *= row[first]
             for joint in others:
-                columns[1:-1] += row[joint] * self._of_joint(joint)
+                columns[1:-1] += row[joint] * self.of_joint(joint)
                 columns[-1] += row[joint] * known[joint]
             yield columns
 
@@ -222,7 +218,7 @@ class Observation(Equations):
         for joint, used in enumerate(self.use):
             current = direction[:, joint, None] * self.current[:, used]
             joints.append(
-                triangle_of(np.concatenate((current, -self._of_joint(joint, used), -known[joint, used][None])))
+                triangle_of(np.concatenate((current, -self.of_joint(joint, used), -known[joint, used][None])))
             )
         clusters, runs = self._by_move(), []
         motors = [triangle_of(np.concatenate(rows).T) for rows in zip(*clusters, strict=True)]

@@ -72,7 +72,8 @@ class Estimate:
 
     def predicted_torque(self, observation: Observation) -> FloatArray:
         """W χ + W_uL χ_uL + W_kL χ_kL [Nm], shape (n, r)."""
-        return np.asarray(np.einsum("jpr,p->jr", observation.linear(), self.parameters) + observation.known())
+        linear = [self.parameters @ observation.of_joint(joint) for joint in range(observation.joint_count)]
+        return np.stack(linear) + observation.known()
 
     def residual_torque(self, observation: Observation) -> FloatArray:
         """ρ = V g − W χ − … (eq. 13) [Nm], shape (n, r)."""

@@ -10,11 +10,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial, score_candidates
+from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, Trial, score_candidates
 from ident.discovery.evidence import Evidence
 from ident.discovery.search import Gates, rank_effects, rank_families
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import Effect
 from ident.effects.electrical import Cogging
 from ident.effects.friction import PositionFriction, Stribeck
 from ident.equations.linearisation import Folds, Linearisation, cut_into_folds, linearise
@@ -147,7 +146,7 @@ def test_shuffled_residuals_get_no_name(small: Evidence) -> None:
     noise = observed.current - drive_train.to_motor @ estimate.predicted_torque(observed) / estimate.gains[:, None]
     # A choice of families, settings and axes that competes as the whole dictionary does, at a part of its price.
     families = tuple(family[::4] for family in EFFECTS)
-    cache: dict[tuple[Effect, int], FloatArray] = {}
+    cache: ColumnCache = {}
     false = 0
     for _ in range(20):
         sign = rng.choice((-1.0, 1.0), size=(3, int(observed.move.max()) + 1))[:, observed.move]

@@ -117,7 +117,7 @@ def test_the_triangles_give_the_formulas_of_all_rows(noisy: Evidence) -> None:
             np.concatenate(
                 (
                     rows.drive_train.direction[:, joint, None] * rows.current[:, used],
-                    -rows.linear()[joint][:, used],
+                    -rows.of_joint(joint, used),
                     -rows.known()[joint, used][None],
                 )
             ).T
