@@ -27,8 +27,7 @@ from tests.studies.study_cells import declared_payload
 from tests.studies.study_plans import CELL, PlanTask, kept_plan
 
 DURATION_S = 40.0
-BETWEEN_S = 60.0
-"""From the beginning of one run to that of the next."""
+PAUSE_S = 20.0  #: From the end of one run to the beginning of the next
 PLAN_SETS = 6
 PLANS_A_SET = 3
 FIRST_PLAN = 3001
@@ -75,17 +74,19 @@ class CaseTask:
     out: Path
     world: str
     case: EffectCase
+    duration_s: float = DURATION_S  #: of each run
 
     @property
     def path(self) -> Path:
         """File of the runs."""
-        return self.out / self.world / f"{self.case.name}.npz"
+        folder = self.world if self.duration_s == DURATION_S else f"{self.world}-{self.duration_s:g}s"
+        return self.out / folder / f"{self.case.name}.npz"
 
     @property
     def plans(self) -> tuple[PlanTask, ...]:
         """Plans of the case's set."""
         first = FIRST_PLAN + self.case.seed % PLAN_SETS * PLANS_A_SET
-        return tuple(PlanTask(self.out, first + letter, DURATION_S) for letter in range(PLANS_A_SET))
+        return tuple(PlanTask(self.out, first + letter, self.duration_s) for letter in range(PLANS_A_SET))
 
 
 def make_case(task: CaseTask) -> float:
@@ -105,7 +106,12 @@ def make_case(task: CaseTask) -> float:
         return 0.0
     raw = [
         simulate_run(
-            cell, spec, plans[letter], name, None if payload is None else declared_payload(payload), BETWEEN_S * number
+            cell,
+            spec,
+            plans[letter],
+            name,
+            None if payload is None else declared_payload(payload),
+            number * (task.duration_s + PAUSE_S),
         )
         for number, (spec, (name, payload, letter)) in enumerate(zip(specs, RUNS, strict=True))
     ]

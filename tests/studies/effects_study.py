@@ -38,7 +38,7 @@ from ident.estimators.identify import identify
 from tests.studies.blind_cells import blind_cases, confusion
 from tests.studies.data_file import as_csv
 from tests.studies.effect_cells import APART, CLEAN, SINGLES, SMALLS, TOGETHER, EffectCase
-from tests.studies.effect_runs import CaseTask, load_runs, make_case
+from tests.studies.effect_runs import DURATION_S, CaseTask, load_runs, make_case
 from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished, mark_of
 from tests.studies.side_by_side import Shard, shard, side_by_side
 from tests.studies.study_cells import WORLDS, world_cell
@@ -151,7 +151,14 @@ class _Task:
 
 
 def study(
-    chosen: Cases, world: str, *, out: Path = OUT, part: Shard | None = None, processes: int = 2, kept: bool = False
+    chosen: Cases,
+    world: str,
+    *,
+    out: Path = OUT,
+    part: Shard | None = None,
+    processes: int = 2,
+    kept: bool = False,
+    duration_s: float = DURATION_S,
 ) -> tuple[Row, ...]:
     """Search the cases of a shard, and return the rows of all cases that were searched so far.
 
@@ -162,6 +169,7 @@ def study(
         part: cases to simulate and search; all by default.
         processes: side by side.
         kept: simulate and search nothing.
+        duration_s: of each run.
 
     Raises:
         TaskFailed: simulating or searching failed; what was finished before is kept.
@@ -169,7 +177,7 @@ def study(
     cases = {case.name: case for _, case in chosen}
     # A shard has whole cases: two of its parts search the same runs.
     tasks = [
-        _Task(CaseTask(out, world, case), tuple(name for name, other in chosen if other is case))
+        _Task(CaseTask(out, world, case, duration_s), tuple(name for name, other in chosen if other is case))
         for case in cases.values()
     ]
     mine = () if kept else (part or Shard()).of(tasks)
@@ -416,6 +424,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--blind", type=int, metavar="SEED", help="draw the cells from a seed instead")
     parser.add_argument("--count", type=int, default=20, help="of the blind cells")
     parser.add_argument("--shard", type=shard, default=Shard(), help="i/n: every n-th case from the i-th on")
+    parser.add_argument("--duration", type=float, default=DURATION_S, help="of each run [s]")
     parser.add_argument("--kept", action="store_true", help="simulate and search nothing: report what is there")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--out", type=Path, default=OUT)
@@ -426,8 +435,17 @@ def main(arguments: list[str] | None = None) -> int:
         if blind:
             chosen = tuple(("blind", case) for case in blind_cases(options.blind, options.count))
         chosen = tuple(pair for pair in chosen if not options.cases or pair[1].name in options.cases)
-        rows = study(chosen, world, out=options.out, part=options.shard, processes=options.processes, kept=options.kept)
+        rows = study(
+            chosen,
+            world,
+            out=options.out,
+            part=options.shard,
+            processes=options.processes,
+            kept=options.kept,
+            duration_s=options.duration,
+        )
         name = f"blind-{options.blind}-{world}" if blind else world
+        name += "" if options.duration == DURATION_S else f"-{options.duration:g}s"
         report = options.out / f"{name}.json"
         replace_file(report, json.dumps({"rows": [asdict(row) for row in rows]}, indent=1).encode())
         shown = confusion([(row.true, row.named) for row in rows]) if blind else table(rows)
