@@ -201,7 +201,8 @@ def _turn(
     most = problem.folds.problem.cluster_count // PIECES_PER_EFFECT
     progress("searching for a missing effect" + (f" beside the {known} found" if known else ""))
     proposed = _proposals(problem, evidence.effects, rng, gates, families)
-    findings, structures = rank_effects(problem, rng, gates, families, proposed), tuple[Finding, ...]()
+    present = {placed.effect.name for placed in evidence.effects if not is_unnamed(placed.effect)}
+    findings, structures = rank_effects(problem, rng, gates, families, proposed, present), tuple[Finding, ...]()
     limits_nm, runs = detection_limits_nm(problem, gates), RunsLeftOut.of(problem)
     taken, searched, aside, ended = set(_keys(evidence)), range(0), list[SetAside](), ""
     while True:

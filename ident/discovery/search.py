@@ -3,7 +3,8 @@
 The lag-one correlation of a residual is about 0.67, so textbook tests are wrong. A candidate must pass every gate:
 
 1. its Wald statistic, clustered by move, exceeds the largest one of all candidates in 99 % of draws that give the noise
-   of each move a random sign (wild bootstrap, Cameron et al. 2008), or in 95 % if the candidate is strong (`Gates`);
+   of each move a random sign (wild bootstrap, Cameron et al. 2008), or in 95 % if the candidate is strong (`Gates`).
+   The joints of a robot are of one design: a family in the model already competes on the other axes with itself alone;
 2. it lowers the error on at least three quarters of the folds of held-out moves;
 3. it explains at least 3 % of the squared residual of the motor that it affects most;
 4. that motor's error on held-out moves falls by at least 2 %;
@@ -76,7 +77,7 @@ class Finding:
     axis: int  #: index of the joint (or motor)
     coefficients: FloatArray  #: first estimate of its linear parameters
     deviations: FloatArray  #: their σ by the scatter of moves
-    probability: float  #: that noise alone makes a candidate this strong somewhere among all
+    probability: float  #: that noise alone makes a candidate this strong among all, or among those of known families
     folds_better: float  #: share of folds on which it lowers the error
     explained: float  #: share of the squared residual of the motor that it affects most
     error_before_percent: float  #: error of that motor on held-out moves without it, ‖e‖/‖v‖ of the current [%]
@@ -98,10 +99,12 @@ def rank_effects(
     gates: Gates | None = None,
     families: tuple[tuple[Effect, ...], ...] = EFFECTS,
     proposed: Mapping[int, tuple[tuple[Effect, ...], ...]] | None = None,
+    known: Collection[str] = (),
 ) -> tuple[Finding, ...]:
     """Test all families on all axes and rank them, the best on held-out moves first.
 
-    What is proposed for an axis takes the place of the families of the same name there.
+    What is proposed for an axis takes the place of the families of the same name there. ``known`` are names of effects
+    in the model: see `rank_families`.
     """
     tested: list[FamilyTrials] = []
     for axis in range(search_problem.axes):
@@ -110,29 +113,47 @@ def rank_effects(
         shared = (family for family in families if family[0].name not in names)
         fitting = (tuple(one for one in family if one.fits_in(search_problem.runs, axis)) for family in (*shared, *own))
         tested += search_problem.test((family for family in fitting if family), axis)
-    return rank_families(search_problem, tested, rng, gates or Gates())
+    return rank_families(search_problem, tested, rng, gates or Gates(), known)
 
 
 def rank_families(
-    search_problem: SearchProblem, tested: Sequence[FamilyTrials], rng: np.random.Generator, gates: Gates
+    search_problem: SearchProblem,
+    tested: Sequence[FamilyTrials],
+    rng: np.random.Generator,
+    gates: Gates,
+    known: Collection[str] = (),
 ) -> tuple[Finding, ...]:
-    """Judge each family by the gates, beside all that are tested with it, and rank them by held-out moves."""
+    """Judge each family by the gates, beside all that are tested with it, and rank them by held-out moves.
+
+    Args:
+        search_problem: around the model.
+        tested: families on axes.
+        rng: of the bootstrap.
+        gates: limits.
+        known: names of effects in the model. Families of these names count as noise only where noise makes one as
+            strong among them, too.
+    """
     if not tested:
         return ()
     trials = tuple(trial for family in tested for _, trial in family.members)
-    probabilities = iter(_max_t(trials, rng, gates.draws))
+    probability = _max_t(trials, rng, gates.draws)
+    alike = np.array([effect.name in known for family in tested for effect, _ in family.members])
+    if alike.any():
+        among_them = _max_t(tuple(trials[index] for index in np.flatnonzero(alike)), rng, gates.draws)
+        probability[alike] = np.minimum(probability[alike], among_them)
+    probabilities = iter(probability)
     before = search_problem.folds.square_sum(search_problem.folds.residual)
     findings = [_judge(search_problem, before, family, probabilities, gates) for family in tested]
     ranked = sorted(findings, key=lambda finding: -finding.held_out_fall)
     errors = np.stack([finding.fold_errors for finding in ranked])
     better = _better(errors[:, None], errors[None])
     # Those that a paired comparison cannot distinguish from it.
-    alike = ~(better | better.T | np.eye(len(ranked), dtype=np.bool_))
-    alike &= np.array([finding.held_out_fall > 0 for finding in ranked])
+    rivals = ~(better | better.T | np.eye(len(ranked), dtype=np.bool_))
+    rivals &= np.array([finding.held_out_fall > 0 for finding in ranked])
     places = [PlacedEffect(finding.effect, finding.axis) for finding in ranked]
     return tuple(
         replace(finding, ambiguity=tuple(places[index] for index in np.flatnonzero(row)))
-        for finding, row in zip(ranked, alike, strict=True)
+        for finding, row in zip(ranked, rivals, strict=True)
     )
 
 

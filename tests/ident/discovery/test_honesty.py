@@ -21,6 +21,7 @@ from tests.ident.recordings import search_problem_of, with_current
 
 FloatArray = NDArray[np.float64]
 GATES = Gates(draws=199)
+KNOWN = ("nonlinear-viscous", "load-friction")
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +140,10 @@ def test_the_choice_of_a_setting_does_not_see_its_fold(problem: Linearisation) -
 
 
 def test_shuffled_residuals_get_no_name(small: Evidence) -> None:
-    """Twenty times every move's noise gets a random sign, on each motor alone: one false name at most."""
+    """Twenty times every move's noise gets a random sign, on each motor alone: one false name at most.
+
+    Nor do families that are known from another axis, which compete among themselves: one more at most.
+    """
     rng = np.random.default_rng(12)
     estimate, observed = small.estimate, small.training
     drive_train = small.model.drive_train
@@ -147,13 +151,35 @@ def test_shuffled_residuals_get_no_name(small: Evidence) -> None:
     # A choice of families, settings and axes that competes as the whole dictionary does, at a part of its price.
     families = tuple(family[::4] for family in EFFECTS)
     cache: ColumnCache = {}
-    false = 0
+    false = known = 0
     for _ in range(20):
         sign = rng.choice((-1.0, 1.0), size=(3, int(observed.move.max()) + 1))[:, observed.move]
-        shuffled = with_current(small, (sign - 1.0) * noise)
-        findings = rank_effects(search_problem_of(shuffled, cache), rng, GATES, families)
-        false += any(finding.passed for finding in findings)
+        problem = search_problem_of(with_current(small, (sign - 1.0) * noise), cache)
+        false += any(finding.passed for finding in rank_effects(problem, rng, GATES, families))
+        alone = tuple(family for family in families if family[0].name in KNOWN)
+        known += any(finding.passed for finding in rank_effects(problem, rng, GATES, alone, known=KNOWN))
     assert false <= 1
+    assert known <= 2
+
+
+def test_a_family_known_from_another_axis_competes_with_its_own_name(small: Evidence) -> None:
+    """Noise makes one as strong less often among few candidates; the others are judged as before."""
+    problem = search_problem_of(small)
+    families = tuple(family[::4] for family in EFFECTS)
+    plain, related = (
+        {
+            (one.effect.name, one.axis): one.probability
+            for one in rank_effects(problem, np.random.default_rng(3), GATES, families, known=known)
+        }
+        for known in ((), KNOWN)
+    )
+    assert plain.keys() == related.keys()
+    for key, probability in plain.items():
+        if key[0] in KNOWN:
+            assert related[key] <= probability
+        else:
+            assert related[key] == probability
+    assert sum(related[key] for key in plain) < sum(plain.values())
 
 
 def _noise_trial(rng: np.random.Generator, moves: int, columns: int, rows: int = 8) -> Trial:
