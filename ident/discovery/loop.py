@@ -80,7 +80,7 @@ class Step:
     limits_nm: FloatArray  #: torque (root mean square) that a detectable effect has at each motor, shape (n,)
     accepted: Finding | None  #: the finding, or the structure without a name, that joined the model; None ends the loop
     after: Evidence  #: the model with it
-    set_aside: tuple[SetAside, ...] = ()  #: what would have joined the model, but for a gate of the joint fit
+    set_aside: tuple[SetAside, ...] = ()  #: what would have joined the model, but for runs left out or the joint fit
     ended: str = ""  #: reason why the search ended here although the residual may call for more; else empty
     #: σ of each gain [Nm/A] from the choice of the effects, contained in that of `after`, shape (n,); last turn only.
     choice_std: FloatArray | None = None
@@ -114,8 +114,9 @@ def find_effects(
        the model must still pass, beside all the others, or it leaves (`without_effects_of`). A term without a name may
        not make a named effect leave: then it does not join.
 
-    What a gate of the joint fit refuses is in `Step.set_aside`, and the next best is tried. The ambiguity of an
-    accepted effect holds what could not be distinguished from it, passed before, and does not pass beside it.
+    What runs left out or a gate of the joint fit refuse is in `Step.set_aside`, and the next best is tried. The
+    ambiguity of an accepted effect holds what could not be distinguished from it, passed before, and does not pass
+    beside it.
 
     It ends when nothing passes, at one effect for PIECES_PER_EFFECT pieces, or after MAX_EFFECTS turns. Held-out runs
     take no part in it. The covariance of the last estimate includes the choice of its effects (`choice_covariance`).
@@ -209,6 +210,7 @@ def _turn(
         named = choose_effect(findings, taken)
         if named is not None and (why := runs.refusal(whitened_columns(problem, named.effect, named.axis))):
             findings = _refused(findings, named, why)
+            aside += _first_of_axis(aside, SetAside(named, why))
             continue
         axes = range(problem.axes) if named is None else range(named.axis, named.axis + 1)
         if axes != searched:
@@ -218,6 +220,7 @@ def _turn(
         accepted = term = choose_effect(structures, taken)
         if term is not None and (why := runs.refusal(whitened_columns(problem, term.effect, term.axis))):
             structures = _refused(structures, term, why)
+            aside += _first_of_axis(aside, SetAside(term, why))
             continue
         if named is not None and (term is None or not is_inadequate(named, term)):
             accepted = named
@@ -258,6 +261,12 @@ def _proposals(
     ripples = propose_orders(search_problem, effects, rng, gates) if Ripple in kinds else {}
     resonances = propose_resonances(search_problem, gates, kinds)
     return {axis: (*ripples.get(axis, ()), *resonances.get(axis, ())) for axis in {*ripples, *resonances}}
+
+
+def _first_of_axis(aside: Sequence[SetAside], new: SetAside) -> tuple[SetAside, ...]:
+    """What runs left out refuse, unless a better finding of its kind on this axis was set aside before."""
+    kind = new.finding.axis, is_unnamed(new.finding.effect)
+    return () if kind in {(one.finding.axis, is_unnamed(one.finding.effect)) for one in aside} else (new,)
 
 
 def _refused(findings: Sequence[Finding], refused: Finding, why: str) -> tuple[Finding, ...]:

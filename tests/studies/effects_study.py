@@ -59,7 +59,7 @@ Stribeck and non-linear viscous friction are not among them: each explains the o
 REMOVED = tuple(case for case in SINGLES if case.effects[0].name in VARIABLES)
 IMPORTED = tuple(case for case in SINGLES if case.effects[0].name == "warm-up")
 """Cases whose runs are imported from CSV files as well: what depends on the time needs the order of the files."""
-SAME = {"spring": ("hinge", "gravity-compensator"), "cogging": ("ripple",)}
+SAME = {"spring": ("hinge", "gravity-compensator"), "cogging": ("ripple",), "load-friction": ("efficiency",)}
 """Families that say the same as another one, and are removed with it."""
 FRICTION = frozenset(
     {
@@ -374,10 +374,11 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
         lines.append(f"warm-up, imported from CSV: {named} of {len(imported)} named")
     removed = [row for row in rows if row.part == "removed"]
     if removed:
-        right = [row for row in removed if _is_structure_of(row)]
+        right = [row for row in removed if {*row.named, *row.set_aside} & set(_structures_of(row))]
         most = [row for row in right if (row.excess_removed or 0.0) >= 0.6]
         lines.append(
-            f"family removed: structure on the right axis and variable in {len(right)} of {len(removed)}, "
+            f"family removed: structure on the right axis and variable in {len(right)} of {len(removed)}, set aside in "
+            f"{sum(not set(row.named) & set(_structures_of(row)) for row in right)} of these; "
             f"60 % of the excess removed in {len(most)}"
         )
     smalls = [row for row in rows if row.part == "small"]
@@ -388,9 +389,10 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def _is_structure_of(row: Row) -> bool:
+def _structures_of(row: Row) -> tuple[str, ...]:
+    """What the removed effect may be called."""
     family, axis = row.true[0].split(" on ")
-    return any(f"{variable} on {axis}" in row.named for variable in VARIABLES[family])
+    return tuple(f"{variable} on {axis}" for variable in VARIABLES[family])
 
 
 def table(rows: Iterable[Row]) -> str:
