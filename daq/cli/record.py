@@ -204,12 +204,14 @@ def plan_verb(
     from daq.config.cell_file import load_cell
     from daq.report.plan import plan_document, plan_text
     from daq.workflow.experiment import RUNS, experiment_of, extra_moves, paths_of
+    from daq.workflow.nameplates import check_controller
     from daq.workflow.plan import plan
     from daq.workflow.plan_file import save_plan
     from ident.planning.excitation import verdicts
 
     check_output(out, (cell,), "drivegain-plan")
     declared = load_cell(cell)
+    check_controller(cell, declared)
     experiment = experiment_of(declared, payload)
     with progress_bar("planning") as report_progress:
         made = plan(

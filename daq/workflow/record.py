@@ -21,11 +21,11 @@ from daq.log.conversion import SiScaling, scaling
 from daq.log.metadata import RunInfo, RunStatistics, readback_of_drives
 from daq.log.writer import LogContent, LogWriter
 from daq.workflow.experiment import path_of
+from daq.workflow.nameplates import check_nameplates
 from daq.workflow.plan import Plan
 from daq.workflow.safeguards import (
     DiskRoom,
     FreeBytes,
-    check_currents,
     check_entered_mass,
     defer_full_gc,
     free_bytes,
@@ -150,7 +150,7 @@ def record(
         network.prepare()
         polling = Polling(network, beside_stream=polling_fits(cell))
         warnings = (
-            *(*load_warnings(cell), *check_currents(cell, network.scales()), *network.unguarded()),
+            *(*load_warnings(cell), *check_nameplates(cell_file, cell, network.scales()), *network.unguarded()),
             *(polling_warnings(cell) if polling else ()),
         )
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())

@@ -1,4 +1,4 @@
-"""Safeguards of a recording: bus lock, disk space, plausible currents, the payload's mass, deferred garbage collection.
+"""Safeguards of a recording: bus lock, disk space, the payload's mass, deferred garbage collection.
 
 Every recording and every job takes the lock of its bus before it sends anything to the drives. It is the lock of
 flock(2) on a file in a folder of the system, and ends with its process. It excludes other programs of drivegain on this
@@ -13,7 +13,7 @@ import re
 import shutil
 import socket
 import stat
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
@@ -23,10 +23,7 @@ from daq.errors import BusTaken, DiskSpaceShort, OutputFailed, UsageError, writi
 from daq.files import hold_lock
 from daq.log.message import joint_state_bytes, joint_state_prefix, sample_dtype
 from daq.log.writer import JOINT_STATE_NS
-from daq.report.bus import actual_current_note
-from drivers.profiles.scale import ScaleReading, check_name_plate
 from ident.model.bodies import Payload
-from ident.model.model import DriveTrain
 
 SHARED_FOLDERS = (Path("/run/lock"), Path("/var/lock"), Path("/tmp"))
 """Tried in this order; all users of a computer must come to the same one, so TMPDIR is not asked."""
@@ -166,29 +163,6 @@ class DiskRoom:
 
 def _megabytes(number: int) -> str:
     return f"{number / 1e6:.1f} MB"
-
-
-def check_currents(cell: Cell, readings: Sequence[ScaleReading]) -> tuple[str, ...]:
-    """Hold each drive's torque constant against the cell's nameplate gain, g = N·Gt·Kt (paper eq. 4).
-
-    Returns:
-        What people must know of the recorded currents: no reference, what could not be checked, what fits badly.
-
-    Raises:
-        SetupRefused: the two torque constants differ by a factor of five or more.
-    """
-    axes_by_warning: dict[str, list[str]] = {}
-    for axis, reduction, reading in zip(cell.axes, DriveTrain(cell.ratio).reduction, readings, strict=True):
-        found = reading.warnings
-        if axis.profile is None or not axis.gain_unit.startswith(("Nm/A", "N/A")):
-            found += (f"the gain is in {axis.gain_unit}; the torque constant cannot be checked",)
-        else:
-            found += check_name_plate(reading, axis.profile.amplitude, axis.nameplate_gain / float(reduction))
-        for warning in found:
-            axes_by_warning.setdefault(warning, []).append(axis.name)
-    note = actual_current_note(cell)
-    grouped = tuple(f"{', '.join(names)}: {warning}" for warning, names in axes_by_warning.items())
-    return grouped if note is None else (note, *grouped)
 
 
 _ROUNDING_KG = 1e-9  #: Two spellings of one number are one number
