@@ -12,7 +12,7 @@ import numpy as np
 
 from daq.config import cell as declared
 from daq.config.bus import cell_address, drive_axes, load_warnings, polling_fits, polling_warnings
-from daq.config.cell import Cell
+from daq.config.cell import Cell, joint_names
 from daq.config.cell_file import bundle
 from daq.environment import software
 from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
@@ -166,7 +166,7 @@ def record(
         check_moves(start_counts, moves, permission, cell.axis_names)
         room = DiskRoom(out, free)
         longest_s = duration_of(moves, start_counts, rate_hz) + ALLOWANCE_S
-        room.require(largest_log_bytes(cell.axis_names, rate_hz, longest_s, files))
+        room.require(largest_log_bytes(joint_names(cell), rate_hz, longest_s, files))
         short: DiskSpaceShort | None = None
         temperatures = polling.temperatures(clocks.wall_ns())
         # Before the first SYNC of the recording's stream, whose schedule does not wait either.
@@ -184,7 +184,7 @@ def record(
             entered_kg=entered_kg,
             controller_sha256=controller_digest(cell),
         )
-        content = LogContent(run, files, readback, cell.axis_names)
+        content = LogContent.of(cell, run, files, readback)
         with LogWriter(out, content, scale.joint_position_of, clocks.monotonic_ns) as log:
             done = 0
 

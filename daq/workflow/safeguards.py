@@ -19,9 +19,10 @@ from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 
 from daq.config.cell import Bus, Cell, WeighedPayload
+from daq.config.cell_file import URDF
 from daq.errors import BusTaken, DiskSpaceShort, OutputFailed, UsageError, writing
 from daq.files import hold_lock
-from daq.log.message import joint_state_bytes, joint_state_prefix, sample_dtype
+from daq.log.message import currents_bytes, joint_state_bytes, joint_state_prefix, sample_dtype
 from daq.log.writer import JOINT_STATE_NS
 from ident.model.bodies import Payload
 
@@ -113,11 +114,13 @@ def free_bytes(folder: Path) -> int:
 
 def largest_log_bytes(names: tuple[str, ...], rate_hz: float, duration_s: float, attached: Mapping[str, bytes]) -> int:
     """Size of a log at most: as if nothing could be compressed [bytes]."""
-    state = joint_state_bytes(joint_state_prefix(names), 0, [0.0] * len(names))
+    zeros = [0.0] * len(names)
+    shown = (joint_state_bytes(joint_state_prefix(names), 0, zeros, zeros), currents_bytes(0, zeros))
     of_samples = rate_hz * (sample_dtype(len(names)).itemsize + INDEX_BYTES)
-    of_states = 1e9 / JOINT_STATE_NS * (MESSAGE_HEAD_BYTES + len(state) + INDEX_BYTES)
+    of_states = 1e9 / JOINT_STATE_NS * sum(MESSAGE_HEAD_BYTES + len(message) + INDEX_BYTES for message in shown)
     growth_bytes_s = of_samples + of_states + CHUNKS_BYTES_S
-    return round(duration_s * growth_bytes_s) + ENDS_BYTES + sum(map(len, attached.values()))
+    files = sum(map(len, attached.values())) + len(attached.get(URDF, b""))  # a topic has it too, for viewers
+    return round(duration_s * growth_bytes_s) + ENDS_BYTES + files
 
 
 class DiskRoom:
