@@ -23,6 +23,7 @@ from daq.log.writer import LogContent, LogWriter
 from daq.workflow.experiment import path_of
 from daq.workflow.nameplates import check_nameplates
 from daq.workflow.plan import Plan
+from daq.workflow.plan_file import check_approach
 from daq.workflow.safeguards import (
     DiskRoom,
     FreeBytes,
@@ -162,8 +163,7 @@ def record(
             producer.start()
         start_counts = _positions(network, _pacing(cell, clocks.wall_ns(), clocks, producer))
         permission = MotionPermission(granted_by, motor_limits(cell, scale))
-        moves = motor_moves(cell, plan, scale, start_counts)
-        check_moves(start_counts, moves, permission, cell.axis_names)
+        moves = _checked_moves(cell, plan, scale, start_counts, permission)
         room = DiskRoom(out, free)
         longest_s = duration_of(moves, start_counts, rate_hz) + ALLOWANCE_S
         room.require(largest_log_bytes(joint_names(cell), rate_hz, longest_s, files))
@@ -314,6 +314,20 @@ def motor_moves(cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence
         moves.append(synchronised_move(here, target, exact, dwell))
         here_rad, here = target_rad, target
     return tuple(moves)
+
+
+def _checked_moves(
+    cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence[int], permission: MotionPermission
+) -> tuple[Move, ...]:
+    """Convert a plan to motor moves that keep the limits, and whose first way is clear.
+
+    Raises:
+        MotionRefused: they do not.
+    """
+    check_approach(cell, plan, scale.joint_position(np.array(start_counts)))
+    moves = motor_moves(cell, plan, scale, start_counts)
+    check_moves(start_counts, moves, permission, cell.axis_names)
+    return moves
 
 
 def _verdict(statistics: StreamStatistics) -> tuple[bool, str]:
