@@ -204,11 +204,11 @@ def plan_verb(
     The moves keep the joint limits and the cell's workspace, and keep clear of the arm itself. The prediction is for
     these moves made once without load and once with the payload.
     """
-    from daq.cli.terminal import check_output, progress_bar, write_output
+    from daq.cli.terminal import check_folder, check_output, check_replaceable, progress_bar, write_output
     from daq.config.cell_file import load_cell
     from daq.files import replace_file
     from daq.report.plan import plan_document, plan_text
-    from daq.report.plan_preview import preview_page
+    from daq.report.plan_preview import MARK, preview_page
     from daq.workflow.experiment import RUNS, experiment_of, extra_moves, paths_of
     from daq.workflow.nameplates import check_controller
     from daq.workflow.plan import plan
@@ -217,7 +217,10 @@ def plan_verb(
 
     check_output(out, (cell,), "drivegain-plan")
     if preview is not None:
-        check_output(preview, (cell, out), "drivegain-plan")
+        if preview.resolve() == out.resolve():
+            raise UsageError("--preview", found="the name of --out", expected="another", remedy="choose another name")
+        check_folder(preview)
+        check_replaceable(preview, MARK, "preview of a plan")
     declared = load_cell(cell)
     check_controller(cell, declared)
     experiment = experiment_of(declared, payload)

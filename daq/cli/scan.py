@@ -36,13 +36,11 @@ def scan_verb(
     from daq.config.bus import bus_parts, cell_address, drive_axes
     from daq.config.cell_file import load_cell
     from daq.report.bus import current_signals, scan_rows, scan_view
-    from daq.workflow.nameplates import check_controller
     from drivers.canopen.network import CanopenNetwork
     from drivers.errors import NodeMissing
     from drivers.profiles.cia402 import State
 
     declared = load_cell(cell)
-    check_controller(cell, declared)
     found, reset = {}, []
     for part in bus_parts(declared):
         axes = tuple(axis for axis in drive_axes(declared) if axis.node_id in part.node_ids)

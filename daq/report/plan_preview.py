@@ -9,6 +9,7 @@ import base64
 import hashlib
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from html import escape
 from itertools import pairwise
 from pathlib import Path
@@ -16,13 +17,14 @@ from pathlib import Path
 import numpy as np
 
 from daq.config.cell import Cell
-from daq.files import sha256
+from daq.files import open_regular, sha256
 from daq.workflow.experiment import PlannedMove, path_of
 from ident.arrays import FloatArray
 from ident.model.robot import poses
 from ident.planning.clearance import Checker
 
 STEP_S, LARGEST_ROWS = 0.04, 1500  #: Time between two rows of a preview, and their largest number
+MARK = '<meta name="drivegain-plan" content="'  #: Text at the beginning of a page, before the digest of its plan
 HEAD_BYTES = 1024  #: Beginning of a page, in which the digest of its plan is
 _STYLE = """
 :root { color-scheme: light dark; --ink: #222; --grid: #ddd; --paper: #fff; }
@@ -62,7 +64,7 @@ def preview_page(cell: Cell, moves: Sequence[PlannedMove], checker: Checker, pla
 <html lang="en">
 <head>
 <meta charset="utf-8">
-<meta name="drivegain-plan" content="{sha256(plan)}">
+{MARK}{sha256(plan)}">
 <meta http-equiv="Content-Security-Policy" content="default-src 'none'; script-src 'sha256-{digest}'; \
 style-src 'unsafe-inline'">
 <meta name="viewport" content="width=device-width, initial-scale=1">
@@ -142,10 +144,11 @@ def _rounded(values: FloatArray, decimals: int) -> list[object]:
 
 
 def find_preview(plan: Path) -> Path | None:
-    """Return the page beside a plan that was made of exactly its content; None without one."""
-    mark = f'name="drivegain-plan" content="{sha256(plan.read_bytes())}"'.encode()
-    for page in sorted(plan.parent.glob("*.html")):
-        with page.open("rb") as stream:
-            if mark in stream.read(HEAD_BYTES):
-                return page
+    """Return the page beside a plan that was made of exactly its content; None without one that can be read."""
+    with suppress(OSError):
+        mark = f'{MARK}{sha256(plan.read_bytes())}"'.encode()
+        for page in sorted(plan.parent.glob("*.html")):
+            with suppress(OSError), open_regular(page) as stream:
+                if mark in stream.read(HEAD_BYTES):
+                    return page
     return None
