@@ -51,6 +51,36 @@ def export_log_verb(
         print_view([f"{done.rows} rows of {len(done.columns)} columns"], out)
 
 
+def export_bag_verb(
+    log: Annotated[Path, typer.Argument(help="A log (.mcap).")],
+    out: Annotated[Path, typer.Option("--out", help="Folder to write (rosbag2); must not exist.")],
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration of the cell; its gains give the effort of the joint states.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Write a log as a ROS 2 bag: /joint_states, currents in A, events and /robot_description.
+
+    Joint states are at the full rate, with the names of the URDF's joints; effort only with --calibration.
+    """
+    from daq.cli.terminal import print_view, status
+    from daq.log.bag_writer import export_bag
+    from daq.workflow.calibration_file import load_calibration
+
+    gains = None if calibration is None else {gain.axis: gain.value for gain in load_calibration(calibration).gains}
+    with status("writing the bag"):
+        done = export_bag(log, out, gains)
+    if done.partial:
+        typer.echo(f"{log} is PARTIAL: saved from an unfinished recording", err=True)
+    if not done.valid:
+        typer.echo(f"{log} is INVALID: {done.reason or 'no reason given'}; a fit refuses it", err=True)
+    if json:
+        print_json({"log": str(log), "bag": str(out), "duration_s": done.duration_s, "messages": done.messages,
+                    "effort": gains is not None, "partial": done.partial, "valid": done.valid})  # fmt: skip
+    else:
+        print_view([f"{topic}: {count} messages" for topic, count in done.messages.items()], out)
+
+
 def export_urdf_verb(
     calibration: CalibrationArgument,
     out: Annotated[Path, typer.Option("--out", help="URDF to write.")],
@@ -178,7 +208,8 @@ def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
 
 
 EXPORT_LOG = Verb("log", export_log_verb, "drivegain export log loaded.mcap --csv --out loaded.csv")
+EXPORT_BAG = Verb("bag", export_bag_verb, "drivegain export bag loaded.mcap --out loaded-bag")
 EXPORT_URDF = Verb(
     "urdf", export_urdf_verb, "drivegain export urdf calibration.yaml --cell cells/demo.yaml --out robot.urdf"
 )
-EXPORT = Verb("export", export_verb, EXPORT_URDF.example, (EXPORT_URDF, EXPORT_LOG))
+EXPORT = Verb("export", export_verb, EXPORT_URDF.example, (EXPORT_URDF, EXPORT_LOG, EXPORT_BAG))

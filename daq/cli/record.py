@@ -43,6 +43,7 @@ def record_verb(
     from daq.config.cell_file import load_cell
     from daq.environment import login
     from daq.report.bus import load_lines
+    from daq.report.plan_preview import find_preview
     from daq.workflow.plan import slowed
     from daq.workflow.plan_file import load_plan
     from daq.workflow.record import record
@@ -58,6 +59,8 @@ def record_verb(
             "the payload's mass was not entered from the scale (--mass KG); `drivegain apply` will ask for it", err=True
         )
     part = _free(out)
+    if (page := find_preview(plan)) is not None:
+        typer.echo(f"preview of these moves: {page}", err=True)
     for line in load_lines(declared):
         typer.echo(line, err=True)
     allowed_by = granted(declared, who, enable_motion)
@@ -192,6 +195,7 @@ def plan_verb(
         float, typer.Option(help="Share of the limits that the fastest move uses.", min=0.05, max=1.0)
     ] = 1.0,
     condition: Annotated[float, typer.Option(help="Largest condition number.", min=1.0)] = LARGEST_CONDITION,
+    preview: Annotated[Path | None, typer.Option(help="Page to write (HTML): the arm moves through the plan.")] = None,
     sigma: Annotated[float, typer.Option(help="Largest σ predicted for a gain [%].", min=0.01)] = LARGEST_STD_PERCENT,
     json: JsonOption = False,
 ) -> None:
@@ -200,16 +204,25 @@ def plan_verb(
     The moves keep the joint limits and the cell's workspace, and keep clear of the arm itself. The prediction is for
     these moves made once without load and once with the payload.
     """
-    from daq.cli.terminal import check_output, progress_bar, write_output
+    from daq.cli.terminal import check_folder, check_output, check_replaceable, progress_bar, write_output
     from daq.config.cell_file import load_cell
+    from daq.files import replace_file
     from daq.report.plan import plan_document, plan_text
+    from daq.report.plan_preview import MARK, preview_page
     from daq.workflow.experiment import RUNS, experiment_of, extra_moves, paths_of
+    from daq.workflow.nameplates import check_controller
     from daq.workflow.plan import plan
-    from daq.workflow.plan_file import save_plan
+    from daq.workflow.plan_file import load_plan, save_plan
     from ident.planning.excitation import verdicts
 
     check_output(out, (cell,), "drivegain-plan")
+    if preview is not None:
+        if preview.resolve() == out.resolve():
+            raise UsageError("--preview", found="the name of --out", expected="another", remedy="choose another name")
+        check_folder(preview)
+        check_replaceable(preview, MARK, "preview of a plan")
     declared = load_cell(cell)
+    check_controller(cell, declared)
     experiment = experiment_of(declared, payload)
     with progress_bar("planning") as report_progress:
         made = plan(
@@ -225,6 +238,11 @@ def plan_verb(
         )
     with write_output(out):
         save_plan(made, out)
+    if preview is not None:
+        checked = load_plan(out, declared)
+        with write_output(preview):
+            page = preview_page(declared, checked.moves, experiment.scene.checker, out.read_bytes())
+            replace_file(preview, page.encode())
     excitation, _ = experiment.excitation(paths_of(declared, made.moves))
     judged = verdicts(experiment.design, [(excitation, RUNS)], extra_moves(experiment))
     if json:

@@ -191,6 +191,15 @@ class Cell:
         return tuple(axis.name for axis in self.axes)
 
 
+def joint_names(cell: Cell) -> tuple[str, ...]:
+    """Return the URDF's name of each axis's joint.
+
+    Raises:
+        ModelError: the URDF describes no robot.
+    """
+    return tuple(joint.name for joint in robot_from_urdf(cell.urdf).joints)
+
+
 def model_of(cell: Cell) -> Model:
     """Build the declared model for `ident`: geometry of the URDF, gravity and drive train.
 

@@ -72,7 +72,7 @@ def cell_from_bundle(
         for member in (f"{DRIVES}{drive}.yaml",)
     }
     urdf = held_urdf(document, model, urdf)
-    check(document, model, urdf, profiles)
+    check(document, model, urdf, profiles, logged=file is None)
     controller = None if model.controller is None else model.controller.file
     used = (CELL, URDF, *(f"{DRIVES}{drive}.yaml" for drive in model.drives))
     return Cell(
@@ -108,6 +108,8 @@ def digest(files: Mapping[str, bytes]) -> str:
 
 _AFTERWARDS = ("policy", "history", "recalibration")
 """Keys for the use of a calibration; no recording and no fit depends on them."""
+_BOUNDS = ("rated_payload_kg",)
+"""Keys of `robot` that only bound others; no recording and no fit depends on them."""
 _BESIDE = ("torque", "temperature")
 """Keys of a drive profile for what is read beside the samples; samples and gains do not depend on them."""
 
@@ -119,6 +121,7 @@ def _canonical(member: str, content: bytes, name: str) -> bytes:
     tree = parse_yaml(content, name).tree
     if member == CELL:
         tree = _without(tree, _AFTERWARDS)
+        tree["robot"] = _without(tree["robot"], _BOUNDS)
     elif member.startswith(DRIVES) and member.endswith(".yaml"):
         tree = _without(tree, _BESIDE)
         if tree.get("facts"):

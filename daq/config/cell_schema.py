@@ -30,6 +30,7 @@ class RobotModel(StrictModel):
 
     urdf: FileName
     gravity_m_s2: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    rated_payload_kg: Positive | None = None
 
 
 class DriveTrainModel(StrictModel):

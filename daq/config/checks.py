@@ -22,12 +22,24 @@ from daq.errors import ConfigurationInconsistent
 from drivers.profiles.profile import DriveProfile
 from ident.errors import ModelError
 from ident.model.robot import Joint, JointKind, robot_from_urdf
+from ident.plausible import (
+    FARTHEST_DEG,
+    FARTHEST_MM,
+    GRAVITY_M_S2,
+    HEAVIEST_PAYLOAD_KG,
+    PAYLOAD_RATIO,
+    SHORTEST_DEG,
+    SHORTEST_MM,
+    SHORTEST_OF_ALL_DEG,
+    TOLERANCE_SHARE,
+)
 
 LARGEST_CONDITION = 1e8  #: Largest condition number of R; above it, joint positions do not follow from motor positions
-LARGEST_TOLERANCE = 0.1  #: Largest tolerance, as a share of the payload's mass: a wrong weight scales all gains alike
 
 
-def check(document: Document, model: CellModel, urdf: str, profiles: Mapping[str, DriveProfile]) -> None:
+def check(
+    document: Document, model: CellModel, urdf: str, profiles: Mapping[str, DriveProfile], *, logged: bool = False
+) -> None:
     """Refuse a cell that contradicts itself.
 
     Args:
@@ -35,6 +47,7 @@ def check(document: Document, model: CellModel, urdf: str, profiles: Mapping[str
         model: its content.
         urdf: text of its robot.
         profiles: drive profiles, by name.
+        logged: the file is a log's copy, which cannot be corrected: typing mistakes are left to the diagnoses of a fit.
 
     Raises:
         ConfigurationInconsistent: with every contradiction and its line.
@@ -45,12 +58,14 @@ def check(document: Document, model: CellModel, urdf: str, profiles: Mapping[str
         *_ratio_faults(model),
         *_bus_faults(model, profiles),
         *_producer_faults(model),
-        *_axis_faults(model, joints, urdf),
+        *_axis_faults(model, joints),
         *_list_faults(model),
         *signer_faults(model.policy.apply.signers),
         *clearance_faults(model.workspace, model.clearance, names),
         *max_change_faults(model.policy.apply, names),
     ]
+    if not logged:
+        faults += [*_mass_faults(model), *_si_faults(model, urdf)]
     if faults:
         raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the cell file")
 
@@ -59,7 +74,7 @@ def _robot(model: CellModel, urdf: str) -> tuple[tuple[Joint, ...], list[Fault]]
     """Return the joints of the URDF, none if it cannot be read, and the faults of the robot as a whole."""
     faults = []
     gravity = hypot(*model.robot.gravity_m_s2)
-    if not 9.7 < gravity < 9.9:
+    if not GRAVITY_M_S2[0] < gravity < GRAVITY_M_S2[1]:
         found = f"{gravity:.4g} m/s² in all"
         faults.append(Fault(("robot", "gravity_m_s2"), found, "9.78 to 9.83 m/s², anywhere on Earth"))
     try:
@@ -103,7 +118,7 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
     for index, payload in enumerate(model.payloads):
         if payload.mass_kg <= 0:
             yield Fault(("payloads", index, "mass_kg"), f"{payload.mass_kg:g}", "a positive mass [kg]")
-        elif payload.mass_tolerance_kg > LARGEST_TOLERANCE * payload.mass_kg:
+        elif payload.mass_tolerance_kg > TOLERANCE_SHARE * payload.mass_kg:
             found = f"{payload.mass_tolerance_kg:g} kg for {payload.mass_kg:g} kg"
             yield Fault(
                 ("payloads", index, "mass_tolerance_kg"), found, "at most a tenth of the mass: it is in every gain"
@@ -115,6 +130,22 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
                 "each mounting a name of its own: it denotes one body in one place",
             )
         yield from _inertia_faults(payload, index)
+
+
+def _mass_faults(model: CellModel) -> Iterator[Fault]:
+    """Find payloads that this robot cannot carry, and g beside kg."""
+    rated_kg = model.robot.rated_payload_kg
+    lightest_kg = min((payload.mass_kg for payload in model.payloads if payload.mass_kg > 0), default=0.0)
+    for index, payload in enumerate(model.payloads):
+        path, found = ("payloads", index, "mass_kg"), f"{payload.mass_kg:g} kg"
+        if rated_kg is not None and payload.mass_kg > rated_kg:
+            yield Fault(path, found, f"at most the {rated_kg:g} kg of `robot.rated_payload_kg`")
+        elif rated_kg is None and payload.mass_kg > HEAVIEST_PAYLOAD_KG:
+            expected = f"at most {HEAVIEST_PAYLOAD_KG:g} kg, or a `robot.rated_payload_kg`; is this in g?"
+            yield Fault(path, found, expected)
+        elif payload.mass_kg > PAYLOAD_RATIO * lightest_kg > 0.0:
+            found += f", {payload.mass_kg / lightest_kg:.3g} times another payload"
+            yield Fault(path, found, f"at most {PAYLOAD_RATIO:g} times; is one of them in g?")
 
 
 def _inertia_faults(payload: PayloadModel, index: int) -> Iterator[Fault]:
@@ -143,20 +174,26 @@ class _Plausible:
 
 
 _PLAUSIBLE = {
-    DEGREE: _Plausible(720.0, "counts or motor degrees", 0.2, "revolutions"),
-    MILLIMETRE: _Plausible(100_000.0, "counts or µm", 5.0, "m"),
+    DEGREE: _Plausible(FARTHEST_DEG, "counts or motor degrees", SHORTEST_DEG, "revolutions"),
+    MILLIMETRE: _Plausible(FARTHEST_MM, "counts or µm", SHORTEST_MM, "m"),
 }
 
 
-def _axis_faults(model: CellModel, joints: Sequence[Joint], urdf: str) -> Iterator[Fault]:
+@dataclass(frozen=True, slots=True)
+class _UrdfLimits:
+    """Limits of a joint by the URDF, in SI."""
+
+    position: tuple[float, float] | None  #: lower and upper end [rad or m]; None for a continuous joint
+    velocity: float  #: largest speed [rad/s or m/s]; 0 if it is not given
+
+
+def _axis_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
     """Find axes that contradict themselves or their joint of the URDF."""
-    si_limits = _urdf_limits(urdf)
     for index, axis in enumerate(model.axes):
         path: Location = ("axes", index)
         if index < len(joints):
             yield from _kind_faults(path, axis, joints[index])
-        in_si = si_limits[index] if index < len(si_limits) else None
-        yield from _limit_faults((*path, "limits", f"position_{axis.limits.unit.name}"), axis, in_si)
+        yield from _limit_faults((*path, "limits", f"position_{axis.limits.unit.name}"), axis)
         for unit, offset in ((DEGREE, axis.zero_offset_deg), (MILLIMETRE, axis.zero_offset_mm)):
             farthest = _PLAUSIBLE[unit].farthest
             if offset is not None and abs(offset) > farthest:
@@ -208,7 +245,7 @@ def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
             )
 
 
-def _limit_faults(path: Location, axis: AxisModel, in_si: tuple[float, float] | None) -> Iterator[Fault]:
+def _limit_faults(path: Location, axis: AxisModel) -> Iterator[Fault]:
     (lower, upper), unit = axis.limits.position, axis.limits.unit
     plausible = _PLAUSIBLE[unit]
     found = f"[{lower:g}, {upper:g}] {unit.name}"
@@ -220,11 +257,35 @@ def _limit_faults(path: Location, axis: AxisModel, in_si: tuple[float, float] | 
         yield Fault(
             path, found, f"a range of at least {plausible.shortest:g} {unit.name}; are these {plausible.too_short}?"
         )
-    elif in_si is not None and in_si[0] < in_si[1]:
-        tolerance = 0.1 * (in_si[1] - in_si[0])
-        if abs(lower - in_si[0]) < tolerance and abs(upper - in_si[1]) < tolerance:
-            remedy = f"{unit.name}; multiply by {1.0 / unit.si:.3g}"
-            yield Fault(path, f"{found}, the numbers of the URDF in {unit.si_name}", remedy)
+
+
+def _si_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
+    """Find limits in rad or m: the numbers of the URDF, or no revolute axis with a range of some degrees."""
+    of_urdf = dict(enumerate(_urdf_limits(urdf)))
+    ranges = [axis.limits.position for axis in model.axes if axis.limits.unit is DEGREE]
+    narrow = all(SHORTEST_DEG < upper - lower < SHORTEST_OF_ALL_DEG for lower, upper in ranges)
+    for index, axis in enumerate(model.axes):
+        (lower, upper), velocity, unit = axis.limits.position, axis.limits.velocity, axis.limits.unit
+        path, in_si = ("axes", index, "limits"), of_urdf.get(index)
+        remedy = f"{unit.name}; multiply by {1.0 / unit.si:.3g}"
+        where, found = (*path, f"position_{unit.name}"), f"[{lower:g}, {upper:g}] {unit.name}"
+        if in_si is not None and _within_urdf((lower, upper), in_si.position, _PLAUSIBLE[unit].farthest * unit.si):
+            yield Fault(where, f"{found}, the numbers of the URDF in {unit.si_name}", remedy)
+        elif narrow and unit is DEGREE:
+            found += f", and on no axis a range of {SHORTEST_OF_ALL_DEG:g} deg"
+            yield Fault(where, found, f"limits in deg; are these in rad? multiply by {1.0 / unit.si:.3g}")
+        if in_si is not None and abs(velocity - in_si.velocity) < 0.1 * in_si.velocity:
+            found = f"{velocity:g} {unit.name}/s, the number of the URDF in {unit.si_name}/s"
+            yield Fault((*path, f"velocity_{unit.name}_s"), found, remedy)
+
+
+def _within_urdf(written: tuple[float, float], in_si: tuple[float, float] | None, farthest: float) -> bool:
+    """Whether limits lie within those of the URDF as numbers, and fill most of them: their unit is then SI too."""
+    if in_si is None or not in_si[0] < in_si[1] or max(map(abs, in_si)) > farthest:
+        return False
+    span = in_si[1] - in_si[0]
+    inside = written[0] > in_si[0] - 0.1 * span and written[1] < in_si[1] + 0.1 * span
+    return inside and written[1] - written[0] > 0.5 * span
 
 
 def _standstill_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
@@ -260,19 +321,21 @@ def _standstill_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fa
                 )
 
 
-def _urdf_limits(urdf: str) -> list[tuple[float, float] | None]:
-    """Read the limits of the moving joints from the URDF [rad or m], in document order; [] if it cannot be read."""
+def _urdf_limits(urdf: str) -> list[_UrdfLimits | None]:
+    """Read the limits of the moving joints from the URDF, in document order; [] if it cannot be read."""
     try:
         joints = ElementTree.fromstring(urdf).iter("joint")
-        limits: list[tuple[float, float] | None] = []
+        limits: list[_UrdfLimits | None] = []
         for joint in joints:
             if joint.get("type") not in {"revolute", "continuous", "prismatic"}:
                 continue
             limit = joint.find("limit")
-            if limit is None or joint.get("type") == "continuous":
+            if limit is None:
                 limits.append(None)
-            else:
-                limits.append((float(limit.get("lower", "0")), float(limit.get("upper", "0"))))
+                continue
+            position = float(limit.get("lower", "0")), float(limit.get("upper", "0"))
+            unlimited = joint.get("type") == "continuous"
+            limits.append(_UrdfLimits(None if unlimited else position, float(limit.get("velocity", "0"))))
     except (ElementTree.ParseError, ValueError):
         return []
     return limits

@@ -5,11 +5,12 @@ from __future__ import annotations
 import importlib
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from importlib.util import find_spec
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from daq.config.cell_file import cell_from_bundle
 from daq.errors import ConfigurationMissing, OutputFailed, UsageError
 from daq.log.conversion import moves, scaling, unwrapped
 from daq.log.reader import LogReader, SampleBlock
-from drivers.stream.sample import CellEvent
+from drivers.stream.sample import CellEvent, Quantity, SlowReading
 
 Columns = dict[str, NDArray[Any]]  #: Columns of equal length by name, in order
 Write = Callable[[Columns], None]
@@ -91,7 +92,7 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
         with ExitStack() as stack:
             stack.callback(unfinished.unlink, missing_ok=True)
             with _WRITERS[kind](unfinished) as write:
-                for columns in tables(LogReader(log), cell, tuple(reader.events)):
+                for columns in tables(LogReader(log), cell, tuple(reader.events), tuple(reader.readings)):
                     names = tuple(columns)
                     rows += len(next(iter(columns.values())))
                     write(columns)
@@ -104,20 +105,32 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
     return Exported(names, rows, reader.partial, said.valid, said.reason)
 
 
-def tables(reader: LogReader, cell: Cell, events: tuple[CellEvent, ...]) -> Iterator[Columns]:
+def tables(
+    reader: LogReader, cell: Cell, events: tuple[CellEvent, ...], readings: tuple[SlowReading, ...] = ()
+) -> Iterator[Columns]:
     """Convert the samples to columns, a block at a time.
 
     Args:
         reader: reader of the log, not yet iterated over.
         cell: cell of the log.
         events: events of the whole log, for the numbers of the moves.
+        readings: torques and temperatures of the whole log; each is in the row of the last SYNC before it.
 
     Raises:
         LogUnreadable: the log is damaged, or cell and log do not belong together.
     """
     last: tuple[NDArray[np.int32], NDArray[np.int64]] | None = None
     first_ns = 0
-    for block in reader:
+    names = _column_names(cell)
+    every = {
+        f"{names[axis]}.{_SLOW_COLUMNS[quantity]}": sorted(
+            (one.time_ns, one.value) for one in readings if (one.axis, one.quantity) == (axis, quantity)
+        )
+        for axis in range(len(names))
+        for quantity in Quantity
+    }
+    slow = {name: found for name, found in every.items() if found}
+    for block, is_last in _with_last(reader):
         scale = scaling(cell, reader.head.readback)
         is_counter = np.array([axis.position_rad_per_count is None for axis in reader.head.readback.axes])
         if last is None:
@@ -126,7 +139,10 @@ def tables(reader: LogReader, cell: Cell, events: tuple[CellEvent, ...]) -> Iter
         last = block.position_counts[-1], counted[-1]
         counts = np.where(is_counter, counted, block.position_counts)
         joints = scale.joint_position(counts)
-        yield _columns(cell, block, counts, joints, scale.current_per_unit, moves(events, block.time_ns), first_ns)
+        yield {
+            **_columns(cell, block, counts, joints, scale.current_per_unit, moves(events, block.time_ns), first_ns),
+            **{name: _in_rows(block.time_ns, found, to_end=is_last) for name, found in slow.items()},
+        }
 
 
 def _columns(
@@ -144,8 +160,7 @@ def _columns(
         "time_s": (block.time_ns - first_ns) * 1e-9,
         "move": np.full(len(block.cycle), -1, dtype=np.int64) if move is None else move,
     }
-    for index, axis in enumerate(cell.axes):
-        name = re.sub(r"\W+", "_", axis.name)
+    for index, (axis, name) in enumerate(zip(cell.axes, _column_names(cell), strict=True)):
         current = axis.gain_unit.partition("/")[2].strip() or "A"
         columns |= {
             f"{name}.position_{axis.unit.si_name}": joints[:, index],
@@ -156,6 +171,42 @@ def _columns(
             f"{name}.answered": ((block.missing >> np.uint32(index)) & 1 == 0).astype(np.uint8),
         }
     return columns
+
+
+def _column_names(cell: Cell) -> list[str]:
+    """Name of each axis in the columns; `A+` and `A-` are both `A_`, and get the number of the axis."""
+    plain = [re.sub(r"\W+", "_", axis.name) for axis in cell.axes]
+    return [name if plain.count(name) == 1 else f"{name}{number}" for number, name in enumerate(plain, start=1)]
+
+
+_SLOW_COLUMNS = {Quantity.TORQUE: "motor_torque_Nm", Quantity.TEMPERATURE: "temperature_degC"}
+
+
+def _in_rows(time_ns: NDArray[np.int64], found: list[tuple[int, float]], *, to_end: bool) -> NDArray[np.float64]:
+    """Take the readings of a block's rows from the front of a list; rows without one are NaN.
+
+    Args:
+        time_ns: of the rows, shape (k,).
+        found: time and value of the readings that are left, in their order; those of these rows are taken out.
+        to_end: the rows are the last, and take all that is left.
+    """
+    values = np.full(len(time_ns), np.nan)
+    step = int(time_ns[-1] - time_ns[-2]) if len(time_ns) > 1 else 1
+    while found and (to_end or found[0][0] < time_ns[-1] + step):
+        stamp, value = found.pop(0)
+        values[max(0, int(np.searchsorted(time_ns, stamp, side="right")) - 1)] = value
+    return values
+
+
+def _with_last(blocks: Iterable[SampleBlock]) -> Iterator[tuple[SampleBlock, bool]]:
+    """Yield each block, and whether it is the last."""
+    held: SampleBlock | None = None
+    for block in blocks:
+        if held is not None:
+            yield held, False
+        held = block
+    if held is not None:
+        yield held, True
 
 
 @contextmanager
@@ -170,7 +221,7 @@ def _csv(path: Path) -> Iterator[Write]:
                 stream.write(",".join(columns) + "\n")
                 begun = True
             # repr of a float is the shortest text that reads back as the same number.
-            texts = [map(repr, column.tolist()) for column in columns.values()]
+            texts = [["" if isnan(value) else repr(value) for value in column.tolist()] for column in columns.values()]
             stream.writelines(",".join(row) + "\n" for row in zip(*texts, strict=True))
 
         yield write

@@ -133,7 +133,7 @@ def import_recording(
         origin=f"imported as {wanted.name} from " + ", ".join(f"{name} ({d[:12]})" for name, d in digests.items()),
         timing=timing,
     )
-    content = LogContent(run, bundle(path), readback, cell.axis_names)
+    content = LogContent.of(cell, run, bundle(path), readback)
     opened = False
     try:
         # A crash of an import loses no sample, so no clock is needed to flush in time.

@@ -19,6 +19,8 @@ from drivers.stream.sample import CellEvent, EventKind, Quantity, Sample, SlowRe
 SAMPLES_TOPIC, EVENTS_TOPIC, JOINTS_TOPIC = "/cell/samples", "/cell/events", "/joint_states"
 SAMPLES_SCHEMA, EVENTS_SCHEMA = "drivegain_msgs/msg/AxisSamples", "drivegain_msgs/msg/CellEvent"
 JOINTS_SCHEMA = "sensor_msgs/msg/JointState"
+CURRENTS_TOPIC, CURRENTS_SCHEMA = "/cell/currents", "drivegain_msgs/msg/AxisCurrents"
+URDF_TOPIC, URDF_SCHEMA = "/robot_description", "std_msgs/msg/String"
 READING_TOPICS = {Quantity.TORQUE: "/cell/torque", Quantity.TEMPERATURE: "/cell/temperature"}
 """Topics of the slow readings; a log without such readings has no such topic."""
 READING_SCHEMA = "drivegain_msgs/msg/AxisReading"
@@ -30,9 +32,9 @@ DEFINITIONS = {
     SAMPLES_SCHEMA: """\
 # One SYNC cycle of a cell, as the amplifiers sent it.
 uint64 cycle                      # number of the SYNC
-builtin_interfaces/Time stamp     # of the SYNC
-int32[] position_counts           # motor side, encoder counts
-int32[] current_raw               # current-loop reference, unit of the drive profile
+builtin_interfaces/Time stamp     # of the SYNC, since 1970
+int32[] position_counts           # motor side [encoder counts]
+int32[] current_raw               # current-loop reference [unit of the drive profile; /cell/currents has it in A]
 uint16[] statusword               # CiA 402 object 6041h
 uint32 missing                    # bit i: axis i did not answer, its values repeat the last known ones
 """
@@ -53,12 +55,19 @@ int16 axis                        # from 0
 float64 value                     # /cell/torque: the drive's own, at the motor [Nm]; /cell/temperature: [degC]
 """
     + _TIME,
+    CURRENTS_SCHEMA: """\
+# Current-loop references of a cell, in the order of its axes.
+builtin_interfaces/Time stamp     # of the SYNC, since 1970
+float64[] current_a               # [A; where the cell's gain is in another unit, what it is multiplied by]
+"""
+    + _TIME,
+    URDF_SCHEMA: "string data                       # the robot's URDF: lengths in m, angles in rad\n",
     JOINTS_SCHEMA: """\
-std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
+std_msgs/Header header            # stamp of the SYNC, since 1970
+string[] name                     # joints of the URDF, in the order of the axes
+float64[] position                # [rad; m of a prismatic joint]
+float64[] velocity                # [rad/s or m/s], mean over some 20 ms
+float64[] effort                  # [Nm or N], torque of the drives by a calibration's gains; empty without one
 """
     + _SEPARATOR
     + "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
@@ -205,10 +214,39 @@ def joint_state_prefix(names: Sequence[str]) -> bytes:
     return bytes(data)
 
 
-def joint_state_bytes(prefix: bytes, time_ns: int, position: Sequence[float]) -> bytes:
-    """Encode a JointState with positions [rad] only."""
+def joint_state_bytes(
+    prefix: bytes, time_ns: int, position: Sequence[float], velocity: Sequence[float], effort: Sequence[float] = ()
+) -> bytes:
+    """Encode a JointState.
+
+    Args:
+        prefix: of `joint_state_prefix`.
+        time_ns: stamp [ns since 1970].
+        position: [rad; m of a prismatic joint], shape (n,).
+        velocity: per second, shape (n,).
+        effort: [Nm; N of a prismatic joint], shape (n,) or empty.
+    """
     seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
     data = bytearray(struct.pack("<iI", seconds, nanoseconds) + prefix)
-    data += b"\0" * (-len(data) % 4) + struct.pack("<I", len(position))
-    data += b"\0" * (-len(data) % 8) + struct.pack(f"<{len(position)}d", *position)
-    return _ENCAPSULATION + bytes(data) + struct.pack("<II", 0, 0)
+    for values in (position, velocity, effort):
+        _append_doubles(data, values)
+    return _ENCAPSULATION + bytes(data)
+
+
+def currents_bytes(time_ns: int, current_a: Sequence[float]) -> bytes:
+    """Encode the currents of all axes [A], shape (n,)."""
+    data = bytearray(struct.pack("<iI", *divmod(time_ns, 1_000_000_000)))
+    _append_doubles(data, current_a)
+    return _ENCAPSULATION + bytes(data)
+
+
+def text_bytes(text: str) -> bytes:
+    """Encode a String."""
+    return _ENCAPSULATION + _string(text)
+
+
+def _append_doubles(data: bytearray, values: Sequence[float]) -> None:
+    """Append a sequence of float64, aligned; an empty one has no element to be aligned."""
+    data += b"\0" * (-len(data) % 4) + struct.pack("<I", len(values))
+    if len(values):
+        data += b"\0" * (-len(data) % 8) + struct.pack(f"<{len(values)}d", *values)

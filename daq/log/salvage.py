@@ -82,7 +82,7 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
     cell = cell_from_bundle(head.files, names={"cell.yaml": f"{damaged}, cell.yaml"})
     scale = scaling(cell, head.readback)
     run = replace(head.run, origin=f"{head.run.origin}; salvaged from {damaged.name}")
-    content = LogContent(run, head.files, head.readback, cell.axis_names)
+    content = LogContent.of(cell, run, head.files, head.readback)
     # A crash loses only this new file, so no clock is needed to flush in time.
     log = LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0, remedy=NOTHING_KEPT)
     with log:

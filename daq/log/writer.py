@@ -14,10 +14,13 @@ from types import TracebackType
 
 from mcap.writer import CompressionType, Writer
 
+from daq.config.cell import Cell, joint_names
 from daq.errors import OutputFailed, UsageError
 from daq.files import fsync_folder
 from daq.log.container import UNFINISHED
 from daq.log.message import (
+    CURRENTS_SCHEMA,
+    CURRENTS_TOPIC,
     DEFINITIONS,
     EVENTS_SCHEMA,
     EVENTS_TOPIC,
@@ -27,12 +30,16 @@ from daq.log.message import (
     READING_TOPICS,
     SAMPLES_SCHEMA,
     SAMPLES_TOPIC,
+    URDF_SCHEMA,
+    URDF_TOPIC,
+    currents_bytes,
     event_bytes,
     joint_state_bytes,
     joint_state_prefix,
     reading_bytes,
     sample_bytes,
     sample_struct,
+    text_bytes,
 )
 from daq.log.metadata import (
     READBACK,
@@ -51,7 +58,7 @@ from drivers.stream.sample import CellEvent, Quantity, Sample, SlowReading
 FLUSH_NS = 150_000_000
 """Time between two flushes, recorded or wall time, whichever ends first [ns]. A kill may cost 200 ms: the rest is
 for the cycle on the bus and the chunk that is being packed."""
-JOINT_STATE_NS = 20_000_000
+JOINT_STATE_NS = 20_000_000  #: Time between two joint states, over which their velocity is the mean
 CHUNK_BYTES = 4 * 2**20  #: Never reached between two flushes; a chunk ends with one
 NOTHING_KEPT = "nothing was written; free space or rights, or choose another folder"
 
@@ -63,7 +70,13 @@ class LogContent:
     run: RunInfo  #: facts about the recording
     files: Mapping[str, bytes]  #: the cell's bundle: configuration, drive profiles, URDF
     readback: Readback  #: answers of the amplifiers
-    joint_names: tuple[str, ...]  #: for viewers, one for each axis
+    joint_names: tuple[str, ...]  #: joints of the URDF, one for each axis
+    urdf: str = ""  #: text of the URDF, its held joints fixed, for viewers; empty without one
+
+    @classmethod
+    def of(cls, cell: Cell, run: RunInfo, files: Mapping[str, bytes], readback: Readback) -> LogContent:
+        """The start of a log of a cell."""
+        return cls(run, files, readback, joint_names(cell), cell.urdf)
 
 
 class LogWriter:
@@ -91,7 +104,7 @@ class LogWriter:
         Args:
             path: path of the finished log.
             content: start of the log.
-            joint_position: converts motor counts to joint positions [rad], for /joint_states.
+            joint_position: converts motor counts to joint positions [rad or m], for /joint_states.
             clock_ns: monotonic clock, for the flush by wall time.
             remedy: advice if the file system refuses, instead of that of a recording.
         """
@@ -112,6 +125,8 @@ class LogWriter:
         self._highest_cycle: int | None = None
         self._flushed_recorded_ns = self._flushed_wall_ns = 0
         self._joint_state_due_ns = 0
+        self._joint_state_before: tuple[int, Sequence[float]] | None = None
+        self._ampere_per_unit = [axis.current_per_unit for axis in content.readback.axes]
         self._conclusion = RunStatistics(0, 0, (), valid=False, reason="not concluded")
 
     def __enter__(self) -> LogWriter:
@@ -176,8 +191,18 @@ class LogWriter:
             raise self._failed(error) from error
         if sample.time_ns >= self._joint_state_due_ns:
             self._joint_state_due_ns = sample.time_ns + JOINT_STATE_NS
-            state = joint_state_bytes(self._prefix, sample.time_ns, self._joint_position(sample.position_counts))
-            self._held.append((self._joints_channel, sample.time_ns, state))
+            self._hold_state(sample)
+
+    def _hold_state(self, sample: Sample) -> None:
+        """Append what viewers show of a sample, in SI."""
+        time_ns, position = sample.time_ns, self._joint_position(sample.position_counts)
+        before_ns, before = self._joint_state_before or (time_ns, position)
+        elapsed_s = max(time_ns - before_ns, 1) * 1e-9
+        velocity = [(now - then) / elapsed_s for now, then in zip(position, before, strict=True)]
+        self._joint_state_before = time_ns, position
+        current = [raw * unit for raw, unit in zip(sample.current_raw, self._ampere_per_unit, strict=True)]
+        self._held.append((self._joints_channel, time_ns, joint_state_bytes(self._prefix, time_ns, position, velocity)))
+        self._held.append((self._currents_channel, time_ns, currents_bytes(time_ns, current)))
 
     def event(self, event: CellEvent) -> None:
         """Append one event."""
@@ -283,6 +308,10 @@ class LogWriter:
         self._samples_channel = self._channel(SAMPLES_TOPIC, SAMPLES_SCHEMA)
         self._events_channel = self._channel(EVENTS_TOPIC, EVENTS_SCHEMA)
         self._joints_channel = self._channel(JOINTS_TOPIC, JOINTS_SCHEMA)
+        self._currents_channel = self._channel(CURRENTS_TOPIC, CURRENTS_SCHEMA)
+        if self._content.urdf:
+            urdf = self._channel(URDF_TOPIC, URDF_SCHEMA)
+            self._held.append((urdf, started_ns, text_bytes(self._content.urdf)))
         self._mcap.flush()
 
     def _channel(self, topic: str, schema: str) -> int:

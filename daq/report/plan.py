@@ -53,6 +53,11 @@ def plan_text(out: Path, cell: Cell, experiment: Experiment, made: Plan, judged:
         ),
         *(f"  {gain.words(axis.name)}" for axis, gain in zip(cell.axes, judged, strict=True)),
         "Assumed: " + "; ".join(experiment.remarks) + ".",
-        "Read the plan before the robot executes it; the way to its first target is not checked.",
+        "Read the plan before the robot executes it, or look at it (--preview PAGE). "
+        + (
+            "`record` checks the way to its first target from where the robot stands."
+            if cell.clearance is not None
+            else "The way to its first target is not checked: the cell file declares no `workspace` and no `clearance`."
+        ),
     ]
     return "\n".join(lines)

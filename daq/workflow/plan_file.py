@@ -15,6 +15,8 @@ from daq.errors import ConfigurationInconsistent
 from daq.files import replace_file
 from daq.workflow.experiment import PlannedMove, duration_of, paths_of, scene_of
 from daq.workflow.plan import Plan
+from drivers.errors import MotionRefused
+from ident.arrays import FloatArray
 from ident.planning.clearance import Checker
 
 LONGEST_S = 3600.0
@@ -135,14 +137,42 @@ def _move(path: Path, cell: Cell, number: int, move: _Move) -> PlannedMove:
     return PlannedMove(target, move.velocity, move.acceleration, move.dwell_s)
 
 
-def _check_room(path: Path, cell: Cell, moves: tuple[PlannedMove, ...]) -> None:
-    """Refuse ways that leave what the cell file declares; that a guessed arm touches itself refuses nothing."""
+def check_approach(cell: Cell, plan: Plan, start_rad: FloatArray) -> None:
+    """Refuse a way to the first target that leaves what the cell file declares.
+
+    Args:
+        cell: with `workspace` or `clearance`; without both, nothing is known of the room.
+        plan: for this cell.
+        start_rad: where the robot stands [rad; m of a prismatic joint], shape (n,).
+
+    Raises:
+        MotionRefused: with the place and the bodies that come too close.
+    """
     if cell.clearance is None:
         return
+    found = _checker(cell).obstruction(start_rad, np.array(plan.moves[0].target_rad))
+    if found is not None:
+        where = ", ".join(axis.unit.spell(p) for axis, p in zip(cell.axes, found.position, strict=True))
+        raise MotionRefused(
+            f"the way from here to the first target of the plan: found {1000 * found.distance_m:.0f} mm between "
+            f"{found.first} and {found.second} at ({where}); bring the robot near the first target by hand, or correct "
+            "`workspace` and `clearance` in the cell file"
+        )
+
+
+def _checker(cell: Cell) -> Checker:
+    """Distances to what the cell file declares; that a guessed arm touches itself refuses nothing."""
     robot = model_of(cell).robot
     lightest = min((payload.mass_kg for payload in cell.payloads), default=1.0)
     scene = scene_of(cell, robot, lightest)
-    checker = Checker(robot, replace(scene.checker.scene, pairs=())) if scene.guessed else scene.checker
+    return Checker(robot, replace(scene.checker.scene, pairs=())) if scene.guessed else scene.checker
+
+
+def _check_room(path: Path, cell: Cell, moves: tuple[PlannedMove, ...]) -> None:
+    """Refuse ways that leave what the cell file declares."""
+    if cell.clearance is None:
+        return
+    checker = _checker(cell)
     for number, way in enumerate(paths_of(cell, moves), start=1):
         found = checker.obstruction(np.asarray(way.start), np.asarray(way.end))
         if found is not None:

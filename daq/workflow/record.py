@@ -12,7 +12,7 @@ import numpy as np
 
 from daq.config import cell as declared
 from daq.config.bus import cell_address, drive_axes, load_warnings, polling_fits, polling_warnings
-from daq.config.cell import Cell
+from daq.config.cell import Cell, joint_names
 from daq.config.cell_file import bundle
 from daq.environment import software
 from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
@@ -21,11 +21,12 @@ from daq.log.conversion import SiScaling, scaling
 from daq.log.metadata import RunInfo, RunStatistics, readback_of_drives
 from daq.log.writer import LogContent, LogWriter
 from daq.workflow.experiment import path_of
+from daq.workflow.nameplates import check_nameplates
 from daq.workflow.plan import Plan
+from daq.workflow.plan_file import check_approach
 from daq.workflow.safeguards import (
     DiskRoom,
     FreeBytes,
-    check_currents,
     check_entered_mass,
     defer_full_gc,
     free_bytes,
@@ -150,7 +151,7 @@ def record(
         network.prepare()
         polling = Polling(network, beside_stream=polling_fits(cell))
         warnings = (
-            *(*load_warnings(cell), *check_currents(cell, network.scales()), *network.unguarded()),
+            *(*load_warnings(cell), *check_nameplates(cell_file, cell, network.scales()), *network.unguarded()),
             *(polling_warnings(cell) if polling else ()),
         )
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
@@ -162,11 +163,10 @@ def record(
             producer.start()
         start_counts = _positions(network, _pacing(cell, clocks.wall_ns(), clocks, producer))
         permission = MotionPermission(granted_by, motor_limits(cell, scale))
-        moves = motor_moves(cell, plan, scale, start_counts)
-        check_moves(start_counts, moves, permission, cell.axis_names)
+        moves = _checked_moves(cell, plan, scale, start_counts, permission)
         room = DiskRoom(out, free)
         longest_s = duration_of(moves, start_counts, rate_hz) + ALLOWANCE_S
-        room.require(largest_log_bytes(cell.axis_names, rate_hz, longest_s, files))
+        room.require(largest_log_bytes(joint_names(cell), rate_hz, longest_s, files))
         short: DiskSpaceShort | None = None
         temperatures = polling.temperatures(clocks.wall_ns())
         # Before the first SYNC of the recording's stream, whose schedule does not wait either.
@@ -184,7 +184,7 @@ def record(
             entered_kg=entered_kg,
             controller_sha256=controller_digest(cell),
         )
-        content = LogContent(run, files, readback, cell.axis_names)
+        content = LogContent.of(cell, run, files, readback)
         with LogWriter(out, content, scale.joint_position_of, clocks.monotonic_ns) as log:
             done = 0
 
@@ -314,6 +314,20 @@ def motor_moves(cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence
         moves.append(synchronised_move(here, target, exact, dwell))
         here_rad, here = target_rad, target
     return tuple(moves)
+
+
+def _checked_moves(
+    cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence[int], permission: MotionPermission
+) -> tuple[Move, ...]:
+    """Convert a plan to motor moves that keep the limits, and whose first way is clear.
+
+    Raises:
+        MotionRefused: they do not.
+    """
+    check_approach(cell, plan, scale.joint_position(np.array(start_counts)))
+    moves = motor_moves(cell, plan, scale, start_counts)
+    check_moves(start_counts, moves, permission, cell.axis_names)
+    return moves
 
 
 def _verdict(statistics: StreamStatistics) -> tuple[bool, str]:

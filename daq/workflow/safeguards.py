@@ -1,4 +1,4 @@
-"""Safeguards of a recording: bus lock, disk space, plausible currents, the payload's mass, deferred garbage collection.
+"""Safeguards of a recording: bus lock, disk space, the payload's mass, deferred garbage collection.
 
 Every recording and every job takes the lock of its bus before it sends anything to the drives. It is the lock of
 flock(2) on a file in a folder of the system, and ends with its process. It excludes other programs of drivegain on this
@@ -13,20 +13,18 @@ import re
 import shutil
 import socket
 import stat
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 
 from daq.config.cell import Bus, Cell, WeighedPayload
+from daq.config.cell_file import URDF
 from daq.errors import BusTaken, DiskSpaceShort, OutputFailed, UsageError, writing
 from daq.files import hold_lock
-from daq.log.message import joint_state_bytes, joint_state_prefix, sample_dtype
+from daq.log.message import currents_bytes, joint_state_bytes, joint_state_prefix, sample_dtype
 from daq.log.writer import JOINT_STATE_NS
-from daq.report.bus import actual_current_note
-from drivers.profiles.scale import ScaleReading, check_name_plate
 from ident.model.bodies import Payload
-from ident.model.model import DriveTrain
 
 SHARED_FOLDERS = (Path("/run/lock"), Path("/var/lock"), Path("/tmp"))
 """Tried in this order; all users of a computer must come to the same one, so TMPDIR is not asked."""
@@ -116,11 +114,13 @@ def free_bytes(folder: Path) -> int:
 
 def largest_log_bytes(names: tuple[str, ...], rate_hz: float, duration_s: float, attached: Mapping[str, bytes]) -> int:
     """Size of a log at most: as if nothing could be compressed [bytes]."""
-    state = joint_state_bytes(joint_state_prefix(names), 0, [0.0] * len(names))
+    zeros = [0.0] * len(names)
+    shown = (joint_state_bytes(joint_state_prefix(names), 0, zeros, zeros), currents_bytes(0, zeros))
     of_samples = rate_hz * (sample_dtype(len(names)).itemsize + INDEX_BYTES)
-    of_states = 1e9 / JOINT_STATE_NS * (MESSAGE_HEAD_BYTES + len(state) + INDEX_BYTES)
+    of_states = 1e9 / JOINT_STATE_NS * sum(MESSAGE_HEAD_BYTES + len(message) + INDEX_BYTES for message in shown)
     growth_bytes_s = of_samples + of_states + CHUNKS_BYTES_S
-    return round(duration_s * growth_bytes_s) + ENDS_BYTES + sum(map(len, attached.values()))
+    files = sum(map(len, attached.values())) + len(attached.get(URDF, b""))  # a topic has it too, for viewers
+    return round(duration_s * growth_bytes_s) + ENDS_BYTES + files
 
 
 class DiskRoom:
@@ -166,29 +166,6 @@ class DiskRoom:
 
 def _megabytes(number: int) -> str:
     return f"{number / 1e6:.1f} MB"
-
-
-def check_currents(cell: Cell, readings: Sequence[ScaleReading]) -> tuple[str, ...]:
-    """Hold each drive's torque constant against the cell's nameplate gain, g = N·Gt·Kt (paper eq. 4).
-
-    Returns:
-        What people must know of the recorded currents: no reference, what could not be checked, what fits badly.
-
-    Raises:
-        SetupRefused: the two torque constants differ by a factor of five or more.
-    """
-    axes_by_warning: dict[str, list[str]] = {}
-    for axis, reduction, reading in zip(cell.axes, DriveTrain(cell.ratio).reduction, readings, strict=True):
-        found = reading.warnings
-        if axis.profile is None or not axis.gain_unit.startswith(("Nm/A", "N/A")):
-            found += (f"the gain is in {axis.gain_unit}; the torque constant cannot be checked",)
-        else:
-            found += check_name_plate(reading, axis.profile.amplitude, axis.nameplate_gain / float(reduction))
-        for warning in found:
-            axes_by_warning.setdefault(warning, []).append(axis.name)
-    note = actual_current_note(cell)
-    grouped = tuple(f"{', '.join(names)}: {warning}" for warning, names in axes_by_warning.items())
-    return grouped if note is None else (note, *grouped)
 
 
 _ROUNDING_KG = 1e-9  #: Two spellings of one number are one number

@@ -5,7 +5,7 @@ A. Each mistake leaves a trace of its own. `diagnose` looks for them in the equa
 reads the runs again, because the equations of a motor hold its own current alone.
 
 A mistake that leaves no usable number is an error (kinds of `ident.errors.ModelContradicted`), any other a `Diagnosis`.
-The limits were set by `make diagnosis-study`.
+The limits were set by `make diagnosis-study`; those of a single number are in `ident.plausible`.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from ident.estimators.least_squares import wls
 from ident.estimators.maximum_likelihood import ml, noise_of
 from ident.estimators.payload_diagnosis import payload_diagnoses
 from ident.model.model import Model
+from ident.plausible import GAIN_RATIO, TORQUE_RATIO, UNIT_RATIO
 
 if TYPE_CHECKING:  # which refuses a fit by the checks below
     from ident.estimators.identify import Identification
@@ -39,12 +40,9 @@ LARGEST_AXIS_ERROR_PERCENT = 20.0  #: Clean recordings stay below 15, with every
 IDLE_TORQUE, IDLE_ERROR = 1e-3, 1e-2
 """Torque and error of an idle axis, relative to the largest torque of any: 0.01 Nm of a wrist beside the 30 Nm of a
 shoulder is below every friction. The wrist of a real robot carries 0.02 of it and more."""
-GAIN_RATIO = 3.0  #: Largest gain / nameplate, and smallest inverse: tolerances and losses give 0.7 to 1.3
-UNIT_RATIO = 30.0  #: On all axes alike it is no property of drives, but a unit
 LARGEST_CONDITION = 1e6
 """Largest condition number. An error of one σ along the weakest direction of the parameters is 1/s_min, and it exceeds
 all parameters together where the condition exceeds s_max ‖χ‖. That is 1e4 to 2e5 in real and simulated recordings."""
-TORQUE_RATIO = 10.0  #: Torque on every axis (root mean square), relative to the URDF's effort limit
 GAIN_DIFFERENCE, GAIN_SIGMAS = 0.1, 3.0  #: Of another estimator's gain from that of ml: relative, and in σ of ml
 ALIKE = 0.25  #: Least squared correlation of two torques of which one is the other's, reversed
 EXCHANGE = 0.4

@@ -141,7 +141,7 @@ def write_log(path: Path, raw: RawRun, cell: Cell, files: dict[str, bytes], star
     status = (ENABLED | raw.limited * bits).tolist()
     positions, currents = raw.position_counts.tolist(), raw.current_raw.tolist()
     changes = np.flatnonzero(np.diff(raw.move, prepend=raw.move[0] - 1)).tolist()
-    with LogWriter(path, LogContent(run, files, readback, cell.axis_names), scale.joint_position_of, lambda: 0) as log:
+    with LogWriter(path, LogContent.of(cell, run, files, readback), scale.joint_position_of, lambda: 0) as log:
         for cycle, (position, current, word) in enumerate(zip(positions, currents, status, strict=True)):
             time_ns = start_ns + cycle * period_ns
             if cycle in changes:

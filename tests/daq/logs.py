@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from daq.config.cell_file import bundle
+from daq.config.cell_file import bundle, load_cell
 from daq.log.metadata import AxisReadback, Readback, RunInfo
 from daq.log.writer import LogContent, LogWriter
 from drivers.stream.sample import CellEvent, Sample
@@ -26,7 +27,8 @@ def content(axes: int, payload: Payload | None = None, files: dict[str, bytes] |
 
 def demo_content(checkout: Path, payload: Payload | None = None) -> LogContent:
     """The start of a log of the demo cell."""
-    return content(6, payload, bundle(checkout / "configs/cells/demo.yaml"))
+    path = checkout / "configs/cells/demo.yaml"
+    return replace(content(6, payload, bundle(path)), urdf=load_cell(path).urdf)
 
 
 def samples(rows: Sequence[Sequence[int]], status: int = 0x1237, missing: int = 0) -> list[Sample]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from math import radians
 from pathlib import Path
@@ -69,6 +70,28 @@ def test_a_cell_without_a_bus_only_imports(checkout: Path) -> None:
         drive_axes(cell)
 
 
+def test_limits_in_rad_are_recognised_without_limits_in_the_urdf(configurations: Path) -> None:
+    """On continuous joints no number of the URDF gives the unit away, but no axis can move more than a few degrees."""
+    urdf, path = configurations / "robots/tx40.urdf", configurations / "cells/demo.yaml"
+    urdf.write_text(re.sub(r"<limit [^>]*>", "", urdf.read_text()).replace('"revolute"', '"continuous"'))
+    load_cell(path)
+    text = path.read_text()
+    in_rad = re.sub(r"position_deg: \[[^]]*\]", "position_deg: [-3.1, 3.1]", text)
+    path.write_text(in_rad)
+    with pytest.raises(ConfigurationInconsistent, match=r"6 faults(.|\n)*are these in rad"):
+        load_cell(path)
+    path.write_text(in_rad.replace("[-3.1, 3.1]", "[-10, 10]", 1))  # one axis moves
+    load_cell(path)
+
+
+def test_a_log_with_an_implausible_cell_can_be_read(configurations: Path) -> None:
+    """Earlier versions recorded with it, and the copy in a log cannot be corrected."""
+    path = configurations / "cells/demo.yaml"
+    files = bundle(path)
+    heavy = {**files, "cell.yaml": files["cell.yaml"].replace(b"mass_kg: 4.59", b"mass_kg: 4590")}
+    assert cell_from_bundle(heavy).payloads[0].mass_kg == 4590.0
+
+
 def test_a_bundle_takes_the_data_sheet_along_that_a_profile_names(checkout: Path, tmp_path: Path) -> None:
     cells, drives = tmp_path / "cells", tmp_path / "drives"
     cells.mkdir()
@@ -119,6 +142,11 @@ def test_the_digest_follows_every_file(configurations: Path) -> None:
         ("name: J2", "name: J1", "J1, used 2 times"),
         ("[-170, 170]", "[170, -170]", "lower limit first"),
         ("[-170, 170]", "[-2.967, 2.967]", "the numbers of the URDF in rad"),
+        ("[-170, 170]", "[-2.5, 2.5]", "the numbers of the URDF in rad; expected deg; multiply by 57.3"),
+        ("velocity_deg_s: 200", "velocity_deg_s: 5.2", r"velocity_deg_s: found 5.2 deg/s, the number .* rad/s"),
+        ("mass_kg: 4.59", "mass_kg: 4590", r"payloads.0..mass_kg: found 4590 kg; expected at most 2500 kg, or .*in g"),
+        ("-9.81]", "-9.81]\n  rated_payload_kg: 2.3", "found 4.59 kg; expected at most the 2.3 kg of `robot.rated"),
+        ("payloads:", "payloads:\n  - {name: ring, mounting: flange-b, mass_kg: 1686}", "367 times another payload"),
         ("[-170, 170]", "[-17000, 17000]", "at most ±720 deg"),
         ("[-170, 170]", "[-0.05, 0.05]", "a range of at least 0.2 deg"),
         ("mass_kg: 4.59", "mass_kg: -4.59", "positive mass"),

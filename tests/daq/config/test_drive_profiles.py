@@ -333,7 +333,7 @@ MAKES = {
 }
 
 
-ENTERED_NM = 1.2
+ENTERED_NM = 0.8  # within a factor of three of every motor's
 HEATED = {"time_constant_s": 2.0, "resistance_k_per_w": 5.0}
 WARMING = UndeclaredEffect(
     "temperature-friction", 1, {"viscous_percent_per_k": -1.0, "coulomb_percent_per_k": 0.0, **HEATED}

@@ -18,8 +18,9 @@ from daq.errors import ExitCode
 from daq.log.conversion import load_run
 from daq.log.export import TableFormat, export_log
 from daq.log.reader import BLOCK_SAMPLES
-from drivers.stream.sample import CellEvent, EventKind, Sample
-from tests.daq.logs import START_NS, demo_content, samples, write
+from daq.log.writer import LogWriter
+from drivers.stream.sample import CellEvent, EventKind, Quantity, Sample, SlowReading
+from tests.daq.logs import START_NS, demo_content, joints, samples, write
 
 ROWS = 2 * BLOCK_SAMPLES + 100
 """Three blocks."""
@@ -82,6 +83,27 @@ def test_a_counter_that_wraps_goes_on_from_block_to_block(tmp_path: Path, checko
     log = write(tmp_path / "wrapping.mcap", demo_content(checkout), bare)
     export_log(log, tmp_path / "out.csv", TableFormat.CSV)
     assert [int(text) for text in _table(tmp_path / "out.csv")["J4.motor_counts"]] == true
+
+
+def test_torques_and_temperatures_are_in_the_row_of_their_sync(tmp_path: Path, checkout: Path) -> None:
+    """Also where blocks meet, and before and after the samples."""
+    path, last = tmp_path / "warm.mcap", START_NS + (ROWS - 1) * 1_000_000
+    edge = START_NS + (BLOCK_SAMPLES - 1) * 1_000_000 + 500_000
+    with LogWriter(path, demo_content(checkout), joints, clock_ns=lambda: 0) as log:
+        for time_ns, value in ((START_NS - 5, 20.0), (last + 10**9, 21.0)):
+            log.reading(SlowReading(time_ns, 2, Quantity.TEMPERATURE, value))
+        for time_ns, value in ((START_NS + 3_999_999, 0.5), (edge, 0.75)):
+            log.reading(SlowReading(time_ns, 0, Quantity.TORQUE, value))
+        for sample in samples([[0] * 6] * ROWS):
+            log.write(sample)
+        log.conclude(True)
+    export_log(path, tmp_path / "warm.csv", TableFormat.CSV)
+    table = _table(tmp_path / "warm.csv")
+    found = {name: {row: text for row, text in enumerate(table[name]) if text} for name in list(table)[-2:]}
+    assert found == {
+        "J1.motor_torque_Nm": {3: "0.5", BLOCK_SAMPLES - 1: "0.75"},
+        "J3.temperature_degC": {0: "20.0", ROWS - 1: "21.0"},
+    }
 
 
 def test_parquet_has_the_same_columns(log: Path, tmp_path: Path) -> None:

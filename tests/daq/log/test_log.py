@@ -195,7 +195,8 @@ def test_an_error_leaves_the_part_with_everything_so_far(tmp_path: Path) -> None
     with part.open("rb") as stream, pytest.raises(EndOfFile):
         found.extend(StreamReader(stream).records)
     sequences = [record.sequence for record in found if isinstance(record, Message)]
-    assert sequences == [10, 0, *range(11, 17)]  # seven samples, and after the first of them the first JointState
+    # Seven samples; after the first of them the first JointState and currents.
+    assert sequences == [10, 0, 0, *range(11, 17)]
     with pytest.raises(UsageError, match="unfinished"):
         write(path, content(1), samples([[0]]))
     assert part.read_bytes() == data

@@ -41,6 +41,13 @@ def test_what_becomes_of_a_calibration_and_comments_make_no_other_recording(conf
     assert after.recording_digest == before.recording_digest
 
 
+def test_nor_does_a_rated_payload(configs: Path) -> None:
+    file = configs / DEMO
+    before = load_cell(file)
+    file.write_text(file.read_text().replace("robot:\n", "robot:\n  rated_payload_kg: 8\n"))
+    assert load_cell(file).recording_digest == before.recording_digest
+
+
 def test_neither_do_comments_and_line_breaks_of_a_drive_profile(configs: Path) -> None:
     before = load_cell(configs / DEMO)
     profile = configs / "drives" / "generic-cia402.yaml"

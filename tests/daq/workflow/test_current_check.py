@@ -1,8 +1,10 @@
-"""The ampere of the drives against the name plates of the cell."""
+"""The nameplate gains of a cell against the drives and the controller."""
 
 from __future__ import annotations
 
 import math
+import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +12,8 @@ import pytest
 
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
-from daq.workflow.safeguards import check_currents
-from drivers.errors import SetupRefused
+from daq.errors import ConfigurationInconsistent
+from daq.workflow.nameplates import check_controller, check_nameplates
 from drivers.profiles.profile import TapPoint
 from drivers.profiles.scale import ScaleReading
 from ident.model.model import DriveTrain
@@ -28,21 +30,57 @@ def readings(cell: Cell, factor: float = 1.0) -> list[ScaleReading]:
 
 @pytest.mark.parametrize("name", ["demo", "gantry", "seven-axis"])
 def test_name_plates_that_agree_say_nothing_whatever_the_drive_train(name: str, checkout: Path) -> None:
-    cell = load_cell(checkout / f"configs/cells/{name}.yaml")
-    assert check_currents(cell, readings(cell)) == ()
+    path = checkout / f"configs/cells/{name}.yaml"
+    cell = load_cell(path)
+    assert check_nameplates(path, cell, readings(cell)) == ()
 
 
-def test_root_two_is_a_warning_for_each_axis_and_a_thousand_is_refused(checkout: Path) -> None:
-    cell = load_cell(checkout / "configs/cells/demo.yaml")
-    found = check_currents(cell, readings(cell, math.sqrt(2)))
+def test_root_two_is_a_warning_for_each_axis(checkout: Path) -> None:
+    path = checkout / "configs/cells/demo.yaml"
+    cell = load_cell(path)
+    found = check_nameplates(path, cell, readings(cell, math.sqrt(2)))
     assert sorted(", ".join(line.partition(":")[0] for line in found).split(", ")) == list(cell.axis_names)
     assert all("near √2" in line for line in found)
-    with pytest.raises(SetupRefused, match=r"node 1: profile generic-cia402: .* 1e\+03 times"):
-        check_currents(cell, readings(cell, 1000.0))
+
+
+@pytest.mark.parametrize(("factor", "refused"), [(0.32, True), (0.35, False), (2.9, False), (3.1, True)])
+def test_a_torque_constant_beyond_a_factor_of_three_is_refused_with_the_line(
+    checkout: Path, factor: float, refused: bool
+) -> None:
+    path = checkout / "configs/cells/demo.yaml"
+    cell = load_cell(path)
+    reported = readings(cell)
+    reported[3] = replace(reported[3], rated_torque_nm=factor * (reported[3].rated_torque_nm or 0.0))
+    line = 1 + next(n for n, text in enumerate(path.read_text().splitlines()) if "-11.52" in text)
+    if refused:
+        where = re.escape(f"demo.yaml:{line}: axes[3].nameplate_gain_nm_per_a")
+        with pytest.raises(ConfigurationInconsistent, match=f"{where}: .*-11.52 Nm/A, while .* drive's motor"):
+            check_nameplates(path, cell, reported)
+    else:
+        (warning,) = check_nameplates(path, cell, reported)
+        assert warning.startswith("J4: torque constants differ")
+
+
+def test_a_controller_with_another_gain_is_refused_with_both_lines(checkout: Path, tmp_path: Path) -> None:
+    configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
+    path, controller = configs / "cells/demo.yaml", configs / "controllers/demo.yaml"
+    check_controller(path, load_cell(path))
+    text = controller.read_text()
+    line = 1 + next(n for n, line in enumerate(text.splitlines()) if "25.65" in line)
+    controller.write_text(text.replace("25.65", "25650"))
+    words = f"axes[2].nameplate_gain_nm_per_a: found 25.65 Nm/A, while it is 2.565e+04 by demo.yaml, line {line}"
+    with pytest.raises(ConfigurationInconsistent, match=re.escape(words)):
+        check_controller(path, load_cell(path))
+    # In another unit by declaration, it is the same gain.
+    path.write_text(path.read_text().replace("drives.J3.gain,", "{key: drives.J3.gain, factor: 1000},"))
+    check_controller(path, load_cell(path))
+    controller.unlink()
+    check_controller(path, load_cell(path))
 
 
 def test_what_was_not_checked_and_what_is_no_reference_is_said(checkout: Path) -> None:
-    cell = load_cell(checkout / "configs/cells/demo.yaml")
+    path = checkout / "configs/cells/demo.yaml"
+    cell = load_cell(path)
     first = cell.axes[0]
     assert first.profile is not None
     actual = replace(first, profile=replace(first.profile, tap=TapPoint.ACTUAL), gain_unit="Nm/A(actual)")
@@ -51,7 +89,7 @@ def test_what_was_not_checked_and_what_is_no_reference_is_said(checkout: Path) -
     reported = readings(cell)
     for index in (2, 4):
         reported[index] = replace(reported[index], rated_torque_nm=None, warnings=("nothing",))
-    note, unit, nothing = check_currents(changed, reported)
+    note, unit, nothing = check_nameplates(path, changed, reported)
     assert note.startswith("J1: ACTUAL current, not the reference (generic-cia402 reports none)")
     assert unit == "J2: the gain is in Nm/V; the torque constant cannot be checked"
     assert nothing == "J3, J5: nothing"

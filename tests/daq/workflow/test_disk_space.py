@@ -47,7 +47,7 @@ def test_the_estimate_grows_with_what_it_depends_on() -> None:
     assert largest_log_bytes(names, 1000.0, 120.0, {}) > 1.9 * base
     assert largest_log_bytes(names, 500.0, 60.0, {}) < 0.7 * base
     assert largest_log_bytes((*names, "J3"), 1000.0, 60.0, {}) > base
-    assert largest_log_bytes(names, 1000.0, 60.0, {"robot.urdf": b"x" * 1000}) == base + 1000
+    assert largest_log_bytes(names, 1000.0, 60.0, {"robot.urdf": b"x" * 1000}) == base + 2000
 
 
 def test_a_real_disk_is_asked(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.config.clearance import Clearance
 from daq.errors import ConfigurationInconsistent, ExitCode, SchemaMismatch
+from daq.report.plan_preview import find_preview
 from daq.workflow.plan import Plan, plan
 from daq.workflow.plan_file import load_plan, save_plan
 from ident.planning.clearance import Box
@@ -124,6 +125,10 @@ def test_the_command_line_says_how_well_each_gain_will_be_seen(
     assert main(arguments) == ExitCode.OK
     text = capsys.readouterr().out
     assert "predicted σ" in text
-    assert "the way to its first target is not checked" in text
+    assert "The way to its first target is not checked: the cell file declares no `workspace`" in text
+    page = tmp_path / "look.html"
+    for _ in range(2):  # a preview is replaced
+        assert main([*arguments, "--preview", str(page)]) == ExitCode.OK
+    assert find_preview(tmp_path / "plan.yaml") == page
     assert main([*arguments, "--sigma", "0.1"]) == ExitCode.USAGE
     assert main([*arguments, "--payload", "anvil"]) == ExitCode.CONFIGURATION

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from ident.data.run import Run
 from ident.errors import CurrentReversed, ModelContradicted, PayloadDiffers, UnitsMistaken
 from ident.estimators.diagnosis import (
-    UNIT_RATIO,
     axis_error_diagnoses,
     diagnose,
     exchanged_channels,
@@ -25,6 +24,7 @@ from ident.estimators.estimate import RelativeError
 from ident.estimators.identify import identify, require_plausible
 from ident.estimators.method import Method
 from ident.estimators.payload_diagnosis import payload_differences
+from ident.plausible import UNIT_RATIO
 from tests.ident.mistaken import AXES, BODY, SMALL, diagnosed, small_recordings, turned, with_currents
 from tests.ident.recordings import MOUNTED, FloatArray, Truth, record
 

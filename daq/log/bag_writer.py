@@ -1,0 +1,235 @@
+"""Write a log as a rosbag2 folder: a bag in MCAP and its `metadata.yaml`, with all numbers in SI.
+
+`metadata.yaml` is of version 5, which ROS 2 reads from Humble on. Topics are reliable and volatile, but for the robot's
+description: like `robot_state_publisher`, it keeps the last message for late subscribers.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
+
+from daq.config.cell import Cell, joint_names
+from daq.config.cell_file import cell_from_bundle
+from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
+from daq.files import fsync_folder
+from daq.log.conversion import scaling, unwrapped
+from daq.log.message import (
+    CURRENTS_SCHEMA,
+    CURRENTS_TOPIC,
+    DEFINITIONS,
+    EVENTS_SCHEMA,
+    EVENTS_TOPIC,
+    JOINTS_SCHEMA,
+    JOINTS_TOPIC,
+    READING_SCHEMA,
+    READING_TOPICS,
+    URDF_SCHEMA,
+    URDF_TOPIC,
+    currents_bytes,
+    event_bytes,
+    joint_state_bytes,
+    joint_state_prefix,
+    reading_bytes,
+    text_bytes,
+)
+from daq.log.reader import Log, read_log
+from ident.arrays import FloatArray
+from ident.model.model import DriveTrain
+
+VELOCITY_S = 0.02  #: Time over which a velocity is the mean, as in a log's own joint states
+_SCHEMAS = {
+    URDF_TOPIC: URDF_SCHEMA,
+    JOINTS_TOPIC: JOINTS_SCHEMA,
+    CURRENTS_TOPIC: CURRENTS_SCHEMA,
+    EVENTS_TOPIC: EVENTS_SCHEMA,
+    **dict.fromkeys(READING_TOPICS.values(), READING_SCHEMA),
+}
+_RELIABLE, _VOLATILE, _TRANSIENT_LOCAL, _KEEP_LAST, _AUTOMATIC = 1, 2, 1, 1, 1  # values of rmw's enumerations
+
+
+@dataclass(frozen=True, slots=True)
+class BagWritten:
+    """A bag that was written."""
+
+    messages: dict[str, int]  #: number of messages by topic
+    duration_s: float  #: from the first to the last message [s]
+    partial: bool  #: the log was never finished
+    valid: bool  #: whether the recorder marked the run valid
+    reason: str  #: why not
+
+
+def export_bag(path: Path, out: Path, gains: Mapping[str, float] | None = None) -> BagWritten:
+    """Write a bag from a log: joint states and currents at every SYNC, events, slow readings, the URDF.
+
+    Args:
+        path: log to read.
+        out: folder to make; must not exist.
+        gains: drive gain of each axis by its name [Nm or N per unit of the current], for the effort of the joint
+            states; None without a calibration.
+
+    Raises:
+        UsageError: a file or folder of that name exists.
+        OutputFailed: the file system refuses; nothing is left.
+        ConfigurationInconsistent: the gains are of other axes than the log.
+        LogUnreadable: the log is damaged or incomplete; nothing is written.
+    """
+    if out.exists():
+        raise UsageError(
+            str(out), found="a file or folder of that name", expected="none", remedy="choose another --out"
+        )
+    log = read_log(path)
+    cell = cell_from_bundle(log.head.files, names={"cell.yaml": f"{path}, cell.yaml"})
+    if gains is not None and set(gains) != set(cell.axis_names):
+        raise ConfigurationInconsistent(
+            str(path),
+            found=f"axes {', '.join(cell.axis_names)}",
+            expected=f"those of the calibration, {', '.join(gains)}",
+            remedy="give a calibration of this cell",
+        )
+    ordered = [] if gains is None else [gains[name] for name in cell.axis_names]
+    messages = sorted(_messages(log, cell, ordered), key=lambda message: message[0])
+    counts = Counter(topic for _, topic, _ in messages)
+    first_ns, last_ns = messages[0][0], messages[-1][0]
+    unfinished, name = out.with_name(out.name + ".part"), f"{out.name}_0.mcap"
+    try:
+        unfinished.mkdir()
+        try:
+            with (unfinished / name).open("wb") as stream:
+                _write(Writer(stream, compression=CompressionType.ZSTD), messages)
+            (unfinished / "metadata.yaml").write_text(_metadata(name, counts, first_ns, last_ns), encoding="utf-8")
+            unfinished.rename(out)
+        except BaseException:
+            shutil.rmtree(unfinished, ignore_errors=True)
+            raise
+        fsync_folder(out)
+    except OSError as error:
+        raise OutputFailed.of(out, error) from error
+    said = log.statistics
+    return BagWritten(dict(sorted(counts.items())), (last_ns - first_ns) * 1e-9, log.partial, said.valid, said.reason)
+
+
+def _messages(log: Log, cell: Cell, gains: Sequence[float]) -> Iterator[tuple[int, str, bytes]]:
+    """Yield stamp [ns], topic and CDR bytes of every message."""
+    samples, scale = log.samples, scaling(cell, log.head.readback)
+    is_counter = np.array([axis.position_rad_per_count is None for axis in log.head.readback.axes])
+    counts = np.where(is_counter, unwrapped(samples.position_counts), samples.position_counts)
+    position = scale.joint_position(counts)
+    velocity = mean_velocity(position, samples.time_ns)
+    current = samples.current_raw * scale.current_per_unit
+    effort = joint_effort(cell, current, gains) if len(gains) else np.empty((len(current), 0))
+    prefix = joint_state_prefix(joint_names(cell))
+    stamps = samples.time_ns.tolist()
+    yield stamps[0], URDF_TOPIC, text_bytes(cell.urdf)
+    rows = zip(stamps, position.tolist(), velocity.tolist(), effort.tolist(), current.tolist(), strict=True)
+    for time_ns, *state, ampere in rows:
+        yield time_ns, JOINTS_TOPIC, joint_state_bytes(prefix, time_ns, *state)
+        yield time_ns, CURRENTS_TOPIC, currents_bytes(time_ns, ampere)
+    for event in log.events:
+        yield event.time_ns, EVENTS_TOPIC, event_bytes(event)
+    for reading in log.readings:
+        yield reading.time_ns, READING_TOPICS[reading.quantity], reading_bytes(reading)
+
+
+def mean_velocity(position: FloatArray, time_ns: NDArray[np.int64]) -> FloatArray:
+    """Mean velocity over VELOCITY_S about each sample, shorter at the ends [rad/s or m/s], shape (k, n).
+
+    Args:
+        position: [rad or m], shape (k, n).
+        time_ns: increasing [ns], shape (k,).
+    """
+    half_ns, last = round(0.5e9 * VELOCITY_S), len(time_ns) - 1
+    index = np.arange(last + 1)
+    before = np.minimum(np.searchsorted(time_ns, time_ns - half_ns), np.maximum(index - 1, 0))
+    after = np.maximum(np.searchsorted(time_ns, time_ns + half_ns, side="right") - 1, np.minimum(index + 1, last))
+    elapsed_s = np.maximum(time_ns[after] - time_ns[before], 1) * 1e-9
+    return np.asarray((position[after] - position[before]) / elapsed_s[:, None])
+
+
+def joint_effort(cell: Cell, current: FloatArray, gains: Sequence[float]) -> FloatArray:
+    """Torque of the drives on each joint, Y = V g (paper eq. 4 through R) [Nm or N], shape (k, n).
+
+    Args:
+        cell: with the drive train.
+        current: [unit of the gains' denominator], shape (k, n).
+        gains: g of each axis, shape (n,).
+    """
+    return np.asarray((np.asarray(gains) * current) @ DriveTrain(cell.ratio).direction)
+
+
+def _write(writer: Writer, messages: Sequence[tuple[int, str, bytes]]) -> None:
+    writer.start(profile="ros2", library="drivegain")
+    channels: dict[str, int] = {}
+    schemas: dict[str, int] = {}
+    for time_ns, topic, data in messages:
+        if topic not in channels:
+            schema = _SCHEMAS[topic]
+            if schema not in schemas:
+                schemas[schema] = writer.register_schema(schema, "ros2msg", DEFINITIONS[schema].encode())
+            metadata = {"offered_qos_profiles": "".join(f"{line}\n" for line in _qos(topic))}
+            channels[topic] = writer.register_channel(topic, "cdr", schemas[schema], metadata)
+        writer.add_message(channels[topic], time_ns, data, time_ns)
+    writer.finish()
+
+
+def _qos(topic: str) -> list[str]:
+    """Return the lines of the quality of service that a topic was offered with."""
+    kept = topic == URDF_TOPIC
+    forever = ["  {}:", "    sec: 9223372036", "    nsec: 854775807"]
+    return [
+        f"- history: {_KEEP_LAST}",
+        f"  depth: {1 if kept else 10}",
+        f"  reliability: {_RELIABLE}",
+        f"  durability: {_TRANSIENT_LOCAL if kept else _VOLATILE}",
+        *(line.format(key) for key in ("deadline", "lifespan") for line in forever),
+        f"  liveliness: {_AUTOMATIC}",
+        *(line.format("liveliness_lease_duration") for line in forever),
+        "  avoid_ros_namespace_conventions: false",
+    ]
+
+
+def _metadata(name: str, counts: Counter[str], first_ns: int, last_ns: int) -> str:
+    """Return the text of `metadata.yaml`."""
+    span = [f"nanoseconds: {last_ns - first_ns}", f"nanoseconds_since_epoch: {first_ns}", f"{sum(counts.values())}"]
+    lines = [
+        "rosbag2_bagfile_information:",
+        "  version: 5",
+        "  storage_identifier: mcap",
+        "  duration:",
+        f"    {span[0]}",
+        "  starting_time:",
+        f"    {span[1]}",
+        f"  message_count: {span[2]}",
+        "  topics_with_message_count:",
+    ]
+    for topic, count in sorted(counts.items()):
+        lines += [
+            "    - topic_metadata:",
+            f"        name: {topic}",
+            f"        type: {_SCHEMAS[topic]}",
+            "        serialization_format: cdr",
+            "        offered_qos_profiles: |",
+            *(f"          {line}" for line in _qos(topic)),
+            f"      message_count: {count}",
+        ]
+    lines += [
+        '  compression_format: ""',
+        '  compression_mode: ""',
+        "  relative_file_paths:",
+        f"    - {name}",
+        "  files:",
+        f"    - path: {name}",
+        "      starting_time:",
+        f"        {span[1]}",
+        "      duration:",
+        f"        {span[0]}",
+        f"      message_count: {span[2]}",
+    ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,106 @@
+"""Compare the nameplate gains of a cell with the controller's file, and with the motors' data in the drives.
+
+A mistyped nameplate is found before anything moves. What tolerances and gear losses can explain is a warning at most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from daq.config.cell import Cell
+from daq.config.yaml_file import Fault, describe, parse_yaml
+from daq.config.yaml_file import read_bytes as read_configuration
+from daq.errors import ConfigurationInconsistent, ControllerUnfit
+from daq.report.bus import actual_current_note
+from daq.writeback.formats.document import decode, read_bytes
+from drivers.profiles.scale import ScaleReading, check_name_plate
+from ident.model.model import DriveTrain
+from ident.plausible import GAIN_RATIO
+
+Reference = tuple[float, str]  #: a gain of an axis from elsewhere, in the unit of its nameplate, and its source
+
+
+def check_controller(cell_file: Path, cell: Cell) -> None:
+    """Compare each nameplate with the gain in the controller's file.
+
+    A file that cannot be read, or without such a number, is left to `drivegain apply`: there need not be one before.
+
+    Args:
+        cell_file: file of the cell, for the lines.
+        cell: content of it.
+
+    Raises:
+        ConfigurationInconsistent: one is more than GAIN_RATIO times the other.
+    """
+    controller, file = cell.controller, cell.controller_path
+    if controller is None or file is None:
+        return
+    try:
+        numbers = decode(read_bytes(file), str(file), controller.format).locate(controller.keys)
+    except ControllerUnfit:
+        return
+    gains = [number.value / factor for number, factor in zip(numbers, controller.factors, strict=True)]
+    sources = [f"by {file.name}, line {number.line}" for number in numbers]
+    _require_alike(cell_file, cell, list(zip(gains, sources, strict=True)))
+
+
+def check_nameplates(cell_file: Path, cell: Cell, readings: Sequence[ScaleReading]) -> tuple[str, ...]:
+    """Compare each nameplate with the controller's gain, and with N·Kt of the motor's data in the drive (paper eq. 4).
+
+    Args:
+        cell_file: file of the cell, for the lines.
+        cell: content of it.
+        readings: of each drive.
+
+    Returns:
+        Warnings about the recorded currents: no reference, what could not be checked, what differs.
+
+    Raises:
+        ConfigurationInconsistent: one is more than GAIN_RATIO times the other.
+    """
+    check_controller(cell_file, cell)
+    axes_by_warning: dict[str, list[str]] = {}
+    references = list[Reference | None]()
+    for axis, reduction, reading in zip(cell.axes, DriveTrain(cell.ratio).reduction, readings, strict=True):
+        found, constant = reading.warnings, reading.torque_constant_nm_per_a
+        if axis.profile is None or not axis.gain_unit.startswith(("Nm/A", "N/A")):
+            found += (f"the gain is in {axis.gain_unit}; the torque constant cannot be checked",)
+            constant = None
+        else:
+            found += check_name_plate(reading, axis.profile.amplitude, axis.nameplate_gain / float(reduction))
+        source = f"by N·Kt of the drive's motor ({reading.rated_torque_nm} Nm / {reading.rated_current_a} A)"
+        references.append(None if constant is None else (constant * abs(float(reduction)), source))
+        for warning in found:
+            axes_by_warning.setdefault(warning, []).append(axis.name)
+    _require_alike(cell_file, cell, references)
+    note = actual_current_note(cell)
+    grouped = tuple(f"{', '.join(names)}: {warning}" for warning, names in axes_by_warning.items())
+    return grouped if note is None else (note, *grouped)
+
+
+def _require_alike(cell_file: Path, cell: Cell, references: Sequence[Reference | None]) -> None:
+    """Refuse nameplates whose size is beyond GAIN_RATIO of a reference; signs are compared before a write."""
+    wrong = [
+        (index, axis.nameplate_gain, axis.gain_unit, reference)
+        for index, (axis, reference) in enumerate(zip(cell.axes, references, strict=True))
+        if reference is not None and not _alike(axis.nameplate_gain, reference[0])
+    ]
+    if not wrong:
+        return
+    document = parse_yaml(read_configuration(cell_file), str(cell_file))
+    faults = []
+    for index, nameplate, unit, (gain, source) in wrong:
+        keys = document.tree["axes"][index]
+        key = next(key for key in keys if key.startswith("nameplate_gain"))
+        found = f"{nameplate:g} {unit}, while it is {gain:.4g} {source}"
+        faults.append(Fault(("axes", index, key), found, f"the same within a factor of {GAIN_RATIO:g}"))
+    raise ConfigurationInconsistent(
+        **describe(document, faults),
+        remedy="correct the nameplate, the gear ratio or the other number: is one of them in another unit (mA, mNm), "
+        "on the motor's side, or of another axis?",
+    )
+
+
+def _alike(one: float, other: float) -> bool:
+    return abs(one) < GAIN_RATIO * abs(other) and abs(other) < GAIN_RATIO * abs(one)

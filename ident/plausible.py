@@ -1,0 +1,21 @@
+"""Limits of plausible numbers: one table for cell files, for commissioning and for the diagnoses of a fit.
+
+A number beyond its limit is in another unit, of another axis or mistyped; no property of a robot explains it.
+"""
+
+from __future__ import annotations
+
+GAIN_RATIO = 3.0
+"""Largest ratio of two gains of one axis, and smallest inverse: identified, nameplate, N·Kt of the motor's data, the
+controller's. Tolerances and losses give 0.7 to 1.3."""
+UNIT_RATIO = 30.0  #: Ratio of all gains to their nameplates that no drive explains, only a unit
+TORQUE_RATIO = 10.0  #: Torque on every axis (root mean square), relative to the URDF's effort limit
+GRAVITY_M_S2 = (9.7, 9.9)  #: Size of gravity anywhere on Earth [m/s²]
+HEAVIEST_PAYLOAD_KG = 2500.0  #: The strongest arms carry 2300 kg; a cell that carries more states its rated payload
+PAYLOAD_RATIO = 200.0  #: Mass of the heaviest payload relative to the lightest: g read as kg makes it 1000
+TOLERANCE_SHARE = 0.1  #: Largest tolerance of a payload's mass, relative to it: a wrong weight scales all gains alike
+FARTHEST_DEG, FARTHEST_MM = 720.0, 100_000.0  #: Largest joint position
+SHORTEST_DEG, SHORTEST_MM = 0.2, 5.0  #: Smallest range of a joint
+SHORTEST_OF_ALL_DEG = 12.6
+"""Smallest range of the widest joint: four π, so that ±2π rad written as degrees are below it. No moves within a few
+degrees on every axis identify a gain."""

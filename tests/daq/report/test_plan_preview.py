@@ -1,0 +1,110 @@
+"""The page of a plan: what it draws is the plan, and it is found again by the plan's content."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daq.config.cell import Cell, model_of
+from daq.config.cell_file import load_cell
+from daq.config.clearance import Clearance
+from daq.report.plan_preview import STEP_S, find_preview, preview_data, preview_page
+from daq.workflow.experiment import PlannedMove, duration_of, scene_of
+from daq.workflow.plan import Plan
+from daq.workflow.plan_file import check_approach
+from drivers.errors import MotionRefused
+from ident.model.robot import poses
+from ident.planning.clearance import Box, Checker
+
+TARGETS = ((0.0, 0.0, 1.2, 0.0, 0.0, 0.0), (0.8, 0.4, 0.6, 0.0, 0.5, 0.0), (-0.8, -0.4, 1.2, 1.0, -0.5, 2.0))
+MOVES = tuple(PlannedMove(target, 0.5, 0.5, 0.1) for target in TARGETS)
+PLAN = Plan("demo", 1, 100.0, (), 1.0, MOVES, ())
+WALL = Box("wall", (0.3, -0.05, 0.0), (0.6, 0.05, 1.0))
+
+
+@pytest.fixture(scope="module")
+def cell(checkout: Path) -> Cell:
+    """The demo cell with a wall in front of the arm."""
+    clearance = Clearance(None, 0.02, (), (WALL,))
+    return replace(load_cell(checkout / "configs/cells/demo.yaml"), clearance=clearance)
+
+
+@pytest.fixture(scope="module")
+def checker(cell: Cell) -> Checker:
+    """Distances of its arm."""
+    return scene_of(cell, model_of(cell).robot, 4.59).checker
+
+
+@pytest.fixture(scope="module")
+def drawn(cell: Cell, checker: Checker) -> dict[str, Any]:
+    """The data of its page."""
+    found: dict[str, Any] = json.loads(json.dumps(preview_data(cell, MOVES, checker)))
+    return found
+
+
+def test_the_rows_pass_through_every_target_at_its_time(cell: Cell, drawn: dict[str, Any]) -> None:
+    at = poses(model_of(cell).robot, np.array(TARGETS)).origin_m.swapaxes(0, 1)
+    chains = np.array(drawn["origins_m"])
+    np.testing.assert_allclose(chains[0], at[0], atol=0.001)
+    np.testing.assert_allclose(chains[-1], at[-1], atol=0.001)
+    second = [row for row, number in enumerate(drawn["move"]) if number == 2]
+    assert np.abs(chains[second] - at[1]).max(axis=(1, 2)).min() < 0.001
+    assert drawn["time_s"][-1] == pytest.approx(duration_of(cell, MOVES), abs=2 * STEP_S)
+    # Half of its limits at most, and the slowest axis of each move at just that.
+    speeds = np.array([axis["values"] for axis in drawn["speeds"]])
+    assert 45.0 < speeds.max() <= 50.1
+
+
+def test_a_capsule_is_where_the_arm_is_and_the_clearance_that_of_the_checker(
+    checker: Checker, drawn: dict[str, Any]
+) -> None:
+    capsules = checker.scene.capsules
+    at = poses(checker.robot, np.array([TARGETS[0]]))
+    for capsule, ends in zip(capsules, drawn["ends_m"][0], strict=True):
+        rotation, origin = at.rotation[capsule.link + 1, 0], at.origin_m[capsule.link + 1, 0]
+        expected = [rotation @ np.array(end) + origin for end in (capsule.start_m, capsule.end_m)]
+        np.testing.assert_allclose(ends, expected, atol=0.001)
+    margin_m = checker.margins(np.array([TARGETS[0], TARGETS[-1]]))
+    found = [drawn["clearance_mm"][row] for row in (0, -1)]
+    np.testing.assert_allclose(found, 1000.0 * (margin_m + 0.02), atol=0.06)
+    assert [box["name"] for box in drawn["boxes"]] == ["wall"]
+
+
+def test_the_page_needs_no_other_file_and_runs_only_its_own_script(cell: Cell, checker: Checker) -> None:
+    hostile = replace(cell, name="</script><script>alert(1)</script>")
+    page = preview_page(hostile, MOVES, checker, b"plan")
+    assert not re.search(r"https?:|src=|url\(", page)
+    assert "<script>alert" not in page
+    (script,) = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"default-src 'none'; script-src 'sha256-{digest}'" in page
+
+
+def test_a_preview_is_found_by_the_content_of_its_plan(cell: Cell, checker: Checker, tmp_path: Path) -> None:
+    plan = tmp_path / "plan.yaml"
+    plan.write_bytes(b"moves")
+    (tmp_path / "another.html").write_text("<html>")
+    assert find_preview(plan) is None
+    (tmp_path / "look.html").write_text(preview_page(cell, MOVES, checker, b"moves"))
+    assert find_preview(plan) == tmp_path / "look.html"
+    plan.write_bytes(b"other moves")
+    assert find_preview(plan) is None
+
+
+def test_a_way_to_the_first_target_through_a_wall_is_refused(cell: Cell) -> None:
+    """The arm, stretched forward, swings about J1 from one side of the wall to the other."""
+    aside = np.array([1.2, 1.5, 0.0, 0.0, 0.0, 0.0])
+    through = replace(PLAN, moves=(replace(MOVES[0], target_rad=(-1.2, *aside[1:].tolist())),))
+    with pytest.raises(MotionRefused, match=r"first target of the plan: found -?\d+ mm between .* and wall at"):
+        check_approach(cell, through, aside)
+    check_approach(replace(cell, clearance=None), through, aside)
+    same_side = replace(PLAN, moves=(replace(MOVES[0], target_rad=(1.0, *aside[1:].tolist())),))
+    check_approach(cell, same_side, aside)
