@@ -41,6 +41,7 @@ def record_verb(
     from daq.config.bus import bus_loads
     from daq.config.cell import PacingMode
     from daq.config.cell_file import load_cell
+    from daq.console.feed import Feed
     from daq.environment import login
     from daq.report.bus import load_lines
     from daq.workflow.plan import slowed
@@ -64,7 +65,12 @@ def record_verb(
     if allowed_by is not None and not enable_motion:
         typer.echo(f"motion is enabled by {allowed_by} in the cell file; the axes move now", err=True)
     try:
-        with bus_lock(declared), interruptible() as block_signals, progress_bar("recording") as report_progress:
+        with (
+            bus_lock(declared),
+            interruptible() as block_signals,
+            Feed(cell) as feed,
+            progress_bar("recording") as report_progress,
+        ):
             done = record(
                 cell,
                 declared,
@@ -78,6 +84,7 @@ def record_verb(
                 entered_kg=mass,
                 block_signals=block_signals,
                 progress=lambda count, total: report_progress(count, total, "moves"),
+                feed=feed,
             )
     except KeyboardInterrupt as interrupt:
         made = next((path for path in (out, part) if path.exists()), None)
