@@ -165,9 +165,10 @@ class Live:
             self.done = max(self.done, event["code"] + 1)
         axis = None if event["axis"] is None else self.cell.axis_names[event["axis"]]
         remedy = remedy_of(event["code"]) if kind is EventKind.EMCY else REMEDIES.get(kind, "")
+        text = event["text"].removeprefix(f"{axis}: ")
         time_s = 1e-9 * (event["time_ns"] - self._origin_ns)
         return {
-            **{"time_s": round(time_s, 6), "axis": axis, "kind": kind.value, "text": event["text"]},
+            **{"time_s": round(time_s, 6), "axis": axis, "kind": kind.value, "text": text},
             **{"remedy": remedy, "alarm": kind in ALARMING},
         }
 

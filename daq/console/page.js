@@ -18,8 +18,10 @@ function number(value, digits) {
   return value === null || value === undefined ? "–" : value.toFixed(digits);
 }
 
-function significant(value, digits) {
-  return value === null ? "–" : value.toPrecision(digits).replace(/e\+?/, "·10^");
+// A value with as many digits as the first two of its standard deviation.
+function withDeviation(value, std) {
+  const digits = std > 0 ? Math.min(10, Math.max(0, 1 - Math.floor(Math.log10(std)))) : 4;
+  return `${number(value, digits)} ± ${number(std, digits)}`;
 }
 
 // ---- Axes
@@ -162,7 +164,7 @@ function drawAll() {
     const predicted = rows.map((row) => [row[0], row[1 + axis.index]]);
     const residual = rows.map((row) => [row[0], row[1 + axes.length + axis.index]]);
     draw(axis.current, colors, begin, end,
-      [{ points: measured, color: colors.current }, { points: predicted, color: colors.predicted, thickness: 2 }],
+      [{ points: predicted, color: colors.predicted, thickness: 4 }, { points: measured, color: colors.current }],
       [{ points: predicted, half, color: colors.band }], axis.current_unit);
     axis.residual.hidden = !shown.rows.length;
     if (shown.rows.length) {
@@ -194,8 +196,8 @@ function showStatus(status) {
     ["Samples", String(status.samples)],
     ["SYNC cycles lost", String(status.lost), status.lost > 0],
     ["Missing answers", String(status.missing), status.missing > 0],
-    ["SYNC rate", `${number(status.rate_hz, 0)} Hz`],
-    ["Bus load, computed", loads || "–"],
+    ["SYNC rate", running ? `${number(status.rate_hz, 0)} Hz` : "–"],
+    ["Bus load, computed", running && loads ? loads : "–"],
     ["Disk free", status.free_bytes === null ? "–" : `${number(status.free_bytes / 1e9, 1)} GB`],
     ["Packets this page missed", String(status.dropped)],
   ];
@@ -278,9 +280,9 @@ function signed(value, digits, unit) {
 function showResults(found) {
   const parts = found.problems.map((text) => element("p", text, "alarm"));
   if (found.gains) {
-    parts.push(element("h3", `Gains of ${found.gains.file}, fitted ${found.gains.created}`));
+    parts.push(element("h3", `Gains of ${found.gains.file}, fitted ${found.gains.created.slice(0, 16).replace("T", " ")}`));
     parts.push(table(["axis", "gain ± σ", "unit", "from the nameplate", `error on ${found.gains.error}`],
-      found.gains.axes.map((one) => [one.axis, `${significant(one.value, 6)} ± ${significant(one.std, 2)}`, one.unit,
+      found.gains.axes.map((one) => [one.axis, withDeviation(one.value, one.std), one.unit,
         signed(one.change_percent, 2, "%"), `${number(one.error_percent, 2)} %`])));
   } else parts.push(element("p", "No calibration yet. After the recordings: drivegain fit LOG … --out calibration.yaml"));
   if (found.report) {
