@@ -38,7 +38,7 @@ def console_verb(
     from daq.config.cell_file import load_cell
     from daq.console.live import Live
     from daq.console.results import Places, Results
-    from daq.console.server import Page, hosts_of, listen, new_token, serve
+    from daq.console.server import Page, hosts_of, listen, new_token, server_of
 
     declared = load_cell(cell)
     results = Results(Places(cell, declared, calibration, report))
@@ -57,7 +57,7 @@ def console_verb(
     with listener:
         port, token = listener.getsockname()[1], new_token()
         typer.echo(f"Open http://127.0.0.1:{port}/{token}/ in a browser on this computer; Ctrl-C ends the page.")
-        serve(Page(declared, live, results).app(token, hosts_of(port)), listener)
+        server_of(Page(declared, live, results).app(token, hosts_of(port))).run(sockets=[listener])
 
 
 CONSOLE = Verb("console", console_verb, "drivegain console cells/demo.yaml --calibration calibration.yaml")

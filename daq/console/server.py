@@ -239,8 +239,8 @@ def hosts_of(port: int) -> frozenset[str]:
     return frozenset({f"127.0.0.1:{port}", f"localhost:{port}"})
 
 
-def serve(app: ASGIApp, listener: socket.socket) -> None:
-    """Serve until SIGINT or SIGTERM; a page that does not read is not waited for."""
+def server_of(app: ASGIApp) -> uvicorn.Server:
+    """Return a server of plain HTTP/1.1; when it ends, it waits a second for pages that do not read."""
     config = uvicorn.Config(
         app,
         log_level="warning",
@@ -251,4 +251,4 @@ def serve(app: ASGIApp, listener: socket.socket) -> None:
         limit_concurrency=CONNECTIONS,
         timeout_graceful_shutdown=1,
     )
-    uvicorn.Server(config).run(sockets=[listener])
+    return uvicorn.Server(config)
