@@ -109,6 +109,7 @@ class Live:
         self.samples = self.lost = self.missing = self.dropped = self.done = 0
         self._number: int | None = None
         self._last: Any = None
+        self._words = [0] * len(self.cell.axes)
         self._origin_ns: int | None = None
         self._predictor: Predictor | None = None
         self._band = [nan] * len(self.cell.axes)
@@ -163,6 +164,9 @@ class Live:
         kind = EventKind(event["kind"])
         if kind is EventKind.MOVE_END:
             self.done = max(self.done, event["code"] + 1)
+        if kind is EventKind.STATE and event["axis"] is not None:
+            # The stop after a fault has no samples, but its states are events.
+            self._words[event["axis"]] = event["code"]
         axis = None if event["axis"] is None else self.cell.axis_names[event["axis"]]
         remedy = remedy_of(event["code"]) if kind is EventKind.EMCY else REMEDIES.get(kind, "")
         text = event["text"].removeprefix(f"{axis}: ")
@@ -180,7 +184,7 @@ class Live:
         shown = samples["cycle"] % self._every == 0
         times = 1e-9 * (samples["time_ns"] - self._origin_ns)
         self.points.add(np.column_stack((times, position / self._unit, current))[shown].tolist())
-        self._last = samples[-1]
+        self._last, self._words = samples[-1], samples[-1]["statusword"].tolist()
         if self._predictor is not None and not self.remark:
             self._predict(samples, position, current, float(times[-1]))
 
@@ -228,7 +232,7 @@ class Live:
                 "position": float(position[index]),
                 "current": float(current[index]),
             }
-            for index, word in enumerate(last["statusword"].tolist())
+            for index, word in enumerate(self._words)
         ]
 
     @property

@@ -7,6 +7,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from http.client import HTTPConnection, HTTPResponse
 from pathlib import Path
 
@@ -17,6 +18,9 @@ from daq.console.results import Places, Results
 from daq.console.server import Page, hosts_of, listen, server_of
 from daq.log.metadata import RunStatistics
 from drivers.stream.sample import Sample
+from ident.calibration import Calibration, Parameter
+from ident.data.conditioning import Conditioning
+from tests.daq.calibrations import demo_calibration
 
 TOKEN = "the-token-of-the-test"
 RATE_HZ = 500.0
@@ -28,6 +32,18 @@ def facts(cell: Cell, log: Path) -> RunFacts:
     identity = [[float(row == column) for column in range(count)] for row in range(count)]
     scales = [1e-3] * count, [1e-3] * count, identity, [0.0] * count
     return RunFacts("id", str(log), cell.axis_names, RATE_HZ, 3, *scales, None, {"can0": 0.4})
+
+
+def predicting_calibration() -> Calibration:
+    """A calibration of the demo cell with every filter and without effects."""
+    filters = Conditioning(standstill_rad_s=(0.03,) * 6).document()
+    # Without dry friction, whose sign depends on the last digit of a speed near zero.
+    each = {"Ia": 1.0, "fv": 3.0, "off": 0.5}
+    parameters = tuple(
+        Parameter(f"{name}{axis}", value / axis, 0.1, "SI") for name, value in each.items() for axis in range(1, 7)
+    )
+    gravity = Parameter("mx2", 2.0, 0.1, "kg m"), Parameter("my3", -1.0, 0.1, "kg m")
+    return replace(demo_calibration(), filter=filters, effects=(), parameters=(*parameters, *gravity))
 
 
 class Recording:
