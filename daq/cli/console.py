@@ -22,7 +22,7 @@ def console_verb(
     ] = None,
     port: Annotated[int, typer.Option(help="Port on 127.0.0.1; 0 takes a free one.", min=0, max=65535)] = 0,
 ) -> None:
-    """Serve a page that shows the cell while it is recorded or monitored; open the address that is printed.
+    """Serve a page that shows the cell while it is recorded; open the address that is printed.
 
     The page reads only, but for a stop button, which does what Ctrl-C does to `record` and `recalibrate` and is no
     safety function. It never opens the bus, and cannot delay a recording. Ctrl-C ends the page alone.

@@ -59,14 +59,12 @@ class RunFacts:
     offset_rad: list[float]  #: joint positions at zero counts [rad; m of a prismatic joint]
     payload: str | None  #: name in the cell file
     bus_load: dict[str, float]  #: mean load of each bus at this rate, as a share
-    by: str = "recorder"  #: the program that publishes
-    can_stop: bool = True  #: whether a stop does anything
 
 
-def socket_names(cell_file: Path, by: str = "recorder") -> tuple[str, str]:
+def socket_names(cell_file: Path) -> tuple[str, str]:
     """Return the addresses of feed and stop for a cell file, in the abstract namespace."""
     digest = hashlib.sha256(str(cell_file.resolve()).encode()).hexdigest()[:24]
-    name = f"\0drivegain-{digest}-{by}"
+    name = f"\0drivegain-{digest}"
     return f"{name}-feed", f"{name}-stop"
 
 
@@ -109,16 +107,15 @@ class Feed:
     Where its addresses are taken, by another program on this cell, nothing is published and `remark` says so.
     """
 
-    def __init__(self, cell_file: Path, stop: Callable[[], None] = interrupt_main_thread, by: str = "recorder") -> None:
+    def __init__(self, cell_file: Path, stop: Callable[[], None] = interrupt_main_thread) -> None:
         """Store the arguments.
 
         Args:
             cell_file: of the cell; consoles of the same file find the feed.
             stop: does what a stop asks for, in another thread than the caller's.
-            by: the program that publishes; each has its own addresses.
         """
         self.remark = ""
-        self._names, self._stop = socket_names(cell_file, by), stop
+        self._names, self._stop = socket_names(cell_file), stop
         self._listening: list[socket.socket] = []
         self._new: deque[socket.socket] = deque()
         self._consoles: list[socket.socket] = []

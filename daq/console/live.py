@@ -45,7 +45,6 @@ KEPT_EVENTS = 500
 RETRY_S = 0.5  #: Time between two tries to find a feed
 STOP_ACCEPTED_S = 3.0  #: Time for the recorder's answer to a stop
 STOP_ENDED_S = 60.0  #: Time until the recorder must have ended
-SOURCES = ("recorder", "monitor")  #: Programs that publish; the first has precedence
 
 GONE = (
     "the recorder is gone without a word: it was killed or has crashed. The amplifiers stop by themselves where they "
@@ -250,11 +249,9 @@ class Live:
         return None
 
     async def follow(self) -> None:
-        """Follow the feeds of the cell, one after the other, for ever."""
+        """Follow the recorders of the cell, one after the other, for ever."""
         while True:
-            connection = None
-            for by in SOURCES:
-                connection = connection or _connected(socket_names(self._file, by)[0], socket.SOCK_SEQPACKET, 0.0)
+            connection = _connected(socket_names(self._file)[0], socket.SOCK_SEQPACKET, 0.0)
             if connection is not None:
                 with connection:
                     await self._read(connection)

@@ -178,7 +178,7 @@ function drawAll() {
 // ---- Words and figures
 
 const PHASES = {
-  waiting: "No recording runs. Start one in a terminal: drivegain record, recalibrate or monitor.",
+  waiting: "No recording runs. Start one in a terminal: drivegain record or drivegain recalibrate.",
   running: "The drives are prepared…",
   ended: "The last run has ended.",
 };
@@ -186,9 +186,9 @@ const PHASES = {
 function showStatus(status) {
   const run = shown.run;
   const running = status.phase === "running";
-  byId("phase").textContent = running && run ? (run.by === "monitor" ? "Monitored" : "Recording") : PHASES[status.phase];
-  byId("stop").disabled = !(running && (!run || run.can_stop));
-  byId("log").textContent = run ? (run.log || run.by) : "no run yet";
+  byId("phase").textContent = running && run ? "Recording" : PHASES[status.phase];
+  byId("stop").disabled = !running;
+  byId("log").textContent = run ? run.log : "no run yet";
   byId("moves").value = status.moves ? status.done / status.moves : 0;
   byId("done").textContent = status.moves ? `${status.done} of ${status.moves} moves` : "";
   const loads = Object.entries(status.bus_load).map(([bus, load]) => `${bus} ${number(100 * load, 0)} %`).join(", ");
@@ -251,9 +251,9 @@ function addEvents(events) {
     line.append(element("strong", event.axis ? `${event.axis} ` : "", event.alarm ? "alarm" : ""));
     line.append(element("span", (event.alarm ? "⚠ " : "") + event.text, event.alarm ? "alarm" : ""));
     if (event.remedy) line.append(element("span", `→ ${event.remedy}`, "remedy"));
-    byId("events").prepend(line);
+    byId(event.alarm ? "alarms" : "events").prepend(line);
   }
-  while (byId("events").children.length > 200) byId("events").lastChild.remove();
+  for (const list of [byId("alarms"), byId("events")]) while (list.children.length > 200) list.lastChild.remove();
 }
 
 // ---- Results
@@ -338,6 +338,7 @@ function take(message) {
   const { status, new: fresh } = message;
   if ("run" in fresh) {
     Object.assign(shown, { run: fresh.run, points: [], rows: [], events: [], received: 0 });
+    byId("alarms").replaceChildren();
     byId("events").replaceChildren();
   }
   for (const name of ["points", "rows", "events"]) {
