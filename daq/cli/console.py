@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
@@ -38,7 +39,7 @@ def console_verb(
     from daq.config.cell_file import load_cell
     from daq.console.live import Live
     from daq.console.results import Places, Results
-    from daq.console.server import Page, hosts_of, listen, new_token, server_of
+    from daq.console.server import Page, listen, new_token, server_of
 
     declared = load_cell(cell)
     results = Results(Places(cell, declared, calibration, report))
@@ -54,10 +55,10 @@ def console_verb(
             expected="a free port on 127.0.0.1",
             remedy="end the other program, or leave --port out",
         ) from error
-    with listener:
+    with listener, suppress(KeyboardInterrupt):
         port, token = listener.getsockname()[1], new_token()
         typer.echo(f"Open http://127.0.0.1:{port}/{token}/ in a browser on this computer; Ctrl-C ends the page.")
-        server_of(Page(declared, live, results).app(token, hosts_of(port))).run(sockets=[listener])
+        server_of(Page(declared, live, results), token, port).run(sockets=[listener])
 
 
 CONSOLE = Verb("console", console_verb, "drivegain console cells/demo.yaml --calibration calibration.yaml")

@@ -42,6 +42,7 @@ from ident.errors import IdentificationError
 POINTS_HZ = 50.0  #: Points a second of the curves, in the time of the samples
 KEPT_POINTS = 6000  #: Two minutes
 KEPT_EVENTS = 500
+DISK_S = 1.0  #: Time between two looks at the free space of the disk
 RETRY_S = 0.5  #: Time between two tries to find a feed
 STOP_ACCEPTED_S = 3.0  #: Time for the recorder's answer to a stop
 STOP_ENDED_S = 60.0  #: Time until the recorder must have ended
@@ -113,6 +114,8 @@ class Live:
         self._predictor: Predictor | None = None
         self._band = [nan] * len(self.cell.axes)
         self._rate: deque[tuple[float, int]] = deque(maxlen=50)
+        self._free: int | None = None
+        self._free_s = -DISK_S
         self._every = 1
         if run is None:
             return
@@ -243,10 +246,11 @@ class Live:
         return (last - first) / max(end_s - begin_s, 1e-3)
 
     def _free_bytes(self) -> int | None:
-        if self.run is not None:
+        if self.run is not None and time.monotonic() - self._free_s > DISK_S:
+            self._free, self._free_s = None, time.monotonic()
             with suppress(OSError):
-                return shutil.disk_usage(Path(self.run["log"]).parent).free
-        return None
+                self._free = shutil.disk_usage(Path(self.run["log"]).parent).free
+        return self._free
 
     async def follow(self) -> None:
         """Follow the recorders of the cell, one after the other, for ever."""

@@ -13,7 +13,7 @@ import hmac
 import json
 import secrets
 import socket
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from importlib.resources import files
 from math import isfinite
@@ -97,6 +97,7 @@ class Page:
     def __init__(self, cell: Cell, live: Live, results: Results) -> None:
         self._cell, self._live, self._results = cell, live, results
         self._document: dict[str, Any] = {}
+        self.over: Callable[[], bool] = lambda: False  #: Whether the server ends
         self._readers = 0
 
     def app(self, token: str, hosts: frozenset[str]) -> ASGIApp:
@@ -177,7 +178,7 @@ class Page:
         live, epoch, seen, before = self._live, -1, [0, 0, 0], b""
         self._readers += 1
         try:
-            while True:
+            while not self.over():
                 message: dict[str, Any] = {}
                 if epoch != live.epoch:
                     epoch, seen = live.epoch, [0, 0, 0]
@@ -239,11 +240,11 @@ def hosts_of(port: int) -> frozenset[str]:
     return frozenset({f"127.0.0.1:{port}", f"localhost:{port}"})
 
 
-def server_of(app: ASGIApp) -> uvicorn.Server:
+def server_of(page: Page, token: str, port: int) -> uvicorn.Server:
     """Return a server of plain HTTP/1.1; when it ends, it waits a second for pages that do not read."""
     config = uvicorn.Config(
-        app,
-        log_level="warning",
+        page.app(token, hosts_of(port)),
+        log_level="critical",  # a page that was cut off at the end is no error
         access_log=False,
         server_header=False,
         proxy_headers=False,
@@ -251,4 +252,6 @@ def server_of(app: ASGIApp) -> uvicorn.Server:
         limit_concurrency=CONNECTIONS,
         timeout_graceful_shutdown=1,
     )
-    return uvicorn.Server(config)
+    server = uvicorn.Server(config)
+    page.over = lambda: server.should_exit
+    return server

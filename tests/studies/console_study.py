@@ -19,7 +19,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from http.client import HTTPConnection
+from http.client import HTTPConnection, HTTPException
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,7 @@ def console(cell: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def _read(host: str, path: str) -> None:
-    with suppress(OSError):
+    with suppress(OSError, HTTPException, ValueError):
         connection = HTTPConnection(host)
         connection.request("GET", f"{path}curves")
         answer = connection.getresponse()

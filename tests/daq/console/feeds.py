@@ -15,7 +15,7 @@ from daq.config.cell import Cell
 from daq.console.feed import Feed, RunFacts
 from daq.console.live import Live
 from daq.console.results import Places, Results
-from daq.console.server import Page, hosts_of, listen, server_of
+from daq.console.server import Page, listen, server_of
 from daq.log.metadata import RunStatistics
 from drivers.stream.sample import Sample
 from ident.calibration import Calibration, Parameter
@@ -75,7 +75,7 @@ class Served:
         self.listener = listen(0)
         self.port = self.listener.getsockname()[1]
         page = Page(cell, self.live, Results(Places(cell_file, cell, None, report)))
-        self.server = server_of(page.app(TOKEN, hosts_of(self.port)))
+        self.server = server_of(page, TOKEN, self.port)
         self.thread = threading.Thread(target=lambda: asyncio.run(self.server.serve(sockets=[self.listener])))
 
     def ask(self, path: str, method: str = "GET", **headers: str) -> tuple[HTTPResponse, bytes]:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, Request, sync_playwright
 
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
@@ -77,16 +77,20 @@ class Rig:
         self.refused: list[str] = []
         self.page = self.opened(browser, width=1280, height=1000)
 
-    def opened(self, browser: Browser, **size: int) -> Page:
+    def opened(self, browser: Browser, width: int, height: int) -> Page:
         """Open the page; what its browser complains of is kept."""
-        page = browser.new_page(viewport=size)
+        page = browser.new_page(viewport={"width": width, "height": height})
         self.stack.callback(page.close)
         page.on("console", lambda message: self.refused.append(message.text))
         page.on("pageerror", lambda error: self.refused.append(str(error)))
-        page.on("request", lambda asked: asked.url.startswith(self.address) or self.refused.append(asked.url))
+        page.on("request", self._note_foreign)
         page.goto(self.address)
         until(page, "window.drivegain.status !== null")
         return page
+
+    def _note_foreign(self, asked: Request) -> None:
+        if not asked.url.startswith((self.address, "data:")):
+            self.refused.append(asked.url)
 
     def start(self, *arguments: str) -> subprocess.Popen[str]:
         """Start a command; it is interrupted at the end of the test."""

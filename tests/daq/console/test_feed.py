@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import struct
 import threading
 import time
 from pathlib import Path
@@ -103,8 +104,8 @@ def test_other_users_are_not_served(cell_file: Path, monkeypatch: pytest.MonkeyP
     one, other = socket.socketpair(socket.AF_UNIX)
     with one, other:
         assert feeds.of_this_user(one)
-        credentials = feeds.struct.pack("3i", 1, os.getuid() + 1, 1)
-        monkeypatch.setattr(feeds.os, "getuid", lambda: 4711)
+        credentials = struct.pack("3i", 1, 1234, 1)
+        monkeypatch.setattr(os, "getuid", lambda: 4711)
         fake = type("Peer", (), {"getsockopt": lambda *_: credentials})()
         assert not feeds.of_this_user(fake)
 
