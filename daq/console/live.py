@@ -43,6 +43,8 @@ POINTS_HZ = 50.0  #: Points a second of the curves, in the time of the samples
 KEPT_POINTS = 6000  #: Two minutes
 KEPT_EVENTS = 500
 DISK_S = 1.0  #: Time between two looks at the free space of the disk
+READ_S = 0.03  #: Time between two looks at the feed
+LARGEST_TURN = 100  #: Packets at one look; requests are answered between two
 RETRY_S = 0.5  #: Time between two tries to find a feed
 STOP_ACCEPTED_S = 3.0  #: Time for the recorder's answer to a stop
 STOP_ENDED_S = 60.0  #: Time until the recorder must have ended
@@ -262,12 +264,20 @@ class Live:
             await asyncio.sleep(RETRY_S)
 
     async def _read(self, connection: socket.socket) -> None:
-        loop = asyncio.get_running_loop()
+        """Take what has come, READ_S after READ_S: waiting for each packet would cost as much as taking it."""
         self._clear(None)
         self.phase = "running"
         with suppress(OSError):
-            while packet := await loop.sock_recv(connection, LARGEST_PACKET):
-                self.take(packet)
+            while True:
+                for _ in range(LARGEST_TURN):
+                    try:
+                        packet = connection.recv(LARGEST_PACKET)
+                    except BlockingIOError:
+                        break
+                    if not packet:
+                        raise ConnectionResetError
+                    self.take(packet)
+                await asyncio.sleep(READ_S)
         if self.phase == "running":
             self.phase, self.end = "ended", {"ok": False, "axes_stopped": False, "text": GONE}
 
