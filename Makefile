@@ -100,7 +100,7 @@ docs: setup
 	$(BIN)/python -m sphinx -q -W --keep-going -b html -d out/docs-doctrees docs out/docs
 
 # The pictures are committed: a build of the site runs no robot.
-screenshots: demo
+screenshots: demo test-console
 	$(BIN)/python docs/screenshots.py --demo out/demo
 
 bench: setup

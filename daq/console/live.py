@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import shutil
 import socket
 import time
@@ -173,7 +174,8 @@ class Live:
             self._words[event["axis"]] = event["code"]
         axis = None if event["axis"] is None else self.cell.axis_names[event["axis"]]
         remedy = remedy_of(event["code"]) if kind is EventKind.EMCY else REMEDIES.get(kind, "")
-        text = event["text"].removeprefix(f"{axis}: ")
+        # The axis is shown beside the text.
+        text = event["text"] if axis is None else re.sub(rf"^{re.escape(axis)}( \(node \d+\))?: ", "", event["text"])
         time_s = 1e-9 * (event["time_ns"] - self._origin_ns)
         return {
             **{"time_s": round(time_s, 6), "axis": axis, "kind": kind.value, "text": text},

@@ -188,7 +188,8 @@ function showStatus(status) {
   const running = status.phase === "running";
   byId("phase").textContent = running && run ? "Recording" : PHASES[status.phase];
   byId("stop").disabled = !running;
-  byId("log").textContent = run ? run.log : "no run yet";
+  byId("log").textContent = run ? run.log.split("/").at(-1) : "no run yet";
+  byId("log").title = run ? run.log : "";
   byId("moves").value = status.moves ? status.done / status.moves : 0;
   byId("done").textContent = status.moves ? `${status.done} of ${status.moves} moves` : "";
   const loads = Object.entries(status.bus_load).map(([bus, load]) => `${bus} ${number(100 * load, 0)} %`).join(", ");

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, Request, sync_playwright
+from playwright.sync_api import Browser, FloatRect, Page, Request, sync_playwright
 
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
@@ -224,7 +224,8 @@ def _pictures(made: Rig, browser: Browser, checkout: Path) -> None:
     """Screenshots for people, in out/, and that nothing is wider than a phone."""
     out = checkout / "out" / "console"
     out.mkdir(parents=True, exist_ok=True)
-    made.page.screenshot(path=out / "desktop.png", full_page=True)
+    clip: FloatRect = {"x": 0, "y": 0, "width": 1280, "height": 1240}
+    made.page.screenshot(path=out / "desktop.png", clip=clip, full_page=True)
     phone = made.opened(browser, width=390, height=844)
     phone.emulate_media(color_scheme="dark")
     until(phone, "window.drivegain.points.length > 100")
