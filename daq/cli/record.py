@@ -71,6 +71,8 @@ def record_verb(
             Feed(cell) as feed,
             progress_bar("recording") as report_progress,
         ):
+            if feed.remark:
+                typer.echo(feed.remark, err=True)
             done = record(
                 cell,
                 declared,

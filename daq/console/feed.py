@@ -46,7 +46,7 @@ HEAD = struct.Struct("<BQQIIH")
 
 @dataclass(frozen=True, slots=True)
 class RunFacts:
-    """What a console must know of a run to show its samples; lists have one entry an axis."""
+    """Facts of a run that a console needs to show its samples; lists have one entry an axis."""
 
     run_id: str  #: of the log
     log: str  #: its path
@@ -188,11 +188,11 @@ class Feed:
 
     def event(self, event: CellEvent) -> None:
         """Publish an event, in its place between the samples."""
-        told = {"time_ns": event.time_ns, "axis": event.axis, "kind": event.kind.value, "code": event.code}
-        told["text"] = event.text
+        shown = {"time_ns": event.time_ns, "axis": event.axis, "kind": event.kind.value, "code": event.code}
+        shown["text"] = event.text
         self._flush()
-        self._events.append(told)
-        self._send({"events": [told]})
+        self._events.append(shown)
+        self._send({"events": [shown]})
 
     def finish(self) -> None:
         """Publish the result of the run, whose log is complete."""
@@ -269,7 +269,7 @@ class Feed:
                 connection.close()
                 return
             self._stop()
-            # It is told how the stop ended when the program ends.
+            # It receives the outcome of the stop when the program ends.
             self._stopping.append(connection)
             connection.send(ACCEPTED)
         except OSError:

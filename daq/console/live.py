@@ -1,4 +1,4 @@
-"""What a console knows of a cell now: curves, states, events and losses, as the feed brings them; and the stop."""
+"""The cell as a console knows it now: curves, states, events and losses, as the feed brings them; and the stop."""
 
 from __future__ import annotations
 

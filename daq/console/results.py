@@ -1,4 +1,4 @@
-"""What the files of a cell say after a run: gains, report, history and drift, proposals with the command to type.
+"""Results in the files of a cell after a run: gains, report, history and drift, proposals with the command to type.
 
 Everything is read, and nothing written. The places are those of the cell file and of the command line; a browser names
 none of them.

@@ -169,7 +169,7 @@ class Page:
         return JSONResponse(await self._live.stop())
 
     async def _curves(self, _: Request) -> Response:
-        """Everything that changes, as server-sent events; a page that does not read gets less, and delays nobody."""
+        """Everything that changes, as server-sent events; a page that does not read gets less, and delays no other."""
         if self._readers >= LARGEST_READERS:
             return PlainTextResponse(f"{LARGEST_READERS} pages are open already: close one", 503)
         return StreamingResponse(self._messages(), media_type="text/event-stream")

@@ -54,7 +54,7 @@ class Recording:
         feed.begin(facts(cell, log), self.statistics)
 
     def statistics(self) -> RunStatistics:
-        """Of the log that there would be."""
+        """Statistics of the log that there would be."""
         return RunStatistics(self.samples, 0, (0,) * self.axes, valid=True)
 
     def run(self, count: int) -> None:

@@ -118,7 +118,7 @@ class Rig:
         return read_log(saved)
 
     def shown(self) -> dict[str, Any]:
-        """What the page holds, once its run has ended."""
+        """The page's data, once its run has ended."""
         until(self.page, "window.drivegain.status.phase === 'ended' && window.drivegain.run")
         return dict(self.page.evaluate("window.drivegain"))
 

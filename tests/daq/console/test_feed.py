@@ -32,7 +32,7 @@ def _console(cell_file: Path, feed: Feed) -> socket.socket:
 def test_a_console_gets_every_sample_and_event_in_their_order(cell_file: Path, cell: Cell) -> None:
     with Feed(cell_file) as feed:
         recording = Recording(feed, cell, cell_file)
-        recording.run(5)  # nobody watches
+        recording.run(5)  # without a console
         with _console(cell_file, feed) as console:
             recording.run(25)
             feed.event(CellEvent(50_000_000, 1, EventKind.EMCY, 0x7305, "EMCY 7305h"))

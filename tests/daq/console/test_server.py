@@ -1,4 +1,4 @@
-"""Who may read the page, and that a page that does not read delays nobody."""
+"""Who may read the page, and that a page that does not read delays no other."""
 
 from __future__ import annotations
 
