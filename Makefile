@@ -11,12 +11,13 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-vcan vcan-tools check docs screenshots bench bench-stream ident-study gain-study coverage-study paper planning-study robot-study crash-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study weigh-study words wheel lock clean
+.PHONY: help setup demo test test-vcan vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study coverage-study paper planning-study robot-study crash-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study weigh-study words wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
 	@echo "make test    set up, then lint, types, import contracts and tests"
 	@echo "make test-vcan  the main job over real SocketCAN (vcan), under User-Mode Linux where this kernel has none"
+	@echo "make test-console  the live console in headless Chromium beside whole recordings; screenshots in out/console"
 	@echo "make docs    build the documentation site into out/docs, offline, warnings as errors"
 	@echo "make screenshots  refresh the pictures of the documentation from real commands; minutes"
 	@echo "make setup   make .venv alone"
@@ -30,6 +31,7 @@ help:
 	@echo "make paper   the paper's Tables 1 to 8 on the simulated cell (docs/evidence/paper.md); minutes"
 	@echo "make planning-study  planned against random moves (docs/evidence/planning.md); minutes"
 	@echo "make crash-study  recorders killed at random moments, damaged logs; some minutes"
+	@echo "make console-study  60 minutes on SocketCAN with the console alternately open and closed: losses, jitter, processor, memory"
 	@echo "make drift-study  detection delay and false alarms of a drifting gain (docs/evidence/drift.md); a minute"
 	@echo "make holdout-study  which wrong gains the hold-out gate detects (docs/evidence/hold-out.md); a minute"
 	@echo "make diagnosis-study  false alarms of the diagnoses on clean recordings, and planted mistakes that are named; a minute"
@@ -78,6 +80,16 @@ vcan-tools:
 		apt-get install -y -qq --no-install-recommends user-mode-linux iproute2; } || { \
 		echo "this needs vcan0, or as root: apt-get install user-mode-linux iproute2" >&2; exit 1; }
 
+CHROMIUM = $$(command -v chromium || command -v chromium-browser || command -v google-chrome)
+
+test-console: setup browser
+	DRIVEGAIN_CHROMIUM="$(CHROMIUM)" $(BIN)/python -m pytest -q -m browser tests/daq/console
+
+browser:
+	@[ -n "$(CHROMIUM)" ] || { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq && \
+		apt-get install -y -qq --no-install-recommends chromium; } || { \
+		echo "this needs Chromium, or as root: apt-get install chromium" >&2; exit 1; }
+
 check: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -88,7 +100,7 @@ docs: setup
 	$(BIN)/python -m sphinx -q -W --keep-going -b html -d out/docs-doctrees docs out/docs
 
 # The pictures are committed: a build of the site runs no robot.
-screenshots: demo
+screenshots: demo test-console
 	$(BIN)/python docs/screenshots.py --demo out/demo
 
 bench: setup
@@ -140,6 +152,10 @@ drift-study: setup
 
 crash-study: setup
 	$(BIN)/python -m tests.studies.crash_study
+
+console-study: setup vcan-tools
+	@mkdir -p out
+	DRIVEGAIN_VCAN_OUT=$(CURDIR)/out $(BIN)/python -m tests.vcan.run $(BIN)/python -m tests.studies.console_study
 
 # Counts phrases; fails above 2 % of the baseline. Not part of `make check` until the language pass is done.
 words: setup

@@ -1,5 +1,6 @@
 """Refresh the pictures of the documentation from real commands: `make screenshots`.
 
+The console's page is that of `make test-console`.
 Terminal pictures are the output of commands on the simulated cell, as SVG without a remote font. Plots are those of
 `make demo`. The page of `report.html` is printed by WeasyPrint, in an environment of its own (out/screenshots-venv).
 A history needs months, so that of the plot is drawn: twenty weekly calibrations, J4 falling from the eleventh on.
@@ -53,6 +54,7 @@ def main() -> int:
     (PICTURES / "one-sample.svg").write_text(drawings.one_sample(), encoding="utf-8")
     _webp(demo / "gains.png", "gains", width=1000)
     _webp(next(demo.glob("residual-*.png")), "residual", width=1100)
+    _webp(ROOT / "out" / "console" / "desktop.png", "console", width=1000)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         _terminals(folder, demo)

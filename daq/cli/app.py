@@ -31,6 +31,7 @@ VERBS = (
     Listed("init", "daq.cli.init:INIT", "Create a folder for a new cell, with templates to fill in."),
     Listed("scan", "daq.cli.scan:SCAN", "Compare the nodes on the bus with the cell file."),
     Listed("monitor", "daq.cli.scan:MONITOR", "Show the state of the axes; nothing is changed."),
+    Listed("console", "daq.cli.console:CONSOLE", "Show the cell live on a page, with a stop button."),
     Listed("explain-emcy", "daq.cli.scan:EXPLAIN_EMCY", "Explain an error code of an amplifier."),
     Listed("plan", "daq.cli.record:PLAN", "Choose moves that excite every parameter."),
     Listed("record", "daq.cli.record:RECORD", "Execute a plan and log it; this moves the robot."),

@@ -58,22 +58,25 @@ def recalibrate_verb(
 
 def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> None:
     from dataclasses import replace
+    from functools import partial
 
     from daq.cli.terminal import interruptible
     from daq.config.cell_file import load_cell
+    from daq.console.feed import Feed
     from daq.environment import login
     from daq.jobs.context import Tools
     from daq.jobs.job import preview, recalibrate
     from daq.jobs.reporting import document, text
     from daq.report.residual_page import save_report
     from daq.report.text import printable
+    from daq.workflow.record import record
 
     declared = load_cell(cell)
     if now and declared.recalibration is not None:
         declared = replace(declared, recalibration=replace(declared.recalibration, every_h=0.0))
     who = f"drivegain recalibrate, {login()}"
-    tools = Tools(save_report=save_report)
-    with interruptible() as block_signals:
+    with interruptible() as block_signals, Feed(cell) as feed:
+        tools = Tools(save_report=save_report, record=partial(record, feed=feed))
         if dry_run:
             seen = preview(cell, declared, tools, journal, who=who)
             if json:

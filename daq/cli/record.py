@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import uuid
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -41,9 +42,8 @@ def record_verb(
     from daq.config.bus import bus_loads
     from daq.config.cell import PacingMode
     from daq.config.cell_file import load_cell
+    from daq.console.feed import Feed
     from daq.environment import login
-    from daq.report.bus import load_lines
-    from daq.report.plan_preview import find_preview
     from daq.workflow.plan import slowed
     from daq.workflow.plan_file import load_plan
     from daq.workflow.record import record
@@ -54,20 +54,20 @@ def record_verb(
     who = operator or login()
     carried = mounted(declared, payload)
     check_entered_mass(declared, carried, mass)
-    if carried is not None and mass is None:
-        typer.echo(
-            "the payload's mass was not entered from the scale (--mass KG); `drivegain apply` will ask for it", err=True
-        )
     part = _free(out)
-    if (page := find_preview(plan)) is not None:
-        typer.echo(f"preview of these moves: {page}", err=True)
-    for line in load_lines(declared):
-        typer.echo(line, err=True)
     allowed_by = granted(declared, who, enable_motion)
-    if allowed_by is not None and not enable_motion:
-        typer.echo(f"motion is enabled by {allowed_by} in the cell file; the axes move now", err=True)
+    not_weighed = carried is not None and mass is None
+    for line in _before_motion(declared, plan, not_weighed, None if enable_motion else allowed_by):
+        typer.echo(line, err=True)
     try:
-        with bus_lock(declared), interruptible() as block_signals, progress_bar("recording") as report_progress:
+        with (
+            bus_lock(declared),
+            interruptible() as block_signals,
+            Feed(cell) as feed,
+            progress_bar("recording") as report_progress,
+        ):
+            if feed.remark:
+                typer.echo(feed.remark, err=True)
             done = record(
                 cell,
                 declared,
@@ -81,6 +81,7 @@ def record_verb(
                 entered_kg=mass,
                 block_signals=block_signals,
                 progress=lambda count, total: report_progress(count, total, "moves"),
+                feed=feed,
             )
     except KeyboardInterrupt as interrupt:
         made = next((path for path in (out, part) if path.exists()), None)
@@ -111,6 +112,20 @@ def record_verb(
     if not log.valid:
         # The log is kept; the exit code keeps a script from using it.
         raise typer.Exit(ExitCode.DATA_UNFIT)
+
+
+def _before_motion(cell: Cell, plan: Path, not_weighed: bool, allowed_by: str | None) -> Iterator[str]:
+    """What a person should know before the axes move; ``allowed_by`` is what in the cell file allows it."""
+    from daq.report.bus import load_lines
+    from daq.report.plan_preview import find_preview
+
+    if not_weighed:
+        yield "the payload's mass was not entered from the scale (--mass KG); `drivegain apply` will ask for it"
+    if (page := find_preview(plan)) is not None:
+        yield f"preview of these moves: {page}"
+    yield from load_lines(cell)
+    if allowed_by is not None:
+        yield f"motion is enabled by {allowed_by} in the cell file; the axes move now"
 
 
 def _free(out: Path) -> Path:

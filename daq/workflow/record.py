@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from daq.config import cell as declared
-from daq.config.bus import cell_address, drive_axes, load_warnings, polling_fits, polling_warnings
+from daq.config.bus import bus_loads, cell_address, drive_axes, load_warnings, polling_fits, polling_warnings
 from daq.config.cell import Cell, joint_names
 from daq.config.cell_file import bundle
+from daq.console.feed import Feed, RunFacts
 from daq.environment import software
 from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
 from daq.files import sha256
@@ -117,6 +118,7 @@ def record(
     block_signals: SignalBlocker = nullcontext,
     progress: Callable[[int, int], None] = lambda _move, _moves: None,
     before_motion: Callable[[], None] = lambda: None,
+    feed: Feed | None = None,
 ) -> Recorded:
     """Make a plan's moves and log every sample.
 
@@ -133,6 +135,7 @@ def record(
         block_signals: blocks signals while the axes are stopped.
         progress: receives the number of finished moves and of all moves.
         before_motion: last check before the log is opened; if it raises, the axes have no power and no file is made.
+        feed: gets what the log gets, for consoles.
 
     Raises:
         UsageError: the weighed mass is not the payload's; nothing has moved and no file was made.
@@ -186,23 +189,16 @@ def record(
         )
         content = LogContent.of(cell, run, files, readback)
         with LogWriter(out, content, scale.joint_position_of, clocks.monotonic_ns) as log:
-            done = 0
-
-            def keep(event: CellEvent) -> None:
-                nonlocal done
-                log.event(event)
-                if event.kind is EventKind.MOVE_END:
-                    done += 1
-                    progress(done, len(moves))
-
+            kept = Kept(log, feed or Feed(cell_file), lambda done: progress(done, len(moves)))
+            kept.feed.begin(_facts(cell, scale, run, out, len(moves)), lambda: log.statistics)
             log.readings(temperatures)
-            stream = SyncStream(network, _pacing(cell, run.started_wall_ns, clocks, producer), keep)
+            stream = SyncStream(network, _pacing(cell, run.started_wall_ns, clocks, producer), kept.event)
             polling.begin(stream, log.reading)
             for sample in until_complete(stream):
-                log.write(sample)
+                kept.sample(sample)
             with closing(execute(network, stream, moves, permission)) as samples:
                 try:
-                    keep_samples(samples, log, room, max(1, round(SPACE_CHECK_S * rate_hz)))
+                    keep_samples(samples, kept, room, max(1, round(SPACE_CHECK_S * rate_hz)))
                 except DiskSpaceShort as error:
                     short = error
             stream.read_on(LATE_LOSSES_S)
@@ -210,9 +206,10 @@ def record(
             verdict = (
                 _verdict(stream.statistics)
                 if short is None
-                else (False, f"stopped after {done} of {len(moves)} moves: {short.found}")
+                else (False, f"stopped after {kept.done} of {len(moves)} moves: {short.found}")
             )
             log.conclude(*verdict, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns())
+        kept.feed.finish()
         if short is not None:
             raise short
         return Recorded(out, log.statistics, stream.statistics, (*warnings, *polling.remarks))
@@ -227,8 +224,48 @@ def controller_digest(cell: Cell) -> str | None:
         return None
 
 
-def keep_samples(samples: Generator[Sample, None, None], log: LogWriter, room: DiskRoom, check_every: int) -> None:
-    """Log every sample of a motion; end the motion when logging fails.
+def _facts(cell: Cell, scale: SiScaling, run: RunInfo, out: Path, moves: int) -> RunFacts:
+    """Return what a console must know of a run."""
+    return RunFacts(
+        run_id=run.run_id,
+        log=str(out.resolve()),
+        axes=cell.axis_names,
+        rate_hz=run.rate_hz,
+        moves=moves,
+        rad_per_count=scale.rad_per_count.tolist(),
+        current_per_unit=scale.current_per_unit.tolist(),
+        to_joint=scale.to_joint.tolist(),
+        offset_rad=scale.offset_rad.tolist(),
+        payload=None if run.payload is None else run.payload.name,
+        bus_load={bus.name: load.mean for bus, load in bus_loads(cell)},
+    )
+
+
+@dataclass(slots=True)
+class Kept:
+    """Log of a run and the feed of what it gets."""
+
+    log: LogWriter
+    feed: Feed
+    progress: Callable[[int], None]  #: receives the number of finished moves
+    done: int = 0  #: finished moves
+
+    def sample(self, sample: Sample) -> None:
+        """Log and publish one sample."""
+        self.log.write(sample)
+        self.feed.sample(sample)
+
+    def event(self, event: CellEvent) -> None:
+        """Log and publish one event."""
+        self.log.event(event)
+        self.feed.event(event)
+        if event.kind is EventKind.MOVE_END:
+            self.done += 1
+            self.progress(self.done)
+
+
+def keep_samples(samples: Generator[Sample, None, None], kept: Kept, room: DiskRoom, check_every: int) -> None:
+    """Log and publish every sample of a motion; end the motion when logging fails.
 
     An error is thrown into `execute`, which stops the axes and attaches to the error what it could not confirm. If the
     generator were only closed, these notes would be lost.
@@ -238,7 +275,7 @@ def keep_samples(samples: Generator[Sample, None, None], log: LogWriter, room: D
     """
     for number, sample in enumerate(samples):
         try:
-            log.write(sample)
+            kept.sample(sample)
             if number % check_every == 0:
                 room.check()
         except BaseException as error:

@@ -14,6 +14,26 @@ CODES = {int(digits, 16): text for digits, text in _TEXTS.items() if len(digits)
 """Text of each code that the two standards name."""
 
 
+_REMEDIES = {
+    0x2: "check motor cable and windings for shorts, and the load; let the drive cool",
+    0x3: "check the supply voltage and the brake resistor; use slower moves",
+    0x4: "let the drive and the motor cool; check fan and load",
+    0x5: "switch the drive off and on; if it comes again, exchange the drive",
+    0x6: "switch the drive off and on; if it comes again, check its parameters and firmware",
+    0x7: "check the plugs and cables of encoder and brake",
+    0x8: "check the bus's cable, termination and load",
+    0x9: "check the device that the drive watches from outside, and its cable",
+}
+"""First remedy of each class of CiA 301, by its digit."""
+
+
+def remedy_of(code: int) -> str:
+    """Return what to try first for an error code; the drive's manual says more."""
+    first = "check brake, load and collision; use slower moves" if code >> 8 in (0x84, 0x85, 0x86) else ""
+    first = first or _REMEDIES.get(code >> 12, "see the drive's manual")
+    return f"{first}; then reset the fault with `drivegain scan CELL --reset-faults`"
+
+
 def describe(code: int) -> str:
     """Describe an error code of 16 bits; for a code that is in no standard, its class."""
     if code in CODES:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canopen.emcy import CODES, describe
+from drivers.canopen.emcy import CODES, describe, remedy_of
 
 
 @pytest.mark.parametrize(
@@ -30,3 +30,11 @@ def test_a_code_has_the_text_of_its_standard_or_of_its_class(code: int, text: st
 def test_every_code_says_something(code: int) -> None:
     assert describe(code)
     assert (describe(code) == CODES.get(code)) == (code in CODES)
+
+
+def test_every_code_has_a_remedy_of_its_class() -> None:
+    assert remedy_of(0x7305).startswith("check the plugs and cables of encoder and brake; then reset the fault")
+    assert remedy_of(0x8611).startswith("check brake, load and collision")
+    assert remedy_of(0x8130).startswith("check the bus's cable")
+    assert remedy_of(0xFF01).startswith("see the drive's manual")
+    assert all("--reset-faults" in remedy_of(code) for code in CODES)

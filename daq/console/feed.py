@@ -1,0 +1,288 @@
+"""The feed of a recording: every sample and event for consoles that may be slow, and a stop that is acknowledged.
+
+The recorder publishes and never waits. A packet of a Unix SEQPACKET socket is sent without blocking: where a console
+does not read, packets are dropped, the console sees from their numbers how many, and the recording goes on. A second
+socket takes the stop, so that it works while the curves are stalled. Both are in Linux's abstract namespace: they leave
+no file and end with the process. Only processes of the same user, or of root, are served.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import select
+import signal
+import socket
+import struct
+import threading
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from daq.log.metadata import RunStatistics
+from drivers.errors import WHILE
+from drivers.stream.sample import CellEvent, Sample
+
+BATCH_S = 0.02  #: Time of the samples in one packet
+SEND_BUFFER_BYTES = 1 << 20  #: Asked of the kernel, which may give less: seconds of samples for a console that pauses
+EVENTS_KEPT = 200  #: Events that a console gets which comes late
+REQUEST_S = 2.0  #: Time that a client of the stop socket has to ask
+STOP, ACCEPTED = b"stop\n", b"accepted\n"
+LARGEST_PACKET = 1 << 18  #: [bytes]
+LARGEST_CONSOLES = 8  #: Served at the same time
+
+SAMPLES, TEXT = 0, 1
+"""Kinds of packets: samples, or a JSON object with some of the keys run, events, result and end."""
+HEAD = struct.Struct("<BQQIIH")
+"""Kind; number of the packet; of the run so far its samples, lost cycles and missing answers; samples in the packet."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunFacts:
+    """Facts of a run that a console needs to show its samples; lists have one entry an axis."""
+
+    run_id: str  #: of the log
+    log: str  #: its path
+    axes: tuple[str, ...]  #: names
+    rate_hz: float  #: of the samples
+    moves: int  #: in the plan
+    rad_per_count: list[float]  #: motor angle of a count [rad]
+    current_per_unit: list[float]  #: current of a raw unit, in the current's unit of the gains
+    to_joint: list[list[float]]  #: R⁻¹, shape (n, n)
+    offset_rad: list[float]  #: joint positions at zero counts [rad; m of a prismatic joint]
+    payload: str | None  #: name in the cell file
+    bus_load: dict[str, float]  #: mean load of each bus at this rate, as a share
+
+
+def socket_names(cell_file: Path) -> tuple[str, str]:
+    """Return the addresses of feed and stop for a cell file, in the abstract namespace."""
+    digest = hashlib.sha256(str(cell_file.resolve()).encode()).hexdigest()[:24]
+    name = f"\0drivegain-{digest}"
+    return f"{name}-feed", f"{name}-stop"
+
+
+def sample_struct(axes: int) -> struct.Struct:
+    """Return the layout of a sample in a packet: cycle, time, missing, positions, currents, statuswords."""
+    return struct.Struct(f"<QqI{axes}i{axes}i{axes}H")
+
+
+def sample_dtype(axes: int) -> np.dtype[np.void]:
+    """Return the layout of `sample_struct` for numpy."""
+    return np.dtype(
+        [
+            ("cycle", "<u8"),
+            ("time_ns", "<i8"),
+            ("missing", "<u4"),
+            ("position_counts", "<i4", (axes,)),
+            ("current_raw", "<i4", (axes,)),
+            ("statusword", "<u2", (axes,)),
+        ]
+    )
+
+
+def of_this_user(connection: socket.socket) -> bool:
+    """Return whether the process at the other end is of this user or of root."""
+    ids = struct.Struct("3i")  # struct ucred: pid, uid, gid
+    _, uid, _ = ids.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, ids.size))
+    return uid in (os.getuid(), 0)
+
+
+def interrupt_main_thread() -> None:
+    """Do what Ctrl-C does; a main thread that waits in a system call is woken."""
+    main = threading.main_thread().ident
+    if main is not None:
+        signal.pthread_kill(main, signal.SIGINT)
+
+
+class Feed:
+    """Context manager that publishes the runs of one program; methods other than `__enter__` never raise or wait.
+
+    Where its addresses are taken, by another program on this cell, nothing is published and `remark` says so.
+    """
+
+    def __init__(self, cell_file: Path, stop: Callable[[], None] = interrupt_main_thread) -> None:
+        """Store the arguments.
+
+        Args:
+            cell_file: of the cell; consoles of the same file find the feed.
+            stop: does what a stop asks for, in another thread than the caller's.
+        """
+        self.remark = ""
+        self._names, self._stop = socket_names(cell_file), stop
+        self._listening: list[socket.socket] = []
+        self._new: deque[socket.socket] = deque()
+        self._consoles: list[socket.socket] = []
+        self._stopping: list[socket.socket] = []
+        self._number = 0
+        self._run: RunFacts | None = None
+        self._statistics: Callable[[], RunStatistics] = lambda: RunStatistics(0, 0, (), valid=False)
+        self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS_KEPT)
+        self._result: dict[str, Any] | None = None
+        self._packed: list[bytes] = []
+        self._layout, self._batch = sample_struct(0), 1
+        self._waiter: threading.Thread | None = None
+
+    def __enter__(self) -> Feed:
+        """Begin to listen for consoles and stops, in a thread that waits."""
+        kinds = (socket.SOCK_SEQPACKET, socket.SOCK_STREAM)
+        try:
+            for name, kind in zip(self._names, kinds, strict=True):
+                listener = socket.socket(socket.AF_UNIX, kind)
+                self._listening.append(listener)
+                listener.bind(name)
+                listener.listen(LARGEST_CONSOLES)
+        except OSError as error:
+            for listener in self._listening:
+                listener.close()
+            self.remark = f"no console can watch: {error.strerror or error}; is another program on this cell?"
+            return self
+        self._waiter = threading.Thread(target=self._wait, name="drivegain feed", daemon=True)
+        self._waiter.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self._flush()
+        ended = end_of(error)
+        self._send({"end": ended})
+        if self._waiter is not None:
+            for listener in self._listening:
+                with suppress(OSError):
+                    listener.shutdown(socket.SHUT_RDWR)  # wakes the thread
+            self._waiter.join(REQUEST_S + 1.0)
+        for connection in self._stopping:
+            with suppress(OSError):
+                connection.send(json.dumps(ended).encode() + b"\n", socket.MSG_DONTWAIT)
+        for connection in (*self._stopping, *self._consoles, *self._new):
+            connection.close()
+
+    def begin(self, run: RunFacts, statistics: Callable[[], RunStatistics]) -> None:
+        """Begin a run; the statistics are those of its log so far."""
+        self._run, self._statistics, self._result = run, statistics, None
+        self._layout, self._batch = sample_struct(len(run.axes)), max(1, round(BATCH_S * run.rate_hz))
+        self._events.clear()
+        self._send({"run": asdict(run)})
+
+    def sample(self, sample: Sample) -> None:
+        """Publish a sample; the packet goes when BATCH_S are full."""
+        if not self._consoles and not self._new:
+            return
+        self._packed.append(
+            self._layout.pack(
+                sample.cycle,
+                sample.time_ns,
+                sample.missing,
+                *sample.position_counts,
+                *sample.current_raw,
+                *sample.statusword,
+            )
+        )
+        if len(self._packed) >= self._batch:
+            self._flush()
+
+    def event(self, event: CellEvent) -> None:
+        """Publish an event, in its place between the samples."""
+        shown = {"time_ns": event.time_ns, "axis": event.axis, "kind": event.kind.value, "code": event.code}
+        shown["text"] = event.text
+        self._flush()
+        self._events.append(shown)
+        self._send({"events": [shown]})
+
+    def finish(self) -> None:
+        """Publish the result of the run, whose log is complete."""
+        self._flush()
+        found = self._statistics()
+        self._result = {"valid": found.valid, "reason": found.reason, "samples": found.samples}
+        self._send({"result": self._result})
+
+    def _flush(self) -> None:
+        if not self._packed:
+            return
+        packed, self._packed = self._packed, []
+        self._send_to_all(SAMPLES, b"".join(packed), len(packed))
+
+    def _send(self, message: dict[str, Any]) -> None:
+        self._send_to_all(TEXT, json.dumps(message).encode(), 0)
+
+    def _send_to_all(self, kind: int, content: bytes, samples: int) -> None:
+        # Consoles that came meanwhile first get what they missed; all packets are sent by this thread alone.
+        while self._new:
+            if len(self._consoles) >= LARGEST_CONSOLES:
+                self._new.popleft().close()
+                continue
+            fresh = self._new.popleft()
+            self._consoles.append(fresh)
+            if self._run is not None:
+                past = {"run": asdict(self._run), "events": list(self._events), "result": self._result}
+                self._put(fresh, self._head(TEXT, 0) + json.dumps(past).encode())
+        self._number += 1
+        packet = self._head(kind, samples) + content if self._consoles else b""
+        for console in tuple(self._consoles):
+            self._put(console, packet)
+
+    def _head(self, kind: int, samples: int) -> bytes:
+        so_far = self._statistics()
+        return HEAD.pack(kind, self._number, so_far.samples, so_far.lost_cycles, sum(so_far.missing), samples)
+
+    def _put(self, console: socket.socket, packet: bytes) -> None:
+        try:
+            console.send(packet, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            pass  # it does not read; the numbers of the packets show the gap
+        except OSError:
+            with suppress(ValueError):
+                self._consoles.remove(console)
+            console.close()
+
+    def _wait(self) -> None:
+        """Accept consoles and stops until the listeners are shut down."""
+        feed, stop = self._listening
+        with feed, stop:
+            self._accept_all(feed, stop)
+
+    def _accept_all(self, feed: socket.socket, stop: socket.socket) -> None:
+        while True:
+            ready, _, _ = select.select((feed, stop), (), ())
+            try:
+                connection, _ = ready[0].accept()
+            except OSError:
+                return
+            if not of_this_user(connection):
+                connection.close()
+            elif ready[0] is feed:
+                with suppress(OSError):
+                    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+                self._new.append(connection)
+            else:
+                self._take_stop(connection)
+
+    def _take_stop(self, connection: socket.socket) -> None:
+        connection.settimeout(REQUEST_S)
+        try:
+            if connection.recv(len(STOP), socket.MSG_WAITALL) != STOP:
+                connection.close()
+                return
+            self._stop()
+            # It receives the outcome of the stop when the program ends.
+            self._stopping.append(connection)
+            connection.send(ACCEPTED)
+        except OSError:
+            connection.close()
+
+
+def end_of(error: BaseException | None) -> dict[str, Any]:
+    """Describe how a program ended: whether all axes are known to be stopped, and the error in words."""
+    chain: list[BaseException] = []
+    while error is not None and error not in chain:
+        chain.append(error)
+        error = error.__context__
+    notes = [note for one in chain for note in getattr(one, "__notes__", ()) if note.startswith(f"{WHILE}stopping")]
+    reason = "" if not chain else str(chain[0]) or ("stopped" if isinstance(chain[0], KeyboardInterrupt) else "")
+    text = reason or ("" if not chain else type(chain[0]).__name__)
+    return {"ok": not chain, "axes_stopped": not notes, "text": "; ".join((text, *notes) if text else notes)}

@@ -1,0 +1,373 @@
+// The console's page: what the server sends is kept for two minutes, drawn on canvases and written as text, never as
+// markup. `drivegain` on the window holds it, for the tests.
+const KEPT = 6000;
+const shown = { run: null, points: [], rows: [], events: [], status: null, received: 0 };
+window.drivegain = shown;
+const byId = (id) => document.getElementById(id);
+const axes = [];
+let changed = true;
+
+function element(name, text, className) {
+  const made = document.createElement(name);
+  if (text !== undefined) made.textContent = text;
+  if (className) made.className = className;
+  return made;
+}
+
+function number(value, digits) {
+  return value === null || value === undefined ? "–" : value.toFixed(digits);
+}
+
+// A value with as many digits as the first two of its standard deviation.
+function withDeviation(value, std) {
+  const digits = std > 0 ? Math.min(10, Math.max(0, 1 - Math.floor(Math.log10(std)))) : 4;
+  return `${number(value, digits)} ± ${number(std, digits)}`;
+}
+
+// ---- Axes
+
+function buildAxis(axis, index) {
+  const card = element("article");
+  const head = element("header");
+  const state = element("span", "no data", "state");
+  head.append(element("h3", axis.name), state);
+  const range = element("div", undefined, "range");
+  const bar = element("div", undefined, "bar");
+  const marker = element("i");
+  bar.append(marker);
+  range.append(element("span", number(axis.lower, 0)), bar, element("span", `${number(axis.upper, 0)} ${axis.unit}`));
+  const values = element("p", "–", "values");
+  const current = element("canvas");
+  current.setAttribute("role", "img");
+  current.setAttribute("aria-label", `Current reference of ${axis.name}`);
+  const residual = element("canvas", undefined, "residual");
+  residual.setAttribute("role", "img");
+  residual.setAttribute("aria-label", `Residual current of ${axis.name}`);
+  residual.hidden = true;
+  card.append(head, range, values, current, residual);
+  byId("axes").append(card);
+  axes.push({ ...axis, index, state, bar, marker, values, current, residual });
+}
+
+function showAxis(axis, status) {
+  const now = status.axes[axis.index];
+  if (!now) return;
+  axis.state.textContent = now.silent ? `${now.state}, DOES NOT ANSWER` : now.state;
+  axis.state.className = `state${now.fault || now.silent ? " fault" : now.power ? " power" : ""}`;
+  axis.values.textContent = `${number(now.position, 2)} ${axis.unit}, ${number(now.current, 3)} ${axis.current_unit}`;
+  const share = (now.position - axis.lower) / (axis.upper - axis.lower);
+  axis.marker.style.left = `calc(${100 * Math.min(1, Math.max(0, share))}% - 0.17rem)`;
+  axis.bar.classList.toggle("near", share < 0.03 || share > 0.97);
+}
+
+// ---- Curves
+
+function since(list, time) {
+  let low = 0, high = list.length;
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (list[middle][0] < time) low = middle + 1; else high = middle;
+  }
+  return list.slice(low);
+}
+
+function niceStep(range) {
+  const power = 10 ** Math.floor(Math.log10(range / 3));
+  return [1, 2, 5, 10].map((one) => one * power).find((one) => range / one <= 4);
+}
+
+// A chart: lines and bands over time, one scale for all of them. A line is {points, color}, of [time, value] pairs.
+function draw(canvas, colors, begin, end, lines, bands, unit) {
+  const scale = window.devicePixelRatio || 1;
+  const width = canvas.clientWidth, height = canvas.clientHeight;
+  if (!width) return;
+  if (canvas.width !== Math.round(width * scale) || canvas.height !== Math.round(height * scale)) {
+    canvas.width = Math.round(width * scale);
+    canvas.height = Math.round(height * scale);
+  }
+  const pen = canvas.getContext("2d");
+  pen.setTransform(scale, 0, 0, scale, 0, 0);
+  pen.clearRect(0, 0, width, height);
+  let low = Infinity, high = -Infinity;
+  for (const { points } of lines) {
+    for (const [, value] of points) {
+      if (value !== null) { low = Math.min(low, value); high = Math.max(high, value); }
+    }
+  }
+  for (const { points, half } of bands) {
+    for (const [, value] of points) {
+      if (value !== null) { low = Math.min(low, value - half); high = Math.max(high, value + half); }
+    }
+  }
+  if (low > high) return;
+  const spare = Math.max(0.08 * (high - low), 1e-3);
+  low -= spare; high += spare;
+  const left = 46, bottom = 4;
+  const x = (time) => left + (width - left - 4) * (time - begin) / (end - begin);
+  const y = (value) => bottom + (height - 2 * bottom) * (high - value) / (high - low);
+  const step = niceStep(high - low);
+  pen.font = "12px system-ui, sans-serif";
+  pen.textAlign = "right";
+  pen.textBaseline = "middle";
+  pen.lineWidth = 1;
+  for (let tick = Math.ceil(low / step) * step; tick <= high; tick += step) {
+    pen.strokeStyle = colors.line;
+    pen.beginPath(); pen.moveTo(left, y(tick)); pen.lineTo(width - 4, y(tick)); pen.stroke();
+    pen.fillStyle = colors.quiet;
+    const text = `${Number(tick.toPrecision(3))}`;
+    pen.fillText(text, left - 4, Math.min(height - 7, Math.max(7, y(tick))));
+  }
+  pen.textAlign = "left";
+  pen.fillText(unit, left + 4, 8);
+  for (const { points, half, color } of bands) {
+    pen.fillStyle = color;
+    for (const part of stretches(points)) {
+      pen.beginPath();
+      part.forEach(([time, value]) => pen.lineTo(x(time), y(value + half)));
+      part.reverse().forEach(([time, value]) => pen.lineTo(x(time), y(value - half)));
+      pen.fill();
+    }
+  }
+  for (const { points, color, thickness } of lines) {
+    pen.strokeStyle = color;
+    pen.lineWidth = thickness || 1.5;
+    for (const part of stretches(points)) {
+      pen.beginPath();
+      part.forEach(([time, value]) => pen.lineTo(x(time), y(value)));
+      pen.stroke();
+    }
+  }
+}
+
+function stretches(points) {
+  const found = [[]];
+  for (const point of points) {
+    if (point[1] === null) { if (found.at(-1).length) found.push([]); } else found.at(-1).push(point);
+  }
+  return found;
+}
+
+function drawAll() {
+  if (!changed || !shown.points.length) return;
+  changed = false;
+  const style = getComputedStyle(document.documentElement);
+  const colors = {};
+  for (const name of ["line", "quiet", "current", "predicted", "band", "residual"]) {
+    colors[name] = style.getPropertyValue(`--${name}`);
+  }
+  const end = shown.points.at(-1)[0];
+  const begin = end - Number(byId("span").value);
+  const points = since(shown.points, begin), rows = since(shown.rows, begin);
+  for (const axis of axes) {
+    const half = shown.status.band[axis.index] || 0;
+    const measured = points.map((point) => [point[0], point[1 + axes.length + axis.index]]);
+    const predicted = rows.map((row) => [row[0], row[1 + axis.index]]);
+    const residual = rows.map((row) => [row[0], row[1 + axes.length + axis.index]]);
+    draw(axis.current, colors, begin, end,
+      [{ points: predicted, color: colors.predicted, thickness: 4 }, { points: measured, color: colors.current }],
+      [{ points: predicted, half, color: colors.band }], axis.current_unit);
+    axis.residual.hidden = !shown.rows.length;
+    if (shown.rows.length) {
+      const zero = residual.map(([time, value]) => [time, value === null ? null : 0]);
+      draw(axis.residual, colors, begin, end, [{ points: residual, color: colors.residual }],
+        [{ points: zero, half, color: colors.band }], axis.current_unit);
+    }
+  }
+}
+
+// ---- Words and figures
+
+const PHASES = {
+  waiting: "No recording runs. Start one in a terminal: drivegain record or drivegain recalibrate.",
+  running: "The drives are prepared…",
+  ended: "The last run has ended.",
+};
+
+function showStatus(status) {
+  const run = shown.run;
+  const running = status.phase === "running";
+  byId("phase").textContent = running && run ? "Recording" : PHASES[status.phase];
+  byId("stop").disabled = !running;
+  byId("log").textContent = run ? run.log.split("/").at(-1) : "no run yet";
+  byId("log").title = run ? run.log : "";
+  byId("moves").value = status.moves ? status.done / status.moves : 0;
+  byId("done").textContent = status.moves ? `${status.done} of ${status.moves} moves` : "";
+  const loads = Object.entries(status.bus_load).map(([bus, load]) => `${bus} ${number(100 * load, 0)} %`).join(", ");
+  const figures = [
+    ["Samples", String(status.samples)],
+    ["SYNC cycles lost", String(status.lost), status.lost > 0],
+    ["Missing answers", String(status.missing), status.missing > 0],
+    ["SYNC rate", running ? `${number(status.rate_hz, 0)} Hz` : "–"],
+    ["Bus load, computed", running && loads ? loads : "–"],
+    ["Disk free", status.free_bytes === null ? "–" : `${number(status.free_bytes / 1e9, 1)} GB`],
+    ["Packets this page missed", String(status.dropped)],
+  ];
+  const list = byId("figures");
+  if (list.children.length !== figures.length) {
+    list.replaceChildren(...figures.map(([name]) => {
+      const entry = element("div");
+      entry.append(element("dt", name), element("dd"));
+      return entry;
+    }));
+  }
+  figures.forEach(([, text, alarm], index) => {
+    const value = list.children[index].lastChild;
+    value.textContent = text;
+    value.className = alarm ? "alarm" : "";
+  });
+  axes.forEach((axis) => showAxis(axis, status));
+  byId("remark").textContent = status.remark;
+  byId("remark").hidden = !status.remark;
+  document.querySelectorAll(".predicted-only").forEach((one) => { one.hidden = !shown.rows.length; });
+  showEnd(status);
+  showStop(status.stop);
+}
+
+function showEnd(status) {
+  const notice = byId("ended");
+  const { end, result } = status;
+  notice.hidden = !(end || result);
+  if (notice.hidden) return;
+  const words = [];
+  if (result) words.push(result.valid ? "The recording is complete." : `The recording is INVALID: ${result.reason}.`);
+  if (end && !end.ok) words.push(`It ended early: ${end.text}.`);
+  if (end && !end.axes_stopped) words.push("NOT ALL AXES ARE CONFIRMED STOPPED: look at the robot.");
+  else if (end && !end.ok) words.push("The axes are stopped.");
+  notice.textContent = words.join(" ") || "The program has ended.";
+  notice.classList.toggle("good", Boolean(!end || end.ok) && Boolean(!result || result.valid));
+}
+
+function showStop(stop) {
+  byId("stopped").hidden = !stop;
+  if (!stop) return;
+  byId("stopped").textContent = `Stop asked at ${stop.at}: ${stop.text}.`;
+  byId("stopped").classList.toggle("good", Boolean(stop.axes_stopped));
+}
+
+function addEvents(events) {
+  for (const event of events) {
+    if (event.kind === "move start" || event.kind === "move end") continue;
+    const line = element("li");
+    line.append(element("span", `${number(event.time_s, 3)} s `, "quiet"));
+    line.append(element("strong", event.axis ? `${event.axis} ` : "", event.alarm ? "alarm" : ""));
+    line.append(element("span", (event.alarm ? "⚠ " : "") + event.text, event.alarm ? "alarm" : ""));
+    if (event.remedy) line.append(element("span", `→ ${event.remedy}`, "remedy"));
+    byId(event.alarm ? "alarms" : "events").prepend(line);
+  }
+  for (const list of [byId("alarms"), byId("events")]) while (list.children.length > 200) list.lastChild.remove();
+}
+
+// ---- Results
+
+function table(headings, rows) {
+  const made = element("table");
+  const head = element("tr");
+  headings.forEach((text) => head.append(element("th", text)));
+  made.append(head);
+  for (const row of rows) {
+    const line = element("tr");
+    row.forEach((text) => line.append(element("td", text)));
+    made.append(line);
+  }
+  const box = element("div", undefined, "table");
+  box.append(made);
+  return box;
+}
+
+function signed(value, digits, unit) {
+  return value === null ? "–" : `${value > 0 ? "+" : ""}${number(value, digits)} ${unit}`;
+}
+
+function showResults(found) {
+  const parts = found.problems.map((text) => element("p", text, "alarm"));
+  if (found.gains) {
+    parts.push(element("h3", `Gains of ${found.gains.file}, fitted ${found.gains.created.slice(0, 16).replace("T", " ")}`));
+    parts.push(table(["axis", "gain ± σ", "unit", "from the nameplate", `error on ${found.gains.error}`],
+      found.gains.axes.map((one) => [one.axis, withDeviation(one.value, one.std), one.unit,
+        signed(one.change_percent, 2, "%"), `${number(one.error_percent, 2)} %`])));
+  } else parts.push(element("p", "No calibration yet. After the recordings: drivegain fit LOG … --out calibration.yaml"));
+  if (found.report) {
+    const link = element("a", "Open the report");
+    link.href = "report";
+    link.target = "_blank";
+    link.rel = "noopener";
+    parts.push(link);
+  }
+  if (found.session) {
+    const { session } = found;
+    parts.push(element("h3", `Scheduled recalibration ${session.session}: ${session.outcome}`));
+    if (session.waits) parts.push(element("p", "A proposal waits for approval. Type in a terminal:", "alarm"));
+    else if (session.problem) parts.push(element("p", session.problem));
+    session.sentences.forEach((text) => parts.push(element("p", text)));
+    if (session.to_do.length) parts.push(element("pre", session.to_do.join("\n")));
+  }
+  if (found.history) {
+    parts.push(element("h3", `History: ${found.history.calibrations} calibrations`));
+    parts.push(table(["axis", "since the baseline", "σ", "drift"], found.history.axes.map((one) => [one.axis,
+      signed(one.change_percent, 2, "%"), one.change_sigmas === null ? "–" : number(Math.abs(one.change_sigmas), 1),
+      one.alarm || "none"])));
+    parts.push(element("pre", found.history.command));
+  }
+  byId("results").replaceChildren(...parts);
+}
+
+let before = "";
+async function look() {
+  try {
+    const text = await (await fetch("results")).text();
+    const found = JSON.parse(text);
+    // The stop is shown by this way too: the curves may be stalled.
+    if (found.stop) showStop(found.stop);
+    if (text !== before && "problems" in found) showResults(found);
+    before = text;
+  } catch { /* the stream reports it */ }
+  setTimeout(look, 1000);
+}
+
+async function stop() {
+  byId("stop").disabled = true;
+  try {
+    showStop(await (await fetch("stop", { method: "POST" })).json());
+  } catch {
+    showStop({ at: "now", text: "the console did not answer: press Ctrl-C in the recorder's terminal, or the emergency stop" });
+  }
+}
+
+// ---- Start
+
+function take(message) {
+  const { status, new: fresh } = message;
+  if ("run" in fresh) {
+    Object.assign(shown, { run: fresh.run, points: [], rows: [], events: [], received: 0 });
+    byId("alarms").replaceChildren();
+    byId("events").replaceChildren();
+  }
+  for (const name of ["points", "rows", "events"]) {
+    if (!fresh[name]) continue;
+    shown[name].push(...fresh[name]);
+    shown[name].splice(0, shown[name].length - KEPT);
+  }
+  shown.received += (fresh.points || []).length;
+  shown.status = status;
+  changed = true;
+  addEvents(fresh.events || []);
+  showStatus(status);
+}
+
+async function begin() {
+  const cell = await (await fetch("cell")).json();
+  byId("cell").textContent = cell.cell;
+  document.title = `${cell.cell} – drivegain console`;
+  cell.axes.forEach(buildAxis);
+  const stream = new EventSource("curves");
+  stream.onmessage = (event) => take(JSON.parse(event.data));
+  stream.onerror = () => { byId("phase").textContent = "The console does not answer; the recording goes on without it."; };
+  byId("stop").addEventListener("click", stop);
+  byId("span").addEventListener("change", () => { changed = true; });
+  window.addEventListener("resize", () => { changed = true; });
+  const frame = () => { drawAll(); requestAnimationFrame(frame); };
+  frame();
+  look();
+}
+
+begin();

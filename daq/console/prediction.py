@@ -1,0 +1,123 @@
+"""The current that a calibration predicts of the samples as they come, with its band and the residual.
+
+The filters are those of the fit, applied to the last samples: a low-pass without phase and central differences for the
+positions, one decimator for predicted and measured current. A row is given once all samples of its window are there,
+some 0.4 s later. At standstill there is none: stiction hides any current below it.
+
+*Band.* Twice the calibration's relative error of the axis on its held-out runs (of the fit, without any), times the
+root mean square of the current predicted so far in motion. It is the size that residuals had, not a limit for alarms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from daq.config.cell import Cell, model_of
+from daq.workflow.validate import check_cell, conditioning_of, unpredictable
+from ident.arrays import FloatArray, IntArray
+from ident.calibration import Calibration
+from ident.data.conditioning import decimator, low_pass
+from ident.data.dataset import planned
+from ident.model.bodies import Payload
+from ident.model.robot import Motion
+from ident.prediction import predict_current
+
+EDGE_S = 0.15  #: Of a window, where the low-pass is not yet what it is over a whole run (to 2·10⁻⁵ at 40 Hz)
+STEP_S = 0.2  #: Samples that are predicted at once: each prediction costs 2 ms, and most of it is not for the samples
+STANDSTILL_SHARE = 0.01  #: Of the speed limit, where the calibration's filter has no standstill speeds
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """Decimated rows; NaN for a motor that is at standstill."""
+
+    cycle: IntArray  #: number of the sample at the centre of the window, shape (r,)
+    predicted: FloatArray  #: current reference [unit of the gains' current], shape (r, n)
+    residual: FloatArray  #: measured minus predicted, both filtered, shape (r, n)
+    band: FloatArray  #: half the band of each motor, shape (n,)
+
+
+class Predictor:
+    """Predicts one run; the samples come in order, in blocks of any length."""
+
+    def __init__(self, calibration: Calibration, cell: Cell, payload: Payload | None, rate_hz: float) -> None:
+        """Check that the calibration knows the cell and what is mounted.
+
+        Raises:
+            CalibrationUnreadable, LogsDiffer: see `daq.workflow.validate`.
+            ModelError: the model of the cell is not that of the calibration.
+        """
+        check_cell(calibration, cell.folder or Path(cell.name), cell)
+        self.problem = unpredictable(calibration, payload)  #: Why nothing is predicted, empty if it is
+        own = set() if payload is None else _identified(calibration, payload.mounting)
+        self._payload = (
+            None
+            if payload is None
+            else replace(payload, known={name: value for name, value in payload.known.items() if name not in own})
+        )
+        self._calibration, self._model = calibration, model_of(cell)
+        self._conditioning, self._rate_hz = conditioning_of(calibration), rate_hz
+        self._filter = decimator(rate_hz, self._conditioning.decimation_cutoff_hz)
+        edge = round(EDGE_S * rate_hz)
+        self._step = max(1, round(STEP_S * rate_hz))
+        self._margin = self._filter.half + -(-edge // self._filter.factor) * self._filter.factor
+        limits = [STANDSTILL_SHARE * axis.limits.velocity for axis in cell.axes]
+        self._still = np.array(self._conditioning.standstill_rad_s or limits)
+        error = calibration.holdout_error_percent or calibration.relative_error_percent
+        self._share = 2e-2 * np.array(error.axes)
+        self._squares, self._count = np.zeros(len(cell.axes)), np.zeros(len(cell.axes))
+        self._cycle, self._position, self._current = -1, np.zeros((0, 0)), np.zeros((0, 0))
+
+    def take(self, cycle: int, position_rad: FloatArray, current: FloatArray) -> Rows | None:
+        """Take consecutive samples, the first of the given cycle; returns the rows that are complete now.
+
+        Args:
+            cycle: a gap after the samples before begins a new window.
+            position_rad: joint positions [rad; m of a prismatic joint], shape (k, n).
+            current: of the motors, shape (k, n).
+
+        Raises:
+            IdentificationError: the calibration cannot predict this motion.
+        """
+        if cycle != self._cycle + len(self._position) or not len(self._position):
+            self._cycle, self._position, self._current = cycle, position_rad, current
+        else:
+            self._position = np.concatenate((self._position, position_rad))
+            self._current = np.concatenate((self._current, current))
+        if self.problem or len(self._position) - 2 - 2 * self._margin < self._step:
+            return None
+        found = self._predict()
+        # The next window begins so that its first whole row follows the last one of this.
+        done = found.cycle[-1] + self._filter.factor - self._cycle - 1 - self._margin
+        self._cycle, self._position, self._current = self._cycle + done, self._position[done:], self._current[done:]
+        return found
+
+    def _predict(self) -> Rows:
+        rate_hz, settings = self._rate_hz, self._conditioning
+        raw = np.ascontiguousarray(self._position.T)
+        smooth = low_pass(raw, rate_hz, settings.position_cutoff_hz, settings.position_order)
+        position, velocity = smooth[:, 1:-1], (smooth[:, 2:] - smooth[:, :-2]) * (0.5 * rate_hz)
+        acceleration = (smooth[:, 2:] - 2.0 * position + smooth[:, :-2]) * rate_hz**2
+        data = planned(Motion(position.T, velocity.T, acceleration.T), rate_hz, self._payload)
+        predicted = self._filter(predict_current(self._calibration, self._model, data).T)
+        measured = self._filter(self._current[1:-1].T)
+        centres = self._filter.centres(position.shape[1])
+        whole = (centres >= self._margin) & (centres < position.shape[1] - self._margin)
+        slow = np.abs(velocity[:, centres[whole]]) < self._still[:, None]
+        # A coupled motor turns with several joints: each of them must move.
+        still = (np.abs(self._model.drive_train.to_motor) > 0).astype(float) @ slow > 0
+        predicted, measured = predicted[:, whole], measured[:, whole]
+        self._squares += np.where(still, 0.0, predicted**2).sum(axis=1)
+        self._count += (~still).sum(axis=1)
+        band = self._share * np.sqrt(self._squares / np.maximum(self._count, 1.0))
+        predicted = np.where(still, np.nan, predicted)
+        return Rows(self._cycle + 1 + centres[whole], predicted.T, (measured - predicted).T, band)
+
+
+def _identified(calibration: Calibration, mounting: str) -> set[str]:
+    """Names of the payload parameters that a calibration holds for a mounting."""
+    names = (parameter.name.partition(":") for parameter in calibration.parameters)
+    return {name for name, _, of in names if of == mounting}

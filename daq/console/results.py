@@ -1,0 +1,146 @@
+"""Results in the files of a cell after a run: gains, report, history and drift, proposals with the command to type.
+
+Everything is read, and nothing written. The places are those of the cell file and of the command line; a browser names
+none of them.
+"""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from daq.config.cell import Cell
+from daq.errors import DaqError, ExitCode
+from daq.jobs.reporting import Conclusion, to_do
+from daq.jobs.session import CALIBRATION, REPORT, Outcome, Session, sessions
+from daq.ledger.store import HistoryStore
+from daq.ledger.watch import alarm_text, watch
+from daq.report.residual_page import PAGE
+from daq.workflow.calibration_file import load_calibration
+from ident.calibration import Calibration
+
+LARGEST_REPORT_BYTES = 64 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Files that a console may read."""
+
+    cell_file: Path
+    cell: Cell
+    calibration: Path | None  #: given on the command line, for the prediction too
+    report: Path | None  #: folder given on the command line
+
+
+class Results:
+    """Reads the files again when they have changed."""
+
+    def __init__(self, places: Places) -> None:
+        self._places = places
+        self._read: dict[Path, tuple[tuple[int, int], Calibration]] = {}
+
+    def calibration(self) -> tuple[Path, Calibration] | None:
+        """Return the calibration of the command line, else that of the newest session; None without either.
+
+        Raises:
+            DaqError: it cannot be read.
+        """
+        newest = self._newest()
+        path = self._places.calibration or (None if newest is None else newest.folder / CALIBRATION)
+        if path is None or not path.exists():
+            return None
+        status = path.stat()
+        mark = status.st_mtime_ns, status.st_size
+        if path not in self._read or self._read[path][0] != mark:
+            self._read = {path: (mark, load_calibration(path))}
+        return path, self._read[path][1]
+
+    def report(self) -> bytes | None:
+        """Return the page of the report, that of the command line or of the newest session; None without one."""
+        path = self._report_path()
+        if path is None or path.stat().st_size > LARGEST_REPORT_BYTES:
+            return None
+        return path.read_bytes()
+
+    def document(self) -> dict[str, Any]:
+        """Return everything for the page; a file that cannot be read is a sentence in `problems`."""
+        problems: list[str] = []
+        found: dict[str, Any] = {"problems": problems, "report": self._report_path() is not None}
+        for name, read in (("gains", self._gains), ("history", self._history), ("session", self._session)):
+            try:
+                found[name] = read()
+            except (DaqError, OSError) as error:
+                found[name] = None
+                problems.append(str(error))
+        return found
+
+    def _newest(self) -> Session | None:
+        section = self._places.cell.recalibration
+        past = () if section is None else sessions(section.folder, self._places.cell.name)
+        return past[-1] if past else None
+
+    def _report_path(self) -> Path | None:
+        newest = self._newest()
+        folder = self._places.report or (None if newest is None else newest.folder / REPORT)
+        return None if folder is None or not (folder / PAGE).is_file() else folder / PAGE
+
+    def _gains(self) -> dict[str, Any] | None:
+        known = self.calibration()
+        if known is None:
+            return None
+        path, calibration = known
+        error = calibration.holdout_error_percent or calibration.relative_error_percent
+        return {
+            "file": path.name,
+            "created": calibration.created,
+            "error": "held-out runs" if calibration.holdout_error_percent is not None else "the fit's own runs",
+            "axes": [
+                {
+                    **{"axis": gain.axis, "unit": gain.unit, "value": gain.value, "std": gain.std},
+                    **{"nameplate": gain.nameplate, "change_percent": gain.change_percent, "error_percent": percent},
+                }
+                for gain, percent in zip(calibration.gains, error.axes, strict=True)
+            ],
+        }
+
+    def _history(self) -> dict[str, Any] | None:
+        place = self._places.cell.history
+        if place is None or not place.store.exists():
+            return None
+        with HistoryStore(place.store) as store:
+            entries, acknowledged = store.entries(), store.acknowledgements()
+        series = watch(entries, acknowledged)
+        return {
+            "calibrations": len(entries),
+            "axes": [
+                {
+                    "axis": one.axis,
+                    "change_percent": None if one.drift is None or len(one.points) < 2 else one.drift.change_percent,
+                    "change_sigmas": None if one.drift is None or len(one.points) < 2 else one.drift.change_sigmas,
+                    "alarm": alarm_text(one),
+                }
+                for one in series
+            ],
+            "command": f"drivegain history {shlex.quote(str(self._places.cell_file))}",
+        }
+
+    def _session(self) -> dict[str, Any] | None:
+        newest = self._newest()
+        if newest is None:
+            return None
+        state = newest.state
+        outcome = state.outcome
+        ended = None
+        if outcome is not None:
+            ended = Conclusion(outcome, state.exit_code or ExitCode.OK, newest, state.problem)
+        return {
+            "session": state.session,
+            "outcome": "not finished" if outcome is None else outcome.value,
+            "waits": outcome is Outcome.PROPOSED,
+            "problem": state.problem,
+            "runs": [{"name": run.name, "samples": run.samples} for run in state.runs],
+            "sentences": [] if state.fitted is None else list(state.fitted.sentences),
+            "to_do": [] if ended is None else to_do(ended, self._places.cell_file),
+        }

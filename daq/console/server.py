@@ -1,0 +1,257 @@
+"""The page on 127.0.0.1: who may read it, and its few addresses.
+
+Every address begins with a random token. A request passes only under the host of this server (a name that was bound
+to 127.0.0.1 by DNS rebinding is another host), and with the origin of this page where a browser names one. The content
+security policy allows this server's own files alone. No address carries a path of a file. The only thing that a browser
+can do is to stop the recorder.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import json
+import secrets
+import socket
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from importlib.resources import files
+from math import isfinite
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.datastructures import Headers
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from daq.config.cell import Cell
+from daq.console.live import Live
+from daq.console.results import Results
+from daq.errors import DaqError
+
+TICK_S = 0.04  #: Time between two messages to a page: 25 a second
+RESULTS_S = 2.0  #: Time between two looks at the files
+LARGEST_READERS = 8  #: Pages that are served curves at the same time
+CONNECTIONS = 64
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+REPORT_POLICY = "sandbox; default-src 'none'; img-src data:; style-src 'unsafe-inline'; frame-ancestors 'none'"
+HEADERS = {
+    "content-security-policy": POLICY,
+    "cache-control": "no-store",
+    "referrer-policy": "no-referrer",
+    "x-content-type-options": "nosniff",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+}
+
+
+class Guard:
+    """Refuses requests of other hosts, other origins and without the token, before anything else sees them."""
+
+    def __init__(self, app: ASGIApp, token: str, hosts: frozenset[str]) -> None:
+        self._app, self._token, self._hosts = app, token.encode(), hosts
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, or answer it with the refusal."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+
+        async def send_guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                there = {name for name, _ in message["headers"]}
+                more = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
+                message["headers"] = [*message["headers"], *(one for one in more if one[0] not in there)]
+            await send(message)
+
+        refusal = self._refusal(scope)
+        if refusal is not None:
+            await refusal(scope, receive, send_guarded)
+            return
+        # The token is not part of the routes: they are few, and compared as they are.
+        scope["path"] = scope["path"][len(self._token) + 1 :]
+        await self._app(scope, receive, send_guarded)
+
+    def _refusal(self, scope: Scope) -> Response | None:
+        headers = Headers(scope=scope)
+        hosts, origins = headers.getlist("host"), headers.getlist("origin")
+        if len(hosts) != 1 or hosts[0] not in self._hosts:
+            return PlainTextResponse("this server has another name: open the address that was printed", 421)
+        own = {f"http://{host}" for host in self._hosts}
+        elsewhere = headers.get("sec-fetch-site", "none") not in ("none", "same-origin")
+        if not set(origins) <= own or elsewhere or (scope["method"] == "POST" and not origins):
+            return PlainTextResponse("only the console's own page may ask", 403)
+        token = scope["path"].split("/")[1].encode()
+        return None if hmac.compare_digest(token, self._token) else PlainTextResponse("not found", 404)
+
+
+class Page:
+    """The answers."""
+
+    def __init__(self, cell: Cell, live: Live, results: Results) -> None:
+        self._cell, self._live, self._results = cell, live, results
+        self._document: dict[str, Any] = {}
+        self.over: Callable[[], bool] = lambda: False  #: Whether the server ends
+        self._readers = 0
+
+    def app(self, token: str, hosts: frozenset[str]) -> ASGIApp:
+        """Build the application; its routes are all that there is."""
+        routes = [
+            Route("/", self._file("page.html", "text/html")),
+            Route("/page.js", self._file("page.js", "text/javascript")),
+            Route("/page.css", self._file("page.css", "text/css")),
+            Route("/cell", self._facts),
+            Route("/curves", self._curves),
+            Route("/results", self._shown_results),
+            Route("/report", self._report),
+            Route("/stop", self._stop, methods=["POST"]),
+        ]
+        return Guard(Starlette(routes=routes, lifespan=self._background), token, hosts)
+
+    @asynccontextmanager
+    async def _background(self, _: Starlette) -> AsyncIterator[None]:
+        tasks = [asyncio.create_task(self._live.follow()), asyncio.create_task(self._look())]
+        yield
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _look(self) -> None:
+        """Look at the files again and again."""
+        while True:
+            with suppress(DaqError, OSError):
+                known = await asyncio.to_thread(self._results.calibration)
+                self._live.calibration = None if known is None else known[1]
+            self._document = await asyncio.to_thread(self._results.document)
+            await asyncio.sleep(RESULTS_S)
+
+    @staticmethod
+    def _file(name: str, kind: str) -> Any:
+        content = files("daq.console").joinpath(name).read_bytes()
+
+        async def answer(_: Request) -> Response:
+            return Response(content, media_type=kind)
+
+        return answer
+
+    async def _facts(self, _: Request) -> Response:
+        """Facts of the cell that do not change."""
+        axes = [
+            {
+                "name": axis.name,
+                "unit": axis.unit.name,
+                "lower": axis.limits.position[0] / axis.unit.si,
+                "upper": axis.limits.position[1] / axis.unit.si,
+                "current_unit": axis.gain_unit.partition("/")[2],
+            }
+            for axis in self._cell.axes
+        ]
+        return JSONResponse({"cell": self._cell.name, "axes": axes})
+
+    async def _shown_results(self, _: Request) -> Response:
+        return Response(_json({**self._document, "stop": self._live.stop_state}), media_type="application/json")
+
+    async def _report(self, _: Request) -> Response:
+        with suppress(DaqError, OSError):
+            content = await asyncio.to_thread(self._results.report)
+            if content is not None:
+                # Its own styles and pictures are inside; a script would not run.
+                return Response(content, media_type="text/html", headers={"content-security-policy": REPORT_POLICY})
+        return PlainTextResponse("there is no report yet", 404)
+
+    async def _stop(self, _: Request) -> Response:
+        return JSONResponse(await self._live.stop())
+
+    async def _curves(self, _: Request) -> Response:
+        """Everything that changes, as server-sent events; a page that does not read gets less, and delays no other."""
+        if self._readers >= LARGEST_READERS:
+            return PlainTextResponse(f"{LARGEST_READERS} pages are open already: close one", 503)
+        return StreamingResponse(self._messages(), media_type="text/event-stream")
+
+    async def _messages(self) -> AsyncIterator[bytes]:
+        live, epoch, seen, before = self._live, -1, [0, 0, 0], b""
+        self._readers += 1
+        try:
+            while not self.over():
+                message: dict[str, Any] = {}
+                if epoch != live.epoch:
+                    epoch, seen = live.epoch, [0, 0, 0]
+                    message["run"] = live.run
+                rings = {"points": live.points, "rows": live.rows, "events": live.events}
+                for place, (name, ring) in enumerate(rings.items()):
+                    if new := ring.since(seen[place]):
+                        message[name] = new
+                    seen[place] = ring.end
+                status = _json(live.status())
+                if message or status != before:
+                    before = status
+                    yield b'data: {"status": %b, "new": %b}\n\n' % (status, _json(message))
+                await asyncio.sleep(TICK_S)
+        finally:
+            self._readers -= 1
+
+
+def _json(document: Any) -> bytes:
+    """Encode a document; numbers that JSON has not become null."""
+
+    def finite(value: Any) -> Any:
+        if isinstance(value, float):
+            return value if isfinite(value) else None
+        if isinstance(value, dict):
+            return {key: finite(one) for key, one in value.items()}
+        return [finite(one) for one in value] if isinstance(value, list | tuple) else value
+
+    try:
+        return json.dumps(document, allow_nan=False).encode()
+    except ValueError:
+        return json.dumps(finite(document)).encode()
+
+
+def listen(port: int) -> socket.socket:
+    """Return a socket that listens on 127.0.0.1.
+
+    Raises:
+        OSError: the port is taken.
+    """
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind(("127.0.0.1", port))
+        listener.listen(CONNECTIONS)
+    except OSError:
+        listener.close()
+        raise
+    return listener
+
+
+def new_token() -> str:
+    """Return a token of 192 bits."""
+    return secrets.token_urlsafe(24)
+
+
+def hosts_of(port: int) -> frozenset[str]:
+    """Return the hosts under which a server on a port is asked."""
+    return frozenset({f"127.0.0.1:{port}", f"localhost:{port}"})
+
+
+def server_of(page: Page, token: str, port: int) -> uvicorn.Server:
+    """Return a server of plain HTTP/1.1; when it ends, it waits a second for pages that do not read."""
+    config = uvicorn.Config(
+        page.app(token, hosts_of(port)),
+        log_level="critical",  # a page that was cut off at the end is no error
+        access_log=False,
+        server_header=False,
+        proxy_headers=False,
+        ws="none",
+        limit_concurrency=CONNECTIONS,
+        timeout_graceful_shutdown=1,
+    )
+    server = uvicorn.Server(config)
+    page.over = lambda: server.should_exit
+    return server

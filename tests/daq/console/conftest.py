@@ -1,0 +1,29 @@
+"""A cell for the console's tests; those in a browser need Chromium."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Make the marker known."""
+    config.addinivalue_line(
+        "markers", "browser: drives Chromium, where DRIVEGAIN_CHROMIUM names it (make test-console)"
+    )
+
+
+@pytest.fixture(scope="session")
+def cell(checkout: Path) -> Cell:
+    """The demo cell."""
+    return load_cell(checkout / "configs" / "cells" / "demo.yaml")
+
+
+@pytest.fixture
+def cell_file(tmp_path: Path) -> Path:
+    """A path of its own, so that the feeds of two tests have different addresses; it is not read."""
+    return tmp_path / "cell.yaml"

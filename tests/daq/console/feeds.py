@@ -1,0 +1,110 @@
+"""A run to publish without a robot, and a console's page served to the test."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from http.client import HTTPConnection, HTTPResponse
+from pathlib import Path
+
+from daq.config.cell import Cell
+from daq.console.feed import Feed, RunFacts
+from daq.console.live import Live
+from daq.console.results import Places, Results
+from daq.console.server import Page, listen, server_of
+from daq.log.metadata import RunStatistics
+from drivers.stream.sample import Sample
+from ident.calibration import Calibration, Parameter
+from ident.data.conditioning import Conditioning
+from tests.daq.calibrations import demo_calibration
+
+TOKEN = "the-token-of-the-test"
+RATE_HZ = 500.0
+
+
+def facts(cell: Cell, log: Path) -> RunFacts:
+    """A run of a cell of uncoupled motors, in which a count is a milliradian and a raw unit a milliampere."""
+    count = len(cell.axes)
+    identity = [[float(row == column) for column in range(count)] for row in range(count)]
+    scales = [1e-3] * count, [1e-3] * count, identity, [0.0] * count
+    return RunFacts("id", str(log), cell.axis_names, RATE_HZ, 3, *scales, None, {"can0": 0.4})
+
+
+def predicting_calibration() -> Calibration:
+    """A calibration of the demo cell with every filter and without effects."""
+    filters = Conditioning(standstill_rad_s=(0.03,) * 6).document()
+    # Without dry friction, whose sign depends on the last digit of a speed near zero.
+    each = {"Ia": 1.0, "fv": 3.0, "off": 0.5}
+    parameters = tuple(
+        Parameter(f"{name}{axis}", value / axis, 0.1, "SI") for name, value in each.items() for axis in range(1, 7)
+    )
+    gravity = Parameter("mx2", 2.0, 0.1, "kg m"), Parameter("my3", -1.0, 0.1, "kg m")
+    return replace(demo_calibration(), filter=filters, effects=(), parameters=(*parameters, *gravity))
+
+
+class Recording:
+    """Publishes samples, as the recorder does."""
+
+    def __init__(self, feed: Feed, cell: Cell, log: Path) -> None:
+        self.feed, self.axes, self.samples = feed, len(cell.axes), 0
+        feed.begin(facts(cell, log), self.statistics)
+
+    def statistics(self) -> RunStatistics:
+        """Statistics of the log that there would be."""
+        return RunStatistics(self.samples, 0, (0,) * self.axes, valid=True)
+
+    def run(self, count: int) -> None:
+        """Publish so many samples; positions and currents are the number of the cycle and of the axis."""
+        for _ in range(count):
+            cycle = self.samples
+            self.samples += 1
+            position = tuple(cycle + axis for axis in range(self.axes))
+            current = tuple(-cycle - axis for axis in range(self.axes))
+            self.feed.sample(Sample(cycle, cycle * 2_000_000, position, current, (0x237,) * self.axes))
+
+
+class Served:
+    """A console on a free port, in a thread."""
+
+    def __init__(self, cell_file: Path, cell: Cell, report: Path | None = None) -> None:
+        self.live = Live(cell_file, cell)
+        self.listener = listen(0)
+        self.port = self.listener.getsockname()[1]
+        page = Page(cell, self.live, Results(Places(cell_file, cell, None, report)))
+        self.server = server_of(page, TOKEN, self.port)
+        self.thread = threading.Thread(target=lambda: asyncio.run(self.server.serve(sockets=[self.listener])))
+
+    def ask(self, path: str, method: str = "GET", **headers: str) -> tuple[HTTPResponse, bytes]:
+        """Ask for a path as it is written; underscores of the headers' names are hyphens."""
+        connection = HTTPConnection("127.0.0.1", self.port, timeout=10)
+        try:
+            named = {name.replace("_", "-"): value for name, value in headers.items()}
+            connection.request(method, path, headers=named)
+            answer = connection.getresponse()
+            return answer, answer.read()
+        finally:
+            connection.close()
+
+    def reader(self) -> socket.socket:
+        """A page that has asked for the curves, and does not read yet."""
+        connection = socket.create_connection(("127.0.0.1", self.port), timeout=10)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        connection.sendall(f"GET /{TOKEN}/curves HTTP/1.1\r\nHost: 127.0.0.1:{self.port}\r\n\r\n".encode())
+        return connection
+
+
+@contextmanager
+def served(cell_file: Path, cell: Cell, report: Path | None = None) -> Iterator[Served]:
+    """Serve a console until the block ends."""
+    console = Served(cell_file, cell, report)
+    with console.listener:
+        console.thread.start()
+        try:
+            yield console
+        finally:
+            console.server.should_exit = True
+            console.thread.join(20)

@@ -1,0 +1,234 @@
+"""The page in Chromium beside whole recordings of the simulated cell: what it shows is what the log holds."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, FloatRect, Page, Request, sync_playwright
+
+from daq.cli.app import main
+from daq.config.cell_file import load_cell
+from daq.errors import ExitCode
+from daq.log.conversion import scaling
+from daq.log.reader import Log, read_log
+from daq.log.salvage import salvage
+from daq.workflow.calibration_file import save_calibration
+from drivers.stream.sample import EventKind
+from tests.daq.console.feeds import predicting_calibration
+
+CHROMIUM = os.environ.get("DRIVEGAIN_CHROMIUM", "")
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(not CHROMIUM, reason="DRIVEGAIN_CHROMIUM names no browser; `make test-console` does"),
+]
+FAULTS = """\
+faults:
+  - {fault: lost, axis: J2, at_s: 1.5, cycles: 1}
+  - {fault: emergency, axis: J3, at_s: 4.0, emcy_code: 0x7305}
+"""
+HEARD_S = 60.0  #: Time for the page to show what is awaited; longer than a busy machine needs
+
+
+def until(page: Page, condition: str) -> None:
+    """Wait for a condition in the page's script; the browser's own waiting would need `unsafe-eval`."""
+    for _ in range(round(20 * HEARD_S)):
+        if page.evaluate(condition):
+            return
+        time.sleep(0.05)
+    raise AssertionError(f"not within {HEARD_S:g} s: {condition}\n{page.inner_text('body')}")
+
+
+class Rig:
+    """A simulated cell with its console, and a browser."""
+
+    def __init__(self, folder: Path, checkout: Path, browser: Browser, stack: ExitStack, faults: str) -> None:
+        self.folder, self.checkout, self.stack = folder, checkout, stack
+        (folder / "faults.yaml").write_text(faults, encoding="utf-8")
+        shutil.copytree(checkout / "configs", folder / "configs")
+        self.cell_file = folder / "configs" / "cells" / "demo.yaml"
+        given = ("--faults", str(folder / "faults.yaml")) if faults else ()
+        simulation = self.start("simulate", "clean", "--port", "0", *given)
+        assert simulation.stdout is not None
+        lines = list(iter(simulation.stdout.readline, "\n")) + list(iter(simulation.stdout.readline, "\n"))
+        text = self.cell_file.read_text(encoding="utf-8")
+        bus = "".join(lines[lines.index("bus:\n") :])
+        self.cell_file.write_text(re.sub(r"bus:\n.*?(?=axes:)", bus, text, flags=re.DOTALL), encoding="utf-8")
+        self.cell = load_cell(self.cell_file)
+        self.plan, self.log = folder / "plan.yaml", folder / "run.mcap"
+        planned = ["plan", str(self.cell_file), "--out", str(self.plan), "--duration", "8", "--exchanges", "0"]
+        assert main(planned) == ExitCode.OK
+        calibration = folder / "calibration.yaml"
+        save_calibration(predicting_calibration(), calibration)
+        self.console = self.start("console", str(self.cell_file), "--calibration", str(calibration))
+        assert self.console.stdout is not None
+        self.address = re.findall(r"http\S+", self.console.stdout.readline())[0]
+        self.refused: list[str] = []
+        self.page = self.opened(browser, width=1280, height=1000)
+
+    def opened(self, browser: Browser, width: int, height: int) -> Page:
+        """Open the page; what its browser complains of is kept."""
+        page = browser.new_page(viewport={"width": width, "height": height})
+        self.stack.callback(page.close)
+        page.on("console", lambda message: self.refused.append(message.text))
+        page.on("pageerror", lambda error: self.refused.append(str(error)))
+        page.on("request", self._note_foreign)
+        page.goto(self.address)
+        until(page, "window.drivegain.status !== null")
+        return page
+
+    def _note_foreign(self, asked: Request) -> None:
+        if not asked.url.startswith((self.address, "data:")):
+            self.refused.append(asked.url)
+
+    def start(self, *arguments: str) -> subprocess.Popen[str]:
+        """Start a command; it is interrupted at the end of the test."""
+        process = subprocess.Popen(
+            [sys.executable, "-m", "daq", *arguments],
+            cwd=self.checkout,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self.stack.enter_context(process)
+        self.stack.callback(process.send_signal, signal.SIGINT)
+        return process
+
+    def record(self) -> subprocess.Popen[str]:
+        """Begin a recording."""
+        return self.start("record", str(self.cell_file), str(self.plan), "--out", str(self.log), "--enable-motion")
+
+    def kept(self) -> Log:
+        """The log, or what was saved of it."""
+        if self.log.exists():
+            return read_log(self.log)
+        saved = self.folder / "saved.mcap"
+        salvage(self.log.with_name(self.log.name + ".part"), saved)
+        return read_log(saved)
+
+    def shown(self) -> dict[str, Any]:
+        """The page's data, once its run has ended."""
+        until(self.page, "window.drivegain.status.phase === 'ended' && window.drivegain.run")
+        return dict(self.page.evaluate("window.drivegain"))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    """Chromium without a window."""
+    with sync_playwright() as playwright:
+        # A container's root may not make the namespaces of the browser's sandbox; it opens our own page alone.
+        found = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield found
+        found.close()
+
+
+@contextmanager
+def rig(folder: Path, checkout: Path, browser: Browser, faults: str = "") -> Iterator[Rig]:
+    """Run cell and console until the block ends."""
+    with ExitStack() as stack:
+        yield Rig(folder, checkout, browser, stack, faults)
+
+
+def test_a_recording_with_a_fault_is_shown_as_its_log_holds_it(
+    tmp_path: Path, checkout: Path, browser: Browser
+) -> None:
+    with rig(tmp_path, checkout, browser, FAULTS) as made:
+        recorder = made.record()
+        output, _ = recorder.communicate(timeout=120)
+        assert recorder.returncode == ExitCode.DEVICE_FAULT, output
+        shown, log = made.shown(), made.kept()
+        status = shown["status"]
+        assert status["samples"] == len(log.samples.cycle)
+        assert status["missing"] == sum(log.statistics.missing) > 0
+        assert (status["lost"], status["dropped"]) == (log.statistics.lost_cycles, 0)
+        assert [axis["state"] for axis in status["axes"]].count("OPERATION ENABLED") == 0
+        # The points: every twentieth cycle of 1 kHz, with the values of the log.
+        of_page = log.samples.cycle % 20 == 0
+        scale = scaling(made.cell, log.head.readback)
+        unit = np.array([axis.unit.si for axis in made.cell.axes])
+        position = scale.joint_position(log.samples.position_counts) / unit
+        current = log.samples.current_raw * scale.current_per_unit
+        points = np.array(shown["points"])
+        assert len(points) == shown["received"] == np.count_nonzero(of_page) > 100
+        np.testing.assert_allclose(points[:, 1:7], position[of_page], rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(points[:, 7:], current[of_page], rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(np.diff(points[:, 0]), 0.02, atol=1e-6)
+        # The events, in words and with the remedy.
+        texts = [event.text for event in log.events]
+        names = made.cell.axis_names
+        in_page = [event["text"] if event["axis"] is None else f"{event['axis']}: {event['text']}"
+                   for event in shown["events"]]  # fmt: skip
+        plain = [re.sub(r"^(J\d)(?: \(node \d+\))?: ", r"\1: ", text) for text in texts]
+        assert len(shown["events"]) == len(log.events)
+        assert all(
+            one.endswith(other.partition(": ")[2]) or other in one for one, other in zip(in_page, plain, strict=True)
+        )
+        emergency = next(event for event in shown["events"] if event["kind"] == EventKind.EMCY.value)
+        assert emergency["axis"] == names[2]
+        body = made.page.inner_text("body")
+        for words in ("7305h", "check the plugs and cables of encoder", "The axes are stopped", "ended early"):
+            assert words in body, words
+        assert "INVALID" not in body  # it never came to an end that could be judged
+        _pictures(made, browser, checkout)
+        assert made.refused == []
+
+
+def test_the_button_stops_the_axes_and_the_page_says_so(tmp_path: Path, checkout: Path, browser: Browser) -> None:
+    with rig(tmp_path, checkout, browser) as made:
+        recorder = made.record()
+        until(made.page, "window.drivegain.points.length > 20")
+        made.page.click("#stop")
+        output, _ = recorder.communicate(timeout=120)
+        assert recorder.returncode == ExitCode.INTERRUPTED, output
+        assert "axes stopped" in output
+        until(made.page, "document.querySelector('#stopped').textContent.includes('its axes are stopped')")
+        shown, log = made.shown(), made.kept()
+        assert shown["status"]["samples"] == len(log.samples.cycle)
+        assert shown["status"]["end"]["axes_stopped"]
+        assert made.page.is_disabled("#stop")
+        # Predicted where the arm moves; this calibration is the declared model, so only its being there is checked.
+        assert any(value is not None for row in shown["rows"] for value in row[1:7]) or not shown["rows"]
+        assert made.refused == []
+
+
+def test_a_page_of_another_site_reads_nothing_and_stops_nothing(
+    tmp_path: Path, checkout: Path, browser: Browser
+) -> None:
+    with rig(tmp_path, checkout, browser) as made:
+        other = browser.new_page()
+        other.route("http://evil.example/", lambda route: route.fulfill(body="<p>evil</p>", content_type="text/html"))
+        other.goto("http://evil.example/")
+        for method in ("GET", "POST"):
+            asked = f"fetch('{made.address}stop', {{method: '{method}'}}).then(() => 'read', () => 'refused')"
+            assert other.evaluate(asked) == "refused"
+        other.close()
+        assert made.page.evaluate("window.drivegain.status.stop") is None
+        injected = "document.body.append(Object.assign(document.createElement('script'), {text: 'window.evil = 1'}))"
+        made.page.evaluate(injected)
+        assert made.page.evaluate("window.evil") is None
+        assert any("Content Security Policy" in text for text in made.refused)
+
+
+def _pictures(made: Rig, browser: Browser, checkout: Path) -> None:
+    """Screenshots for people, in out/, and that nothing is wider than a phone."""
+    out = checkout / "out" / "console"
+    out.mkdir(parents=True, exist_ok=True)
+    clip: FloatRect = {"x": 0, "y": 0, "width": 1280, "height": 1240}
+    made.page.screenshot(path=out / "desktop.png", clip=clip, full_page=True)
+    phone = made.opened(browser, width=390, height=844)
+    phone.emulate_media(color_scheme="dark")
+    until(phone, "window.drivegain.points.length > 100")
+    phone.wait_for_timeout(500)
+    phone.screenshot(path=out / "phone.png", full_page=True)
+    assert phone.evaluate("document.documentElement.scrollWidth") <= 390

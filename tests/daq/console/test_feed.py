@@ -1,0 +1,127 @@
+"""The feed never waits, counts what it drops, and takes a stop by another way."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import struct
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daq.config.cell import Cell
+from daq.console import feed as feeds
+from daq.console.feed import ACCEPTED, HEAD, LARGEST_PACKET, SAMPLES, STOP, Feed, end_of, sample_dtype, socket_names
+from drivers.stream.sample import CellEvent, EventKind
+from tests.daq.console.feeds import Recording
+
+
+def _console(cell_file: Path, feed: Feed) -> socket.socket:
+    console = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    console.settimeout(10)
+    console.connect(socket_names(cell_file)[0])
+    while not feed._new:  # the feed's thread has accepted it
+        time.sleep(0.001)
+    return console
+
+
+def test_a_console_gets_every_sample_and_event_in_their_order(cell_file: Path, cell: Cell) -> None:
+    with Feed(cell_file) as feed:
+        recording = Recording(feed, cell, cell_file)
+        recording.run(5)  # without a console
+        with _console(cell_file, feed) as console:
+            recording.run(25)
+            feed.event(CellEvent(50_000_000, 1, EventKind.EMCY, 0x7305, "EMCY 7305h"))
+            recording.run(10)
+            feed.finish()
+            packets = [console.recv(LARGEST_PACKET) for _ in range(6)]
+    heads = [HEAD.unpack_from(packet) for packet in packets]
+    assert json.loads(packets[0][HEAD.size :])["run"]["axes"] == list(cell.axis_names)
+    assert [number - heads[0][1] for _, number, *_ in heads] == [0, 1, 2, 3, 4, 5]
+    kinds = ["samples" if kind == SAMPLES else next(iter(json.loads(packet[HEAD.size :]))) for packet, (kind, *_) in
+             zip(packets, heads, strict=True)]  # fmt: skip
+    assert kinds == ["run", "samples", "samples", "samples", "events", "samples"]
+    cycles = [
+        cycle
+        for packet, head in zip(packets, heads, strict=True)
+        if head[0] == SAMPLES
+        for cycle in np.frombuffer(packet[HEAD.size :], sample_dtype(len(cell.axes)))["cycle"].tolist()
+    ]
+    assert cycles == list(range(5, 40))
+    assert heads[-1][2] == 40  # all samples of the run, also those from before
+
+
+def test_a_console_that_does_not_read_loses_packets_and_delays_nothing(cell_file: Path, cell: Cell) -> None:
+    with Feed(cell_file) as feed:
+        recording = Recording(feed, cell, cell_file)
+        with _console(cell_file, feed) as console:
+            recording.run(60_000)  # would wait for ever if it waited
+            console.setblocking(False)
+            numbers = []
+            while True:
+                try:
+                    numbers.append(HEAD.unpack_from(console.recv(LARGEST_PACKET))[1])
+                except BlockingIOError:
+                    break
+            recording.run(10)
+            after = HEAD.unpack_from(console.recv(LARGEST_PACKET))
+        recording.run(20)  # it has gone
+        assert not feed._consoles
+    assert 0 < len(numbers) < 5000
+    assert after[1] - numbers[-1] > 100
+    assert after[2] == 60_010
+
+
+def test_a_stop_is_acknowledged_and_its_end_reported_while_the_curves_stall(cell_file: Path, cell: Cell) -> None:
+    stopped = threading.Event()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
+        asking.settimeout(10)
+        feed = Feed(cell_file, stopped.set).__enter__()
+        recording = Recording(feed, cell, cell_file)
+        with _console(cell_file, feed):
+            recording.run(60_000)
+            asking.connect(socket_names(cell_file)[1])
+            asking.sendall(STOP)
+            assert asking.recv(len(ACCEPTED)) == ACCEPTED
+            assert stopped.wait(10)
+            feed.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
+        assert json.loads(asking.recv(4096)) == {"ok": False, "axes_stopped": True, "text": "stopped"}
+
+
+def test_another_word_stops_nothing(cell_file: Path) -> None:
+    with Feed(cell_file, stop=lambda: pytest.fail("stopped")), socket.socket(socket.AF_UNIX) as asking:
+        asking.settimeout(10)
+        asking.connect(socket_names(cell_file)[1])
+        asking.sendall(b"GET /")
+        assert asking.recv(10) == b""
+
+
+def test_other_users_are_not_served(cell_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one, other = socket.socketpair(socket.AF_UNIX)
+    with one, other:
+        assert feeds.of_this_user(one)
+        credentials = struct.pack("3i", 1, 1234, 1)
+        monkeypatch.setattr(os, "getuid", lambda: 4711)
+        fake = type("Peer", (), {"getsockopt": lambda *_: credentials})()
+        assert not feeds.of_this_user(fake)
+
+
+def test_a_second_program_on_a_cell_publishes_nothing_and_goes_on(cell_file: Path, cell: Cell) -> None:
+    with Feed(cell_file), Feed(cell_file) as second:
+        Recording(second, cell, cell_file).run(20)
+        assert "no console can watch" in second.remark
+
+
+def test_what_a_stop_could_not_confirm_is_in_its_end() -> None:
+    error = RuntimeError("node 3")
+    error.add_note("while stopping: node 2 does not answer")
+    assert end_of(error) == {
+        "ok": False,
+        "axes_stopped": False,
+        "text": "node 3; while stopping: node 2 does not answer",
+    }
+    assert end_of(None) == {"ok": True, "axes_stopped": True, "text": ""}

@@ -1,0 +1,86 @@
+"""The live prediction is that of a whole run under the filters of the fit, row by row."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daq.config.cell import Cell, model_of
+from daq.console.prediction import Predictor
+from daq.errors import LogsDiffer
+from daq.workflow.validate import conditioning_of
+from ident.data.dataset import differentiate
+from ident.data.run import Run
+from ident.equations.rows import row_filter
+from ident.model.bodies import Payload
+from ident.prediction import predict_current
+from tests.daq.console.feeds import predicting_calibration
+
+RATE_HZ, SAMPLES = 500.0, 3000
+
+
+def _motion(cell: Cell) -> tuple[np.ndarray, np.ndarray]:
+    """Joint positions [rad] that come to rest half-way, and currents [A], shape (k, n)."""
+    time_s = np.arange(SAMPLES) / RATE_HZ
+    frequency = 0.5 + 0.1 * np.arange(len(cell.axes))
+    position = np.where(time_s[:, None] < 4.0, np.sin(2.0 * np.pi * frequency * time_s[:, None]), 0.0)
+    position[time_s >= 4.0] = position[time_s < 4.0][-1]
+    return 0.5 * position, np.random.default_rng(1).normal(0.0, 1.0, position.shape)
+
+
+@pytest.mark.parametrize("block", [1, 10, 997])
+def test_rows_are_those_of_the_whole_run(cell: Cell, block: int) -> None:
+    calibration, model = predicting_calibration(), model_of(cell)
+    position, current = _motion(cell)
+    predictor = Predictor(calibration, cell, None, RATE_HZ)
+    parts = [predictor.take(at, position[at : at + block], current[at : at + block]) for at in range(0, SAMPLES, block)]
+    found = [part for part in parts if part is not None]
+    cycle, predicted, residual = (
+        np.concatenate([getattr(part, name) for part in found]) for name in ("cycle", "predicted", "residual")
+    )
+    # Each row once, without a gap, until the windows of the last samples are not whole.
+    assert set(np.diff(cycle)) == {10}
+    assert cycle[0] < 0.3 * RATE_HZ and cycle[-1] > SAMPLES - (0.6 * RATE_HZ if block < 100 else 1000)
+    conditioning = conditioning_of(calibration)
+    run = Run("whole", np.arange(SAMPLES) / RATE_HZ, position, current, None, None)
+    data = differentiate(run, model.drive_train, conditioning)
+    filter_ = row_filter(data, conditioning)
+    expected = filter_(predict_current(calibration, model, data).T)
+    left = expected[:, :1] * 0.0 + filter_(data.current_a.T) - expected
+    at_row = (cycle - 1 - filter_.half) / filter_.factor
+    moving = np.isfinite(predicted).all(axis=1) & (cycle < 1900)
+    assert np.count_nonzero(moving) > 50
+    # The grid of the rows is another: the whole run's are interpolated between.
+    axis = np.arange(expected.shape[1])
+    for motor in range(len(cell.axes)):
+        assert predicted[moving, motor] == pytest.approx(np.interp(at_row, axis, expected[motor])[moving], abs=0.05)
+    on_grid = moving & (at_row == np.floor(at_row))
+    for motor in range(len(cell.axes)):
+        rows = at_row[on_grid].astype(int)
+        assert predicted[on_grid, motor] == pytest.approx(expected[motor, rows], abs=2e-4)
+        assert residual[on_grid, motor] == pytest.approx(left[motor, rows], abs=2e-4)
+
+
+def test_nothing_is_predicted_at_standstill_and_a_gap_begins_anew(cell: Cell) -> None:
+    predictor = Predictor(predicting_calibration(), cell, None, RATE_HZ)
+    position, current = _motion(cell)
+    still = predictor.take(0, position[2100:2600], current[2100:2600])
+    assert still is not None
+    assert np.isnan(still.predicted).all() and np.isnan(still.residual).all()
+    after = predictor.take(10_000, position[:500], current[:500])
+    assert after is not None
+    assert after.cycle[0] > 10_000
+    assert np.isfinite(after.predicted).any()
+    assert (after.band > 0.0).all()
+
+
+def test_what_the_calibration_does_not_know_is_not_predicted(cell: Cell) -> None:
+    unknown = Predictor(predicting_calibration(), cell, Payload("body", "flange", {"m": 1.0}), RATE_HZ)
+    assert "nothing is known of mounting" in unknown.problem
+    position, current = _motion(cell)
+    assert unknown.take(0, position, current) is None
+    with pytest.raises(LogsDiffer):
+        Predictor(replace(predicting_calibration(), cell="other"), replace(cell, folder=Path()), None, RATE_HZ)

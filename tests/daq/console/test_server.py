@@ -1,0 +1,120 @@
+"""Who may read the page, and that a page that does not read delays no other."""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from daq.config.cell import Cell
+from daq.console.feed import Feed
+from tests.daq.console.feeds import TOKEN, Recording, Served, served
+
+
+@pytest.fixture(scope="module")
+def console(cell: Cell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A console with a report."""
+    folder = tmp_path_factory.mktemp("console")
+    (folder / "report.html").write_text("<p>the report</p>")
+    (folder / "secret.txt").write_text("secret")
+    with served(folder / "cell.yaml", cell, folder) as one:
+        yield one
+
+
+def _wait(until: Callable[[], bool]) -> None:
+    for _ in range(2000):
+        if until():
+            return
+        time.sleep(0.005)
+    raise AssertionError("it did not happen in 10 s")
+
+
+def test_the_page_loads_nothing_from_elsewhere_and_runs_no_inline_script(console: Served) -> None:
+    answer, page = console.ask(f"/{TOKEN}/")
+    assert answer.status == 200
+    policy = answer.headers["content-security-policy"]
+    assert "default-src 'none'" in policy and "script-src 'self'" in policy and "unsafe" not in policy
+    assert answer.headers["referrer-policy"] == "no-referrer"
+    assert "server" not in answer.headers
+    for name in re.findall(rb'(?:src|href)="([^"]+)"', page):
+        assert name == b"data:," or console.ask(f"/{TOKEN}/{name.decode()}")[0].status == 200
+    script = console.ask(f"/{TOKEN}/page.js")[1]
+    assert not re.search(rb"https?:|innerHTML|eval\(|document\.write", script + page)
+    assert not re.search(rb"<script(?![^>]* src=)|<style|\son[a-z]+=|\sstyle=", page)
+
+
+@pytest.mark.parametrize("path", ["/", "/wrong/", "/wrong/stop", "//", f"/{TOKEN[:-1]}/", f"/x{TOKEN}/", f"/{TOKEN}x/"])
+def test_without_the_token_there_is_nothing(console: Served, path: str) -> None:
+    answer, content = console.ask(path)
+    assert (answer.status, content) == (404, b"not found")
+    assert "content-security-policy" in answer.headers
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1", "127.0.0.1:1", "localhost.evil.example", "[::1]"])
+def test_a_name_that_was_bound_to_this_computer_is_refused(console: Served, host: str) -> None:
+    assert console.ask(f"/{TOKEN}/", host=host)[0].status == 421
+    assert console.ask(f"/{TOKEN}/stop", "POST", host=host, origin=f"http://{host}")[0].status == 421
+
+
+def test_another_origin_can_neither_read_nor_stop(console: Served) -> None:
+    own = f"http://127.0.0.1:{console.port}"
+    for headers in ({"origin": "http://evil.example"}, {"origin": "null"}, {"sec_fetch_site": "cross-site"}):
+        assert console.ask(f"/{TOKEN}/cell", **headers)[0].status == 403
+    for headers in ({}, {"origin": "null"}, {"origin": own.replace("http", "https")}):
+        assert console.ask(f"/{TOKEN}/stop", "POST", **headers)[0].status == 403
+    assert console.ask(f"/{TOKEN}/stop", origin=own)[0].status == 405  # a link stops nothing
+    answer, content = console.ask(f"/{TOKEN}/stop", "POST", origin=own)
+    assert answer.status == 200
+    assert json.loads(content)["accepted"] is False
+    assert "use the emergency stop" in json.loads(content)["text"]
+
+
+@pytest.mark.parametrize(
+    "path", ["secret.txt", "report/secret.txt", "report/../secret.txt", "../secret.txt", "%2e%2e/secret.txt",
+             "page.js/../../../pyproject.toml", "/etc/passwd", "report?file=secret.txt%00", "..%2fsecret.txt"]
+)  # fmt: skip
+def test_no_path_leads_to_a_file(console: Served, path: str) -> None:
+    answer, content = console.ask(f"/{TOKEN}/{path}")
+    assert b"secret" not in content and b"root:" not in content and b"[project]" not in content
+    assert answer.status == (200 if path.startswith("report?") else 404)
+
+
+def test_the_report_runs_no_script(console: Served) -> None:
+    answer, content = console.ask(f"/{TOKEN}/report")
+    assert content == b"<p>the report</p>"
+    assert answer.headers["content-security-policy"].startswith("sandbox; default-src 'none'")
+
+
+def test_a_reader_that_stalls_delays_neither_another_nor_a_stop(cell: Cell, cell_file: Path) -> None:
+    stopped = threading.Event()
+    with served(cell_file, cell) as console, Feed(cell_file, stopped.set) as feed:
+        recording = Recording(feed, cell, cell_file)
+        _wait(lambda: bool(feed._new))  # the console has found the feed, and was accepted
+        with console.reader(), console.reader() as reading:
+            lines = reading.makefile("rb")
+            shown: list[list[float]] = []
+            while len(shown) < 1000:
+                recording.run(100)
+                while b"data: " not in (line := lines.readline()):
+                    pass
+                shown += json.loads(line[6:])["new"].get("points", [])
+                _wait(lambda: console.live.samples == recording.samples)
+            own = f"http://127.0.0.1:{console.port}"
+            answer, content = console.ask(f"/{TOKEN}/stop", "POST", origin=own)
+            assert answer.status == 200
+            assert json.loads(content)["accepted"]
+            assert stopped.wait(10)
+        # Every tenth sample of 500 Hz, with its values.
+        first = round(shown[0][0] * 500)
+        assert [round(500 * point[0]) for point in shown] == [first + 10 * step for step in range(len(shown))]
+        assert console.live.dropped == 0
+    degree = cell.axes[0].unit.si
+    for point in shown[:50]:
+        cycle = round(point[1] * degree * 1e3)
+        assert point[2] * degree * 1e3 == pytest.approx(cycle + 1)
+        assert point[1 + len(cell.axes)] == pytest.approx(-1e-3 * cycle)

@@ -1,0 +1,150 @@
+"""`make console-study`: recordings on SocketCAN with the console alternately open and closed.
+
+The rate is the highest of RATES_HZ that one recording without a console holds without a loss. Then blocks of recordings
+follow, without and with a console whose page is read. Of each block: cycles lost, the jitter of SYNC by the kernel's
+stamps, and the console's processor time and memory. Written to out/console-study.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from http.client import HTTPConnection, HTTPException
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from daq.cli.app import main as drivegain
+from daq.log.reader import read_log
+from tests.vcan.cells import record_once, simulated, write_cell, write_simulation
+from tests.vcan.run import OUT
+
+RATES_HZ = (500, 400, 250, 200, 125, 100, 80, 50, 40, 25)
+TICKS = os.sysconf("SC_CLK_TCK")
+PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
+
+
+@contextmanager
+def console(cell: Path) -> Iterator[subprocess.Popen[str]]:
+    """A console in a process of its own, and a reader of its page in this one."""
+    command = [sys.executable, "-m", "daq", "console", str(cell)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        found = re.search(r"http://([^/]+)(/\S+/)", process.stdout.readline())
+        assert found is not None
+        thread = threading.Thread(target=_read, args=(found[1], found[2]), daemon=True)
+        thread.start()
+        try:
+            yield process
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.wait(timeout=60)
+            thread.join(10)
+
+
+def _read(host: str, path: str) -> None:
+    with suppress(OSError, HTTPException, ValueError):
+        connection = HTTPConnection(host)
+        connection.request("GET", f"{path}curves")
+        answer = connection.getresponse()
+        while answer.read1(65536):
+            pass
+
+
+def used(pid: int) -> tuple[float, float]:
+    """Processor time [s] and resident memory [MB] of a process."""
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
+    return (int(fields[11]) + int(fields[12])) / TICKS, pages * PAGE_BYTES / 1e6
+
+
+def recording(cell: Path, plan: Path, log: Path) -> dict[str, Any]:
+    """One recording: its losses and the deviations of its SYNC intervals from the period [µs]."""
+    log.unlink(missing_ok=True)
+    log.with_name(log.name + ".part").unlink(missing_ok=True)
+    document = record_once(cell, plan, log)
+    if not log.exists():
+        return {"ended_early": 1, "lost": 0, "missing": 0, "samples": 0, "jitter_us": []}
+    found = read_log(log)
+    interval_ns = np.diff(found.samples.time_ns)
+    jitter_us = 1e-3 * np.abs(interval_ns - 1e9 / found.head.run.rate_hz)
+    return {
+        "ended_early": 0,
+        "lost": document["lost_cycles"],
+        "missing": sum(document["missing"]),
+        "samples": document["samples"],
+        "jitter_us": jitter_us.tolist(),
+    }
+
+
+def block(cell: Path, plan: Path, log: Path, seconds: float, process: subprocess.Popen[str] | None) -> dict[str, Any]:
+    """Recordings one after the other for a time."""
+    began_s, parts = time.monotonic(), []
+    start = (0.0, 0.0) if process is None else used(process.pid)
+    while time.monotonic() - began_s < seconds:
+        parts.append(recording(cell, plan, log))
+    lasted_s = time.monotonic() - began_s
+    jitter = np.concatenate([part.pop("jitter_us") for part in parts])
+    summed = {key: sum(part[key] for part in parts) for key in parts[0]}
+    found = {"open": process is not None, "recordings": len(parts), "seconds": round(lasted_s, 1), **summed}
+    if jitter.size:
+        found |= {f"jitter_us_p{share:g}": round(float(np.percentile(jitter, share)), 1) for share in (50, 99, 99.9)}
+    if process is not None:
+        end = used(process.pid)
+        found |= {"console_percent": round(100.0 * (end[0] - start[0]) / lasted_s, 2), "console_mb": [start[1], end[1]]}
+    return found
+
+
+def cell_at(folder: Path, rate_hz: int, seconds: float) -> tuple[Path, Path, Path]:
+    """Cell, simulation and plan at a rate."""
+    folder.mkdir()
+    cell = write_cell(folder, 1_000_000 // rate_hz, "timed")
+    plan = folder / "plan.yaml"
+    assert drivegain(["plan", str(cell), "--out", str(plan), "--duration", str(seconds), "--exchanges", "0"]) == 0
+    return cell, write_simulation(folder, 1_000_000 // rate_hz), plan
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Find the rate, then run the blocks; 1 where a console cost a cycle."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.console_study", description=__doc__)
+    parser.add_argument("--minutes", type=float, default=60.0, help="of all blocks together")
+    parser.add_argument("--block", type=float, default=10.0, help="minutes of a block")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of the plan")
+    options = parser.parse_args(arguments)
+    out = Path(os.environ.get(OUT, "out")) / "console-study.json"
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for rate_hz in RATES_HZ:
+            cell, simulation, plan = cell_at(folder / str(rate_hz), rate_hz, options.seconds)
+            with simulated(simulation):
+                tried = recording(cell, plan, folder / "run.mcap")
+            if not (tried["lost"] or tried["missing"] or tried["ended_early"]):
+                break
+        blocks = []
+        with simulated(simulation):
+            for number in range(round(options.minutes / options.block)):
+                if number % 2 == 0:
+                    blocks.append(block(cell, plan, folder / "run.mcap", 60.0 * options.block, None))
+                else:
+                    with console(cell) as process:
+                        blocks.append(block(cell, plan, folder / "run.mcap", 60.0 * options.block, process))
+                sys.stdout.write(f"{json.dumps({'rate_hz': rate_hz, **blocks[-1]})}\n")
+                sys.stdout.flush()
+    out.parent.mkdir(exist_ok=True)
+    out.write_text(json.dumps({"rate_hz": rate_hz, "blocks": blocks}, indent=1) + "\n", encoding="utf-8")
+    return int(any(one["lost"] or one["ended_early"] for one in blocks if one["open"]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
