@@ -155,7 +155,7 @@ def _fit_cases(
         print_view(cases_view(fits, tables), *files.values(), page_file)
 
 
-FIT = Verb("fit", fit_verb, "drivegain fit bare.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml")
+FIT = Verb("fit", fit_verb, "drivegain fit unloaded.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml")
 
 
 def residual_verb(
@@ -220,17 +220,20 @@ def residual_verb(
 
 
 def check_report(folder: Path | None) -> None:
-    """Create the folder of a report before any long work, and refuse one with other files of the same names."""
+    """Create the folder of a report before any long work, and refuse one with other files of the same names.
+
+    A folder in which nothing is written in the end is removed again.
+    """
     from tempfile import TemporaryFile
 
-    from daq.cli.terminal import check_replaceable
+    from daq.cli.terminal import check_replaceable, make_folder
     from daq.errors import writing
     from daq.report.residual_page import MARKS
 
     if folder is None:
         return
     with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         with TemporaryFile(dir=folder):
             pass
     for name, mark in MARKS.items():
@@ -240,7 +243,7 @@ def check_report(folder: Path | None) -> None:
 RESIDUAL = Verb(
     "residual",
     residual_verb,
-    "drivegain residual bare.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml --report report",
+    "drivegain residual unloaded.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml --report report",
 )
 
 

@@ -284,4 +284,4 @@ def _write_files(chosen: tuple[Series, ...], cell: Cell, picture: Path | None, c
             replace_file(csv, csv_text(chosen).encode())
 
 
-HISTORY = Verb("history", history_verb, "drivegain history cells/demo.yaml --axis J4 --plot history.png")
+HISTORY = Verb("history", history_verb, "drivegain history CELL --axis J4 --plot history.png")

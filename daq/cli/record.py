@@ -177,7 +177,7 @@ def mounted(cell: Cell, name: str | None) -> Payload | None:
 RECORD = Verb(
     "record",
     record_verb,
-    "drivegain record cells/demo.yaml plan.yaml --out loaded.mcap --payload disc --mass 4.59 --enable-motion",
+    "drivegain record CELL plan.yaml --out loaded.mcap --payload disc --mass 4.59 --enable-motion",
 )
 
 
@@ -233,4 +233,4 @@ def plan_verb(
         typer.echo(plan_text(out, declared, experiment, made, judged))
 
 
-PLAN = Verb("plan", plan_verb, "drivegain plan cells/demo.yaml --out plan.yaml --seed 1 --duration 40")
+PLAN = Verb("plan", plan_verb, "drivegain plan CELL --out plan.yaml --seed 1 --duration 40")

@@ -66,7 +66,7 @@ def scan_verb(
         raise NodeMissing(missing, tuple(node.node_id for nodes in found.values() for node in nodes), wait)
 
 
-SCAN = Verb("scan", scan_verb, "drivegain scan cells/demo.yaml")
+SCAN = Verb("scan", scan_verb, "drivegain scan CELL")
 
 
 def monitor_verb(
@@ -150,7 +150,7 @@ def _readings(cell: Cell, network: CanopenNetwork, interval_s: float) -> Iterato
         yield monitor_document(cell, reading, ampere, list(event_lines))
 
 
-MONITOR = Verb("monitor", monitor_verb, "drivegain monitor cells/demo.yaml")
+MONITOR = Verb("monitor", monitor_verb, "drivegain monitor CELL")
 
 _HEX = re.compile(r"(?:0[xX])?([0-9a-fA-F]{1,4})[hH]?")
 

@@ -6,7 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -27,12 +27,38 @@ WRITTEN: list[Path] = []
 """Files and folders that this command has written, for the message of an error or interrupt that comes later."""
 
 
+STARTED: list[Path] = []
+"""Folders that this command was filling when it was interrupted."""
+
+_MADE: list[Path] = []
+"""Folders that this command has made before it had anything to put into them."""
+
+
 @contextmanager
 def write_output(path: Path) -> Iterator[None]:
     """Write a file or folder within the block, as `writing`, and note in `WRITTEN` that it is there."""
-    with writing(path):
-        yield
+    try:
+        with writing(path):
+            yield
+    except KeyboardInterrupt:
+        if path.is_dir() and any(path.iterdir()):
+            STARTED.append(path)
+        raise
     WRITTEN.append(path)
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder, with its parents, before there is anything to put into it; it is removed if it stays empty."""
+    missing = [one for one in (folder, *folder.parents) if not one.exists()]
+    _MADE.extend(reversed(missing))
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def remove_empty_folders() -> None:
+    """Remove the folders of `make_folder` that are still empty."""
+    while _MADE:
+        with suppress(OSError):  # not empty
+            _MADE.pop().rmdir()
 
 
 def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) -> None:

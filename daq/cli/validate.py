@@ -88,6 +88,4 @@ def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]
     return {file.stem if stems[file.stem] == 1 else str(file): load_calibration(file) for file in files}
 
 
-VALIDATE = Verb(
-    "validate", validate_verb, "drivegain validate calibration.yaml runs/later.mcap --beside cases --out tables"
-)
+VALIDATE = Verb("validate", validate_verb, "drivegain validate calibration.yaml held-out.mcap --pictures pictures")
