@@ -114,9 +114,20 @@ def at_most_one(**options: object) -> None:
         )
 
 
+def output_console() -> Console:
+    """Console of stdout; a pipe has no width, so nothing in it is broken into lines."""
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    if not console.is_terminal:
+        console.width = PIPE_COLUMNS
+    return console
+
+
+PIPE_COLUMNS = 1_000  #: Wider than any table
+
+
 def print_view(parts: Iterable[RenderableType], *written: Path | None) -> None:
     """Print tables and lines on stdout, then the files written; lines are not broken, so that they can be copied."""
-    console = Console(soft_wrap=True, highlight=False, markup=False)
+    console = output_console()
     for part in parts:
         console.print(part)
     say_written(console, *written)
