@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CellOption, JsonOption, Verb, print_json
+from daq.cli.verb import CellOption, JsonOption, Verb, print_json, say_next
 from daq.workflow.choices import Known
 from ident.estimators.method import Method
 
@@ -115,6 +115,8 @@ def fit_verb(
         print_json(fit_document(found, calibration, comparison))
     else:
         print_view(fit_view(found, calibration, comparison), out, pictures)
+        held_out = [word for log in holdout or () for word in ("--holdout", log)]
+        say_next("drivegain", "residual", *logs, *held_out, "--out", out or "calibration.yaml", "--report", "report")
 
 
 def _fit_cases(
@@ -217,6 +219,8 @@ def residual_verb(
         print_json(residual_document(closed, changed, calibration))
     else:
         print_view(residual_view(closed, changed, calibration), out, report, pictures)
+        if out is not None:
+            say_next("drivegain", "validate", out, *(holdout or logs))
 
 
 def check_report(folder: Path | None) -> None:

@@ -6,7 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -181,10 +181,17 @@ def show_steps() -> Iterator[Stepper]:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[ProgressCallback]:
-    """Show one progress bar on stderr."""
-    with show_steps() as stepper:
-        stepper.step(title)
-        yield stepper.progress
+    """Show one progress bar on stderr from the first progress on: none where the work is refused."""
+    with ExitStack() as stack:
+        shown: list[Stepper] = []
+
+        def report(done: int, total: int, remark: str) -> None:
+            if not shown:
+                shown.append(stack.enter_context(show_steps()))
+                shown[0].step(title)
+            shown[0].progress(done, total, remark)
+
+        yield report
 
 
 @contextmanager
