@@ -19,6 +19,7 @@ from pydantic import BaseModel, TypeAdapter
 from sphinx.application import Sphinx
 
 from daq.cli.app import build_app
+from daq.cli.verb import help_record
 from daq.config.cell_schema import CellModel
 from daq.config.drive import DriveModel
 from daq.config.import_description import ImportDescription
@@ -108,7 +109,7 @@ def _command(command: Any, name: str, parent: typer.Context, level: int) -> str:
     context = typer.Context(command, info_name=name.rpartition(" ")[2], parent=parent)
     usage = " ".join(command.collect_usage_pieces(context))
     parts = [f"{'#' * level} {name}", _paragraphs(command.help or ""), f"```text\n{name} {usage}\n```"]
-    records = [record for record in (one.get_help_record(context) for one in command.get_params(context)) if record]
+    records = [record for record in (help_record(one, context) for one in command.get_params(context)) if record]
     parts += [f"`{term.strip()}`\n: {_escaped(' '.join(text.split())) or '—'}" for term, text in records]
     if command.epilog and "Example:" in command.epilog:
         example = command.epilog.partition("Example:")[2].strip()

@@ -74,7 +74,7 @@ def _terminals(folder: Path, demo: Path) -> None:
     _terminal("plan", f"plan {cell} --out plan.yaml --duration 14", folder)
     (folder / "calibration.yaml").symlink_to(demo / "calibration.yaml")
     (folder / "configs").symlink_to(ROOT / "configs")
-    _terminal("apply", "apply calibration.yaml --cell configs/cells/demo.yaml", folder, _short_diff)
+    _terminal("apply", "apply configs/cells/demo.yaml calibration.yaml", folder, _short_diff)
 
 
 def _short_diff(lines: list[str]) -> list[str]:

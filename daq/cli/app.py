@@ -14,66 +14,79 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.text import Text
 from typer.core import TyperGroup
 
-from daq.cli.terminal import WRITTEN
-from daq.cli.verb import Listed
+from daq.cli.failure import Failure, show_failure
+from daq.cli.terminal import STARTED, WRITTEN, remove_empty_folders
+from daq.cli.verb import HELP_NAMES, Job, Listed
 from daq.environment import software
-from daq.errors import DaqError, ExitCode, OutputFailed, exit_code
+from daq.errors import DaqError, ExitCode, OutputFailed
 from daq.report.text import printable
 from drivers.errors import DriverError
 from ident.errors import IdentificationError
 
 VERBS = (
-    Listed("demo", "daq.cli.simulate:DEMO", "Run the whole calibration on a simulated six-axis cell."),
-    Listed("init", "daq.cli.init:INIT", "Create a folder for a new cell, with templates to fill in."),
-    Listed("scan", "daq.cli.scan:SCAN", "Compare the nodes on the bus with the cell file."),
-    Listed("monitor", "daq.cli.scan:MONITOR", "Show the state of the axes; nothing is changed."),
-    Listed("console", "daq.cli.console:CONSOLE", "Show the cell live on a page, with a stop button."),
-    Listed("explain-emcy", "daq.cli.scan:EXPLAIN_EMCY", "Explain an error code of an amplifier."),
-    Listed("plan", "daq.cli.record:PLAN", "Choose moves that excite every parameter."),
-    Listed("record", "daq.cli.record:RECORD", "Execute a plan and log it; this moves the robot."),
-    Listed("info", "daq.cli.logs:INFO", "Show what is in a log."),
-    Listed("salvage", "daq.cli.logs:SALVAGE", "Save the readable part of an unfinished or damaged log."),
-    Listed("import", "daq.cli.logs:IMPORT", "Convert CSV, MATLAB or ROS 2 files to a log."),
-    Listed("fit", "daq.cli.fit:FIT", "Identify all drive gains and dynamic parameters."),
-    Listed("residual", "daq.cli.fit:RESIDUAL", "Fit, then detect and add missing effects."),
-    Listed("fleet", "daq.cli.fleet:FLEET", "Fit the logs of many cells."),
-    Listed("validate", "daq.cli.validate:VALIDATE", "Predict the torque of other logs with a calibration."),
-    Listed("weigh", "daq.cli.weigh:WEIGH", "Weigh the body on the flange with a calibration."),
-    Listed("contact", "daq.cli.weigh:CONTACT", "Find external torques, with a threshold for alarms."),
-    Listed("export", "daq.cli.export:EXPORT", "Write a calibration or a log for other programs."),
-    Listed("sign", "daq.cli.sign:SIGN", "Sign a calibration as its second approver."),
-    Listed("apply", "daq.cli.apply:APPLY", "Write gains to the controller; a dry run without --yes."),
-    Listed("rollback", "daq.cli.apply:ROLLBACK", "Undo the last write."),
-    Listed("history", "daq.cli.history:HISTORY", "Show the calibrations of a cell and any drift."),
-    Listed("recalibrate", "daq.cli.recalibrate:RECALIBRATE", "Scheduled job: record, fit, propose or apply."),
-    Listed("install-units", "daq.cli.recalibrate:INSTALL_UNITS", "Schedule the job with systemd or cron."),
-    Listed("simulate", "daq.cli.simulate:SIMULATE", "Run a simulated cell on a bus, to try the other verbs."),
+    Listed(Job.COMMISSION, "demo", "daq.cli.simulate:DEMO", "Run the whole calibration on a simulated six-axis cell."),
+    Listed(Job.COMMISSION, "init", "daq.cli.init:INIT", "Create a folder for a new cell, with templates to fill in."),
+    Listed(Job.COMMISSION, "scan", "daq.cli.scan:SCAN", "Compare the nodes on the bus with the cell file."),
+    Listed(Job.COMMISSION, "plan", "daq.cli.record:PLAN", "Choose moves that excite every parameter."),
+    Listed(Job.COMMISSION, "record", "daq.cli.record:RECORD", "Execute a plan and log it; this moves the robot."),
+    Listed(Job.COMMISSION, "fit", "daq.cli.fit:FIT", "Identify all drive gains and dynamic parameters."),
+    Listed(Job.COMMISSION, "residual", "daq.cli.fit:RESIDUAL", "Fit, then detect and add missing effects."),
+    Listed(
+        Job.COMMISSION, "validate", "daq.cli.validate:VALIDATE", "Predict the torque of other logs with a calibration."
+    ),
+    Listed(Job.COMMISSION, "apply", "daq.cli.apply:APPLY", "Write gains to the controller; a dry run without --yes."),
+    Listed(Job.COMMISSION, "rollback", "daq.cli.apply:ROLLBACK", "Undo the last write."),
+    Listed(Job.LOOK, "monitor", "daq.cli.scan:MONITOR", "Show the state of the axes; nothing is changed."),
+    Listed(Job.LOOK, "console", "daq.cli.console:CONSOLE", "Show the cell live on a page, with a stop button."),
+    Listed(Job.LOOK, "info", "daq.cli.logs:INFO", "Show what is in a log."),
+    Listed(Job.LOOK, "history", "daq.cli.history:HISTORY", "Show the calibrations of a cell and any drift."),
+    Listed(Job.LOOK, "explain-emcy", "daq.cli.scan:EXPLAIN_EMCY", "Explain an error code of an amplifier."),
+    Listed(
+        Job.MAINTAIN, "recalibrate", "daq.cli.recalibrate:RECALIBRATE", "Scheduled job: record, fit, propose or apply."
+    ),
+    Listed(
+        Job.MAINTAIN, "install-units", "daq.cli.recalibrate:INSTALL_UNITS", "Schedule the job with systemd or cron."
+    ),
+    Listed(Job.MAINTAIN, "sign", "daq.cli.sign:SIGN", "Sign a calibration as its second approver."),
+    Listed(Job.MAINTAIN, "fleet", "daq.cli.fleet:FLEET", "Fit the logs of many cells."),
+    Listed(Job.MAINTAIN, "salvage", "daq.cli.logs:SALVAGE", "Save the readable part of an unfinished or damaged log."),
+    Listed(Job.EXPERT, "import", "daq.cli.logs:IMPORT", "Convert CSV, MATLAB or ROS 2 files to a log."),
+    Listed(Job.EXPERT, "export", "daq.cli.export:EXPORT", "Write a calibration or a log for other programs."),
+    Listed(Job.EXPERT, "weigh", "daq.cli.weigh:WEIGH", "Weigh the body on the flange with a calibration."),
+    Listed(Job.EXPERT, "contact", "daq.cli.weigh:CONTACT", "Find external torques, with a threshold for alarms."),
+    Listed(
+        Job.EXPERT, "simulate", "daq.cli.simulate:SIMULATE", "Run a simulated cell on a bus, to try the other verbs."
+    ),
 )
-"""Verbs in the order of the help; each is imported when it is called."""
-
-NOTES = ("kept", "hint")
-"""Labels of the notes that `show_error` prints; a verb adds them to an error with ``error.add_note("hint: …")``."""
+"""Verbs in the order of the help, by job; each is imported when it is called."""
 
 
 class _Verbs(TyperGroup):
-    """Group that lists the verbs without importing them, and imports the one that is called."""
+    """Group that lists the verbs by job without importing them, and imports the one that is called."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         """Return name, command and remaining arguments, with the verb itself in place of its placeholder."""
-        name, _, rest = super().resolve_command(ctx, args)
-        return name, next(listed.load().command() for listed in VERBS if listed.name == name), rest
+        name, command, rest = super().resolve_command(ctx, args)
+        listed = next((listed for listed in VERBS if listed.name == name), None)
+        return name, command if listed is None else listed.load().command(), rest
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """List the verbs of each job with their whole summaries."""
+        width = max(len(listed.name) for listed in VERBS)
+        for job in Job:
+            with formatter.section(job.value):
+                formatter.write_dl([(f"{one.name:{width}}", one.summary) for one in VERBS if one.job is job])
 
     def invoke(self, ctx: Any) -> Any:
         """Run the verb; an interrupt is one line that says what was written."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt as interrupt:
-            unchanged = ": nothing was changed" if ctx.invoked_subcommand in {"apply", "rollback"} else ""
-            typer.echo(printable(f"interrupted: {_kept()}" if WRITTEN else f"interrupted{unchanged}"), err=True)
+            writes = ctx.invoked_subcommand in {"apply", "rollback"}
+            nothing = "nothing was changed" if writes else "no file was written"
+            typer.echo(printable(f"interrupted: {_kept() or nothing}"), err=True)
             raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
 
 
@@ -87,7 +100,7 @@ def build_app() -> typer.Typer:
         "4 data unfit, 5 device fault, 6 configuration, 10 to 14 see recalibrate (12: the bus is taken), "
         "130 interrupted.",
         no_args_is_help=True,
-        add_completion=False,
+        context_settings={"help_option_names": HELP_NAMES},
         pretty_exceptions_enable=False,
         rich_markup_mode=None,  # rich would read the units in brackets, [s], as markup and drop them
     )
@@ -104,16 +117,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # again is a sixth of the time of `info`. A recording sets limits of its own (daq/workflow/safeguards.py).
         gc.set_threshold(20_000, 50, 100)
     WRITTEN.clear()
+    STARTED.clear()
     if isinstance(sys.stdout, io.TextIOWrapper):
         codecs.register_error("drivegain", _spelled)
         sys.stdout.reconfigure(errors="drivegain")
-    code = _run(arguments)
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    json_wanted = "--json" in words[: words.index("--") if "--" in words else None]
+    try:
+        code = _run(words, json_wanted)
+    finally:
+        remove_empty_folders()
     try:
         # Flush here: at the end of the interpreter a failure could not be reported.
         if sys.stdout is not None:
             sys.stdout.flush()
     except OSError as error:
-        return code or _output_failed(error)
+        return code or _output_failed(error, json_wanted)
     return code
 
 
@@ -122,31 +141,56 @@ def _spelled(error: Any) -> tuple[str, int]:
     return json.dumps(error.object[error.start : error.end])[1:-1], error.end
 
 
-def _run(arguments: Sequence[str] | None) -> int:
+def _run(words: list[str], json_wanted: bool) -> int:
     try:
-        build_app()(args=None if arguments is None else list(arguments), prog_name="drivegain")
+        ended = typer.main.get_command(build_app()).main(words, prog_name="drivegain", standalone_mode=False)
     except (DaqError, DriverError, IdentificationError) as error:
-        if isinstance(error, OutputFailed) and WRITTEN:
+        if isinstance(error, OutputFailed) and _kept():
             error.add_note(f"kept: {_kept()}")
-        show_error(error, Console(stderr=True, soft_wrap=True))
-        return exit_code(type(error)) or ExitCode.UNEXPECTED
+        failure = Failure.of(error)
+        show_failure(failure, json_wanted=json_wanted)
+        return failure.exit_code
     except OSError as error:
-        return _output_failed(error)
-    except SystemExit as stop:  # typer ends so, after success too
-        if isinstance(stop.__context__, BrokenPipeError):  # rich and click end so
-            return _output_failed(stop.__context__)
-        return stop.code if isinstance(stop.code, int) else ExitCode.OK
-    return ExitCode.OK
+        return _output_failed(error, json_wanted)
+    except SystemExit as stop:  # typer ends so after an option such as --show-completion, rich at a closed pipe
+        if isinstance(stop.__context__, BrokenPipeError):
+            return _output_failed(stop.__context__, json_wanted)
+        ended = stop.code
+    except typer.Abort:
+        typer.echo("interrupted: no file was written", err=True)  # Ctrl-C or Ctrl-D at a prompt
+        ended = ExitCode.INTERRUPTED
+    except Exception as error:
+        if not hasattr(error, "format_message"):
+            raise
+        ended = _usage_failed(error, json_wanted)
+    return ended if isinstance(ended, int) else ExitCode.OK
 
 
-def _output_failed(error: OSError) -> int:
+def _usage_failed(error: Any, json_wanted: bool) -> int:
+    """Report a command line that cannot be parsed. typer brings a click of its own, without public names; hence Any."""
+    if error.ctx is None or "Usage:" in error.message:
+        error.show()  # a verb without arguments shows its help
+        return ExitCode.USAGE
+    found = str(error.format_message())
+    param = getattr(error, "param", None)
+    if param is not None:
+        shown = param.name.upper() if param.param_type_name == "argument" else max(param.opts, key=len)
+        found = found.replace(f"'{param.display_name_raw}'", f"'{shown}'", 1)
+    help_of = f"{error.ctx.command_path} --help"
+    usage = error.ctx.get_usage()
+    failure = Failure("UsageError", error.ctx.command_path, found, usage, f"`{help_of}` explains it", ExitCode.USAGE)
+    show_failure(failure, json_wanted=json_wanted)
+    return ExitCode.USAGE
+
+
+def _output_failed(error: OSError, json_wanted: bool) -> int:
     # A reader that closed the pipe needs no message where nothing was written; a full disk does.
     if WRITTEN or not isinstance(error, BrokenPipeError):
         failed = OutputFailed.of(Path(str(error.filename or "standard output")), error)
         if not error.filename:
             failed.expected = "an output that takes what is printed"
             failed.remedy = f"only the printed output is lost: {_kept()}" if WRITTEN else "send it elsewhere"
-        show_error(failed, Console(stderr=True, soft_wrap=True))
+        show_failure(Failure.of(failed), json_wanted=json_wanted)
     try:
         sys.stdout.flush()
     except OSError:
@@ -159,25 +203,11 @@ def _output_failed(error: OSError) -> int:
 
 
 def _kept() -> str:
-    return f"{', '.join(map(str, WRITTEN))} was written before that, completely"
-
-
-def show_error(error: Exception, console: Console) -> None:
-    """Print subject, found, expected and remedy of an error, a line each, and its notes."""
-    lines = [("error", error.subject if isinstance(error, DaqError) else str(error), "bold red")]
-    if isinstance(error, DaqError):
-        parts = (("found", error.found), ("expected", error.expected), ("do", error.remedy))
-        lines += [(label, text, "bold") for label, text in parts]
-    notes = getattr(error, "__notes__", ())
-    lines += [(label, text, "bold") for label, _, text in (note.partition(": ") for note in notes) if label in NOTES]
-    # A stop of the axes that could not be confirmed is a note on the error.
-    unconfirmed = [note for note in notes if note.startswith(("while stopping", "while closing"))]
-    lines += [("note", text, "bold") for text in unconfirmed]
-    if unconfirmed:
-        lines.append(("AXES", "NOT ALL ARE CONFIRMED STOPPED: use the emergency stop", "bold red"))
-    for label, text, style in lines:
-        # Indented, a line end in the name of a file cannot make another line of an error.
-        console.print(Text(f"{label + ':':<10}", style=style) + Text(printable(text).replace("\n", "\n" + 10 * " ")))
+    """Say what this command has written: files that are complete, and folders that it was still filling."""
+    unfinished = [str(path) for path in STARTED if path.exists()]
+    parts = [f"{', '.join(map(str, WRITTEN))} was written before that, completely"] if WRITTEN else []
+    parts += [f"{', '.join(unfinished)} has what was finished until then"] if unfinished else []
+    return "; ".join(parts)
 
 
 def _show_version(wanted: bool) -> None:

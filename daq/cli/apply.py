@@ -20,7 +20,7 @@ import typer
 from rich.console import Console
 
 from daq.cli.terminal import WRITTEN, at_most_one, delay_signals, interruptible, write_output
-from daq.cli.verb import JsonOption, Verb, print_json
+from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
 from daq.environment import login
 from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, DaqError, ExitCode, UsageError
 from daq.report.text import terminal_text
@@ -47,8 +47,8 @@ SaveUnknownOption = Annotated[
 
 
 def apply_verb(
-    calibration: Annotated[Path, typer.Argument(help="calibration.yaml of `drivegain fit`.")],
-    cell: Annotated[Path, typer.Option(help="Cell file; it names the controller file and its keys.")],
+    cell: Annotated[Path, typer.Argument(help="Cell file; it names the controller file and its keys.")],
+    calibration: CalibrationArgument,
     to: Annotated[Path | None, typer.Option(help="Controller file, instead of the one that the cell names.")] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Write; without it the change is only shown.")] = False,
     base: Annotated[
@@ -96,7 +96,7 @@ def apply_verb(
         content=content,
     )
     audit = audit_of(declared, (cell, calibration, to))
-    undo = f"drivegain rollback --cell {shlex.quote(str(cell))}"
+    undo = f"drivegain rollback {shlex.quote(str(cell))}"
     if drives:
         at_most_one(drives=drives, to=to)
         opening = drives_on_the_bus(declared, saving)
@@ -230,18 +230,18 @@ def entered_masses(entries: Sequence[str], calibration: Calibration) -> dict[str
     return found
 
 
-APPLY = Verb("apply", apply_verb, "drivegain apply calibration.yaml --cell cells/demo.yaml --yes")
+APPLY = Verb("apply", apply_verb, "drivegain apply CELL calibration.yaml")
 
 
 def rollback(
-    cell: Annotated[Path | None, typer.Option(help="Cell file; it names the controller file and the audit.")] = None,
+    cell: Annotated[Path | None, typer.Argument(help="Cell file; it names the controller file and the audit.")] = None,
     to: Annotated[Path | None, typer.Option("--to", help="Another controller file than the cell's.")] = None,
     by: ByOption = None,
     drives: DrivesOption = False,
     ram_only: RamOnlyOption = False,
     save_unknown: SaveUnknownOption = False,
     yes: Annotated[bool, typer.Option("--yes", help="With --drives: write, not only show.")] = False,
-    audit: Annotated[Path | None, typer.Option("--audit", help="Audit file, where no --cell names it.")] = None,
+    audit: Annotated[Path | None, typer.Option("--audit", help="Audit file, where no cell file names it.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Undo the last write to a controller file; the replaced content is backed up too, so a second rollback undoes it.
@@ -264,7 +264,7 @@ def rollback(
         raise UsageError(
             "rollback",
             found="no cell" if drives else "neither a cell nor a controller file",
-            expected="--cell CELL, which says where the gains are",
+            expected="CELL, which says where the gains are",
             remedy="name the cell whose controller is to be rolled back",
         )
     if audit is not None:
@@ -292,7 +292,7 @@ def rollback(
         console = Console(soft_wrap=True, highlight=False)
         show_file_rollback(written, console)
         if audit is None:
-            console.print("Not in an audit: neither --cell nor --audit was given.", markup=False)
+            console.print("Not in an audit: neither a cell nor --audit was given.", markup=False)
 
 
 def rollback_drives(
@@ -333,7 +333,7 @@ def _enter_rollback(cell: Cell, written: Written, now: datetime, actor: Applier)
     )
 
 
-ROLLBACK = Verb("rollback", rollback, "drivegain rollback --cell cells/demo.yaml")
+ROLLBACK = Verb("rollback", rollback, "drivegain rollback CELL")
 
 
 @dataclass(frozen=True, slots=True)

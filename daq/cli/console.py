@@ -61,4 +61,4 @@ def console_verb(
         server_of(Page(declared, live, results), token, port).run(sockets=[listener])
 
 
-CONSOLE = Verb("console", console_verb, "drivegain console cells/demo.yaml --calibration calibration.yaml")
+CONSOLE = Verb("console", console_verb, "drivegain console CELL --calibration calibration.yaml")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
+from daq.cli.verb import JsonOption, Verb, print_json
 from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
 
 if TYPE_CHECKING:
@@ -82,12 +82,12 @@ def export_bag_verb(
 
 
 def export_urdf_verb(
-    calibration: CalibrationArgument,
+    cell: Annotated[Path, typer.Argument(help="Cell file: URDF, gravity, drive train, limits; none with --urdf.")],
     out: Annotated[Path, typer.Option("--out", help="URDF to write.")],
-    cell: Annotated[Path | None, typer.Option("--cell", help="Cell file: URDF, gravity, drive train, limits.")] = None,
+    calibration: Annotated[Path | None, typer.Argument(help="calibration.yaml written by `drivegain fit`.")] = None,
     urdf: Annotated[
         Path | None,
-        typer.Option("--urdf", help="Instead of --cell, for a robot with a motor for each joint, base upright."),
+        typer.Option("--urdf", help="Instead of CELL, for a robot with a motor for each joint, base upright."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -96,7 +96,7 @@ def export_urdf_verb(
     A URDF needs the bodies behind the identified parameter combinations. A semidefinite programme finds the nearest
     physical bodies (pip install 'drivegain[physical]'); the change of torque is reported.
     """
-    from daq.cli.terminal import check_output, one_of, print_view, status
+    from daq.cli.terminal import check_output, print_view, status
     from daq.config.cell import model_of
     from daq.config.cell_file import URDF, bundle
     from daq.config.yaml_file import read_bytes
@@ -107,8 +107,14 @@ def export_urdf_verb(
     from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, require_solver, update_urdf
     from ident.errors import ModelContradicted
 
-    one_of("give the cell file; --urdf is for a robot without one", cell=cell, urdf=urdf)
-    given = cell or urdf or Path()
+    if (calibration is None) == (urdf is None):
+        raise UsageError(
+            "export urdf",
+            found="one file and no --urdf" if urdf is None else "a cell file and --urdf",
+            expected="CELL CALIBRATION, or CALIBRATION --urdf FILE for a robot without a cell file",
+            remedy="give the cell file, then the calibration; or leave the cell file out",
+        )
+    given, calibration = urdf or cell, calibration or cell
     require_solver()
     check_output(out, (calibration, given), FORMAT)
     known = load_calibration(calibration)
@@ -209,7 +215,5 @@ def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
 
 EXPORT_LOG = Verb("log", export_log_verb, "drivegain export log loaded.mcap --csv --out loaded.csv")
 EXPORT_BAG = Verb("bag", export_bag_verb, "drivegain export bag loaded.mcap --out loaded-bag")
-EXPORT_URDF = Verb(
-    "urdf", export_urdf_verb, "drivegain export urdf calibration.yaml --cell cells/demo.yaml --out robot.urdf"
-)
+EXPORT_URDF = Verb("urdf", export_urdf_verb, "drivegain export urdf CELL calibration.yaml --out robot.urdf")
 EXPORT = Verb("export", export_verb, EXPORT_URDF.example, (EXPORT_URDF, EXPORT_LOG, EXPORT_BAG))

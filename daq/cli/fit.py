@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CellOption, JsonOption, Verb, print_json
+from daq.cli.verb import CellOption, JsonOption, Verb, print_json, say_next
 from daq.workflow.choices import Known
 from ident.estimators.method import Method
 
@@ -115,6 +115,8 @@ def fit_verb(
         print_json(fit_document(found, calibration, comparison))
     else:
         print_view(fit_view(found, calibration, comparison), out, pictures)
+        held_out = [word for log in holdout or () for word in ("--holdout", log)]
+        say_next("drivegain", "residual", *logs, *held_out, "--out", out or "calibration.yaml", "--report", "report")
 
 
 def _fit_cases(
@@ -155,7 +157,7 @@ def _fit_cases(
         print_view(cases_view(fits, tables), *files.values(), page_file)
 
 
-FIT = Verb("fit", fit_verb, "drivegain fit bare.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml")
+FIT = Verb("fit", fit_verb, "drivegain fit unloaded.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml")
 
 
 def residual_verb(
@@ -217,20 +219,25 @@ def residual_verb(
         print_json(residual_document(closed, changed, calibration))
     else:
         print_view(residual_view(closed, changed, calibration), out, report, pictures)
+        if out is not None:
+            say_next("drivegain", "validate", out, *(holdout or logs))
 
 
 def check_report(folder: Path | None) -> None:
-    """Create the folder of a report before any long work, and refuse one with other files of the same names."""
+    """Create the folder of a report before any long work, and refuse one with other files of the same names.
+
+    A folder in which nothing is written in the end is removed again.
+    """
     from tempfile import TemporaryFile
 
-    from daq.cli.terminal import check_replaceable
+    from daq.cli.terminal import check_replaceable, make_folder
     from daq.errors import writing
     from daq.report.residual_page import MARKS
 
     if folder is None:
         return
     with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         with TemporaryFile(dir=folder):
             pass
     for name, mark in MARKS.items():
@@ -240,7 +247,7 @@ def check_report(folder: Path | None) -> None:
 RESIDUAL = Verb(
     "residual",
     residual_verb,
-    "drivegain residual bare.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml --report report",
+    "drivegain residual unloaded.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml --report report",
 )
 
 

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from daq.cli.apply import applier
-from daq.cli.terminal import check_replaceable, say_written, write_output
+from daq.cli.terminal import check_replaceable, output_console, say_written, write_output
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.errors import AuditUnusable, ConfigurationInconsistent, DataError, HistoryUnreadable, UsageError
 from daq.report.text import printable
@@ -102,7 +101,7 @@ def history_verb(
             # Where its links lead decides which writes are this cell's: another user's link could hide some.
             resolve_links(declared.controller_path)
         checked = _verified(ledger) if verify else None
-        console = Console(soft_wrap=True, highlight=False, markup=False)
+        console = output_console()
         if json:
             document = describe(declared.name, entries, chosen, all_series, current)
             print_json(document if checked is None else {**document, "audit": describe_verification(checked)})
@@ -284,4 +283,4 @@ def _write_files(chosen: tuple[Series, ...], cell: Cell, picture: Path | None, c
             replace_file(csv, csv_text(chosen).encode())
 
 
-HISTORY = Verb("history", history_verb, "drivegain history cells/demo.yaml --axis J4 --plot history.png")
+HISTORY = Verb("history", history_verb, "drivegain history CELL --axis J4 --plot history.png")

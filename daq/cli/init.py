@@ -85,4 +85,4 @@ def _copy(source: str, path: Path, name: str, texts: dict[str, Any]) -> Path:
     return path
 
 
-INIT = Verb("init", init, "drivegain init cells/press-4")
+INIT = Verb("init", init, "drivegain init press-4 --simulated")

@@ -24,7 +24,7 @@ def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: Json
         print_view([log_table(description)])
 
 
-INFO = Verb("info", info, "drivegain info runs/unloaded-1.mcap --json")
+INFO = Verb("info", info, "drivegain info loaded.mcap")
 
 
 def import_files(
@@ -56,7 +56,7 @@ def import_files(
 
 
 IMPORT = Verb(
-    "import", import_files, "drivegain import configs/imports/tx40.yaml --data ../shared/data/tx40 --out tx40.mcap"
+    "import", import_files, "drivegain import press-4/imports/press-4.yaml --data csv-files --out imported.mcap"
 )
 
 
@@ -91,4 +91,4 @@ def salvage_verb(
         typer.echo(f"INVALID: {printable(statistics.reason)}; a fit will refuse it")
 
 
-SALVAGE = Verb("salvage", salvage_verb, "drivegain salvage bare.mcap.part --out bare-partial.mcap")
+SALVAGE = Verb("salvage", salvage_verb, "drivegain salvage loaded.mcap.part --out loaded-partial.mcap")

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def recalibrate_verb(
-    cell: Annotated[Path, typer.Option(help="Cell file; `recalibration` and `policy` configure the job.")],
+    cell: Annotated[Path, typer.Argument(help="Cell file; `recalibration` and `policy` configure the job.")],
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show the next steps; move and write nothing.")] = False,
     now: Annotated[bool, typer.Option("--now", help="Run even if the last good calibration is recent.")] = False,
     json: JsonOption = False,
@@ -93,14 +93,14 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
         raise typer.Exit(ended.exit_code)
 
 
-RECALIBRATE = Verb("recalibrate", recalibrate_verb, "drivegain recalibrate --cell cells/demo.yaml --dry-run")
+RECALIBRATE = Verb("recalibrate", recalibrate_verb, "drivegain recalibrate CELL --dry-run")
 
 
 _SYSTEM, _OF_USER = Path("/etc/systemd/system"), Path(".config/systemd/user")
 
 
 def install_units(
-    cell: Annotated[Path, typer.Option(help="Cell file with `recalibration`.")],
+    cell: Annotated[Path, typer.Argument(help="Cell file with `recalibration`.")],
     to: Annotated[Path | None, typer.Option("--to", help="Folder of the units, by default that of systemd.")] = None,
     user: Annotated[bool, typer.Option("--user", help="Install units of this user, not of the system.")] = False,
     schedule: Annotated[str, typer.Option(help="weekly, daily, or as 'Sun 03:00' (systemd.time).")] = "weekly",
@@ -204,4 +204,4 @@ def require_own_unit(path: Path, option: str = "") -> None:
         raise UsageError(str(path), found=found, expected=f"no such file, or {expected}", remedy=remedy)
 
 
-INSTALL_UNITS = Verb("install-units", install_units, "drivegain install-units --cell cells/demo.yaml --schedule weekly")
+INSTALL_UNITS = Verb("install-units", install_units, "drivegain install-units CELL --schedule weekly")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CellArgument, JsonOption, Verb, print_json
+from daq.cli.verb import CellArgument, JsonOption, Verb, print_json, say_next
 from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError
 from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_STD_PERCENT
 from drivers.errors import DriverError, SampleLost
@@ -112,6 +112,18 @@ def record_verb(
     if not log.valid:
         # The log is kept; the exit code keeps a script from using it.
         raise typer.Exit(ExitCode.DATA_UNFIT)
+    if not json:
+        _say_next(cell, declared, plan, out, carried)
+
+
+def _say_next(cell: Path, declared: Cell, plan: Path, out: Path, carried: Payload | None) -> None:
+    """Name the run with the payload after one without, and the fit of both after that."""
+    if carried is not None:
+        others = [path for path in sorted(out.parent.glob("*.mcap")) if path.name != out.name]
+        say_next("drivegain", "fit", *others, out, "--out", "calibration.yaml")
+    elif declared.payloads:
+        weighed = ("--payload", declared.payloads[0].payload.name, "--mass", "KG")
+        say_next("drivegain", "record", cell, plan, "--out", "loaded.mcap", *weighed, "--enable-motion")
 
 
 def _before_motion(cell: Cell, plan: Path, not_weighed: bool, allowed_by: str | None) -> Iterator[str]:
@@ -195,7 +207,7 @@ def mounted(cell: Cell, name: str | None) -> Payload | None:
 RECORD = Verb(
     "record",
     record_verb,
-    "drivegain record cells/demo.yaml plan.yaml --out loaded.mcap --payload disc --mass 4.59 --enable-motion",
+    "drivegain record CELL plan.yaml --out loaded.mcap --payload disc --mass 4.59 --enable-motion",
 )
 
 
@@ -264,6 +276,7 @@ def plan_verb(
         print_json(plan_document(out, declared, experiment, made, judged))
     else:
         typer.echo(plan_text(out, declared, experiment, made, judged))
+        say_next("drivegain", "record", cell, out, "--out", "unloaded.mcap", "--enable-motion")
 
 
-PLAN = Verb("plan", plan_verb, "drivegain plan cells/demo.yaml --out plan.yaml --seed 1 --duration 40")
+PLAN = Verb("plan", plan_verb, "drivegain plan CELL --out plan.yaml --seed 1 --duration 40")

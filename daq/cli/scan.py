@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from daq.cli.verb import CellArgument, JsonOption, Verb, print_json
+from daq.cli.verb import CellArgument, JsonOption, Verb, print_json, say_next
 from daq.errors import UsageError
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
     from drivers.canopen.network import CanopenNetwork
+    from drivers.profiles.profile import Axis
 
 
 def scan_verb(
@@ -42,6 +43,7 @@ def scan_verb(
 
     declared = load_cell(cell)
     found, reset = {}, []
+    causes: dict[str, str] = {}
     for part in bus_parts(declared):
         axes = tuple(axis for axis in drive_axes(declared) if axis.node_id in part.node_ids)
         with CanopenNetwork(part.address, axes) as network:
@@ -50,6 +52,7 @@ def scan_verb(
         faulty = tuple(axis for axis in axes if axis.node_id in in_fault)
         if reset_faults and faulty:
             with CanopenNetwork(part.address, faulty) as network:
+                causes |= {axis.name: _fault_of(network, axis) for axis in faulty}
                 network.reset_faults()
             with CanopenNetwork(part.address, axes) as network:
                 found[part.name] = network.scan(wait_s=wait)
@@ -57,16 +60,33 @@ def scan_verb(
     rows = [row for name, nodes in found.items() for row in scan_rows(declared, nodes, name)]
     if json:
         address = str(cell_address(declared))
-        print_json({"bus": address, "nodes": rows, "reset": reset, "current": current_signals(declared)})
+        print_json(
+            {"bus": address, "nodes": rows, "reset": reset, "faults": causes, "current": current_signals(declared)}
+        )
     else:
-        print_view(scan_view(declared, rows, reset, Console().width))
+        print_view(scan_view(declared, rows, causes, Console().width))
     absent = {row["node_id"] for row in rows if row["verdict"] == "missing"}
     missing = [axis for axis in drive_axes(declared) if axis.node_id in absent]
     if missing:
         raise NodeMissing(missing, tuple(node.node_id for nodes in found.values() for node in nodes), wait)
+    if not json and all(row["verdict"] == "ok" for row in rows):
+        say_next("drivegain", "plan", cell, "--out", "plan.yaml")
 
 
-SCAN = Verb("scan", scan_verb, "drivegain scan cells/demo.yaml")
+def _fault_of(network: CanopenNetwork, axis: Axis) -> str:
+    """Describe the error code (603Fh) of an axis in fault, which its reset clears."""
+    from drivers.canopen.emcy import describe
+    from drivers.errors import DriverError
+    from drivers.profiles.profile import ObjectEntry
+
+    try:
+        code = network.link.objects(axis.node_id).read(ObjectEntry(0x603F, 0, 16, signed=False))
+    except DriverError:
+        return "the drive names no error code (603Fh)"
+    return f"{code:04X}h: {describe(code)}" if code else "the drive names no error code (603Fh)"
+
+
+SCAN = Verb("scan", scan_verb, "drivegain scan CELL")
 
 
 def monitor_verb(
@@ -125,6 +145,7 @@ def _readings(cell: Cell, network: CanopenNetwork, interval_s: float) -> Iterato
     from contextlib import suppress
 
     from daq.report.bus import monitor_document
+    from daq.workflow.safeguards import bus_taken
     from drivers.errors import DriverError
     from drivers.profiles.scale import read_scale
     from drivers.stream.monitor import QUIET_S, CellMonitor, ReadingSource
@@ -147,10 +168,10 @@ def _readings(cell: Cell, network: CanopenNetwork, interval_s: float) -> Iterato
                     access = network.link.objects(network.node_ids[axis])
                     ampere[axis] = read_scale(access, network.axes[axis].profile).ampere_per_unit
         event_lines.extend(event.text for event in reading.events)
-        yield monitor_document(cell, reading, ampere, list(event_lines))
+        yield monitor_document(cell, reading, ampere, list(event_lines), recorder=bus_taken(cell))
 
 
-MONITOR = Verb("monitor", monitor_verb, "drivegain monitor cells/demo.yaml")
+MONITOR = Verb("monitor", monitor_verb, "drivegain monitor CELL")
 
 _HEX = re.compile(r"(?:0[xX])?([0-9a-fA-F]{1,4})[hH]?")
 

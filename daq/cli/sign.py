@@ -75,8 +75,8 @@ def sign_calibration_verb(
 
 
 def sign_check_verb(
+    cell: Annotated[Path, typer.Argument(help="Cell file; its policy names the signers.")],
     calibration: CalibrationArgument,
-    cell: Annotated[Path, typer.Option("--cell", help="Cell file; its policy names the signers.")],
     json: JsonOption = False,
 ) -> None:
     """Show which of the cell's signers have signed a calibration; an invalid signature is exit code 3."""
@@ -105,5 +105,5 @@ SIGN_KEY = Verb("key", sign_key_verb, "drivegain sign key --name anna --folder k
 SIGN_CALIBRATION = Verb(
     "calibration", sign_calibration_verb, "drivegain sign calibration calibration.yaml --key keys/anna.key --name anna"
 )
-SIGN_CHECK = Verb("check", sign_check_verb, "drivegain sign check calibration.yaml --cell cells/demo.yaml")
+SIGN_CHECK = Verb("check", sign_check_verb, "drivegain sign check CELL calibration.yaml")
 SIGN = Verb("sign", sign_verb, SIGN_CALIBRATION.example, (SIGN_KEY, SIGN_CALIBRATION, SIGN_CHECK))

@@ -6,7 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -27,12 +27,38 @@ WRITTEN: list[Path] = []
 """Files and folders that this command has written, for the message of an error or interrupt that comes later."""
 
 
+STARTED: list[Path] = []
+"""Folders that this command was filling when it was interrupted."""
+
+_MADE: list[Path] = []
+"""Folders that this command has made before it had anything to put into them."""
+
+
 @contextmanager
 def write_output(path: Path) -> Iterator[None]:
     """Write a file or folder within the block, as `writing`, and note in `WRITTEN` that it is there."""
-    with writing(path):
-        yield
+    try:
+        with writing(path):
+            yield
+    except KeyboardInterrupt:
+        if path.is_dir() and any(path.iterdir()):
+            STARTED.append(path)
+        raise
     WRITTEN.append(path)
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder, with its parents, before there is anything to put into it; it is removed if it stays empty."""
+    missing = [one for one in (folder, *folder.parents) if not one.exists()]
+    _MADE.extend(reversed(missing))
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def remove_empty_folders() -> None:
+    """Remove the folders of `make_folder` that are still empty."""
+    while _MADE:
+        with suppress(OSError):  # not empty
+            _MADE.pop().rmdir()
 
 
 def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) -> None:
@@ -88,9 +114,20 @@ def at_most_one(**options: object) -> None:
         )
 
 
+def output_console() -> Console:
+    """Console of stdout; a pipe has no width, so nothing in it is broken into lines."""
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    if not console.is_terminal:
+        console.width = PIPE_COLUMNS
+    return console
+
+
+PIPE_COLUMNS = 1_000  #: Wider than any table
+
+
 def print_view(parts: Iterable[RenderableType], *written: Path | None) -> None:
     """Print tables and lines on stdout, then the files written; lines are not broken, so that they can be copied."""
-    console = Console(soft_wrap=True, highlight=False, markup=False)
+    console = output_console()
     for part in parts:
         console.print(part)
     say_written(console, *written)
@@ -144,10 +181,17 @@ def show_steps() -> Iterator[Stepper]:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[ProgressCallback]:
-    """Show one progress bar on stderr."""
-    with show_steps() as stepper:
-        stepper.step(title)
-        yield stepper.progress
+    """Show one progress bar on stderr from the first progress on: none where the work is refused."""
+    with ExitStack() as stack:
+        shown: list[Stepper] = []
+
+        def report(done: int, total: int, remark: str) -> None:
+            if not shown:
+                shown.append(stack.enter_context(show_steps()))
+                shown[0].step(title)
+            shown[0].progress(done, total, remark)
+
+        yield report
 
 
 @contextmanager

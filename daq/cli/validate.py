@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CalibrationArgument, CellOption, JsonOption, Verb, print_json
+from daq.cli.verb import CalibrationArgument, CellOption, JsonOption, Verb, cell_here, print_json, say_next
 from daq.errors import CalibrationMissing
 
 if TYPE_CHECKING:
@@ -65,6 +65,7 @@ def validate_verb(
         print_json({**validation_document(known, found.validations, drawn), **cross_document(found)})
     else:
         print_view(validation_view(known, found), *drawn.values(), page_file)
+        say_next("drivegain", "apply", cell or cell_here(known.cell), calibration)
 
 
 def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]:
@@ -88,6 +89,4 @@ def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]
     return {file.stem if stems[file.stem] == 1 else str(file): load_calibration(file) for file in files}
 
 
-VALIDATE = Verb(
-    "validate", validate_verb, "drivegain validate calibration.yaml runs/later.mcap --beside cases --out tables"
-)
+VALIDATE = Verb("validate", validate_verb, "drivegain validate calibration.yaml held-out.mcap --pictures pictures")

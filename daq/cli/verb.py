@@ -1,4 +1,4 @@
-"""A verb of the command line, and the options that several verbs share.
+"""A verb of the command line, its help, and the options that several verbs share.
 
 A verb parses, calls and prints. Its module imports what the help needs; the verb imports what it runs when it runs, so
 that no help waits for numerics or for the bus.
@@ -7,13 +7,19 @@ that no help waits for numerics or for the bus.
 from __future__ import annotations
 
 import importlib
+import inspect
+import re
+import shlex
+import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from daq.report.text import json_text
 
@@ -23,13 +29,25 @@ CellOption = Annotated[Path | None, typer.Option("--cell", help="Another cell fi
 CalibrationArgument = Annotated[Path, typer.Argument(help="calibration.yaml written by `drivegain fit`.")]
 
 
+HELP_NAMES = ["-h", "--help"]
+
+
+class Job(Enum):
+    """Work of a person at a cell, which groups the verbs in the help."""
+
+    COMMISSION = "Commission a cell"
+    LOOK = "Look"
+    MAINTAIN = "Maintain"
+    EXPERT = "Expert"
+
+
 @dataclass(frozen=True, slots=True)
 class Verb:
     """One verb."""
 
     name: str  #: on the command line
     function: Callable[..., None]  #: takes its arguments as typer parses them; its docstring is the help
-    example: str  #: a command line that works, shown at the end of the help
+    example: str  #: a command line that works, shown at the end of the help; CELL is the cell file of the user's folder
     #: Verbs with arguments of their own, `drivegain export urdf …`; then `function` takes none and is the help alone.
     kinds: tuple[Verb, ...] = ()
 
@@ -37,28 +55,31 @@ class Verb:
         """Click command of this verb, or group of its kinds."""
         # rich would read the units in brackets, [s], as markup and drop them.
         app = typer.Typer(
+            cls=_Kinds,
             add_completion=False,
             pretty_exceptions_enable=False,
             rich_markup_mode=None,
             no_args_is_help=True,
-            epilog=self._epilog,
+            epilog=self._epilog(),
         )
         if self.kinds:
             app.callback()(self.function)
         for verb in self.kinds or (self,):
-            app.command(verb.name, epilog=verb._epilog)(verb.function)
+            app.command(verb.name, cls=_VerbCommand, epilog=verb._epilog())(verb.function)
         return typer.main.get_command(app)
 
-    @property
     def _epilog(self) -> str:
-        """Example as click shows it; \\b keeps it on one line, ready to copy."""
-        return f"\b\nExample:\n  {self.example}"
+        """Example as click shows it; \\b keeps the lines of the command, ready to copy."""
+        width = max(min(shutil.get_terminal_size().columns, 80) - 2, 50)  # as click computes it
+        command = " ".join(str(cell_here()) if word == "CELL" else word for word in self.example.split(" "))
+        return "\b\nExample:\n" + "\n".join(continued(command, width - 2, indent="  "))
 
 
 @dataclass(frozen=True, slots=True)
 class Listed:
     """Entry of the list of verbs, before the verb is imported."""
 
+    job: Job  #: what it is for
     name: str  #: on the command line
     place: str  #: where its `Verb` is defined, as module:name
     summary: str  #: one line for the list
@@ -70,6 +91,138 @@ class Listed:
         if not isinstance(verb, Verb):
             raise TypeError(f"{self.place} is no Verb")
         return verb
+
+
+_HYPHEN = "\u2011"  #: Non-breaking: a line is broken at spaces alone, so that --enable-motion stays whole
+
+
+class _VerbCommand(TyperCommand):
+    """Command whose help names values as a manual does: CELL, SECONDS; `--cell CELL` is the former spelling of CELL."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if any(param.name == "cell" and param.param_type_name == "argument" for param in self.params):
+            args = _cell_first(args)
+        return super().parse_args(ctx, args)
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        return [piece.replace("{", "").replace("}", "").upper() for piece in super().collect_usage_pieces(ctx)]
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        for title in ("argument", "option"):
+            params = [param for param in self.get_params(ctx) if param.param_type_name == title]
+            records = [record for record in (help_record(param, ctx) for param in params) if record is not None]
+            if records:
+                with formatter.section(f"{title.capitalize()}s"):
+                    formatter.write_dl([(name, text.replace("-", _HYPHEN)) for name, text in records])
+
+    def format_help_text(self, ctx: Any, formatter: Any) -> None:
+        formatter.write_paragraph()
+        with formatter.indentation():
+            formatter.write_text(inspect.cleandoc(self.help or "").replace("-", _HYPHEN))
+
+    def get_help(self, ctx: Any) -> str:
+        return super().get_help(ctx).replace(_HYPHEN, "-")
+
+
+class _Kinds(TyperGroup):
+    """Verb with kinds of its own, which are listed with their whole first sentences."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        rows = [(name, str(kind.help).partition("\n\n")[0]) for name, kind in self.commands.items()]
+        with formatter.section("Kinds"):
+            formatter.write_dl([(name, " ".join(text.split())) for name, text in rows])
+
+
+def help_record(param: Any, ctx: Any) -> tuple[str, str] | None:
+    """Name of an argument or option with the word for its value, and its help; None for a hidden one."""
+    # typer brings a click of its own, whose classes have no public name; hence Any.
+    record = param.get_help_record(ctx)
+    if record is None:
+        return None
+    _, text = record
+    if param.param_type_name == "argument":
+        return param.name.upper() + ("..." if param.nargs != 1 else ""), text
+    names = ", ".join(sorted(param.opts, key=len))
+    return names if param.is_flag or param.count else f"{names} {_value_word(param, ctx)}", text
+
+
+_WORDS = {
+    **dict.fromkeys(("by", "name", "operator", "payload"), "NAME"),
+    **{"axis": "AXIS", "base": "BEFORE-AFTER", "channel": "CHANNEL", "payload_mass": "NAME=KG", "schedule": "WHEN"},
+}
+"""Words for the texts that options take, by the name of the option."""
+_UNITS = {"s": "SECONDS", "kg": "KG", "%": "PERCENT"}
+
+
+def _value_word(param: Any, ctx: Any) -> str:
+    """Word for the value of an option: the declared one, or by its type, its unit or the first word of its help."""
+    if param.metavar is not None:
+        return str(param.metavar)
+    described = param.type_descriptor
+    if described.is_choice:
+        return str(param.display_type(ctx)).strip("<>")
+    if "Path" in str(described.annotation):
+        return "FOLDER" if (param.help or "").startswith("Folder") else "FILE"
+    if described.annotation in (str, list[str]):
+        return _WORDS.get(param.name, "TEXT")
+    unit = re.search(r"\[(\S+)\]", param.help or "")
+    return _UNITS.get(unit[1], "NUMBER") if unit is not None else "NUMBER"
+
+
+def _cell_first(args: Sequence[str]) -> list[str]:
+    """Put the value of `--cell` in front, where the cell file is an argument."""
+    words = list(args)
+    end = words.index("--") if "--" in words else len(words)
+    for place, word in enumerate(words[:end]):
+        name, equals, value = word.partition("=")
+        if name == "--cell" and (equals or place + 1 < end):
+            taken = [value] if equals else words[place + 1 : place + 2]
+            return [*taken, *words[:place], *words[place + (1 if equals else 2) :]]
+    return words
+
+
+_CELLS = ("*.yaml", "cells/*.yaml", "*/cells/*.yaml")
+_TEMPLATE = Path("press-4/cells/press-4.yaml")  #: What the example of `drivegain init` makes
+
+
+def cell_here(name: str | None = None) -> Path:
+    """Find the cell file in or below this folder, for a command to copy; of that cell, if a name is given.
+
+    Where there is none, it is the one that the example of `drivegain init` makes.
+    """
+    return next(_cells_here(name), _TEMPLATE if name is None else Path("CELL"))
+
+
+def _cells_here(name: str | None) -> Iterator[Path]:
+    for pattern in _CELLS:
+        for path in sorted(Path().glob(pattern)):
+            try:
+                with path.open(encoding="utf-8", errors="replace") as stream:
+                    head = stream.read(4096)
+            except OSError:
+                continue
+            found = re.search(r"^name: *(\S+)", head, re.MULTILINE)
+            if re.search(r"^robot:", head, re.MULTILINE) and found and name in (None, found[1]):
+                yield path
+
+
+def continued(command: str, width: int, indent: str = "") -> list[str]:
+    r"""Break a command at its spaces into lines that a shell reads as one, each but the last with ` \` at its end."""
+    lines, line = [], indent
+    # An option stays with its value.
+    for word in re.findall(r"--?\S+(?: [^-\s]\S*)?|\S+", command):
+        longer = f"{line}{word}" if not line.strip() else f"{line} {word}"
+        if line.strip() and len(longer) > len(indent) + width - 2:
+            lines.append(f"{line} \\")
+            longer = f"{indent}  {word}"
+        line = longer
+    return [*lines, line]
+
+
+def say_next(*words: object) -> None:
+    """Print the command of the next step on stderr, quoted for a shell; without `--json` only."""
+    # Written names of things that the user has to fill in, such as CELL, need no quotes.
+    typer.echo("Next: " + " ".join(shlex.quote(str(word)) for word in words), err=True)
 
 
 def print_json(document: Any) -> None:

@@ -42,7 +42,7 @@ def weigh_verb(
         print_view(weighed_view(found))
 
 
-WEIGH = Verb("weigh", weigh_verb, "drivegain weigh gripper.mcap --calibration calibration.yaml --bare unloaded.mcap")
+WEIGH = Verb("weigh", weigh_verb, "drivegain weigh loaded.mcap --calibration calibration.yaml --bare unloaded.mcap")
 
 
 def contact_verb(
@@ -81,5 +81,5 @@ def contact_verb(
 
 
 CONTACT = Verb(
-    "contact", contact_verb, "drivegain contact later.mcap --calibration calibration.yaml --quiet held-out.mcap"
+    "contact", contact_verb, "drivegain contact loaded.mcap --calibration calibration.yaml --quiet held-out.mcap"
 )

@@ -200,14 +200,14 @@ def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
         sign = f"let a second person sign it: drivegain sign calibration {calibration} --key KEY --name NAME"
         return [
             *([sign] if session.state.target.unsigned else []),
-            f"drivegain apply {calibration} --cell {cell}",
+            f"drivegain apply {cell} {calibration}",
             "check the change, and if it is right, write it:",
-            f"drivegain apply {calibration} --cell {cell} --yes --base {session.state.target.looked_at}",
+            f"drivegain apply {cell} {calibration} --yes --base {session.state.target.looked_at}",
         ]
     if outcome is Outcome.APPLIED and session is not None and session.state.target is not None:
         return [
             "let the controller load the file",
-            f"to undo it: drivegain rollback --cell {shlex.quote(str(cell_file))}",
+            f"to undo it: drivegain rollback {shlex.quote(str(cell_file))}",
         ]
     return {
         Outcome.REFUSED: ["see which check failed; the next job records anew"],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,8 +28,11 @@ ENABLED = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTIO
 FAULTY = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 
 
-def scan_view(cell: Cell, rows: list[dict[str, Any]], reset: Sequence[str], width: int) -> Iterator[RenderableType]:
-    """Table of the nodes on all buses, and what needs attention; at most `width` columns wide."""
+def scan_view(cell: Cell, rows: list[dict[str, Any]], reset: Mapping[str, str], width: int) -> Iterator[RenderableType]:
+    """Table of the nodes on all buses, and what needs attention; at most `width` columns wide.
+
+    `reset` has the fault of each axis that was reset.
+    """
     table = scan_table(rows, width, several=len({row["bus"] for row in rows}) > 1)
     yield table
     shown = {str(column.header).lower() for column in table.columns}
@@ -39,8 +42,8 @@ def scan_view(cell: Cell, rows: list[dict[str, Any]], reset: Sequence[str], widt
         if row["enabled"]:
             name = f"node {row['node_id']}" + (f" ({printable(row['axis'])})" if row["axis"] else "")
             yield Text(f"{name} IS ENABLED: its motor has torque and may move at any time.", "bold red")
-    for name in reset:
-        yield Text(f"The fault of {printable(name)} was reset; it has no power.")
+    for name, fault in reset.items():
+        yield Text(f"The fault of {printable(name)} was reset; it has no power. It was {printable(fault)}.")
     if any(row["in_fault"] for row in rows):
         yield Text(
             "An axis is in fault. Its display, the drive's own tool or an EMCY in the log of the last run (`drivegain "
@@ -126,13 +129,16 @@ def scan_table(rows: list[dict[str, Any]], width: int = 80, several: bool = Fals
     return table
 
 
-def monitor_document(cell: Cell, reading: CellReading, ampere: list[float | None], events: list[str]) -> dict[str, Any]:
+def monitor_document(
+    cell: Cell, reading: CellReading, ampere: list[float | None], events: list[str], *, recorder: bool = False
+) -> dict[str, Any]:
     """JSON document of one reading of the bus.
 
     Args:
         cell, reading: the cell, and what was read from its buses.
         ampere: amperes per raw unit of each axis' current, None where unknown.
         events: texts of recent events, oldest first.
+        recorder: whether a recording or job of drivegain on this computer has the bus.
     """
     from drivers.canopen.link import nmt_name  # noqa: PLC0415 - as above
 
@@ -163,6 +169,7 @@ def monitor_document(cell: Cell, reading: CellReading, ampere: list[float | None
     return {
         "cell": cell.name,
         "source": reading.source.value,
+        "recorder": recorder,
         **picked(reading, "seconds", "sync_hz"),
         "frames_per_s": sum(map(sum, reading.frames)) / reading.seconds,
         "bus_load_percent": max(loads),
@@ -200,8 +207,10 @@ def bus_loads_percent(cell: Cell, reading: CellReading) -> tuple[float, ...]:
     )
 
 
+_ALARMING = {str(state) for state in (*FAULTY, State.QUICK_STOP_ACTIVE)}
 _SOURCE_TEXT = {
     "overheard": "another master leads this bus; its traffic is read and nothing is sent",
+    "recorder": "drivegain's recorder leads this bus; its traffic is read and nothing is sent",
     "asked": "no other master: the axes are queried, nothing is written",
 }
 
@@ -214,13 +223,16 @@ def monitor_view(document: dict[str, Any]) -> Group:
         current = "?" if axis["current_raw"] is None else f"{axis['current_raw']:+d} raw"
         if axis["current_a"] is not None:
             current = f"{axis['current_a']:+.3f} A"
-        note, style = (" (ENABLED)", "bold") if axis["enabled"] else ("", None)
+        note, style = (" (ENABLED)", "bold green") if axis["enabled"] else ("", None)
+        if axis["state"] in _ALARMING:
+            note, style = f"{note} (see the events below, or `drivegain scan --reset-faults`)", "bold red"
         if axis["silent"]:
-            note, style = " (SILENT)", "red"
+            note, style = " (SILENT)", "bold red"
         state = (axis["state"] or "?").lower() + note
         cells = (printable(axis["axis"]), position, current, state, f"{axis['rate_hz']:.1f}", str(axis["lost"]))
         table.add_row(*map(Text, cells), style=style)
-    head = Text(printable(f"{document['cell']}: {_SOURCE_TEXT[document['source']]}"))
+    source = "recorder" if document["source"] == "overheard" and document["recorder"] else document["source"]
+    head = Text(printable(f"{document['cell']}: {_SOURCE_TEXT[source]}"))
     loads = ", ".join(f"{printable(bus['bus'])} {bus['load_percent']:.1f} % at worst" for bus in document["buses"])
     load = Text(f"{loads}, {document['frames_per_s']:.0f} frames/s, SYNC {document['sync_hz']:.1f} Hz")
     return Group(head, table, load, *(Text(printable(event), "yellow") for event in document["events"]))

@@ -7,15 +7,13 @@ import io
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from rich import box
 from rich.console import RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from daq.jobs.cell_fit import Failure, Summary
 from daq.jobs.fleet import FleetRow
 from daq.report.gains import with_deviation
-from daq.report.text import inert, inert_row, picked, printable, spelled_bytes
+from daq.report.text import WholeTable, inert, inert_row, picked, printable, spelled_bytes
 from ident.calibration import Gain
 
 FIRST_COLUMNS = ("cell", "configuration_sha256", "fit", "holdout")
@@ -27,7 +25,7 @@ LAST_COLUMNS = (
 
 def fleet_view(rows: Sequence[FleetRow]) -> Iterator[RenderableType]:
     """Table of the cells, a row each, and remarks on it; errors are red."""
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    table = WholeTable()
     table.add_column("cell", overflow="fold")
     table.add_column("gains ± σ", ratio=1)
     table.add_column("worst σ %", justify="right", no_wrap=True)

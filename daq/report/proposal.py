@@ -8,14 +8,13 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from rich import box
 from rich.console import Console
 from rich.syntax import Syntax
 from rich.table import Table
 
 from daq.ledger.judgement import NOTHING, Spread, judge
 from daq.report.gains import with_deviation
-from daq.report.text import picked, terminal_lines, terminal_text
+from daq.report.text import WholeTable, picked, terminal_lines, terminal_text
 from daq.writeback.drive_target import DriveEdit
 from daq.writeback.file_target import FileEdit
 from daq.writeback.request import Edit, GainChange
@@ -42,7 +41,8 @@ def show(proposal: Proposal[E], console: Console, known: Spread = NOTHING) -> No
 
 def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING, place: str = "in the file") -> Table:
     """Make the table of old and new gains, with the figures to judge a change by; it fits 80 columns."""
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, collapse_padding=True)
+    table = WholeTable()
+    table.collapse_padding = True
     table.add_column("axis", no_wrap=True)
     for heading in (place, "identified ± σ", "σ %", "Δ %", "Δ in σ", "nameplate", "off %"):
         table.add_column(heading, justify="right", no_wrap=True)

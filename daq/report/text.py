@@ -8,6 +8,9 @@ from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from rich import box
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
@@ -28,12 +31,43 @@ def terminal_lines(text: str) -> str:
     return "\n".join("".join(c if c.isprintable() or c == "\t" else f"\\x{ord(c):02x}" for c in line) for line in lines)
 
 
+class WholeTable(Table):
+    """Table without a frame that never cuts a value: where it is too wide, each value gets a line of its own."""
+
+    def __init__(self, title: Text | None = None) -> None:
+        super().__init__(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Render as a table, or as a paragraph a row: heading and value."""
+        free = options.update(width=_UNBOUNDED, min_width=0, max_width=_UNBOUNDED)
+        cells = [[*column.cells] for column in self.columns]
+        needed = _GAP * (len(cells) - 1)
+        for column, values in zip(self.columns, cells, strict=True):
+            widths = [Measurement.get(console, free, value) for value in (column.header, *values)]
+            needed += max(one.maximum if column.no_wrap else one.minimum for one in widths)
+        if needed <= options.max_width:
+            yield from super().__rich_console__(console, options)
+            return
+        if self.title is not None:
+            yield self.title
+        names = [str(column.header) for column in self.columns]
+        indent = max(map(cell_len, names))
+        for number, row in enumerate(zip(*cells, strict=True)):
+            if number:
+                yield ""
+            for name, value in zip(names, row, strict=True):
+                yield Text(f"{name}{' ' * (indent - cell_len(name) + 2)}{value}")
+
+
+_UNBOUNDED, _GAP = 10_000, 3  #: Columns of a line
+
+
 def plain_table(
     headings: Iterable[str], *, title: str | None = None, left: Collection[int] = (0,), wrap: Collection[int] = ()
 ) -> Table:
     """Table without a frame; columns of words are aligned to the left, and cells of `wrap` may be broken into lines."""
     heading = None if title is None else terminal_text(title)
-    table = Table(title=heading, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    table = WholeTable(heading)
     for index, name in enumerate(headings):
         table.add_column(terminal_text(name), justify="left" if index in left else "right", no_wrap=index not in wrap)
     return table

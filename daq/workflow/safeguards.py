@@ -62,6 +62,17 @@ def bus_lock(cell: Cell, folder: Path | None = None) -> Iterator[None]:
         yield
 
 
+def bus_taken(cell: Cell, folder: Path | None = None, locks: Path = Path("/proc/locks")) -> bool:
+    """Whether a recording or job of this computer has a bus of the cell; the lock itself is not touched."""
+    try:
+        lines = [line for line in locks.read_text().splitlines() if " FLOCK " in line]
+        held = {int(line.split()[-3].rpartition(":")[2]) for line in lines}
+        files = [(folder or _shared_folder()) / lock_name(bus) for bus in cell.buses]
+        return any(file.exists() and file.stat().st_ino in held for file in files)
+    except (OSError, ValueError, IndexError):
+        return False  # a kernel that does not list locks
+
+
 def lock_name(bus: Bus) -> str:
     """Name of a bus's lock file: by interface and channel, for a hub by its host's address and port."""
     parts = [bus.interface, bus.channel]

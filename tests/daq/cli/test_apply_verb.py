@@ -115,7 +115,7 @@ def test_the_command_shows_writes_and_rolls_back(bench: Bench, capsys: pytest.Ca
 
     assert bench.apply("--yes", "--base", dry["base_sha256"], "--by", "Ada") == ExitCode.OK
     undo = shlex.split(capsys.readouterr().out.splitlines()[-1].removeprefix("To undo: drivegain "))
-    assert undo == ["rollback", "--cell", str(bench.cell)]
+    assert undo == ["rollback", str(bench.cell)]
     assert b"-9.2100" in bench.controller.read_bytes()
 
     assert bench.apply("--yes") == ExitCode.OK
@@ -591,7 +591,7 @@ def test_an_output_that_fails_after_a_write_says_what_was_written(bench: Bench, 
         os.close(writing)
         assert bench.controller.read_bytes() != before
         assert done.returncode == ExitCode.UNEXPECTED
-        assert re.search(r"^error: +standard output$", done.stderr, re.MULTILINE)
+        assert re.search(r'^(error: +|\{"error": ")standard output\b', done.stderr, re.MULTILINE)
         assert f"only the printed output is lost: {bench.controller} was written" in done.stderr
         assert not re.search("nothing was|another folder|Traceback|Exception", done.stderr)
 

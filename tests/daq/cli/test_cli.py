@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -17,8 +18,9 @@ from rich.console import Console
 
 from daq.cli import main
 from daq.cli.app import VERBS
+from daq.cli.init import INIT
 from daq.cli.terminal import say_written
-from daq.cli.verb import Listed
+from daq.cli.verb import Job, Listed, cell_here, continued
 from daq.config.cell import PacingMode
 from daq.config.cell_file import load_cell
 from daq.config.import_description import load_import
@@ -29,8 +31,9 @@ from tests.daq.logs import DISC, START_NS, demo_content, samples, write
 
 @pytest.mark.parametrize("listed", VERBS, ids=[verb.name for verb in VERBS])
 def test_every_help_is_whole_and_ends_with_an_example_to_copy(
-    listed: Listed, capsys: pytest.CaptureFixture[str]
+    listed: Listed, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     verb = listed.load()
     assert verb.name == listed.name
     kinds = verb.kinds
@@ -39,12 +42,15 @@ def test_every_help_is_whole_and_ends_with_an_example_to_copy(
         output = capsys.readouterr().out
         shown = next((kind for kind in kinds if kind.name == command[-1]), verb)
         assert shown.example.startswith("drivegain " + " ".join(command))
-        assert output.splitlines()[-1].strip() == shown.example
+        copied = output.rpartition("Example:")[2].replace("\\\n", " ")
+        assert copied.split() == shown.example.replace("CELL", str(cell_here())).split()
         # Nothing of a help text is taken for markup: units are in brackets.
         reported = _squeezed(output)
+        assert max(map(len, output.splitlines())) <= 80
         for parameter in inspect.signature(shown.function, eval_str=True).parameters.values():
             (option,) = parameter.annotation.__metadata__
             assert _squeezed(option.help) in reported
+            assert set(option.help.split()) <= set(output.split())  # no word is cut
 
 
 def test_the_list_shows_every_verb_with_its_whole_summary(capsys: pytest.CaptureFixture[str]) -> None:
@@ -52,6 +58,61 @@ def test_the_list_shows_every_verb_with_its_whole_summary(capsys: pytest.Capture
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     for listed in VERBS:
         assert f"{listed.name} {listed.summary}" in lines
+
+
+def test_every_job_of_the_help_has_its_verbs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["-h"]) == 0
+    sections = capsys.readouterr().out.split("\n\n")
+    for job in Job:
+        (section,) = (one for one in sections if one.startswith(f"{job.value}:"))
+        named = [line.split()[0] for line in section.splitlines()[1:]]
+        assert named == [listed.name for listed in VERBS if listed.job is job]
+
+
+def test_an_example_uses_the_cell_file_of_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cell_here() == Path("press-4/cells/press-4.yaml")
+    (example,) = re.findall(r"init (\S+)", INIT.example)
+    assert main(["init", "other-cells/lathe"]) == 0
+    assert main(["init", example]) == 0
+    assert cell_here().is_file()
+    assert cell_here("press-4") == Path("press-4/cells/press-4.yaml")
+    monkeypatch.chdir(tmp_path / "other-cells" / "lathe")
+    assert main(["scan", "-h"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1].strip() == "drivegain scan cells/lathe.yaml"
+
+
+def test_examples_name_files_that_other_examples_make() -> None:
+    examples = [kind.example for listed in VERBS for kind in (listed.load(), *listed.load().kinds)]
+    made = {value for one in examples for value in re.findall(r"--(?:out|report) (\S+)", one)}
+    used = {word for one in examples for word in one.split() if re.search(r"\.(mcap|yaml)$", word)}
+    # Made by `record` with other options, as in the guide, and by `init`.
+    assert used - made == {"unloaded.mcap", "held-out.mcap", "press-4/imports/press-4.yaml"}
+
+
+@pytest.mark.parametrize("width", [40, 78])
+def test_a_command_that_is_broken_into_lines_is_the_same_to_a_shell(width: int) -> None:
+    command = "drivegain record cells/a.yaml plan.yaml --out loaded.mcap --payload disc --mass 4.59 --enable-motion"
+    lines = continued(command, width, indent="  ")
+    assert max(map(len, lines)) <= width + 2
+    assert shlex.split("\n".join(lines).replace("\\\n", " ")) == command.split()
+    assert not any(line.endswith(("--out \\", "--mass \\")) for line in lines)
+
+
+def test_the_table_of_exit_codes_is_that_of_the_code(checkout: Path) -> None:
+    page = (checkout / "docs/reference/exit-codes.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([\d to]+) \|", page, re.MULTILINE)
+    named = [code for row in rows for first, _, last in [row.partition(" to ")] for code in _span(first, last)]
+    assert sorted(named) == sorted(code.value for code in ExitCode)
+    for code in ExitCode:
+        word = {ExitCode.OK: "ok"}.get(code, code.name.lower().replace("_", " ").split()[-1])
+        assert word in page or code in range(10, 15)
+
+
+def _span(first: str, last: str) -> range:
+    return range(int(first), int(last or first) + 1)
 
 
 def test_a_unit_in_a_help_text_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
@@ -87,12 +148,25 @@ def _squeezed(text: str) -> str:
     return "".join(text.split())
 
 
-@pytest.mark.parametrize("arguments", [["no-such-verb"], ["info"], ["info", "--no-such-option", "x"], ["import", "x"]])
-def test_wrong_usage_is_exit_code_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["no-such-verb"], "no-such-verb"),
+        (["info"], "'LOG'"),
+        (["info", "--no-such-option", "x"], "--no-such-option"),
+        (["import", "x"], "'--data'"),
+        (["record", "a", "b", "--out", "c", "--mass", "heavy"], "'--mass'"),
+    ],
+)
+def test_wrong_usage_is_exit_code_2(arguments: list[str], named: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(arguments) == 2
     output = capsys.readouterr()
     assert output.out == ""
-    assert "Usage" in output.err
+    assert re.search(rf"found: .*{named}.*\nexpected: Usage: drivegain.*\ndo: .*--help", output.err)
+    assert main([*arguments, "--json"]) == 2
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert named in json.loads(output.err)["found"]
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

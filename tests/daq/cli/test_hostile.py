@@ -6,9 +6,9 @@ import os
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
-from daq.cli.app import main, show_error
+from daq.cli.app import main
+from daq.cli.failure import Failure, show_failure
 from daq.config.yaml_file import MAX_EXPLAINED, StrictModel, parse_yaml, read_model
 from daq.errors import ExitCode, OutputFailed, SchemaMismatch
 from daq.log.metadata import (
@@ -140,7 +140,7 @@ def test_a_disk_that_is_full_from_the_start_leaves_nothing(tmp_path: Path, monke
 def test_a_stop_that_was_not_confirmed_is_shouted(capsys: pytest.CaptureFixture[str]) -> None:
     error = DriveFault(3, "fault")
     error.add_note("while stopping: node 3: object 6041h:00: no answer")
-    show_error(error, Console(stderr=True, soft_wrap=True))
+    show_failure(Failure.of(error), json_wanted=False)
     output = capsys.readouterr().err
     assert "node 3: object 6041h:00: no answer" in output
     assert "emergency stop" in output
@@ -148,7 +148,7 @@ def test_a_stop_that_was_not_confirmed_is_shouted(capsys: pytest.CaptureFixture[
 
 
 def test_a_stop_that_was_confirmed_is_not(capsys: pytest.CaptureFixture[str]) -> None:
-    show_error(DriveFault(3, "fault"), Console(stderr=True, soft_wrap=True))
+    show_failure(Failure.of(DriveFault(3, "fault")), json_wanted=False)
     assert "emergency" not in capsys.readouterr().err
 
 

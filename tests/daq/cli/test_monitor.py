@@ -22,6 +22,7 @@ from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
 from daq.report.bus import bus_loads_percent, joint_positions, monitor_document, monitor_view
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from daq.workflow.safeguards import bus_lock, bus_taken
 from drivers.canopen.bus import BusAddress, open_bus
 from drivers.canopen.link import Link
 from drivers.canopen.sdo import SdoPolicy
@@ -239,3 +240,23 @@ def test_a_cell_that_is_not_there_is_a_device_fault(cell: Path, capsys: pytest.C
     streams = capsys.readouterr()
     assert "(SILENT)" in streams.out
     assert "did not answer" in streams.err
+
+
+def test_our_own_recorder_is_no_other_master(tmp_path: Path) -> None:
+    assert not bus_taken(CELL, tmp_path)
+    with bus_lock(CELL, tmp_path):
+        assert bus_taken(CELL, tmp_path)
+    assert not bus_taken(CELL, tmp_path)
+    assert not bus_taken(CELL, tmp_path, tmp_path / "no list of locks")
+    axis = AxisReading(0, 1, 0x1208, None, 1.0, 0)
+    reading = CellReading(ReadingSource.OVERHEARD, 1.0, (axis,) * 6, 100.0, ((0,) * 9,), ())
+    said = []
+    for recorder in (False, True):
+        out = io.StringIO()
+        document = monitor_document(CELL, reading, [None] * 6, [], recorder=recorder)
+        Console(file=out, width=200).print(monitor_view(document))
+        said.append(out.getvalue())
+    assert "another master" in said[0]
+    assert "drivegain's recorder" in said[1]
+    assert "another master" not in said[1]
+    assert "--reset-faults" in said[0]

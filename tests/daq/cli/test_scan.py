@@ -75,7 +75,7 @@ def test_a_narrow_terminal_gets_fewer_columns_and_whole_words(cell: Cell) -> Non
         assert max(cell_len(line.rstrip()) for line in lines) <= width
         assert sum("ENABLED" in line for line in lines) == 6
     rows = scan_rows(cell, nodes, "demo")
-    said = {width: [str(part) for part in scan_view(cell, rows, (), width)] for width in (80, 200)}
+    said = {width: [str(part) for part in scan_view(cell, rows, {}, width)] for width in (80, 200)}
     assert "No room for nmt; --json has all columns." in said[80]
     assert not any("No room" in part for part in said[200])
 
@@ -105,6 +105,7 @@ def test_a_fault_is_reset_when_a_person_says_so_and_nothing_gets_power(
         assert main(["scan", file, "--reset-faults", "--json"]) == ExitCode.OK
         document = json.loads(capsys.readouterr().out)
         assert document["reset"] == ["J3"]
+        assert document["faults"]["J3"].startswith("8611h: ")
         assert [node["verdict"] for node in document["nodes"]] == ["ok"] * 6
         assert [node.drive.state for node in simulated.nodes] == [PowerState.SWITCH_ON_DISABLED] * 6
         # Asked of a cell without a fault it does nothing.

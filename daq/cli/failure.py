@@ -1,0 +1,213 @@
+"""An error for the user: subject, found, expected and remedy, a line each, or one line of JSON under `--json`.
+
+The errors of `daq` carry the four parts. Those of `drivers` and `ident` say what was found; `ADVICE` adds what the
+command line expects there, and a remedy. Errors of the operating system on a bus are explained by their number.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from rich.console import Console
+from rich.text import Text
+
+from daq.errors import DaqError, ExitCode, exit_code
+from daq.report.text import printable, spelled_bytes
+from drivers import errors as driver
+from ident import errors as identification
+
+NOTES = ("kept", "hint")
+"""Labels of the notes that are shown; a verb adds them to an error with ``error.add_note("hint: …")``."""
+NOT_STOPPED = "NOT ALL ARE CONFIRMED STOPPED: use the emergency stop"
+
+_VCAN = "`sudo modprobe vcan`, `sudo ip link add dev vcan0 type vcan`, `sudo ip link set vcan0 up`"
+_SIMULATE = "at a desk `drivegain simulate demo` in a second terminal is a cell"
+
+ADVICE: dict[type[Exception], tuple[str, str]] = {
+    driver.BusError: (
+        "a bus that is up, with the amplifiers on it",
+        "check `bus` in the cell file, the adapter (`ip -details link show`) and the power of the cell",
+    ),
+    driver.BusBusy: ("no other master on the bus", "end the other program; `drivegain monitor CELL` only listens"),
+    driver.NodeMissing: (
+        "an answer from every axis of the cell file",
+        "`drivegain scan CELL` lists the nodes that answer",
+    ),
+    driver.NodeMisplaced: (
+        "every axis on the bus that the cell file names",
+        "correct the wiring or the cell file; `drivegain scan CELL` lists the nodes of each bus",
+    ),
+    driver.ObjectAccessError: (
+        "an object that this drive has and answers for",
+        "check that the drive profile (`drive` in the cell file) is that of this drive, then its wiring",
+    ),
+    driver.SetupRefused: (
+        "the drive that the cell file describes",
+        "compare the drive with `drivegain scan CELL`, and correct `identity` or `drive` in the cell file",
+    ),
+    driver.StateRefused: (
+        "a drive that follows the commands of CiA 301 and CiA 402",
+        "check the power stage and the safety chain; `drivegain scan CELL --reset-faults` names and resets a fault",
+    ),
+    driver.ParameterRefused: (
+        "a parameter that reads back as written",
+        "nothing else was changed; check write protection and the drive's manual",
+    ),
+    driver.DriveFault: (
+        "no fault while the axes move",
+        "remove the cause (`drivegain explain-emcy CODE` explains a code), then `drivegain scan CELL --reset-faults`",
+    ),
+    driver.NodeError: ("an amplifier as the cell file describes it", "compare it with `drivegain scan CELL`"),
+    driver.ParametersMixed: (
+        "all drives with their old values, or all with the new ones",
+        "`drivegain rollback CELL --drives` before an axis is enabled",
+    ),
+    driver.SampleLost: (
+        "an answer from every axis to every SYNC",
+        "check the power of the cell and the load of bus and computer: `drivegain monitor CELL`",
+    ),
+    driver.MotionRefused: (
+        "a person or the cell's policy that permits motion, and moves within the limits",
+        "pass --enable-motion when the cell is clear; plan again where a limit is named",
+    ),
+    driver.MotionTimeout: ("every move within its time", "check brakes and limits, or record with --speed 0.5"),
+    driver.DriverError: ("an undisturbed bus", "read the message above; `drivegain monitor CELL` shows the bus"),
+    identification.DataUnfit: ("runs that can be used", "leave the run out, or record it again"),
+    identification.TooFewMoves: ("enough moves to judge the scatter", "record a longer plan (`plan --duration 60`)"),
+    identification.RankDeficient: (
+        "moves that identify every unknown",
+        "record runs without load and with the payload, with a plan of `drivegain plan`",
+    ),
+    identification.PayloadUnseen: (
+        "a payload that the moves can feel",
+        "use a heavier payload or a plan of `drivegain plan`",
+    ),
+    identification.NotConverged: ("a fit that settles", "check the cell file, or try `fit --method wls`"),
+    identification.IdentificationError: (
+        "a model and runs that belong together",
+        "check the cell file and the logs (`drivegain info LOG`)",
+    ),
+}
+"""Expected and remedy by class of error, the nearest class first, where the error has none of its own."""
+
+_BY_NUMBER: dict[int, tuple[str, str, str]] = {
+    errno.ECONNREFUSED: (
+        "nothing that listens there (connection refused)",
+        "a CAN server, or a simulated cell",
+        f"start the CAN server of the cell; {_SIMULATE}",
+    ),
+    errno.EAFNOSUPPORT: (
+        "no CAN in this kernel",
+        "a Linux kernel with SocketCAN",
+        "load it (`sudo modprobe can can_raw`) or use a kernel that has it; for a virtual bus also "
+        f"{_VCAN}; without SocketCAN, {_SIMULATE}",
+    ),
+    errno.ENODEV: (
+        "no such CAN interface",
+        "an interface of that name (`ip link` lists them)",
+        f"connect the adapter, or correct `bus.channel` in the cell file; for a virtual bus {_VCAN}",
+    ),
+    errno.ENETDOWN: (
+        "an interface that is down",
+        "one that is up",
+        "bring it up: `sudo ip link set can0 up type can bitrate 1000000`, with the cell's channel and bit rate",
+    ),
+    errno.EPERM: (
+        "no permission to use it",
+        "a user who may open CAN sockets",
+        "run it as such a user; in a container, share the host's network and the capability NET_RAW",
+    ),
+    errno.ENOSPC: ("no space left", "room for frames and files", "free space on the disk"),
+    errno.ETIMEDOUT: (
+        "no answer from its host",
+        "a host that can be reached",
+        "check `bus.host` in the cell file, the network cable and the firewall",
+    ),
+}
+_BY_NUMBER |= {
+    errno.EPROTONOSUPPORT: _BY_NUMBER[errno.EAFNOSUPPORT],
+    errno.EACCES: _BY_NUMBER[errno.EPERM],
+    errno.EHOSTUNREACH: _BY_NUMBER[errno.ETIMEDOUT],
+    errno.ENETUNREACH: _BY_NUMBER[errno.ETIMEDOUT],
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """An error in its parts."""
+
+    kind: str  #: class of the error
+    error: str  #: subject, or the whole message where that says what was found
+    found: str
+    expected: str
+    do: str
+    exit_code: int
+    notes: dict[str, str] = field(default_factory=dict)  #: by label: kept, hint
+    unconfirmed: tuple[str, ...] = ()  #: parts of a stop of the axes that could not be confirmed
+
+    @classmethod
+    def of(cls, error: Exception) -> Failure:
+        """Take an error of `daq`, `drivers` or `ident` apart."""
+        notes = getattr(error, "__notes__", ())
+        labelled = {label: text for label, _, text in (note.partition(": ") for note in notes) if label in NOTES}
+        return cls(
+            type(error).__name__,
+            *_parts(error),
+            int(exit_code(type(error)) or ExitCode.UNEXPECTED),
+            labelled,
+            tuple(note for note in notes if note.startswith(("while stopping", "while closing"))),
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return the object of `--json`."""
+        stop = {"axes": NOT_STOPPED, "unconfirmed": list(self.unconfirmed)} if self.unconfirmed else {}
+        parts = {"error": self.error, "found": self.found, "expected": self.expected, "do": self.do}
+        return {**parts, "exit_code": self.exit_code, "kind": self.kind, **self.notes, **stop}
+
+    def lines(self) -> Iterator[tuple[str, str, str]]:
+        """Label, text and style of each line for a terminal."""
+        yield "error", self.error, "bold red"
+        for label, text in (("found", self.found), ("expected", self.expected), ("do", self.do)):
+            if text != self.error:
+                yield label, text, "bold"
+        yield from ((label, text, "bold") for label, text in self.notes.items())
+        yield from (("note", text, "bold") for text in self.unconfirmed)
+        if self.unconfirmed:
+            yield "AXES", NOT_STOPPED, "bold red"
+
+
+def _parts(error: Exception) -> tuple[str, str, str, str]:
+    """Subject, found, expected and remedy."""
+    if isinstance(error, DaqError | identification.ModelContradicted):
+        return error.subject, error.found, error.expected, error.remedy
+    if isinstance(error, driver.BusError):
+        known = _BY_NUMBER.get(_number(error) or 0)
+        if known is not None:
+            return f"bus {error.address}", *known
+    advice = next((ADVICE[kind] for kind in type(error).__mro__ if kind in ADVICE), ("", ""))
+    return str(error), str(error), *advice
+
+
+def _number(error: BaseException | None) -> int | None:
+    """Return the number of the operating system's error that an error came from."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno is not None:
+            return error.errno
+        error = error.__cause__
+    return None
+
+
+def show_failure(failure: Failure, *, json_wanted: bool) -> None:
+    """Print an error on stderr."""
+    console = Console(stderr=True, soft_wrap=True)
+    if json_wanted:
+        line = json.dumps(failure.document(), ensure_ascii=False)
+        console.file.write(spelled_bytes(line) + "\n")
+        return
+    for label, text, style in failure.lines():
+        # Indented, a line end in the name of a file cannot make another line of an error.
+        console.print(Text(f"{label + ':':<10}", style=style) + Text(printable(text).replace("\n", "\n" + 10 * " ")))

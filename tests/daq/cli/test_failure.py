@@ -1,0 +1,122 @@
+"""Errors as a person and as a program see them: found, expected and a remedy in every one."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import signal
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daq.cli.app import main
+from daq.cli.failure import ADVICE, Failure, show_failure
+from daq.errors import DataError, ExitCode
+from drivers.canopen.bus import bus_errors
+from drivers.errors import BusError, DriveFault, DriverError
+from ident.errors import IdentificationError
+
+
+def _all(root: type[Exception]) -> Iterator[type[Exception]]:
+    yield root
+    for child in root.__subclasses__():
+        yield from _all(child)
+
+
+@pytest.mark.parametrize("kind", [*_all(DriverError), *_all(IdentificationError)], ids=lambda kind: kind.__name__)
+def test_every_error_of_drivers_and_of_the_science_has_a_remedy(kind: type[Exception]) -> None:
+    error = kind.__new__(kind)
+    error.args = ("J3 (node 3): evidence",)
+    for name in ("subject", "found", "expected", "remedy"):  # those that carry the parts themselves
+        object.__setattr__(error, name, name)
+    if kind is BusError:
+        object.__setattr__(error, "address", "socketcan:can0")
+    failure = Failure.of(error)
+    assert all((failure.error, failure.found, failure.expected, failure.do))
+    assert all(label in dict(line[:2] for line in failure.lines()) for label in ("error", "expected", "do"))
+
+
+def test_advice_names_verbs_that_exist(capsys: pytest.CaptureFixture[str]) -> None:
+    for expected, remedy in ADVICE.values():
+        for verb, rest in re.findall(r"`drivegain ([a-z-]+)([^`]*)`", f"{expected} {remedy}"):
+            assert main([verb, "--help"]) == 0
+            text = capsys.readouterr().out
+            assert all(option in text for option in re.findall(r"--[a-z-]+", rest))
+
+
+@pytest.mark.parametrize(
+    ("number", "found", "remedy"),
+    [
+        (errno.ECONNREFUSED, "connection refused", "drivegain simulate demo"),
+        (errno.EAFNOSUPPORT, "no CAN in this kernel", "modprobe vcan"),
+        (errno.EPROTONOSUPPORT, "no CAN in this kernel", "ip link add dev vcan0 type vcan"),
+        (errno.ENODEV, "no such CAN interface", "bus.channel"),
+        (errno.ENETDOWN, "down", "ip link set can0 up"),
+        (errno.EPERM, "no permission", "NET_RAW"),
+        (errno.EACCES, "no permission", "NET_RAW"),
+    ],
+)
+def test_an_error_of_the_operating_system_is_explained(number: int, found: str, remedy: str) -> None:
+    with pytest.raises(BusError) as caught, bus_errors("socketcan:can0"):
+        raise OSError(number, os.strerror(number))
+    failure = Failure.of(caught.value)
+    assert failure.error == "bus socketcan:can0"
+    assert found in failure.found
+    assert remedy in failure.do
+    assert failure.exit_code == ExitCode.DEVICE_FAULT
+
+
+def test_a_cell_that_nobody_started_says_how_to_start_it(
+    checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    assert main(["init", str(tmp_path / "lathe"), "--simulated"]) == 0
+    cell = tmp_path / "lathe/cells/lathe.yaml"
+    cell.write_text(cell.read_text(encoding="utf-8").replace("29536", str(port)), encoding="utf-8")
+    capsys.readouterr()
+    assert main(["scan", str(cell)]) == ExitCode.DEVICE_FAULT
+    said = capsys.readouterr().err
+    assert re.search(r"^found: .*connection refused.*\nexpected: .*\ndo: .*drivegain simulate demo", said, re.MULTILINE)
+    assert "Errno" not in said
+
+
+def test_a_program_gets_one_object_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    error = DataError("a\nb\udcff", found="x", expected="y", remedy="z")
+    error.add_note("kept: c.mcap")
+    show_failure(Failure.of(error), json_wanted=True)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert json.loads(line) == {
+        **{"error": "a\nb\udcff", "found": "x", "expected": "y", "do": "z"},
+        **{"exit_code": 4, "kind": "DataError", "kept": "c.mcap"},
+    }
+    stop = DriveFault(3, "fault")
+    stop.add_note("while stopping: J3 (node 3) does not answer")
+    assert "emergency stop" in Failure.of(stop).document()["axes"]
+
+
+def test_an_error_of_a_verb_is_an_object_under_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (["scan", "none.yaml"], ["info", str(tmp_path / "none.mcap")], ["explain-emcy", "x"]):
+        code = main([*arguments, "--json"])
+        output = capsys.readouterr()
+        document: dict[str, Any] = json.loads(output.err)
+        assert output.out == ""
+        assert {"error", "found", "expected", "do", "exit_code", "kind"} <= document.keys()
+        assert document["exit_code"] == code != 0
+
+
+def test_an_interrupt_says_what_was_kept_and_leaves_no_empty_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daq.workflow.fit.fit", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    (tmp_path / "kept").mkdir()
+    for folder, stays in ((tmp_path / "new" / "report", False), (tmp_path / "kept", True)):
+        assert main(["residual", "x.mcap", "--report", str(folder)]) == ExitCode.INTERRUPTED
+        assert capsys.readouterr().err.endswith("interrupted: no file was written\n")
+        assert folder.exists() is stays
+    assert not (tmp_path / "new").exists()
