@@ -41,7 +41,7 @@ class WholeTable(Table):
         """Render as a table, or as a paragraph a row: heading and value."""
         free = options.update(width=_UNBOUNDED, min_width=0, max_width=_UNBOUNDED)
         cells = [[*column.cells] for column in self.columns]
-        needed = _GAP * (len(cells) - 1)
+        needed = (_GAP - self.collapse_padding) * (len(cells) - 1)
         for column, values in zip(self.columns, cells, strict=True):
             widths = [Measurement.get(console, free, value) for value in (column.header, *values)]
             needed += max(one.maximum if column.no_wrap else one.minimum for one in widths)
