@@ -22,6 +22,7 @@ from ident.discovery.before_after import Account, BeforeAfter
 from ident.discovery.evidence import Evidence
 from ident.discovery.loop import Step
 from ident.effects.effect import PlacedEffect
+from ident.effects.unnamed import is_unnamed
 
 PAGE, DOCUMENT = "report.html", "residual.json"
 FORMAT, VERSION = "drivegain-residual", 1
@@ -164,11 +165,10 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
     axes = fitted.cell.axis_names
     axis, final = axes[placed.axis], fitted.steps[-1].after
     kept = placed in final.effects
-    settings = ", ".join(f"{name} {value:.4g}" for name, value in placed.effect.settings.items())
     rivals = () if step.accepted is None else step.accepted.ambiguity
     ambiguous = ", ".join(rival.name_among(axes) for rival in rivals)
     sentences = (
-        f"Effect {placed.name_among(axes)}" + (f" ({settings})." if settings else "."),
+        f"Effect {placed.name_among(axes)}.",
         f"These data cannot distinguish it from: {ambiguous}."
         if ambiguous
         else "Every other candidate is clearly worse.",
@@ -184,12 +184,13 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
         for name, first, second in pairs
         if first is not None and second is not None
     ]
-    found = coefficients(final if kept else step.after, placed)
+    # The coefficients of a term without a name mean nothing one by one; the certificate draws its curve.
+    found = () if is_unnamed(placed.effect) else coefficients(final if kept else step.after, placed)
     sizes = [(one.name, with_deviation(one.value, one.std), one.unit) for one in found]
     return section(
         f"{axis}: {effect_text(placed.effect, axes)}",
         paragraph(" ".join(sentences)),
-        table("Identified coefficients", ("coefficient", "value ± σ", "unit"), sizes),
+        table("Identified coefficients", ("coefficient", "value ± σ", "unit"), sizes) if sizes else "",
         table(f"Relative error of {axis} [%]", ("", *WHEN), errors),
         picture(
             draw_effect(before, step.after, placed, fitted.cell),
