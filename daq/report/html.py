@@ -133,12 +133,10 @@ def figure(svg: str, caption: str) -> str:
     return f"<figure>{svg}{element('figcaption', caption)}</figure>"
 
 
-def picture(svg: bytes, caption: str) -> str:
-    """Embed the content of an SVG file with its caption; in an image nothing of it can run or load."""
-    data, words = base64.b64encode(svg).decode("ascii"), spelled(caption)
-    return (
-        f'<figure><img alt="{words}" src="data:image/svg+xml;base64,{data}"><figcaption>{words}</figcaption></figure>'
-    )
+def picture(png: bytes, caption: str) -> str:
+    """Embed a picture with its caption."""
+    data, words = base64.b64encode(png).decode("ascii"), spelled(caption)
+    return f'<figure><img alt="{words}" src="data:image/png;base64,{data}"><figcaption>{words}</figcaption></figure>'
 
 
 def spelled(text: str) -> str:

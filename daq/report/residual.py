@@ -132,15 +132,22 @@ def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
     if not found:
         return (*first, f"No structure found: the error {where} is {after.total:.1f} %{noise}.", *ending)
     whole = f"All axes together: the error {where} {error_change_text(before.total, after.total)}{noise}."
+    gains = gains_sentence(fitted, account)
+    return (*first, *found, whole, *((gains,) if gains else ()), *ending)
+
+
+def gains_sentence(fitted: Fit, account: Account) -> str:
+    """Say which gains the effects change by more than noise; empty where the gains were held."""
     if fitted.estimate.gains_fixed:
-        return (*first, *found, whole, *ending)
+        return ""
     changed = [
         f"{axis} by {change.change_percent:+.1f} %"
         for axis, change in zip(fitted.cell.axis_names, account.total.gains, strict=True)
         if change.significant
     ]
-    gains = f"The effects change gains by more than noise: {', '.join(changed)}."
-    return (*first, *found, whole, gains if changed else "The effects change no gain by more than noise.", *ending)
+    if not changed:
+        return "The effects change no gain by more than noise."
+    return f"The effects change gains by more than noise: {', '.join(changed)}."
 
 
 def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:
