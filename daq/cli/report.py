@@ -91,4 +91,4 @@ def compare(cell: Cell, request: Request, command: str = "") -> Comparison:
     return replace(Comparison.of(proposal, cell.apply, known), command=command)
 
 
-REPORT = Verb("report", report_verb, "drivegain report calibration.yaml --cell cells/demo.yaml")
+REPORT = Verb("report", report_verb, "drivegain report calibration.yaml --cell CELL")
