@@ -40,7 +40,7 @@ caption { text-align: left; font-weight: bold; padding: 0.2rem 0; }
 th, td { padding: 0.2rem 0.6rem; border-bottom: 1px solid var(--line); text-align: right; vertical-align: baseline; }
 th { font-weight: 600; } td { white-space: nowrap; } thead th { color: var(--soft); font-weight: normal; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; }
-.words td:last-child, .words th:last-child { text-align: left; white-space: normal; min-width: 11rem; }
+.words td:last-child, .words th:last-child { text-align: left; white-space: normal; min-width: 13.5rem; }
 .pair { display: flex; flex-wrap: wrap; gap: 0 1.5rem; } .pair figure { flex: 1 1 21rem; max-width: 30rem; }
 figure { margin: 0.6rem 0; } figure svg { max-width: 30rem; } figcaption { color: var(--soft); font-size: 0.9rem; }
 svg { width: 100%; height: auto; display: block; } img { max-width: 100%; background: #fff; }
@@ -56,7 +56,7 @@ pre { overflow-x: auto; background: var(--shade); padding: 0.5rem; font-size: 0.
 @page { size: A4; margin: 13mm; }
 @media print {
   :root { --paper: #fff; --ink: #000; --soft: #444; --line: #bbb; --shade: #f2f2f2; --data: #0072B2; --act: #B34700; }
-  body { margin: 0; padding: 0; max-width: none; font-size: 9.5pt; }
+  html { font-size: 8.5pt; } body { margin: 0; padding: 0; max-width: none; font-size: 9pt; }
   h1 { font-size: 15pt; } h2 { font-size: 11pt; margin: 3mm 0 1mm; } .verdict { font-size: 11pt; margin: 2mm 0; }
   .pair { flex-wrap: nowrap; } .pair figure { flex: 1 1 0; min-width: 0; } .scroll { overflow: visible; }
   th, td { padding: 0.4mm 1.5mm; } td { white-space: normal; }

@@ -146,8 +146,8 @@ def gains_sentence(fitted: Fit, account: Account) -> str:
         if change.significant
     ]
     if not changed:
-        return "The effects change no gain by more than noise."
-    return f"The effects change gains by more than noise: {', '.join(changed)}."
+        return "With and without the effects, the gains are the same within noise."
+    return f"The effects change gains by more than noise: {', '.join(changed)} of the gain without them."
 
 
 def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:

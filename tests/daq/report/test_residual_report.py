@@ -342,8 +342,11 @@ def test_a_skew_of_time_within_its_noise_is_not_said(closed: Closed) -> None:
 def test_the_summary_says_what_the_effects_change(closed: Closed) -> None:
     gains = closed.account.total.gains
     for significant, sentence in (
-        (False, "The effects change no gain by more than noise."),
-        (True, f"The effects change gains by more than noise: J1 by {gains[0].change_percent:+.1f} %."),
+        (False, "With and without the effects, the gains are the same within noise."),
+        (
+            True,
+            f"The effects change gains by more than noise: J1 by {gains[0].change_percent:+.1f} % of the gain without them.",
+        ),
     ):
         marked = (replace(gains[0], significant=significant), *(replace(gain, significant=False) for gain in gains[1:]))
         changed = replace(closed.account, total=replace(closed.account.total, gains=marked))
