@@ -36,6 +36,7 @@ VERBS = (
     Listed(
         Job.COMMISSION, "validate", "daq.cli.validate:VALIDATE", "Predict the torque of other logs with a calibration."
     ),
+    Listed(Job.COMMISSION, "report", "daq.cli.report:REPORT", "Write the certificate of a calibration as one page."),
     Listed(Job.COMMISSION, "apply", "daq.cli.apply:APPLY", "Write gains to the controller; a dry run without --yes."),
     Listed(Job.COMMISSION, "rollback", "daq.cli.apply:ROLLBACK", "Undo the last write."),
     Listed(Job.LOOK, "monitor", "daq.cli.scan:MONITOR", "Show the state of the axes; nothing is changed."),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +16,9 @@ from ident.errors import IdentificationError
 
 if TYPE_CHECKING:
     from daq.jobs.journal import Journal
+    from daq.workflow.fit import Fit
+    from ident.calibration import Calibration
+    from ident.discovery.before_after import Account
 
 
 def recalibrate_verb(
@@ -58,8 +62,10 @@ def recalibrate_verb(
 
 def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> None:
     from dataclasses import replace
+    from datetime import UTC, datetime
     from functools import partial
 
+    from daq.cli.report import compare
     from daq.cli.terminal import interruptible
     from daq.config.cell_file import load_cell
     from daq.console.feed import Feed
@@ -67,16 +73,24 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
     from daq.jobs.context import Tools
     from daq.jobs.job import preview, recalibrate
     from daq.jobs.reporting import document, text
+    from daq.jobs.session import CALIBRATION
     from daq.report.residual_page import save_report
     from daq.report.text import printable
     from daq.workflow.record import record
+    from daq.writeback.request import Request
 
     declared = load_cell(cell)
     if now and declared.recalibration is not None:
         declared = replace(declared, recalibration=replace(declared.recalibration, every_h=0.0))
     who = f"drivegain recalibrate, {login()}"
     with interruptible() as block_signals, Feed(cell) as feed:
-        tools = Tools(save_report=save_report, record=partial(record, feed=feed))
+
+        def certify(fitted: Fit, changed: Account, calibration: Calibration, folder: Path) -> None:
+            request = Request(calibration, datetime.now(UTC))
+            command = f"drivegain apply {shlex.quote(str(cell))} {shlex.quote(str(folder.parent / CALIBRATION))}"
+            save_report(fitted, changed, calibration, folder, compare(declared, request, command))
+
+        tools = Tools(save_report=certify, record=partial(record, feed=feed))
         if dry_run:
             seen = preview(cell, declared, tools, journal, who=who)
             if json:

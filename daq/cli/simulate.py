@@ -221,22 +221,20 @@ def demo(
     show_proposal(outcome.proposal, Console(highlight=False))
     if outcome.written is not None:
         typer.echo(f"Written to the copy {outcome.written.edit.subject}.")
-    typer.echo(f"\nLogs, calibration.yaml, pictures and summary.json are in {out}.")
+    typer.echo(f"\nLogs, calibration.yaml, pictures, summary.json and report/report.html are in {out}.")
 
 
 def demo_view(outcome: Outcome) -> Iterator[RenderableType]:
     """Nodes on the bus, turns of the loop, errors before and after, and the gains beside the truth."""
     from daq.report.bus import scan_rows, scan_table
-    from daq.report.fit import start_of
     from daq.report.gains import gain_table
     from daq.report.residual import before_after_table, turns_view
-    from ident.discovery.before_after import account
 
     fitted, truth = outcome.fitted, outcome.truth
     yield scan_table(scan_rows(outcome.cell, outcome.nodes, outcome.cell.buses[0].name))
     yield ""
     yield from turns_view(fitted)
-    yield before_after_table(account(start_of(fitted), fitted.steps), fitted.cell.axis_names)
+    yield before_after_table(outcome.changed, fitted.cell.axis_names)
     yield ""
     yield gain_table(outcome.calibration.gains, truth, title="Drive gains beside the truth of the simulated cell")
     if fitted.paper is not None:

@@ -185,6 +185,7 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
             lost_cycles=log.statistics.lost_cycles,
             missing=log.statistics.missing,
             controller_sha256=run.controller_sha256,
+            operator=run.operator or None,
         ),
     )
 

@@ -1,10 +1,21 @@
-"""Effects in a technician's words."""
+"""Effects in a technician's words, with their sizes; a term without a name as its curve."""
 
 from __future__ import annotations
 
-from ident.effects.effect import Effect
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from daq.report.gains import with_deviation
+from ident.arrays import FloatArray
+from ident.calibration import AcceptedEffect, Calibration, Parameter
+from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.signals import Abscissa
-from ident.effects.unnamed import is_unnamed
+from ident.effects.unnamed import FOLDED, Periodic, Smooth, is_unnamed
+from ident.errors import EffectRefused
+from ident.prediction import placed_effect
 
 WORDS = {
     "stribeck": "dry friction that changes at low speed",
@@ -31,6 +42,37 @@ WORDS = {
 }
 """Words by family; an effect that is not listed is called by its name."""
 
+_WHERE = {
+    "stribeck": "below about {speed_rad_s:.2g} rad/s",
+    "nonlinear-viscous": "with the speed to the power {exponent:.2g}",
+    "cogging": "{order:g} times in a turn of the motor",
+    "ripple": "{order:.4g} times in a turn",
+    "warm-up": "within about {time_constant_s:.2g} s",
+    "presliding": "within about {distance_rad:.2g} rad",
+    "hinge": "from a position of {start_rad:.2g} rad on",
+    "gravity-compensator": "{order:g} times in a turn of the joint",
+}
+"""Where or how fast an effect acts, by family, from its searched parameters; other families need no such words."""
+_SIGMAS = 2.0  #: Of the band around a curve
+_POINTS = 61
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """Torque of a term without a name over its variable."""
+
+    x: FloatArray  #: variable, of a velocity its magnitude, shape (k,)
+    torque_nm: FloatArray  #: torque that the term adds in the positive direction, shape (k,)
+    half_nm: FloatArray | None  #: two σ of it, shape (k,); None where the calibration has no covariance
+    variable: str  #: name of the variable with its unit
+    turns: bool  #: whether the torque turns with the direction of motion, as friction does
+
+    @property
+    def text(self) -> str:
+        """Its range in words."""
+        turns = ", against the motion in either direction" if self.turns else ""
+        return f"between {self.torque_nm.min():+.2g} and {self.torque_nm.max():+.2g} Nm{turns}"
+
 
 def effect_text(effect: Effect, axes: tuple[str, ...]) -> str:
     """Describe an effect, to follow "J3 has": `friction that grows with the load`."""
@@ -47,6 +89,88 @@ def variable_text(effect: Effect, axes: tuple[str, ...]) -> str:
     if effect.abscissa is Abscissa.OTHER_VELOCITY and other is not None:
         return f"the velocity of {axes[other]}"
     return "the " + effect.abscissa.value.partition(" [")[0]
+
+
+def accepted_text(accepted: AcceptedEffect, calibration: Calibration) -> str:
+    """Describe an effect of a calibration, to follow "J3 has"."""
+    placed = _placed(accepted, calibration)
+    axes = tuple(gain.axis for gain in calibration.gains)
+    return (
+        WORDS.get(accepted.name, f"the effect {accepted.name!r}")
+        if placed is None
+        else effect_text(placed.effect, axes)
+    )
+
+
+def size_text(accepted: AcceptedEffect, calibration: Calibration) -> str:
+    """Describe the size of an effect ± σ: `coefficient 12.0 ± 0.2 % of the load torque`; no searched parameter's name.
+
+    An effect that this version cannot place has its coefficients alone.
+    """
+    placed = _placed(accepted, calibration)
+    if placed is None:
+        return ", ".join(_sized("coefficient", one) for one in accepted.coefficients)
+    if (curve := curve_of(accepted, calibration)) is not None:
+        return curve.text
+    return named_size(placed.effect, _in_order(accepted, placed))
+
+
+def named_size(effect: Effect, found: Sequence[Parameter]) -> str:
+    """Describe the size of a named effect from its coefficients, in the order of `effect.coefficients`."""
+    names = [column.name for column in effect.coefficients]
+    where = _WHERE.get(effect.name, "").format(**effect.settings)
+    if names == ["cosine", "sine"]:
+        cosine, sine = found
+        amplitude = math.hypot(cosine.value, sine.value)
+        std = math.hypot(cosine.value * cosine.std, sine.value * sine.std) / (amplitude or 1.0)
+        sizes = f"amplitude {with_deviation(amplitude, std)} {cosine.unit}"
+    else:
+        sizes = ", ".join(_sized(name, one) for name, one in zip(names, found, strict=True))
+    return f"{sizes}, {where}" if where else sizes
+
+
+def curve_of(accepted: AcceptedEffect, calibration: Calibration) -> Curve | None:
+    """Return the curve of a term without a name; None for any other effect."""
+    placed = _placed(accepted, calibration)
+    if placed is None or not isinstance(placed.effect, Smooth | Periodic):
+        return None
+    effect = placed.effect
+    lower, upper = (effect.lower, effect.upper) if isinstance(effect, Smooth) else (0.0, 2.0 * math.pi)
+    x = np.linspace(lower, upper, _POINTS)
+    shapes = effect.shapes(x)
+    words = [column.name for column in placed.columns]
+    index = {parameter.name: number for number, parameter in enumerate(calibration.parameters, len(calibration.gains))}
+    half_nm = None
+    if (covariance := calibration.covariance) is not None and all(name in index for name in words):
+        rows = [index[name] for name in words]
+        half_nm = _SIGMAS * np.sqrt(np.einsum("pk,pq,qk->k", shapes, covariance[np.ix_(rows, rows)], shapes))
+    folded = isinstance(effect, Smooth) and effect.variable in FOLDED
+    axes = tuple(gain.axis for gain in calibration.gains)
+    _, _, unit = effect.abscissa.value.partition(" [")
+    name = variable_text(effect, axes).removeprefix("the ") + (", magnitude" if folded else "")
+    values = np.array([one.value for one in _in_order(accepted, placed)])
+    return Curve(x, values @ shapes, half_nm, f"{name} [{unit}", bool(effect.signed))
+
+
+def _placed(accepted: AcceptedEffect, calibration: Calibration) -> PlacedEffect | None:
+    """Place an effect; None for one of another version, which a gate refuses."""
+    try:
+        return placed_effect(accepted, calibration)[0]
+    except EffectRefused:
+        return None
+
+
+def _in_order(accepted: AcceptedEffect, placed: PlacedEffect) -> list[Parameter]:
+    by_name = {one.name: one for one in accepted.coefficients}
+    return [by_name[column.name] for column in placed.columns]
+
+
+def _sized(name: str, one: Parameter) -> str:
+    if one.unit == "Nm/Nm":
+        return f"{with_deviation(100.0 * one.value, 100.0 * one.std)} % of the load torque"
+    if one.unit == "s":
+        return f"{with_deviation(1e3 * one.value, 1e3 * one.std)} ms"
+    return f"{name} {with_deviation(one.value, one.std)} {one.unit}"
 
 
 def other_axis(effect: Effect) -> int | None:

@@ -13,9 +13,9 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from daq.report.effect_names import effect_text
+from daq.report.effect_names import effect_text, size_text
 from daq.report.fit import coefficients, error_document, error_table, identifiability_notes
-from daq.report.gains import diagnosis_texts, gain_table, partial_note, with_deviation
+from daq.report.gains import diagnosis_texts, gain_table, partial_note
 from daq.report.text import picked, plain_table
 from daq.workflow.calibration_file import as_document
 from daq.workflow.fit import Fit
@@ -54,16 +54,15 @@ def residual_view(fitted: Fit, account: Account, calibration: Calibration) -> It
     """Turns of the loop, the effects with their coefficients, the summary, errors, gains, and what σ lacks."""
     yield from turns_view(fitted)
     for effect in calibration.effects:
-        sizes = ", ".join(f"{c.name} {with_deviation(c.value, c.std)} {c.unit}" for c in effect.coefficients)
         more = len(effect.ambiguity) - _SHOWN_RIVALS
         rivals = ", ".join(effect.ambiguity[:_SHOWN_RIVALS]) + (f" and {more} more" if more > 0 else "")
         rivals = f"; not distinguishable from {rivals}" if rivals else ""
-        yield f"{effect.axis}: {effect.name}: {sizes}{rivals}"
+        yield f"{effect.axis}: {effect.name}: {size_text(effect, calibration)}{rivals}"
     yield from summary(fitted, account)
     yield ""
     yield before_after_table(account, fitted.cell.axis_names)
     yield ""
-    yield gain_table(calibration.gains, title="Drive gains with the effects in the model")
+    yield gain_table(calibration.gains, title="Drive gains with the effects; change % is from the a priori gain")
     yield from identifiability_notes(fitted)
     if (note := partial_note(calibration)) is not None:
         yield Text(note, style="bold")
@@ -133,15 +132,22 @@ def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
     if not found:
         return (*first, f"No structure found: the error {where} is {after.total:.1f} %{noise}.", *ending)
     whole = f"All axes together: the error {where} {error_change_text(before.total, after.total)}{noise}."
+    gains = gains_sentence(fitted, account)
+    return (*first, *found, whole, *((gains,) if gains else ()), *ending)
+
+
+def gains_sentence(fitted: Fit, account: Account) -> str:
+    """Say which gains the effects change by more than noise; empty where the gains were held."""
     if fitted.estimate.gains_fixed:
-        return (*first, *found, whole, *ending)
+        return ""
     changed = [
         f"{axis} by {change.change_percent:+.1f} %"
         for axis, change in zip(fitted.cell.axis_names, account.total.gains, strict=True)
         if change.significant
     ]
-    gains = f"The effects change gains by more than noise: {', '.join(changed)}."
-    return (*first, *found, whole, gains if changed else "The effects change no gain by more than noise.", *ending)
+    if not changed:
+        return "With and without the effects, the gains are the same within noise."
+    return f"The effects change gains by more than noise: {', '.join(changed)} of the gain without them."
 
 
 def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:

@@ -19,7 +19,10 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
+from daq.report.certificate import Comparison
+from daq.report.fit import start_of
 from daq.report.plots import draw_fit
+from daq.report.residual_page import save_report
 from daq.report.text import picked
 from daq.simulation.simulation_file import load_simulation, require_simulator
 from daq.workflow.calibration_file import as_document, save_calibration
@@ -34,8 +37,10 @@ from drivers.canopen.bus import open_bus
 from drivers.canopen.scan import FoundNode
 from drivers.simulation.spec import CellSpec
 from ident.calibration import Calibration
+from ident.discovery.before_after import Account, account
 
 MARK = ".drivegain-demo"
+REPORT = "report"  #: Folder of the certificate
 RETRIES = 2  #: Of a run that came out invalid
 PLANS = ("a", "b", "c")
 RUNS = (
@@ -75,6 +80,7 @@ class Outcome:
     plans: tuple[Plan, ...]  #: made
     recorded: tuple[Recorded, ...]  #: logs
     fitted: Fit  #: with the effects that were found
+    changed: Account  #: by the effects
     calibration: Calibration  #: as saved
     truth: dict[str, float]  #: true gain by axis
     proposal: Proposal[FileEdit]  #: what the controller file would get
@@ -122,7 +128,10 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     spec = load_simulation(settings.simulation)
     truth = {axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, spec.axes, strict=True)}
     draw_fit(fitted, calibration, truth, out)
-    return Outcome(cell, nodes, plans, recorded, fitted, calibration, truth, proposal, written)
+    changed = account(start_of(fitted), fitted.steps)
+    (out / REPORT).mkdir(exist_ok=True)
+    save_report(fitted, changed, calibration, out / REPORT, Comparison.of(proposal, cell.apply))
+    return Outcome(cell, nodes, plans, recorded, fitted, changed, calibration, truth, proposal, written)
 
 
 def summary(outcome: Outcome) -> dict[str, Any]:

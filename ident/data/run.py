@@ -22,6 +22,7 @@ class Recording:
     missing: tuple[int, ...]  #: samples in which each axis did not answer
     #: Digest of the controller's file when it was recorded; None where the cell named none.
     controller_sha256: str | None
+    operator: str | None = None  #: person or job responsible for it; None in calibrations of earlier versions
 
 
 @dataclass(frozen=True, slots=True)

@@ -68,9 +68,12 @@ class Smooth(Effect):
         """Columns, shape (p, k)."""
         x = signals.variable(self.variable, axis, self.other_axis - 1 if self.other_axis else None)
         sign = np.sign(x if self.variable in FOLDED else signals.velocity_rad_s[axis])
-        basis = cubic_basis(np.abs(x) if self.variable in FOLDED else x, self.lower, self.upper)
-        basis = self._combinations().T @ basis
+        basis = self.shapes(np.abs(x) if self.variable in FOLDED else x)
         return np.asarray(basis * sign if self.signed else basis)
+
+    def shapes(self, x: FloatArray) -> FloatArray:
+        """Functions S_k at values of x, of a velocity its magnitude, shape (p, k)."""
+        return np.asarray(self._combinations().T @ cubic_basis(x, self.lower, self.upper))
 
     def _combinations(self) -> FloatArray:
         """Weights of the B-splines in each S_k, shape (INTERVALS + 3, p), orthogonal to those of the declared terms.
@@ -101,9 +104,12 @@ class Periodic(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2 · orders, k)."""
-        angle = signals.motor_position_rad[axis]
-        waves = np.stack([wave for order in PERIODIC_ORDERS for wave in cos_sin(order * angle)])
+        waves = self.shapes(signals.motor_position_rad[axis])
         return np.asarray(waves * np.sign(signals.velocity_rad_s[axis]) if self.signed else waves)
+
+    def shapes(self, x: FloatArray) -> FloatArray:
+        """Functions cos kθ and sin kθ at values x of θ [rad], shape (p, k)."""
+        return np.stack([wave for order in PERIODIC_ORDERS for wave in cos_sin(order * x)])
 
 
 def cubic_basis(x: FloatArray, lower: float, upper: float) -> FloatArray:

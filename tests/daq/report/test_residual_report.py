@@ -22,9 +22,10 @@ from daq.environment import shipped_configurations
 from daq.errors import EffectsRefuted, ExitCode, OutputFailed, UsageError
 from daq.report import residual_page as residual_page_module
 from daq.report.effect_names import WORDS, effect_text, other_axis
+from daq.report.html import page, paragraph, table
 from daq.report.plots import draw_fit
 from daq.report.residual import _gear_sentence, error_change_text, residual_document, summary
-from daq.report.residual_page import DOCUMENT, PAGE, page, paragraph, residual_page, save_report, table
+from daq.report.residual_page import DOCUMENT, PAGE, residual_page, save_report
 from daq.report.text import json_text
 from daq.workflow import fit as fit_module
 from daq.workflow.fit import Fit, calibration_of, fit
@@ -195,7 +196,7 @@ def test_the_page_is_self_contained(shown: Reader) -> None:
         for name in ("src", "href", "srcset", "action", "data", "poster"):
             value = element.attributes.get(name)
             assert value is None or value.startswith("data:image/png;base64,")
-    style = page.texts[[text.startswith("\nbody") for text in page.texts].index(True)]
+    style = page.texts[[text.startswith("\n:root") for text in page.texts].index(True)]
     assert "url(" not in style
     assert "@import" not in style
     assert all(element.attributes.get("alt") for element in page.elements if element.tag == "img")
@@ -208,7 +209,7 @@ def test_the_page_says_the_outcome_first(closed: Closed, shown: Reader) -> None:
     assert reported.after.holdout is not None
     before, after = reported.before.holdout.axes[2], reported.after.holdout.axes[2]
     page = shown
-    first = next(text for text in page.texts if text.startswith("J3 has"))
+    first = next(text for text in page.texts if text.startswith("J3 has a spring: the error"))
     assert first.startswith(
         f"J3 has a spring: the error of J3 on held-out runs falls from {before:.1f} to {after:.1f} % ("
     )
@@ -235,7 +236,7 @@ def test_what_files_say_is_escaped(closed: Closed) -> None:
     assert "<script" not in text
     page = Reader(text)
     assert all((element.attributes.get("src") or "data:").startswith("data:") for element in page.elements)
-    assert f"Residual of cell {HOSTILE}" in page.texts
+    assert f"Cell {HOSTILE}" in page.texts
 
 
 def test_the_document_has_the_numbers_of_the_rows(closed: Closed) -> None:
@@ -341,8 +342,11 @@ def test_a_skew_of_time_within_its_noise_is_not_said(closed: Closed) -> None:
 def test_the_summary_says_what_the_effects_change(closed: Closed) -> None:
     gains = closed.account.total.gains
     for significant, sentence in (
-        (False, "The effects change no gain by more than noise."),
-        (True, f"The effects change gains by more than noise: J1 by {gains[0].change_percent:+.1f} %."),
+        (False, "With and without the effects, the gains are the same within noise."),
+        (
+            True,
+            f"The effects change gains by more than noise: J1 by {gains[0].change_percent:+.1f} % of the gain without them.",
+        ),
     ):
         marked = (replace(gains[0], significant=significant), *(replace(gain, significant=False) for gain in gains[1:]))
         changed = replace(closed.account, total=replace(closed.account.total, gains=marked))
@@ -464,7 +468,7 @@ def test_a_folder_that_takes_no_file_is_refused_before_any_work(
 def test_what_is_not_seen_is_spelt_out(unseen: str) -> None:
     text = page(f"a{unseen}b", [paragraph(f"{unseen}"), table(unseen, [unseen], [[unseen, unseen]])])
     assert unseen not in text
-    assert f"<h1>a\\u{ord(unseen):04x}b</h1>" in text
+    assert f"<title>a\\u{ord(unseen):04x}b</title>" in text
     text.encode()
 
 

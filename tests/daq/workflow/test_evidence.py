@@ -88,6 +88,7 @@ def test_a_run_knows_how_its_log_came_to_be(tmp_path: Path, checkout: Path) -> N
         lost_cycles=0,
         missing=(0,) * 6,
         controller_sha256="c" * 64,
+        operator="Ada",
     )
     undated = replace(start, run=replace(start.run, started_wall_ns=0))
     run, _ = load_run(write(tmp_path / "imported.mcap", undated, rows))

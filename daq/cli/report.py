@@ -1,0 +1,94 @@
+"""`drivegain report`: the certificate of a calibration as one page."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
+
+if TYPE_CHECKING:
+    from daq.config.cell import Cell
+    from daq.report.certificate import Comparison
+    from daq.writeback.request import Request
+
+
+def report_verb(
+    calibration: CalibrationArgument,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Page to write; by default beside the calibration, as .html.")
+    ] = None,
+    cell: Annotated[
+        Path | None, typer.Option("--cell", help="Cell file: compare with the gains in its controller.")
+    ] = None,
+    beside: Annotated[Path | None, typer.Option("--beside", help="Earlier calibration to compare with.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Write the certificate of a calibration: one page for screen, phone and paper, without network or script.
+
+    It shows each gain beside the one in the controller with the limits, the error on held-out runs, the effects, what
+    would be written where, and one verdict. Nothing is written to the controller.
+    """
+    from datetime import UTC, datetime
+
+    from daq.cli.terminal import check_folder, check_replaceable, print_view, write_output
+    from daq.config.cell_file import load_cell
+    from daq.files import replace_file
+    from daq.report.certificate import certificate_document, certify, without_controller
+    from daq.report.certificate_page import certificate_page
+    from daq.report.html import MARK
+    from daq.workflow.calibration_file import decode, load_calibration, read
+    from daq.writeback.request import Request
+
+    page = out or calibration.with_suffix(".html")
+    check_folder(page)
+    check_replaceable(page, MARK, "page of drivegain")
+    content = read(calibration)
+    fitted = decode(content, str(calibration))
+    earlier = None if beside is None else load_calibration(beside)
+    request = Request(fitted, datetime.now(UTC), file=calibration, content=content)
+    if cell is None:
+        unread = "The controller was not read; add --cell CELL to compare with its gains and the limits of the cell."
+        comparison = without_controller(fitted, unread, request.now)
+    else:
+        command = f"drivegain apply {shlex.quote(str(cell))} {shlex.quote(str(calibration))}"
+        comparison = compare(load_cell(cell), request, command)
+    certificate = certify(fitted, comparison, earlier)
+    with write_output(page):
+        replace_file(page, certificate_page(certificate).encode())
+    if json:
+        print_json(certificate_document(certificate))
+    else:
+        print_view((certificate.sentence,), page)
+
+
+def compare(cell: Cell, request: Request, command: str = "") -> Comparison:
+    """Compare a calibration with the controller's file of a cell, as `apply` would; reads only.
+
+    Without a file that can be read the gains are compared with the nameplate, and the reason is kept.
+    """
+    from dataclasses import replace
+
+    from daq.cli.apply import query_history
+    from daq.errors import DaqError
+    from daq.report.certificate import Comparison, without_controller
+    from daq.writeback.file_target import FileTarget
+    from daq.writeback.target import propose
+
+    if cell.controller is not None and not cell.controller.gains:
+        places = zip(cell.axis_names, cell.controller.objects, strict=True)
+        listed = ", ".join(f"{axis} {entry.parameter}" for axis, entry in places)
+        unread = f"The drives hold the gains ({listed}), and this page does not open the bus: `{command} --drives`."
+        return without_controller(request.calibration, unread, request.now, cell)
+    try:
+        proposal = propose(FileTarget.of(cell), request)
+    except DaqError as error:
+        return without_controller(request.calibration, f"The controller was not read: {error}.", request.now, cell)
+    known = query_history(cell, proposal.edit.subject, request, proposal.edit.changes)
+    return replace(Comparison.of(proposal, cell.apply, known), command=command)
+
+
+REPORT = Verb("report", report_verb, "drivegain report calibration.yaml --cell CELL")

@@ -1,0 +1,317 @@
+"""The certificate of a calibration: its gains beside those in the controller, the limits, and one verdict.
+
+The judgement is that of `drivegain apply`: the same gates, and the same test for a change beyond noise. Where the
+controller was not read, the nameplate takes its place, and the limit of a change is that from the nameplate.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from enum import Enum
+from typing import Any
+
+from daq.config.cell import Cell
+from daq.config.policy import ApplyPolicy
+from daq.errors import CalibrationRefused
+from daq.ledger.judgement import NOTHING, Spread, judge
+from daq.report.effect_names import accepted_text, size_text
+from daq.report.fit import error_document
+from daq.report.text import picked
+from daq.writeback.file_target import FileEdit
+from daq.writeback.gates.gate import Gate, GateContext, Refusal
+from daq.writeback.gates.table import check_gates
+from daq.writeback.request import Edit, GainChange, Request
+from daq.writeback.target import Proposal
+from ident.calibration import Calibration
+from ident.drift.change import FALSE_ALARM
+
+FORMAT, VERSION = "drivegain-certificate", 1
+_OPERATORS = frozenset({Gate.SIGNATURE, Gate.BASE})
+"""Gates that an operator opens by reviewing or signing; the calibration itself is not at fault."""
+
+
+class Verdict(Enum):
+    """What may happen with the gains of a calibration."""
+
+    READY = "ready"  #: every check passed, and a gain differs by more than noise
+    UNCHANGED = "unchanged"  #: every check passed, and no gain does
+    WAITING = "waits for an operator"  #: a review or a signature is missing
+    NOT_COMPARED = "not compared"  #: every check passed that needs no controller
+    REFUSED = "refused"  #: a check failed
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Gains beside those that are in the controller, or beside the nameplate where it was not read."""
+
+    changes: tuple[GainChange, ...]  #: one an axis
+    refusals: tuple[Refusal, ...]  #: failed checks
+    policy: ApplyPolicy  #: limits
+    known: Spread = NOTHING  #: σ of the gains in the controller, by the history
+    edit: FileEdit | None = None  #: planned change of the controller's file; None where it was not read
+    unread: str = ""  #: why it was not read
+    command: str = ""  #: that shows the change and, with --yes, writes it
+
+    @classmethod
+    def of(cls, proposal: Proposal[FileEdit], policy: ApplyPolicy, known: Spread = NOTHING) -> Comparison:
+        """Comparison with a controller's file, as `apply` would change it."""
+        return cls(proposal.edit.changes, proposal.refusals, policy, known, proposal.edit)
+
+    def allowed_percent(self, change: GainChange) -> tuple[float, float]:
+        """Limits of the change of a gain [% of the one in the controller]; infinite where it has none."""
+        if not change.old or not math.isfinite(change.old):
+            return -math.inf, math.inf
+        nameplate, bound = change.nameplate / change.old, self.policy.max_nameplate_percent
+        ends = [100.0 * (nameplate * (1.0 + sign * bound / 100.0) - 1.0) for sign in (-1.0, 1.0)]
+        if self.edit is not None:
+            most = self.policy.max_change_percent
+            if (absolute := self.policy.max_change.get(change.axis)) is not None:
+                most = min(most, abs(100.0 * absolute / change.old))
+            ends = [max(min(ends), -most), min(max(ends), most)]
+        return min(ends), max(ends)
+
+
+def without_controller(calibration: Calibration, unread: str, now: datetime, cell: Cell | None = None) -> Comparison:
+    """Compare with the nameplate, and check the gates that need no controller.
+
+    Args:
+        calibration: whose gains are judged.
+        unread: why the controller was not read.
+        now: wall-clock time, for the age of the logs.
+        cell: from the logs, None where there is none; then the default limits hold.
+    """
+    changes = tuple(GainChange.of(g, "", 0, g.nameplate, (g.value, "")) for g in calibration.gains)
+    edit = Edit(subject="", before=b"", after=b"", changes=changes)
+    refusals = check_gates(GateContext(Request(calibration, now), edit, cell))
+    return Comparison(
+        changes,
+        tuple(refusal for refusal in refusals if refusal.gate not in {Gate.CHANGE, *_OPERATORS}),
+        ApplyPolicy() if cell is None else cell.apply,
+        unread=unread,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class AxisRow:
+    """One gain of the certificate."""
+
+    change: GainChange  #: gain in the controller, or nameplate, and identified one with its σ
+    allowed_percent: tuple[float, float]  #: limits of the change
+    sigmas: float  #: the change in σ of both, as calibrations scatter; NaN where it cannot be judged
+    significant: bool  #: whether it is more than noise
+    refusals: tuple[Refusal, ...]  #: failed checks of this axis
+
+    def words(self, place: str) -> str:
+        """Verdict in words; `place` has the other gain: the controller or the nameplate."""
+        if self.refusals:
+            return "; ".join(f"refused: {refusal.found}" for refusal in self.refusals)
+        return f"differs from the {place}" if self.significant else "same within noise"
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """All that the first page shows."""
+
+    calibration: Calibration
+    comparison: Comparison
+    rows: tuple[AxisRow, ...]  #: one an axis
+    earlier: Calibration | None = None  #: another calibration of the cell to compare with
+    #: Change from the earlier calibration, judged with the σ of both, one an axis; empty without one.
+    since: tuple[AxisRow, ...] = ()
+
+    @property
+    def place(self) -> str:
+        """What the gains are compared with."""
+        return "nameplate" if self.comparison.edit is None else "controller"
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict on the whole calibration."""
+        gates = {refusal.gate for refusal in self.comparison.refusals}
+        if gates - _OPERATORS:
+            return Verdict.REFUSED
+        if self.comparison.edit is None:
+            return Verdict.NOT_COMPARED
+        if not any(row.significant for row in self.rows):
+            return Verdict.UNCHANGED
+        return Verdict.WAITING if gates else Verdict.READY
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in one sentence."""
+        refusals = self.comparison.refusals
+        differing = [row for row in self.rows if row.significant]
+        most = max(differing, key=lambda row: abs(row.change.change_percent), default=None)
+        furthest = "" if most is None else f"{most.change.axis} by {most.change.change_percent:+.1f} %"
+        count = f"{len(differing)} of {len(self.rows)} gains"
+        match self.verdict:
+            case Verdict.REFUSED:
+                failed = [refusal for refusal in refusals if refusal.gate not in _OPERATORS]
+                more = "" if len(failed) == 1 else f", and {len(failed) - 1} more failed"
+                one = failed[0]
+                return f"Must not be written: {one.subject}: {one.found}, expected {one.expected}{more}."
+            case Verdict.UNCHANGED:
+                return "Nothing to change: no gain differs from the one in the controller by more than noise."
+            case Verdict.WAITING:
+                return f"Waits for an operator: {count} change, most {furthest}; {refusals[0].remedy}."
+            case Verdict.READY:
+                return f"Ready to be written: {count} change by more than noise, most {furthest}; every check passed."
+        differ = f"{count} differ from the nameplate by more than noise, most {furthest}"
+        return f"Identified, not compared with a controller: {differ if differing else 'all agree with the nameplate'}."
+
+
+def certify(calibration: Calibration, comparison: Comparison, earlier: Calibration | None = None) -> Certificate:
+    """Judge a calibration.
+
+    Args:
+        calibration: with its evidence.
+        comparison: with the controller or the nameplate.
+        earlier: another calibration of the same cell to compare with; None for none.
+
+    Raises:
+        CalibrationRefused: the earlier calibration is of another cell or of other axes.
+    """
+    since: tuple[AxisRow, ...] = ()
+    if earlier is not None:
+        _require_same(calibration, earlier)
+        old = {gain.axis: gain for gain in earlier.gains}
+        changes = tuple(GainChange.of(g, "", 0, old[g.axis].value, (g.value, "")) for g in calibration.gains)
+        since = _rows(
+            replace(comparison, changes=changes, refusals=(), known=Spread({a: g.std for a, g in old.items()}))
+        )
+    return Certificate(calibration, comparison, _rows(comparison), earlier, since)
+
+
+def _rows(comparison: Comparison) -> tuple[AxisRow, ...]:
+    judged = judge(comparison.changes, comparison.known)
+    found = {
+        axis: (abs(change.sigmas), probability <= FALSE_ALARM)
+        for axis, change, probability in zip(judged.axes, judged.changes, judged.adjusted, strict=True)
+    }
+    return tuple(
+        AxisRow(
+            change,
+            comparison.allowed_percent(change),
+            *found.get(change.axis, (math.nan, False)),
+            tuple(refusal for refusal in comparison.refusals if refusal.subject == change.axis),
+        )
+        for change in comparison.changes
+    )
+
+
+def _require_same(calibration: Calibration, earlier: Calibration) -> None:
+    axes, others = ({gain.axis for gain in one.gains} for one in (calibration, earlier))
+    if calibration.cell != earlier.cell or axes != others:
+        raise CalibrationRefused(
+            "--beside",
+            found=f"cell {earlier.cell!r} with axes {', '.join(sorted(others))}",
+            expected=f"cell {calibration.cell!r} with axes {', '.join(sorted(axes))}",
+            remedy="give an earlier calibration of the same cell",
+        )
+
+
+def identity(calibration: Calibration) -> tuple[tuple[str, str], ...]:
+    """Cell, drives, operator, payload, dates and software as pairs of name and text; what is missing is said."""
+    recordings = [source.recording for source in calibration.sources if source.recording is not None]
+    operators = sorted({one.operator for one in recordings if one.operator})
+    times = sorted(one.recorded_s for one in recordings if one.recorded_s is not None)
+    days = list(dict.fromkeys(datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M") for time_s in times))
+    between = days[0] if len(days) == 1 else f"{days[0]} to {days[-1]}" if days else ""
+    return (
+        ("Serial numbers", _serials(calibration)),
+        ("Operator", ", ".join(operators) or "not known: the recordings name none"),
+        ("Payload", "; ".join(payload_texts(calibration)) or "none: every run was recorded without load"),
+        ("Recorded", f"{between} UTC" if between else "not known: the logs have no time of day"),
+        ("Fitted", f"{_minute(calibration.created)}, {calibration.software or 'software not known'}"),
+    )
+
+
+def payload_texts(calibration: Calibration) -> tuple[str, ...]:
+    """The mass of each payload as it was entered twice: in the cell file, and from the scale at each recording."""
+    mounted: dict[tuple[str, float | None], list[float]] = {}
+    for source in calibration.sources:
+        if source.payload is not None:
+            entered = None if source.recording is None else source.recording.entered_kg
+            masses = mounted.setdefault((source.payload, source.mass_kg), [])
+            masses += [entered] if entered is not None and entered not in masses else []
+    return tuple(
+        f"{name}: "
+        + ("no mass in the cell file" if declared is None else f"{declared:g} kg in the cell file")
+        + (
+            f", {' and '.join(f'{one:g}' for one in masses)} kg on the scale"
+            if masses
+            else ", not weighed a second time"
+        )
+        for (name, declared), masses in mounted.items()
+    )
+
+
+def _serials(calibration: Calibration) -> str:
+    recordings = [source.recording for source in calibration.sources if source.recording is not None]
+    found = []
+    for index, gain in enumerate(calibration.gains):
+        serials = dict.fromkeys(one.serials[index] for one in recordings if index < len(one.serials))
+        known = [str(serial) for serial in serials if serial is not None]
+        if known:
+            found.append(f"{gain.axis} {' and '.join(known)}")
+    return ", ".join(found) or "not known: the drives reported none"
+
+
+def _minute(iso: str) -> str:
+    """Write an ISO 8601 time to the minute, in UTC; any other text as it is."""
+    try:
+        return datetime.fromisoformat(iso).astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    except ValueError:
+        return iso or "time not known"
+
+
+def certificate_document(certificate: Certificate) -> dict[str, Any]:
+    """Return the numbers of the page, for `report --json`."""
+    calibration, comparison = certificate.calibration, certificate.comparison
+    edit = comparison.edit
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "cell": calibration.cell,
+        "identity": dict(identity(calibration)),
+        "verdict": certificate.verdict.value,
+        "sentence": certificate.sentence,
+        "controller": None if edit is None else str(edit.file),
+        "controller_unread": comparison.unread or None,
+        "axes": [_axis_document(row, certificate.place) for row in certificate.rows],
+        "refusals": [asdict(refusal) | {"gate": refusal.gate.value} for refusal in comparison.refusals],
+        "holdout_error_percent": error_document(calibration.holdout_error_percent),
+        "nameplate_holdout_error_percent": error_document(calibration.nameplate_holdout_error_percent),
+        "relative_error_percent": error_document(calibration.relative_error_percent),
+        "effects": [
+            {
+                "axis": effect.axis,
+                "effect": accepted_text(effect, calibration),
+                "size": size_text(effect, calibration),
+                **picked(effect, "error_before_percent", "error_after_percent"),
+                "ambiguity": list(effect.ambiguity),
+            }
+            for effect in calibration.effects
+        ],
+        "beside": None
+        if certificate.earlier is None
+        else {
+            "created": certificate.earlier.created,
+            "axes": [_axis_document(row, "earlier calibration") for row in certificate.since],
+            "holdout_error_percent": error_document(certificate.earlier.holdout_error_percent),
+        },
+    }
+
+
+def _axis_document(row: AxisRow, place: str) -> dict[str, Any]:
+    return {
+        **picked(row.change, "axis", "key", "line", "old", "new", "std", "std_percent", "unit", "nameplate"),
+        **picked(row.change, "change_percent"),
+        "written": row.change.spelling or None,
+        "allowed_percent": list(row.allowed_percent),
+        "sigmas": row.sigmas,
+        "significant": row.significant,
+        "verdict": row.words(place),
+    }

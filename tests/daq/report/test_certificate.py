@@ -1,0 +1,160 @@
+"""The certificate: the verdict is that of the gates, its numbers are on the page, and files cannot put code there."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from datetime import timedelta
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daq.cli.app import main
+from daq.errors import CalibrationRefused, ExitCode
+from daq.report.certificate import Verdict, certificate_document, certify, without_controller
+from daq.report.certificate_page import certificate_page
+from daq.report.effect_names import curve_of, size_text
+from daq.report.gains import with_deviation
+from daq.workflow.calibration_file import save_calibration
+from ident.calibration import AcceptedEffect, Calibration, Parameter
+from ident.effects.effect import PlacedEffect
+from ident.effects.signals import Abscissa
+from ident.effects.unnamed import Smooth
+from tests.daq.calibrations import RECORDED, demo_calibration, with_recordings
+
+NOW = RECORDED + timedelta(hours=1)
+HOSTILE = '<script>alert("x")</script>&<img src=http://example.org/x>'
+
+
+class Reader(HTMLParser):
+    """Takes a page apart; unbalanced tags fail at once."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.open: list[str] = []
+        self.texts: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        assert not any(name in {"src", "href"} or name.startswith("on") for name, _ in attrs)
+        self.tags.append(tag)
+        if tag != "meta":
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.texts.append(data)
+
+
+def _with_smooth() -> Calibration:
+    """A term without a name on J2: its torque is that of the B-splines alone."""
+    placed = PlacedEffect(Smooth(Abscissa.POSITION, lower=-2.38838, upper=1.5), 1)
+    found = tuple(Parameter(c.name, 0.1 * k - 0.3, 0.02, c.unit) for k, c in enumerate(placed.columns))
+    effect = AcceptedEffect(placed.effect.name, "J2", dict(placed.effect.settings), found, 5.0, 3.0)
+    made = demo_calibration()
+    return replace(made, effects=(effect,), parameters=(*made.parameters, *found))
+
+
+def _page(calibration: Calibration, earlier: Calibration | None = None) -> str:
+    return certificate_page(certify(calibration, without_controller(calibration, "not read", NOW), earlier))
+
+
+def test_every_number_of_the_document_is_on_the_page() -> None:
+    calibration = demo_calibration()
+    certificate = certify(calibration, without_controller(calibration, "not read", NOW))
+    text, document = certificate_page(certificate), certificate_document(certificate)
+    page = Reader(text)
+    assert not set(page.tags) & {"script", "link", "iframe", "object", "a", "img"}
+    assert "http" not in text.replace("http-equiv", "")
+    assert f"? {document['sentence']}" in page.texts
+    for gain, axis in zip(calibration.gains, document["axes"], strict=True):
+        assert {f"{axis['old']:.5g}", with_deviation(gain.value, gain.std), axis["verdict"]} <= set(page.texts)
+        assert axis["change_percent"] == pytest.approx(gain.change_percent)
+    for error in (document["holdout_error_percent"], document["nameplate_holdout_error_percent"]):
+        assert {f"{value:.2f}" for value in (*error["axes"], error["total"])} <= set(page.texts)
+    for value in document["identity"].values():
+        assert value in page.texts
+
+
+def test_the_mass_is_shown_as_it_was_entered_twice_and_what_is_missing_is_said() -> None:
+    calibration = with_recordings(demo_calibration(), operator="Ada")
+    texts = Reader(_page(calibration)).texts
+    assert "disc: 4.59 kg in the cell file, 4.592 and 4.588 kg on the scale" in texts
+    assert "Ada" in texts
+    bare = replace(calibration, sources=(), holdout_error_percent=None, effects=())
+    texts = Reader(_page(bare)).texts
+    assert "not known: the recordings name none" in texts
+    assert any(text.startswith("No run was held out") for text in texts)
+    assert "The calibration holds no effect beyond the declared model." in texts
+
+
+def test_what_files_say_is_escaped() -> None:
+    made = demo_calibration()
+    gains = tuple(replace(gain, axis=f"{gain.axis}{HOSTILE}") for gain in made.gains)
+    hostile = with_recordings(replace(made, cell=HOSTILE, gains=gains, software=HOSTILE), operator=HOSTILE)
+    text = _page(hostile)
+    assert "<script" not in text
+    assert f"Cell {HOSTILE}" in Reader(text).texts
+
+
+def test_a_term_without_a_name_is_its_curve() -> None:
+    calibration = _with_smooth()
+    curve = curve_of(calibration.effects[0], calibration)
+    assert curve is not None
+    assert curve.half_nm is None
+    assert (curve.x[0], curve.x[-1]) == (-2.38838, 1.5)
+    # The shapes leave out the constant, whose B-spline weights are all one: the weights of the curve sum to zero.
+    placed = Smooth(Abscissa.POSITION, lower=-2.38838, upper=1.5)
+    weights = np.linalg.lstsq(placed.shapes(curve.x).T, curve.torque_nm, rcond=None)[0]
+    assert weights == pytest.approx([one.value for one in calibration.effects[0].coefficients])
+    text = _page(calibration)
+    for internal in ("lower", "upper", "other_axis", "signed", "part 7", "2.38838"):
+        assert internal not in text.partition("</style>")[2]
+    assert size_text(calibration.effects[0], calibration) in " ".join(Reader(text).texts)
+
+
+def test_the_verdict_is_that_of_the_gates() -> None:
+    calibration = demo_calibration()
+    assert certify(calibration, without_controller(calibration, "", NOW)).verdict is Verdict.NOT_COMPARED
+    vague = replace(calibration, gains=(replace(calibration.gains[0], std=5.0), *calibration.gains[1:]))
+    refused = certify(vague, without_controller(vague, "", NOW))
+    assert refused.verdict is Verdict.REFUSED
+    assert refused.sentence.startswith("Must not be written: J1: σ 14.75 %, expected at most 3 %")
+    assert "refused: σ 14.75 %" in Reader(certificate_page(refused)).texts
+
+
+def test_a_page_beside_an_earlier_one_shows_what_changed() -> None:
+    calibration = demo_calibration()
+    first = calibration.gains[0]
+    earlier = replace(calibration, gains=(replace(first, value=0.9 * first.value), *calibration.gains[1:]), effects=())
+    texts = Reader(_page(calibration, earlier)).texts
+    assert texts.count("changed") == 1
+    assert "+11.1" in texts
+    assert any(text.startswith("New: J3 has friction that grows with the load") for text in texts)
+    with pytest.raises(CalibrationRefused, match="of the same cell"):
+        _page(calibration, replace(earlier, cell="other"))
+
+
+def test_the_verb_writes_one_page_and_never_over_another_file(
+    tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, page = tmp_path / "calibration.yaml", tmp_path / "calibration.html"
+    save_calibration(demo_calibration(), file)
+    cell = str(checkout / "configs" / "cells" / "demo.yaml")
+    assert main(["report", str(file), "--cell", cell, "--beside", str(file), "--json"]) == ExitCode.OK
+    document = json.loads(capsys.readouterr().out)
+    # The configuration of the demo cell is not the one that the calibration names.
+    assert document["verdict"] == "refused"
+    assert [axis["key"] for axis in document["axes"]] == [f"drives.J{number}.gain" for number in range(1, 7)]
+    texts = Reader(page.read_text(encoding="utf-8")).texts
+    assert {axis["written"] for axis in document["axes"]} <= set(texts)
+    page.write_text("the user's own", encoding="utf-8")
+    assert main(["report", str(file)]) == ExitCode.USAGE
+    assert page.read_text(encoding="utf-8") == "the user's own"
