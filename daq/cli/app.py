@@ -25,43 +25,46 @@ from daq.report.text import printable
 from drivers.errors import DriverError
 from ident.errors import IdentificationError
 
-VERBS = (
-    Listed(Job.COMMISSION, "demo", "daq.cli.simulate:DEMO", "Run the whole calibration on a simulated six-axis cell."),
-    Listed(Job.COMMISSION, "init", "daq.cli.init:INIT", "Create a folder for a new cell, with templates to fill in."),
-    Listed(Job.COMMISSION, "scan", "daq.cli.scan:SCAN", "Compare the nodes on the bus with the cell file."),
-    Listed(Job.COMMISSION, "plan", "daq.cli.record:PLAN", "Choose moves that excite every parameter."),
-    Listed(Job.COMMISSION, "record", "daq.cli.record:RECORD", "Execute a plan and log it; this moves the robot."),
-    Listed(Job.COMMISSION, "fit", "daq.cli.fit:FIT", "Identify all drive gains and dynamic parameters."),
-    Listed(Job.COMMISSION, "residual", "daq.cli.fit:RESIDUAL", "Fit, then detect and add missing effects."),
-    Listed(
-        Job.COMMISSION, "validate", "daq.cli.validate:VALIDATE", "Predict the torque of other logs with a calibration."
+CLICK_ERROR: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+"""What typer raises of a command line that cannot be parsed: it brings a click of its own, without public names."""
+BY_JOB = {
+    Job.COMMISSION: (
+        Listed("demo", "daq.cli.simulate:DEMO", "Run the whole calibration on a simulated six-axis cell."),
+        Listed("init", "daq.cli.init:INIT", "Create a folder for a new cell, with templates to fill in."),
+        Listed("scan", "daq.cli.scan:SCAN", "Compare the nodes on the bus with the cell file."),
+        Listed("plan", "daq.cli.record:PLAN", "Choose moves that excite every parameter."),
+        Listed("record", "daq.cli.record:RECORD", "Execute a plan and log it; this moves the robot."),
+        Listed("fit", "daq.cli.fit:FIT", "Identify all drive gains and dynamic parameters."),
+        Listed("residual", "daq.cli.fit:RESIDUAL", "Fit, then detect and add missing effects."),
+        Listed("validate", "daq.cli.validate:VALIDATE", "Predict the torque of other logs with a calibration."),
+        Listed("report", "daq.cli.report:REPORT", "Write the certificate of a calibration as one page."),
+        Listed("apply", "daq.cli.apply:APPLY", "Write gains to the controller; a dry run without --yes."),
+        Listed("rollback", "daq.cli.apply:ROLLBACK", "Undo the last write."),
     ),
-    Listed(Job.COMMISSION, "report", "daq.cli.report:REPORT", "Write the certificate of a calibration as one page."),
-    Listed(Job.COMMISSION, "apply", "daq.cli.apply:APPLY", "Write gains to the controller; a dry run without --yes."),
-    Listed(Job.COMMISSION, "rollback", "daq.cli.apply:ROLLBACK", "Undo the last write."),
-    Listed(Job.LOOK, "monitor", "daq.cli.scan:MONITOR", "Show the state of the axes; nothing is changed."),
-    Listed(Job.LOOK, "console", "daq.cli.console:CONSOLE", "Show the cell live on a page, with a stop button."),
-    Listed(Job.LOOK, "info", "daq.cli.logs:INFO", "Show what is in a log."),
-    Listed(Job.LOOK, "history", "daq.cli.history:HISTORY", "Show the calibrations of a cell and any drift."),
-    Listed(Job.LOOK, "explain-emcy", "daq.cli.scan:EXPLAIN_EMCY", "Explain an error code of an amplifier."),
-    Listed(
-        Job.MAINTAIN, "recalibrate", "daq.cli.recalibrate:RECALIBRATE", "Scheduled job: record, fit, propose or apply."
+    Job.LOOK: (
+        Listed("monitor", "daq.cli.scan:MONITOR", "Show the state of the axes; nothing is changed."),
+        Listed("console", "daq.cli.console:CONSOLE", "Show the cell live on a page, with a stop button."),
+        Listed("info", "daq.cli.logs:INFO", "Show what is in a log."),
+        Listed("history", "daq.cli.history:HISTORY", "Show the calibrations of a cell and any drift."),
+        Listed("explain-emcy", "daq.cli.scan:EXPLAIN_EMCY", "Explain an error code of an amplifier."),
     ),
-    Listed(
-        Job.MAINTAIN, "install-units", "daq.cli.recalibrate:INSTALL_UNITS", "Schedule the job with systemd or cron."
+    Job.MAINTAIN: (
+        Listed("recalibrate", "daq.cli.recalibrate:RECALIBRATE", "Scheduled job: record, fit, propose or apply."),
+        Listed("install-units", "daq.cli.recalibrate:INSTALL_UNITS", "Schedule the job with systemd or cron."),
+        Listed("sign", "daq.cli.sign:SIGN", "Sign a calibration as its second approver."),
+        Listed("fleet", "daq.cli.fleet:FLEET", "Fit the logs of many cells."),
+        Listed("salvage", "daq.cli.logs:SALVAGE", "Save the readable part of an unfinished or damaged log."),
     ),
-    Listed(Job.MAINTAIN, "sign", "daq.cli.sign:SIGN", "Sign a calibration as its second approver."),
-    Listed(Job.MAINTAIN, "fleet", "daq.cli.fleet:FLEET", "Fit the logs of many cells."),
-    Listed(Job.MAINTAIN, "salvage", "daq.cli.logs:SALVAGE", "Save the readable part of an unfinished or damaged log."),
-    Listed(Job.EXPERT, "import", "daq.cli.logs:IMPORT", "Convert CSV, MATLAB or ROS 2 files to a log."),
-    Listed(Job.EXPERT, "export", "daq.cli.export:EXPORT", "Write a calibration or a log for other programs."),
-    Listed(Job.EXPERT, "weigh", "daq.cli.weigh:WEIGH", "Weigh the body on the flange with a calibration."),
-    Listed(Job.EXPERT, "contact", "daq.cli.weigh:CONTACT", "Find external torques, with a threshold for alarms."),
-    Listed(
-        Job.EXPERT, "simulate", "daq.cli.simulate:SIMULATE", "Run a simulated cell on a bus, to try the other verbs."
+    Job.EXPERT: (
+        Listed("import", "daq.cli.logs:IMPORT", "Convert CSV, MATLAB or ROS 2 files to a log."),
+        Listed("export", "daq.cli.export:EXPORT", "Write a calibration or a log for other programs."),
+        Listed("weigh", "daq.cli.weigh:WEIGH", "Weigh the body on the flange with a calibration."),
+        Listed("contact", "daq.cli.weigh:CONTACT", "Find external torques, with a threshold for alarms."),
+        Listed("simulate", "daq.cli.simulate:SIMULATE", "Run a simulated cell on a bus, to try the other verbs."),
     ),
-)
-"""Verbs in the order of the help, by job; each is imported when it is called."""
+}
+"""Verbs by job, in the order of the help; each is imported when it is called."""
+VERBS = tuple(listed for verbs in BY_JOB.values() for listed in verbs)
 
 
 class _Verbs(TyperGroup):
@@ -76,9 +79,9 @@ class _Verbs(TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """List the verbs of each job with their whole summaries."""
         width = max(len(listed.name) for listed in VERBS)
-        for job in Job:
+        for job, verbs in BY_JOB.items():
             with formatter.section(job.value):
-                formatter.write_dl([(f"{one.name:{width}}", one.summary) for one in VERBS if one.job is job])
+                formatter.write_dl([(f"{listed.name:{width}}", listed.summary) for listed in verbs])
 
     def invoke(self, ctx: Any) -> Any:
         """Run the verb; an interrupt is one line that says what was written."""
@@ -160,15 +163,13 @@ def _run(words: list[str], json_wanted: bool) -> int:
     except typer.Abort:
         typer.echo("interrupted: no file was written", err=True)  # Ctrl-C or Ctrl-D at a prompt
         ended = ExitCode.INTERRUPTED
-    except Exception as error:
-        if not hasattr(error, "format_message"):
-            raise
+    except CLICK_ERROR as error:
         ended = _usage_failed(error, json_wanted)
     return ended if isinstance(ended, int) else ExitCode.OK
 
 
 def _usage_failed(error: Any, json_wanted: bool) -> int:
-    """Report a command line that cannot be parsed. typer brings a click of its own, without public names; hence Any."""
+    """Report a command line that cannot be parsed."""
     if error.ctx is None or "Usage:" in error.message:
         error.show()  # a verb without arguments shows its help
         return ExitCode.USAGE

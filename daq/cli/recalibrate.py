@@ -68,7 +68,6 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
     from daq.cli.report import compare
     from daq.cli.terminal import interruptible
     from daq.config.cell_file import load_cell
-    from daq.console.feed import Feed
     from daq.environment import login
     from daq.jobs.context import Tools
     from daq.jobs.job import preview, recalibrate
@@ -76,6 +75,7 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
     from daq.jobs.session import CALIBRATION
     from daq.report.residual_page import save_report
     from daq.report.text import printable
+    from daq.workflow.feed import Feed
     from daq.workflow.record import record
     from daq.writeback.request import Request
 

@@ -42,8 +42,8 @@ def record_verb(
     from daq.config.bus import bus_loads
     from daq.config.cell import PacingMode
     from daq.config.cell_file import load_cell
-    from daq.console.feed import Feed
     from daq.environment import login
+    from daq.workflow.feed import Feed
     from daq.workflow.plan import slowed
     from daq.workflow.plan_file import load_plan
     from daq.workflow.record import record

@@ -79,7 +79,6 @@ class Verb:
 class Listed:
     """Entry of the list of verbs, before the verb is imported."""
 
-    job: Job  #: what it is for
     name: str  #: on the command line
     place: str  #: where its `Verb` is defined, as module:name
     summary: str  #: one line for the list

@@ -19,7 +19,11 @@ from typing import Any
 import numpy as np
 
 from daq.config.cell import Cell
-from daq.console.feed import (
+from daq.console.prediction import Predictor
+from daq.errors import DaqError
+from daq.log.conversion import SiScaling
+from daq.report.bus import ENABLED, FAULTY
+from daq.workflow.feed import (
     ACCEPTED,
     HEAD,
     LARGEST_PACKET,
@@ -29,10 +33,6 @@ from daq.console.feed import (
     sample_dtype,
     socket_names,
 )
-from daq.console.prediction import Predictor
-from daq.errors import DaqError
-from daq.log.conversion import SiScaling
-from daq.report.bus import ENABLED, FAULTY
 from drivers.canopen.emcy import remedy_of
 from drivers.profiles.cia402 import decode
 from drivers.stream.sample import EventKind

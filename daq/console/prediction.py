@@ -19,7 +19,7 @@ from daq.config.cell import Cell, model_of
 from daq.workflow.validate import check_cell, conditioning_of, unpredictable
 from ident.arrays import FloatArray, IntArray
 from ident.calibration import Calibration
-from ident.data.conditioning import decimator, low_pass
+from ident.data.conditioning import central_differences, decimator, low_pass
 from ident.data.dataset import planned
 from ident.model.bodies import Payload
 from ident.model.robot import Motion
@@ -99,8 +99,7 @@ class Predictor:
         rate_hz, settings = self._rate_hz, self._conditioning
         raw = np.ascontiguousarray(self._position.T)
         smooth = low_pass(raw, rate_hz, settings.position_cutoff_hz, settings.position_order)
-        position, velocity = smooth[:, 1:-1], (smooth[:, 2:] - smooth[:, :-2]) * (0.5 * rate_hz)
-        acceleration = (smooth[:, 2:] - 2.0 * position + smooth[:, :-2]) * rate_hz**2
+        position, velocity, acceleration = central_differences(smooth, rate_hz)
         data = planned(Motion(position.T, velocity.T, acceleration.T), rate_hz, self._payload)
         predicted = self._filter(predict_current(self._calibration, self._model, data).T)
         measured = self._filter(self._current[1:-1].T)

@@ -1,8 +1,8 @@
 """Pieces of a page that needs no other file: no script, no address, pictures inside, every text escaped.
 
 The page reads on a phone (16 px, wide tables scroll in a box of their own), on paper (the first sheet is one A4 page)
-and in dark mode. Colours are those of `daq.report.picture`, told apart by colour-blind readers; no meaning rests on
-colour alone.
+and in dark mode. Colour-blind readers can distinguish the colours, those of `daq.report.picture`, and no meaning rests
+on colour alone.
 """
 
 from __future__ import annotations

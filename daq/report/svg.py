@@ -94,21 +94,21 @@ def curve(x: FloatArray, y: FloatArray, half: FloatArray | None, title: str, lab
     high = high if high > low else low + 1.0
     across, left, height = _WIDTH - 8.0, 46.0, 140.0
 
-    def place(xs: FloatArray, ys: FloatArray) -> str:
-        right = left + (xs - x[0]) / (x[-1] - x[0]) * (across - left)
-        down = 20.0 + (high - ys) / (high - low) * (height - 20.0)
-        return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(right, down, strict=True))
+    def right(value: float) -> float:
+        return left + (value - float(x[0])) / float(x[-1] - x[0]) * (across - left)
 
     def down(value: float) -> float:
         return 20.0 + (high - value) / (high - low) * (height - 20.0)
+
+    def place(xs: FloatArray, ys: FloatArray) -> str:
+        return " ".join(f"{right(a):.1f},{down(b):.1f}" for a, b in zip(xs.tolist(), ys.tolist(), strict=True))
 
     parts = [
         _line(left, down(tick), across, down(tick), "zero" if tick == 0.0 else "grid") for tick in _ticks(low, high)
     ]
     parts += [_text(left - 5, down(tick) + 4, f"{tick:g}", "soft end") for tick in _ticks(low, high)]
     for tick in _ticks(float(x[0]), float(x[-1])):
-        at = left + (tick - x[0]) / (x[-1] - x[0]) * (across - left)
-        parts.append(_text(at, height + 16, f"{tick:g}", "soft mid"))
+        parts.append(_text(right(tick), height + 16, f"{tick:g}", "soft mid"))
     if half is not None:
         both = place(np.concatenate([x, x[::-1]]), np.concatenate([y + half, (y - half)[::-1]]))
         parts.append(f'<polygon class="band" points="{both}"/>')

@@ -14,7 +14,6 @@ from daq.config import cell as declared
 from daq.config.bus import bus_loads, cell_address, drive_axes, load_warnings, polling_fits, polling_warnings
 from daq.config.cell import Cell, joint_names
 from daq.config.cell_file import bundle
-from daq.console.feed import Feed, RunFacts
 from daq.environment import software
 from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
 from daq.files import sha256
@@ -22,6 +21,7 @@ from daq.log.conversion import SiScaling, scaling
 from daq.log.metadata import RunInfo, RunStatistics, readback_of_drives
 from daq.log.writer import LogContent, LogWriter
 from daq.workflow.experiment import path_of
+from daq.workflow.feed import Feed, RunFacts
 from daq.workflow.nameplates import check_nameplates
 from daq.workflow.plan import Plan
 from daq.workflow.plan_file import check_approach

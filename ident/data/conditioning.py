@@ -55,6 +55,13 @@ def low_pass(values: FloatArray, rate_hz: float, cutoff_hz: float, order: int) -
     return _filtered(sections, forwards[:, ::-1])[:, ::-1][:, pad:-pad]
 
 
+def central_differences(smooth: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Position, velocity and acceleration of all samples but the first and last; time last, (c, k) → (c, k − 2)."""
+    position = smooth[:, 1:-1]
+    velocity = (smooth[:, 2:] - smooth[:, :-2]) * (0.5 * rate_hz)
+    return position, velocity, (smooth[:, 2:] - 2.0 * position + smooth[:, :-2]) * rate_hz**2
+
+
 def _butterworth(order: int, cutoff: float) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
     """Second-order sections (b_0, b_1, b_2), (a_1, a_2) of gain one at rest, by the bilinear transform.
 

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray, Refusal, as_array
-from ident.data.conditioning import Conditioning, low_pass
+from ident.data.conditioning import Conditioning, central_differences, low_pass
 from ident.data.run import Run
 from ident.errors import DataUnfit
 from ident.model.bodies import Payload
@@ -80,9 +80,7 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     rate = run.rate_hz
     raw = np.ascontiguousarray(position.T)
     smooth = low_pass(raw, rate, conditioning.position_cutoff_hz, conditioning.position_order)
-    position = smooth[:, 1:-1]
-    velocity = (smooth[:, 2:] - smooth[:, :-2]) * (0.5 * rate)
-    acceleration = (smooth[:, 2:] - 2.0 * position + smooth[:, :-2]) * rate**2
+    position, velocity, acceleration = central_differences(smooth, rate)
     speed_limit = np.asarray(conditioning.standstill_rad_s or standstill_speed(raw, smooth, rate, conditioning))[
         :, None
     ]

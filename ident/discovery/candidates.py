@@ -25,7 +25,7 @@ from ident.estimators.estimate import Estimate
 from ident.model.model import Model
 
 ColumnCache = dict[tuple[Effect, int], npt.NDArray[np.float32]]
-"""Columns that are tested turn after turn: half as long as those of a fit, of which there are few."""
+"""Columns of candidates by effect and axis. There are hundreds, and single precision is enough for their trials."""
 Felt = Mapping[int, FloatArray]  #: Whitened columns of a candidate on the rows of each motor that feels it, (p, rows)
 
 BATCH_COLUMNS = 48  #: Columns tested together: enough for fast products, few enough to keep memory small

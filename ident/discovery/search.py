@@ -130,8 +130,8 @@ def rank_families(
         tested: families on axes.
         rng: of the bootstrap.
         gates: limits.
-        known: names of effects in the model. Families of these names count as noise only where noise makes one as
-            strong among them, too.
+        known: names of effects in the model. Families of these names compete among themselves as well, and the
+            smaller of both probabilities counts.
     """
     if not tested:
         return ()

@@ -17,7 +17,7 @@ import yaml
 from rich.console import Console
 
 from daq.cli import main
-from daq.cli.app import VERBS
+from daq.cli.app import BY_JOB, VERBS
 from daq.cli.init import INIT
 from daq.cli.terminal import say_written
 from daq.cli.verb import Job, Listed, cell_here, continued
@@ -66,7 +66,7 @@ def test_every_job_of_the_help_has_its_verbs(capsys: pytest.CaptureFixture[str])
     for job in Job:
         (section,) = (one for one in sections if one.startswith(f"{job.value}:"))
         named = [line.split()[0] for line in section.splitlines()[1:]]
-        assert named == [listed.name for listed in VERBS if listed.job is job]
+        assert named == [listed.name for listed in BY_JOB[job]]
 
 
 def test_an_example_uses_the_cell_file_of_the_folder(

@@ -71,7 +71,7 @@ def test_an_error_of_the_operating_system_is_explained(number: int, found: str, 
     assert failure.exit_code == ExitCode.DEVICE_FAULT
 
 
-def test_a_cell_that_nobody_started_says_how_to_start_it(
+def test_a_refused_connection_names_the_command_that_starts_a_cell(
     checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:

@@ -12,11 +12,11 @@ from http.client import HTTPConnection, HTTPResponse
 from pathlib import Path
 
 from daq.config.cell import Cell
-from daq.console.feed import Feed, RunFacts
 from daq.console.live import Live
 from daq.console.results import Places, Results
 from daq.console.server import Page, listen, server_of
 from daq.log.metadata import RunStatistics
+from daq.workflow.feed import Feed, RunFacts
 from drivers.stream.sample import Sample
 from ident.calibration import Calibration, Parameter
 from ident.data.conditioning import Conditioning

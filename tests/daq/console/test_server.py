@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from daq.config.cell import Cell
-from daq.console.feed import Feed
+from daq.workflow.feed import Feed
 from tests.daq.console.feeds import TOKEN, Recording, Served, served
 
 
@@ -94,7 +94,7 @@ def test_a_reader_that_stalls_delays_neither_another_nor_a_stop(cell: Cell, cell
     stopped = threading.Event()
     with served(cell_file, cell) as console, Feed(cell_file, stopped.set) as feed:
         recording = Recording(feed, cell, cell_file)
-        _wait(lambda: bool(feed._new))  # the console has found the feed, and was accepted
+        _wait(lambda: bool(feed._new or feed._consoles))  # the console has found the feed, and was accepted
         with console.reader(), console.reader() as reading:
             lines = reading.makefile("rb")
             shown: list[list[float]] = []

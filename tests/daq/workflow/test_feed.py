@@ -14,10 +14,23 @@ import numpy as np
 import pytest
 
 from daq.config.cell import Cell
-from daq.console import feed as feeds
-from daq.console.feed import ACCEPTED, HEAD, LARGEST_PACKET, SAMPLES, STOP, Feed, end_of, sample_dtype, socket_names
+from daq.config.cell_file import load_cell
+from daq.workflow import feed as feeds
+from daq.workflow.feed import ACCEPTED, HEAD, LARGEST_PACKET, SAMPLES, STOP, Feed, end_of, sample_dtype, socket_names
 from drivers.stream.sample import CellEvent, EventKind
 from tests.daq.console.feeds import Recording
+
+
+@pytest.fixture(scope="module")
+def cell(checkout: Path) -> Cell:
+    """The demo cell."""
+    return load_cell(checkout / "configs" / "cells" / "demo.yaml")
+
+
+@pytest.fixture
+def cell_file(tmp_path: Path) -> Path:
+    """A path of its own, so that the feeds of two tests have different addresses; it is not read."""
+    return tmp_path / "cell.yaml"
 
 
 def _console(cell_file: Path, feed: Feed) -> socket.socket:
