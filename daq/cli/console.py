@@ -38,11 +38,11 @@ def console_verb(
         )
     from daq.config.cell_file import load_cell
     from daq.console.live import Live
-    from daq.console.results import Places, Results
+    from daq.console.results import Results
     from daq.console.server import Page, listen, new_token, server_of
 
     declared = load_cell(cell)
-    results = Results(Places(cell, declared, calibration, report))
+    results = Results(cell, declared, calibration, report)
     known = results.calibration()
     live = Live(cell, declared)
     live.calibration = None if known is None else known[1]

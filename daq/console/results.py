@@ -7,7 +7,6 @@ none of them.
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,21 +23,14 @@ from ident.calibration import Calibration
 LARGEST_REPORT_BYTES = 64 << 20
 
 
-@dataclass(frozen=True, slots=True)
-class Places:
-    """Files that a console may read."""
-
-    cell_file: Path
-    cell: Cell
-    calibration: Path | None  #: given on the command line, for the prediction too
-    report: Path | None  #: folder given on the command line
-
-
 class Results:
     """Reads the files again when they have changed."""
 
-    def __init__(self, places: Places) -> None:
-        self._places = places
+    def __init__(
+        self, cell_file: Path, cell: Cell, calibration: Path | None = None, report: Path | None = None
+    ) -> None:
+        """Store the places that may be read; calibration and folder of the report are those of the command line."""
+        self._cell_file, self._cell, self._calibration, self._report = cell_file, cell, calibration, report
         self._read: dict[Path, tuple[tuple[int, int], Calibration]] = {}
 
     def calibration(self) -> tuple[Path, Calibration] | None:
@@ -48,7 +40,7 @@ class Results:
             DaqError: it cannot be read.
         """
         newest = self._newest()
-        path = self._places.calibration or (None if newest is None else newest.folder / CALIBRATION)
+        path = self._calibration or (None if newest is None else newest.folder / CALIBRATION)
         if path is None or not path.exists():
             return None
         status = path.stat()
@@ -77,13 +69,13 @@ class Results:
         return found
 
     def _newest(self) -> Session | None:
-        section = self._places.cell.recalibration
-        past = () if section is None else sessions(section.folder, self._places.cell.name)
+        section = self._cell.recalibration
+        past = () if section is None else sessions(section.folder, self._cell.name)
         return past[-1] if past else None
 
     def _report_path(self) -> Path | None:
         newest = self._newest()
-        folder = self._places.report or (None if newest is None else newest.folder / REPORT)
+        folder = self._report or (None if newest is None else newest.folder / REPORT)
         return None if folder is None or not (folder / PAGE).is_file() else folder / PAGE
 
     def _gains(self) -> dict[str, Any] | None:
@@ -106,7 +98,7 @@ class Results:
         }
 
     def _history(self) -> dict[str, Any] | None:
-        place = self._places.cell.history
+        place = self._cell.history
         if place is None or not place.store.exists():
             return None
         with HistoryStore(place.store) as store:
@@ -123,7 +115,7 @@ class Results:
                 }
                 for one in series
             ],
-            "command": f"drivegain history {shlex.quote(str(self._places.cell_file))}",
+            "command": f"drivegain history {shlex.quote(str(self._cell_file))}",
         }
 
     def _session(self) -> dict[str, Any] | None:
@@ -142,5 +134,5 @@ class Results:
             "problem": state.problem,
             "runs": [{"name": run.name, "samples": run.samples} for run in state.runs],
             "sentences": [] if state.fitted is None else list(state.fitted.sentences),
-            "to_do": [] if ended is None else to_do(ended, self._places.cell_file),
+            "to_do": [] if ended is None else to_do(ended, self._cell_file),
         }

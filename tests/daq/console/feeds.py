@@ -13,7 +13,7 @@ from pathlib import Path
 
 from daq.config.cell import Cell
 from daq.console.live import Live
-from daq.console.results import Places, Results
+from daq.console.results import Results
 from daq.console.server import Page, listen, server_of
 from daq.log.metadata import RunStatistics
 from daq.workflow.feed import Feed, RunFacts
@@ -74,7 +74,7 @@ class Served:
         self.live = Live(cell_file, cell)
         self.listener = listen(0)
         self.port = self.listener.getsockname()[1]
-        page = Page(cell, self.live, Results(Places(cell_file, cell, None, report)))
+        page = Page(cell, self.live, Results(cell_file, cell, report=report))
         self.server = server_of(page, TOKEN, self.port)
         self.thread = threading.Thread(target=lambda: asyncio.run(self.server.serve(sockets=[self.listener])))
 
