@@ -1,8 +1,9 @@
 """`make console-study`: recordings on SocketCAN with the console alternately open and closed.
 
-The rate is the highest of RATES_HZ that one recording without a console holds without a loss. Then blocks of recordings
-follow, without and with a console whose page is read. Of each block: cycles lost, the jitter of SYNC by the kernel's
-stamps, and the console's processor time and memory. Written to out/console-study.json.
+Blocks of recordings follow one another, without and with a console whose page is read. Of each block: cycles lost, the
+jitter of SYNC by the kernel's stamps, and the console's processor time and memory. The rate is the highest of RATES_HZ
+that is lossless without a console: in some recordings before the blocks, and in every block without one. A block
+without a console that loses a cycle starts the study again at the next rate. Written to out/console-study.json.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from http.client import HTTPConnection, HTTPException
 from pathlib import Path
 from typing import Any
@@ -115,35 +116,58 @@ def cell_at(folder: Path, rate_hz: int, seconds: float) -> tuple[Path, Path, Pat
     return cell, write_simulation(folder, 1_000_000 // rate_hz), plan
 
 
+def is_lossless(found: dict[str, Any]) -> bool:
+    """Return whether a recording or block has every sample of every cycle."""
+    return not (found["lost"] or found["missing"] or found["ended_early"])
+
+
+def blocks_at(folder: Path, rate_hz: int, options: argparse.Namespace) -> list[dict[str, Any]] | None:
+    """All blocks at one rate; None where a recording without a console lost a sample."""
+    cell, simulation, plan = cell_at(folder / str(rate_hz), rate_hz, options.seconds)
+    log = folder / "run.mcap"
+    blocks: list[dict[str, Any]] = []
+    with simulated(simulation):
+        for _ in range(options.tries):
+            tried = recording(cell, plan, log)
+            if not is_lossless(tried):
+                _show({"rate_hz": rate_hz, "lossless": False, **tried, "jitter_us": None})
+                return None
+        for number in range(round(options.minutes / options.block)):
+            is_open = number % 2 == 1
+            with console(cell) if is_open else nullcontext() as process:
+                blocks.append(block(cell, plan, log, 60.0 * options.block, process))
+            _show({"rate_hz": rate_hz, **blocks[-1]})
+            if not is_open and not is_lossless(blocks[-1]):
+                return None
+    return blocks
+
+
+def _show(row: dict[str, Any]) -> None:
+    sys.stdout.write(f"{json.dumps(row)}\n")
+    sys.stdout.flush()
+
+
 def main(arguments: list[str] | None = None) -> int:
-    """Find the rate, then run the blocks; 1 where a console cost a cycle."""
+    """Go down the rates until one is lossless without a console; 1 where a console cost a cycle, or none is."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.console_study", description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0, help="of all blocks together")
     parser.add_argument("--block", type=float, default=10.0, help="minutes of a block")
     parser.add_argument("--seconds", type=float, default=60.0, help="of the plan")
+    parser.add_argument("--tries", type=int, default=3, help="recordings before the blocks")
+    parser.add_argument("--rates", type=int, nargs="+", default=list(RATES_HZ), metavar="HZ", help="the highest first")
     options = parser.parse_args(arguments)
     out = Path(os.environ.get(OUT, "out")) / "console-study.json"
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        for rate_hz in RATES_HZ:
-            cell, simulation, plan = cell_at(folder / str(rate_hz), rate_hz, options.seconds)
-            with simulated(simulation):
-                tried = recording(cell, plan, folder / "run.mcap")
-            if not (tried["lost"] or tried["missing"] or tried["ended_early"]):
-                break
-        blocks = []
-        with simulated(simulation):
-            for number in range(round(options.minutes / options.block)):
-                if number % 2 == 0:
-                    blocks.append(block(cell, plan, folder / "run.mcap", 60.0 * options.block, None))
-                else:
-                    with console(cell) as process:
-                        blocks.append(block(cell, plan, folder / "run.mcap", 60.0 * options.block, process))
-                sys.stdout.write(f"{json.dumps({'rate_hz': rate_hz, **blocks[-1]})}\n")
-                sys.stdout.flush()
     out.parent.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as name:
+        for rate_hz in options.rates:
+            blocks = blocks_at(Path(name), rate_hz, options)
+            if blocks is not None:
+                break
+        else:
+            _show({"lossless_at_no_rate_of_hz": options.rates})
+            return 1
     out.write_text(json.dumps({"rate_hz": rate_hz, "blocks": blocks}, indent=1) + "\n", encoding="utf-8")
-    return int(any(one["lost"] or one["ended_early"] for one in blocks if one["open"]))
+    return int(not all(map(is_lossless, blocks)))
 
 
 if __name__ == "__main__":
