@@ -1,4 +1,4 @@
-"""`drivegain plan` and `drivegain record`: plan the moves of a recording, make them, and log them."""
+"""`drivegain record`: make the moves of a plan, and log them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import typer
 
 from daq.cli.verb import CellArgument, JsonOption, Verb, print_json, say_next
 from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError
-from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_STD_PERCENT
 from drivers.errors import DriverError, SampleLost
 
 if TYPE_CHECKING:
@@ -40,9 +39,9 @@ def record_verb(
     """
     from daq.cli.terminal import interruptible, progress_bar
     from daq.config.bus import bus_loads
-    from daq.config.cell import PacingMode
     from daq.config.cell_file import load_cell
     from daq.environment import login
+    from daq.report.text import picked
     from daq.workflow.feed import Feed
     from daq.workflow.plan import slowed
     from daq.workflow.plan_file import load_plan
@@ -88,32 +87,38 @@ def record_verb(
         typer.echo(_interrupted(interrupt, made, out), err=True)
         raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
     except DriverError as error:
-        if part.exists():
-            error.add_note(
-                f"kept: the samples recorded until then are in {part}, which `fit` does not read; {_next_command(part)}"
-            )
-        if isinstance(error, SampleLost) and declared.sync is not None and declared.sync.pacing is PacingMode.TIMED:
-            error.add_note(
-                "hint: a cell of `drivegain simulate` answers as fast as its computer can and needs `sync.pacing: "
-                "lockstep` in the cell file; on a real cell, check the load of bus and computer"
-            )
+        _add_what_is_kept(error, declared, part)
         raise
     for warning in done.warnings:
         typer.echo(warning, err=True)
-    log = done.log
     if json:
-        print_json({"log": str(out), "samples": log.samples, "lost_cycles": log.lost_cycles, "missing": log.missing,
-                    "valid": log.valid, "reason": log.reason, "warnings": done.warnings,
+        print_json({"log": str(out), **picked(done.log, "samples", "lost_cycles", "missing", "valid", "reason"),
+                    "warnings": done.warnings,
                     "bus_load": [{"bus": bus.name, "mean_percent": 100 * load.mean, "worst_percent": 100 * load.worst}
                                  for bus, load in bus_loads(declared)]})  # fmt: skip
     else:
-        verdict = "complete" if log.valid else f"INVALID: {log.reason}; a fit will refuse it"
-        typer.echo(f"{out}: {log.samples} samples, {log.lost_cycles} cycles lost, {verdict}")
-    if not log.valid:
+        verdict = "complete" if done.log.valid else f"INVALID: {done.log.reason}; a fit will refuse it"
+        typer.echo(f"{out}: {done.log.samples} samples, {done.log.lost_cycles} cycles lost, {verdict}")
+    if not done.log.valid:
         # The log is kept; the exit code keeps a script from using it.
         raise typer.Exit(ExitCode.DATA_UNFIT)
     if not json:
         _say_next(cell, declared, plan, out, carried)
+
+
+def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:
+    """Say in notes of an error what became of the samples, and what helps a cell that is too slow for its clock."""
+    from daq.config.cell import PacingMode
+
+    if part.exists():
+        error.add_note(
+            f"kept: the samples recorded until then are in {part}, which `fit` does not read; {_next_command(part)}"
+        )
+    if isinstance(error, SampleLost) and cell.sync is not None and cell.sync.pacing is PacingMode.TIMED:
+        error.add_note(
+            "hint: a cell of `drivegain simulate` answers as fast as its computer can and needs `sync.pacing: "
+            "lockstep` in the cell file; on a real cell, check the load of bus and computer"
+        )
 
 
 def _say_next(cell: Path, declared: Cell, plan: Path, out: Path, carried: Payload | None) -> None:
@@ -209,74 +214,3 @@ RECORD = Verb(
     record_verb,
     "drivegain record CELL plan.yaml --out loaded.mcap --payload disc --mass 4.59 --enable-motion",
 )
-
-
-def plan_verb(
-    cell: CellArgument,
-    out: Annotated[Path, typer.Option("--out", help="Plan to write (YAML).")],
-    seed: Annotated[int, typer.Option(help="The same seed gives the same plan.", min=0)] = 1,
-    duration: Annotated[float, typer.Option(help="Duration of the run [s].", min=5.0, max=3600.0)] = 40.0,
-    payload: Annotated[str | None, typer.Option(help="Payload that will be mounted; the cell's first one.")] = None,
-    exchanges: Annotated[int, typer.Option(help="Changes to try; 0 gives random moves.", min=0)] = EXCHANGES,
-    speed: Annotated[
-        float, typer.Option(help="Share of the limits that the fastest move uses.", min=0.05, max=1.0)
-    ] = 1.0,
-    condition: Annotated[float, typer.Option(help="Largest condition number.", min=1.0)] = LARGEST_CONDITION,
-    preview: Annotated[Path | None, typer.Option(help="Page to write (HTML): the arm moves through the plan.")] = None,
-    sigma: Annotated[float, typer.Option(help="Largest σ predicted for a gain [%].", min=0.01)] = LARGEST_STD_PERCENT,
-    json: JsonOption = False,
-) -> None:
-    """Choose point-to-point moves that identify the worst gain as precisely as the time allows.
-
-    The moves keep the joint limits and the cell's workspace, and keep clear of the arm itself. The prediction is for
-    these moves made once without load and once with the payload.
-    """
-    from daq.cli.terminal import check_folder, check_output, check_replaceable, progress_bar, write_output
-    from daq.config.cell_file import load_cell
-    from daq.files import replace_file
-    from daq.report.plan import plan_document, plan_text
-    from daq.report.plan_preview import MARK, preview_page
-    from daq.workflow.experiment import RUNS, experiment_of, extra_moves, paths_of
-    from daq.workflow.nameplates import check_controller
-    from daq.workflow.plan import plan
-    from daq.workflow.plan_file import load_plan, save_plan
-    from ident.planning.excitation import verdicts
-
-    check_output(out, (cell,), "drivegain-plan")
-    if preview is not None:
-        if preview.resolve() == out.resolve():
-            raise UsageError("--preview", found="the name of --out", expected="another", remedy="choose another name")
-        check_folder(preview)
-        check_replaceable(preview, MARK, "preview of a plan")
-    declared = load_cell(cell)
-    check_controller(cell, declared)
-    experiment = experiment_of(declared, payload)
-    with progress_bar("planning") as report_progress:
-        made = plan(
-            declared,
-            seed=seed,
-            duration_s=duration,
-            exchanges=exchanges,
-            speed=speed,
-            largest_condition=condition,
-            largest_std_percent=sigma,
-            experiment=experiment,
-            progress=lambda done, worst: report_progress(done, exchanges, f"worst gain σ {worst:.2f} %"),
-        )
-    with write_output(out):
-        save_plan(made, out)
-    if preview is not None:
-        checked = load_plan(out, declared)
-        with write_output(preview):
-            page = preview_page(declared, checked.moves, experiment.scene.checker, out.read_bytes())
-            replace_file(preview, page.encode())
-    excitation, _ = experiment.excitation(paths_of(declared, made.moves))
-    judged = verdicts(experiment.design, [(excitation, RUNS)], extra_moves(experiment))
-    if json:
-        print_json(plan_document(out, declared, experiment, made, judged))
-    else:
-        typer.echo(plan_text(out, declared, experiment, made, judged))
-        say_next("drivegain", "record", cell, out, "--out", "unloaded.mcap", "--enable-motion")
-
-
-PLAN = Verb("plan", plan_verb, "drivegain plan CELL --out plan.yaml --seed 1 --duration 40")

@@ -1,0 +1,83 @@
+"""`drivegain plan`: choose the moves of a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from daq.cli.verb import CellArgument, JsonOption, Verb, print_json, say_next
+from daq.errors import UsageError
+from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_STD_PERCENT
+
+
+def plan_verb(
+    cell: CellArgument,
+    out: Annotated[Path, typer.Option("--out", help="Plan to write (YAML).")],
+    seed: Annotated[int, typer.Option(help="The same seed gives the same plan.", min=0)] = 1,
+    duration: Annotated[float, typer.Option(help="Duration of the run [s].", min=5.0, max=3600.0)] = 40.0,
+    payload: Annotated[str | None, typer.Option(help="Payload that will be mounted; the cell's first one.")] = None,
+    exchanges: Annotated[int, typer.Option(help="Changes to try; 0 gives random moves.", min=0)] = EXCHANGES,
+    speed: Annotated[
+        float, typer.Option(help="Share of the limits that the fastest move uses.", min=0.05, max=1.0)
+    ] = 1.0,
+    condition: Annotated[float, typer.Option(help="Largest condition number.", min=1.0)] = LARGEST_CONDITION,
+    preview: Annotated[Path | None, typer.Option(help="Page to write (HTML): the arm moves through the plan.")] = None,
+    sigma: Annotated[float, typer.Option(help="Largest σ predicted for a gain [%].", min=0.01)] = LARGEST_STD_PERCENT,
+    json: JsonOption = False,
+) -> None:
+    """Choose point-to-point moves that identify the worst gain as precisely as the time allows.
+
+    The moves keep the joint limits and the cell's workspace, and keep clear of the arm itself. The prediction is for
+    these moves made once without load and once with the payload.
+    """
+    from daq.cli.terminal import check_folder, check_output, check_replaceable, progress_bar, write_output
+    from daq.config.cell_file import load_cell
+    from daq.files import replace_file
+    from daq.report.plan import plan_document, plan_text
+    from daq.report.plan_preview import MARK, preview_page
+    from daq.workflow.experiment import RUNS, experiment_of, extra_moves, paths_of
+    from daq.workflow.nameplates import check_controller
+    from daq.workflow.plan import plan
+    from daq.workflow.plan_file import load_plan, save_plan
+    from ident.planning.excitation import verdicts
+
+    check_output(out, (cell,), "drivegain-plan")
+    if preview is not None:
+        if preview.resolve() == out.resolve():
+            raise UsageError("--preview", found="the name of --out", expected="another", remedy="choose another name")
+        check_folder(preview)
+        check_replaceable(preview, MARK, "preview of a plan")
+    declared = load_cell(cell)
+    check_controller(cell, declared)
+    experiment = experiment_of(declared, payload)
+    with progress_bar("planning") as report_progress:
+        made = plan(
+            declared,
+            seed=seed,
+            duration_s=duration,
+            exchanges=exchanges,
+            speed=speed,
+            largest_condition=condition,
+            largest_std_percent=sigma,
+            experiment=experiment,
+            progress=lambda done, worst: report_progress(done, exchanges, f"worst gain σ {worst:.2f} %"),
+        )
+    with write_output(out):
+        save_plan(made, out)
+    if preview is not None:
+        checked = load_plan(out, declared)
+        with write_output(preview):
+            page = preview_page(declared, checked.moves, experiment.scene.checker, out.read_bytes())
+            replace_file(preview, page.encode())
+    excitation, _ = experiment.excitation(paths_of(declared, made.moves))
+    judged = verdicts(experiment.design, [(excitation, RUNS)], extra_moves(experiment))
+    if json:
+        print_json(plan_document(out, declared, experiment, made, judged))
+    else:
+        typer.echo(plan_text(out, declared, experiment, made, judged))
+        say_next("drivegain", "record", cell, out, "--out", "unloaded.mcap", "--enable-motion")
+
+
+PLAN = Verb("plan", plan_verb, "drivegain plan CELL --out plan.yaml --seed 1 --duration 40")
