@@ -108,9 +108,9 @@ def block(cell: Path, plan: Path, log: Path, seconds: float, process: subprocess
 
 
 def cell_at(folder: Path, rate_hz: int, seconds: float) -> tuple[Path, Path, Path]:
-    """Cell, simulation and plan at a rate."""
+    """Cell, simulation and plan at a rate; the kernel sends SYNC, so that a recorder that has to wait loses nothing."""
     folder.mkdir()
-    cell = write_cell(folder, 1_000_000 // rate_hz, "timed")
+    cell = write_cell(folder, 1_000_000 // rate_hz, "timed\n  producer: kernel")
     plan = folder / "plan.yaml"
     assert drivegain(["plan", str(cell), "--out", str(plan), "--duration", str(seconds), "--exchanges", "0"]) == 0
     return cell, write_simulation(folder, 1_000_000 // rate_hz), plan
