@@ -31,8 +31,6 @@ def scan_verb(
     Every node id is tried on every bus, so that an amplifier on the wrong bus is found. Nothing is changed without
     --reset-faults; find out why an axis is in fault before you reset it.
     """
-    from rich.console import Console
-
     from daq.cli.terminal import print_view
     from daq.config.bus import bus_parts, cell_address, drive_axes
     from daq.config.cell_file import load_cell
@@ -64,7 +62,7 @@ def scan_verb(
             {"bus": address, "nodes": rows, "reset": reset, "faults": causes, "current": current_signals(declared)}
         )
     else:
-        print_view(scan_view(declared, rows, causes, Console().width))
+        print_view(scan_view(declared, rows, causes))
     absent = {row["node_id"] for row in rows if row["verdict"] == "missing"}
     missing = [axis for axis in drive_axes(declared) if axis.node_id in absent]
     if missing:

@@ -38,7 +38,7 @@ def _node(node_id: int, statusword: int | None, serial: int | None = None) -> Fo
 
 def _shown(cell: Cell, nodes: tuple[FoundNode, ...], width: int) -> str:
     out = io.StringIO()
-    Console(file=out, width=width, soft_wrap=True).print(scan_table(scan_rows(cell, nodes, "demo"), width))
+    Console(file=out, width=width, soft_wrap=True).print(scan_table(scan_rows(cell, nodes, "demo")))
     return out.getvalue()
 
 
@@ -68,16 +68,21 @@ def test_an_enabled_axis_is_shouted(cell: Cell, statusword: int | None, enabled:
         assert "…" not in text
 
 
-def test_a_narrow_terminal_gets_fewer_columns_and_whole_words(cell: Cell) -> None:
+def test_a_narrow_terminal_gets_every_column_and_whole_words(cell: Cell) -> None:
     nodes = tuple(_node(number, 0x237) for number in range(1, 7))
     for width in (50, 80, 200):
-        lines = _shown(cell, nodes, width).splitlines()
-        assert max(cell_len(line.rstrip()) for line in lines) <= width
-        assert sum("ENABLED" in line for line in lines) == 6
-    rows = scan_rows(cell, nodes, "demo")
-    said = {width: [str(part) for part in scan_view(cell, rows, {}, width)] for width in (80, 200)}
-    assert "No room for nmt; --json has all columns." in said[80]
-    assert not any("No room" in part for part in said[200])
+        text = _shown(cell, nodes, width)
+        assert max(cell_len(line.rstrip()) for line in text.splitlines()) <= width
+        assert text.count("ENABLED") == 6
+        assert text.count("pre-operational") == 6
+        assert all(str(1000 + number) in text for number in range(1, 7))
+
+
+def test_a_message_names_the_axis_first(cell: Cell) -> None:
+    rows = scan_rows(cell, (_node(3, 0x237), _node(9, 0x237)), "demo")
+    said = [str(part) for part in scan_view(cell, rows, {})]
+    assert said[1].startswith("J3 (node 3) IS ENABLED")
+    assert said[2].startswith("node 9 IS ENABLED")
 
 
 def test_identity_and_power_are_distinguished(cell: Cell) -> None:
@@ -133,7 +138,7 @@ def test_a_node_is_reported_where_it_is_and_where_it_belongs(two: Cell) -> None:
     right = scan_rows(two, tuple(_node(number, 0x250) for number in (4, 5, 6)), "right")
     assert [row["verdict"] for row in right] == ["ok"] * 3
     out = io.StringIO()
-    Console(file=out, width=50, soft_wrap=True).print(scan_table(left + right, 50, several=True))
+    Console(file=out, width=200, soft_wrap=True).print(scan_table(left + right))
     heading, _, *lines = out.getvalue().splitlines()
     assert heading.split()[:2] == ["bus", "node"]
     assert [line.split()[0] for line in lines if line.strip()] == ["left"] * 5 + ["right"] * 3
