@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,8 +26,13 @@ ENABLED = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTIO
 FAULTY = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 
 
-def scan_view(cell: Cell, rows: list[dict[str, Any]], reset: Mapping[str, str]) -> Iterator[RenderableType]:
-    """Table of the nodes on all buses, and what needs attention; `reset` has the fault of each axis that was reset."""
+def scan_view(
+    cell: Cell, rows: list[dict[str, Any]], reset: Mapping[str, str], mistyped: Sequence[str] = ()
+) -> Iterator[RenderableType]:
+    """Table of the nodes on all buses, and what needs attention.
+
+    `reset` has the fault of each axis that was reset, `mistyped` the nameplates that `plan` and `record` would refuse.
+    """
     yield scan_table(rows)
     for row in rows:
         if row["enabled"]:
@@ -41,6 +46,7 @@ def scan_view(cell: Cell, rows: list[dict[str, Any]], reset: Mapping[str, str]) 
             "explain-emcy`) shows the cause. Remove it, then reset the fault with --reset-faults; nothing moves.",
             "yellow",
         )
+    yield from (Text(printable(text), "yellow") for text in mistyped)
     if (note := actual_current_note(cell)) is not None:
         yield Text(note, "yellow")
 
@@ -52,7 +58,7 @@ def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[s
     """Rows of the nodes of one bus, configured or found."""
     from drivers.canopen.link import nmt_name  # noqa: PLC0415 - `info` shows currents without the CAN library
 
-    homes = {axis.node_id: axis.bus for axis in cell.axes if axis.node_id is not None}
+    homes = {axis.node_id: axis for axis in cell.axes if axis.node_id is not None}
     axes = {axis.node_id: axis for axis in cell.axes if axis.node_id is not None and axis.bus == bus}
     nodes = {node.node_id: node for node in found}
     rows = []
@@ -63,7 +69,7 @@ def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[s
         if node is None:
             verdict = "missing"
         elif axis is None:
-            verdict = f"belongs on {homes[node_id]}" if node_id in homes else "not configured"
+            verdict = f"belongs on {homes[node_id].bus}" if node_id in homes else "not configured"
         else:
             verdict = "ok" if expected is None or expected == identity else "other identity"
         in_fault = node is not None and node.state in FAULTY
@@ -73,7 +79,7 @@ def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[s
             {
                 "bus": bus,
                 "node_id": node_id,
-                "axis": None if axis is None else axis.name,
+                "axis": homes[node_id].name if node_id in homes else None,
                 **(dict.fromkeys(_IDENTITY) if identity is None else picked(identity, *_IDENTITY)),
                 "device_name": None if node is None else node.device_name,
                 "nmt": None if node is None or node.nmt is None else nmt_name(node.nmt),

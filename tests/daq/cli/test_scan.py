@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,6 +24,7 @@ from drivers.canopen.scan import FoundNode
 from drivers.profiles.profile import Identity
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import ErrorCode, PowerState
+from ident.model.model import DriveTrain
 from tests.two_buses import on_two_buses
 
 
@@ -118,6 +121,29 @@ def test_a_fault_is_reset_when_a_person_says_so_and_nothing_gets_power(
         assert "was reset" not in capsys.readouterr().out
 
 
+def test_a_mistyped_nameplate_is_reported_with_its_line(
+    checkout: Path, cell: Cell, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """25.65 of J3 is written as mNm: the motor's data in the drive and the controller's file contradict it."""
+    configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
+    file = configs / "cells/demo.yaml"
+    file.write_text(file.read_text().replace("25.65", "25650"))
+    line = 1 + next(n for n, text in enumerate(file.read_text().splitlines()) if "25650" in text)
+    spec = load_simulation(shipped_simulation("clean"))
+    third, reduction = spec.axes[2], float(DriveTrain(cell.ratio).reduction[2])
+    entered = replace(third, entered_torque_nm=25.65 / abs(reduction) * third.rated_current_a)
+    spec = replace(spec, axes=(*spec.axes[:2], entered, *spec.axes[3:]))
+    with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus):
+        assert main(["scan", str(file)]) == ExitCode.OK
+        shown = capsys.readouterr()
+        (configs / "controllers/demo.yaml").unlink()
+        assert main(["scan", str(file), "--json"]) == ExitCode.OK
+        (by_drive,) = json.loads(capsys.readouterr().out)["mistyped"]
+    assert f"demo.yaml:{line}: axes[2].nameplate_gain_nm_per_a: found 25650 Nm/A, while it is 25.65 by" in shown.out
+    assert "Next" not in shown.err
+    assert "by N·Kt of the drive's motor" in by_drive
+
+
 @pytest.fixture(scope="module")
 def two(checkout: Path) -> Cell:
     """The demo cell on two buses."""
@@ -132,7 +158,7 @@ def test_a_node_is_reported_where_it_is_and_where_it_belongs(two: Cell) -> None:
         ("left", 1, "J1", "ok"),
         ("left", 2, "J2", "ok"),
         ("left", 3, "J3", "missing"),
-        ("left", 4, None, "belongs on right"),
+        ("left", 4, "J4", "belongs on right"),
         ("left", 9, None, "not configured"),
     ]
     right = scan_rows(two, tuple(_node(number, 0x250) for number in (4, 5, 6)), "right")
