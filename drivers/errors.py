@@ -107,9 +107,9 @@ class NodeMissing(DriverError):
 class NodeMisplaced(DriverError):
     """A node is heard on another bus than its own."""
 
-    def __init__(self, node_id: int, expected: str, found: str, names: Mapping[int, str] | None = None) -> None:
+    def __init__(self, node_id: int, expected: str, found: str, axis: str = "") -> None:
         super().__init__(
-            f"{node_label(node_id, names)} is heard on bus {found}, the cell configuration has it on bus "
+            f"{node_label(node_id, {node_id: axis})} is heard on bus {found}, the cell configuration has it on bus "
             f"{expected}: it is wired to the other bus, two amplifiers have that node id, or both CAN interfaces are "
             "on one wire; `drivegain scan` shows the nodes of each bus"
         )

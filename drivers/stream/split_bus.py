@@ -222,7 +222,7 @@ class SplitBus(can.BusABC):
         home = self._homes.get(node_id, index)
         if home != index and (node_id, index) not in self._misplaced:
             self._misplaced.add((node_id, index))
-            raise NodeMisplaced(node_id, self._names[home], self._names[index], self._axis_names)
+            raise NodeMisplaced(node_id, self._names[home], self._names[index], self._axis_names.get(node_id, ""))
         return home == index
 
     def _wait(self, left_s: float | None) -> None:

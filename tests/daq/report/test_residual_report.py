@@ -26,6 +26,7 @@ from daq.report.html import page, paragraph, table
 from daq.report.plots import draw_fit
 from daq.report.residual import _gear_sentence, error_change_text, residual_document, summary
 from daq.report.residual_page import DOCUMENT, PAGE, residual_page, save_report
+from daq.report.schemas import ResidualReport
 from daq.report.text import json_text
 from daq.workflow import fit as fit_module
 from daq.workflow.fit import Fit, calibration_of, fit
@@ -293,6 +294,7 @@ def test_the_document_is_complete_and_described(closed: Closed, checkout: Path) 
         assert f"`{key}`" in described, key
     assert document["filter"]["position_cutoff_hz"] == closed.fitted.cell.conditioning.position_cutoff_hz
     assert set(document["before"]) == set(document["after"]) == set(turn["before"])
+    ResidualReport.model_validate_json(json_text(document))
 
 
 def test_what_to_check_comes_first(closed: Closed) -> None:
