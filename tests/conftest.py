@@ -109,13 +109,16 @@ def reports_match_their_schemas() -> Iterator[None]:
     def noted(words: list[str], json_wanted: bool) -> int:
         nonlocal running
         running = words[0] if words else ""
-        return run(words, json_wanted)
+        try:
+            return run(words, json_wanted)
+        finally:
+            running = ""
 
     def spelled(document: Any) -> str:
         text = spell(document)
         if running in REPORTS:
             # Bytes of file names that are not UTF-8 are spelled \\udcff, which not every reader of JSON takes.
-            TypeAdapter(REPORTS[running]).validate_json(text.replace("\\udc", "udc"))
+            TypeAdapter(REPORTS[running]).validate_json(text.replace("\\ud", "ud"))
         return text
 
     def described(error: failure.Failure) -> dict[str, Any]:

@@ -13,10 +13,26 @@ from typing import Any, Literal
 from pydantic import Field
 
 from daq.config.yaml_file import StrictModel
-from daq.workflow.calibration_file import CalibrationBody
-from ident.errors import Diagnosis
-
-Figure = float | None  #: null where it is not known
+from daq.jobs.session import SessionState
+from daq.report.controller_schemas import (
+    CertificateReport,
+    DriveChange,
+    DriveRollback,
+    FileChange,
+    FileRollback,
+    HistoryReport,
+)
+from daq.report.fit_schemas import (
+    CasesReport,
+    ContactReport,
+    Errors,
+    Figure,
+    FitReport,
+    ResidualReport,
+    ValidateReport,
+    WeighReport,
+)
+from daq.workflow.calibration_file import EffectEntry
 
 
 class ErrorReport(StrictModel):
@@ -177,398 +193,274 @@ class InfoReport(StrictModel):
     attachments: dict[str, int] = Field(description="size of each [bytes]")
 
 
-class Errors(StrictModel):
-    """Relative errors [%], null for an axis that did not move."""
-
-    axes: list[Figure]
-    total: Figure
-
-
-class ComparedGain(StrictModel):
-    """A gain by another estimator."""
+class FleetGain(StrictModel):
+    """A gain of a cell of the fleet."""
 
     axis: str
-    value: float
-    std_percent: Figure
-
-
-class ComparedFit(StrictModel):
-    """The paper's total least squares on the same rows."""
-
-    gains: list[ComparedGain]
-    condition: Figure
-
-
-class OwnTorque(StrictModel):
-    """Slope of the drive's own torque over the current."""
-
-    axis: str
-    slope: Figure
-    std: Figure = None
-    ratio: Figure = None
-    ratio_std: Figure = None
-    readings: int = 0
-
-
-class RemovedParameter(StrictModel):
-    """Parameter that is not essential."""
-
-    name: str
-    std_percent: Figure
-
-
-class GainWords(StrictModel):
-    """Verdict on how well the data show a gain."""
-
-    axis: str
-    std_percent: Figure
-    verdict: str
-    seen_by: list[str]
-    words: str
-
-
-class Trial(StrictModel):
-    """One estimator under one filter."""
-
-    estimator: str
-    position_cutoff_hz: float
-    decimation_cutoff_hz: float
-    gains: list[ComparedGain] | None
-    relative_error_percent: Figure = None
-    reason: str = ""
-
-
-class FitReport(CalibrationBody):
-    """`fit`."""
-
-    compared: dict[Literal["tls"], ComparedFit]
-    torque_channel: tuple[OwnTorque, ...] = ()
-    removed: list[RemovedParameter]
-    verdicts: list[GainWords]
-    comparison: tuple[Trial, ...] = ()
-
-
-class CaseReport(CalibrationBody):
-    """One case of the paper."""
-
-    title: str
-    known: str
-    removed: list[RemovedParameter]
-
-
-class CasesReport(StrictModel):
-    """`fit --cases`."""
-
-    cases: dict[str, CaseReport]
-
-
-class MotorNoise(StrictModel):
-    """Noise floor of one motor."""
-
-    axis: str
-    noise: float = Field(description="in the unit of the current reference")
-    source: str
-    std_percent: Figure
-    dwells: int | None
-    pairs: int | None
-    degrees_of_freedom: Figure
-    left: Figure = Field(description="what the last model leaves in motion")
-    refuted: bool
-
-
-class NoiseFloor(StrictModel):
-    """Error that noise alone would leave."""
-
-    motors: list[MotorNoise | None]
-    relative_error_percent: Errors
-    holdout_error_percent: Errors | None
-
-
-class Skew(StrictModel):
-    """Delay of currents against positions [s]."""
-
-    seconds: float
-    std: float
-
-
-class GearLossEntry(StrictModel):
-    """Which side of a gear drives, and its loss."""
-
-    axis: str
-    motoring_rows: Figure
-    motoring_torque: Figure
-    loss: Figure
-    loss_std: Figure
-    efficiency: Figure
-    gain_factor: Figure
-    hidden_shift: Figure
-    gain_carries_it: bool
-
-
-class LeftOutRun(StrictModel):
-    """Error of one run by a fit of the others, or why there is none."""
-
-    run: str
-    error_percent: Errors | None
-    reason: str | None
-
-
-class LeftOutRuns(StrictModel):
-    """Errors of runs left out in turn."""
-
-    error_percent: Errors | None
-    runs: list[LeftOutRun]
-
-
-class ModelErrors(StrictModel):
-    """Errors of one model."""
-
-    relative_error_percent: Errors
-    cross_validated_error_percent: Errors
-    left_out_runs: LeftOutRuns | None
-    holdout_error_percent: Errors | None
-
-
-class ChangedGain(StrictModel):
-    """A gain before and after effects."""
-
-    axis: str
-    unit: str
-    before: float
-    before_std: Figure
-    after: float
-    after_std: Figure
-    choice_std: Figure
-    change_percent: Figure
-    change_std_percent: Figure
-    significant: bool
-
-
-class Coefficient(StrictModel):
-    """Linear parameter of an effect."""
-
-    name: str
     value: float
     std: Figure
+    std_percent: Figure
     unit: str
 
 
-class PlacedEffectEntry(StrictModel):
-    """An effect on an axis."""
+class FleetEffect(StrictModel):
+    """An accepted effect."""
 
-    effect: str
+    name: str
     axis: str
-    settings: dict[str, float]
-    coefficients: list[Coefficient]
 
 
-class FindingEntry(PlacedEffectEntry):
-    """Result of testing one effect on one axis."""
+class FleetFailure(StrictModel):
+    """Why a cell has no calibration."""
 
-    variable: str
-    probability: float
-    folds_better: float
-    explained: Figure
+    kind: str
+    text: str
+
+
+class FleetCell(StrictModel):
+    """One cell in one configuration."""
+
+    cell: str
+    configuration_sha256: str | None
+    configurations: int
+    fit: list[str]
+    holdout: list[str]
+    gains: list[FleetGain]
+    worst: FleetGain | None
+    error_percent: Figure
+    error_on: Literal["holdout", "fit"] | None
+    effects: list[FleetEffect]
+    partial: bool | None
+    seconds: float
+    kept: bool
+    calibration: str | None
+    exit_code: int
+    error: FleetFailure | None
+
+
+class FleetReport(StrictModel):
+    """`fleet`."""
+
+    cells: list[FleetCell]
+    fitted: int
+    failed: int
+
+
+class ImportReport(StrictModel):
+    """`import`."""
+
+    log: str
+    samples: int
+    lost_cycles: int
+    missing: list[int]
+    valid: bool
+    reason: str
+    partial: bool
+    wall_minus_monotonic_ns: int | None
+    timing: Stamps | None
+    remarks: list[str]
+
+
+class SalvageReport(StrictModel):
+    """`salvage`."""
+
+    log: str
+    partial: bool
+    samples: int
+    duration_s: float
+    lost_cycles: int
+    missing: list[int]
+    valid: bool
+    reason: str
+    left_out_bytes: int
+    damage: str
+
+
+class TableReport(StrictModel):
+    """`export log`."""
+
+    log: str
+    table: str
+    format: str
+    rows: int
+    columns: list[str]
+    partial: bool
+    valid: bool
+
+
+class BagReport(StrictModel):
+    """`export bag`."""
+
+    log: str
+    bag: str
+    duration_s: float
+    messages: dict[str, int]
+    effort: bool
+    partial: bool
+    valid: bool
+
+
+class ShiftedParameter(StrictModel):
+    """Identified parameter, and the nearest one of a physical robot."""
+
+    name: str
+    identified: float
+    physical: float
+    standard_deviations: Figure
+
+
+class UrdfJoint(StrictModel):
+    """Body and friction of one moving joint."""
+
+    name: str
+    link: str
+    mass_kg: float
+    centre_m: list[float]
+    inertia_kg_m2: list[list[float]] | list[float]
+    damping: float
+    friction: float
+    smallest_eigenvalue: float
+    prior_assumed: bool
+
+
+class NotInUrdf(StrictModel):
+    """Parameter that a URDF cannot hold."""
+
+    name: str
+    value: float
+    unit: str
+
+
+class UrdfReport(StrictModel):
+    """`export urdf`."""
+
+    urdf: str
+    calibration: str
+    same_configuration: bool | None
+    exact: bool
+    torque_change_percent: Errors
+    shifts: list[ShiftedParameter]
+    margin: float
+    joints: list[UrdfJoint]
+    merged_links: list[str]
+    not_in_urdf: list[NotInUrdf]
+    effects_left_out: list[str]
+
+
+class KeyReport(StrictModel):
+    """`sign key`."""
+
+    name: str
+    secret_key: str
+    public_key: str
+
+
+class SignatureReport(StrictModel):
+    """`sign calibration`."""
+
+    calibration: str
+    signature: str
+    name: str
+
+
+class SignersReport(StrictModel):
+    """`sign check`."""
+
+    signers: list[str]
+    signatures_needed: int
+
+
+class DryRunReport(StrictModel):
+    """`recalibrate --dry-run`."""
+
+    dry_run: Literal[True]
+    remark: str
+    steps: list[str]
+
+
+class RefusedJob(StrictModel):
+    """`recalibrate` where no session was begun."""
+
+    outcome: str
+    exit_code: int
+    remark: str
+    to_do: list[str]
+
+
+class JobReport(SessionState):
+    """`recalibrate`: the state of its session, and what is left to do."""
+
+    remark: str
+    to_do: list[str]
+    folder: str
+
+
+class DemoGain(StrictModel):
+    """A gain beside the truth of the simulated cell."""
+
+    axis: str
+    nameplate: float
+    identified: float
+    std_percent: Figure
+    truth: float
+    error_percent: float
+    paper_tls: Figure
+
+
+class DemoPlan(StrictModel):
+    """A plan of the demonstration."""
+
+    moves: int
+    condition: float
+    predicted_std_percent: list[Figure]
+
+
+class DemoLog(StrictModel):
+    """A log of the demonstration."""
+
+    log: str
+    samples: int
+    lost_cycles: int
+    valid: bool
+
+
+class DemoReport(StrictModel):
+    """`demo`."""
+
+    gains: list[DemoGain]
+    effect: FleetEffect | None
+    effects: list[EffectEntry]
     error_before_percent: Figure
     error_after_percent: Figure
-    error_fall: Figure
-    held_out_fall: Figure
-    passed: bool
-    share_of_excess: Figure
-    refusals: list[str]
-    ambiguity: list[str] | None
-
-
-class AsideEntry(FindingEntry):
-    """Finding that passed and did not join the model."""
-
-    reason: str
-
-
-class DetectionLimit(StrictModel):
-    """Torque that an effect needs to be detected, root mean square in motion."""
-
-    axis: str
-    rms: Figure
-    unit: str
-
-
-class TurnEntry(StrictModel):
-    """One turn of the loop."""
-
-    accepted: FindingEntry | None
-    added: list[PlacedEffectEntry]
-    removed: list[str]
-    before: ModelErrors | None
-    after: ModelErrors | None
-    gain_changes: list[ChangedGain] | None
-    findings: list[FindingEntry]
-    structures: list[FindingEntry]
-    set_aside: list[AsideEntry]
-    detection_limits: list[DetectionLimit]
-
-
-class ResidualReport(CalibrationBody):
-    """`residual`, and the body of `residual.json`."""
-
-    summary: list[str]
-    axes: list[str]
-    metric: str
-    noise_floor: NoiseFloor
-    time_skew: Skew | None
-    gear_loss: list[GearLossEntry]
-    before: ModelErrors
-    after: ModelErrors
-    gain_changes: list[ChangedGain]
-    worse_holdout: bool | None
-    turns: list[TurnEntry]
-
-
-class ValidatedLog(StrictModel):
-    """Errors of one log."""
-
-    log: str
-    sha256: str
-    seen_by_fit: bool
-    partial: bool
-    held_out: bool
-    same_configuration: bool
-    rows: int
-    relative_error_percent: Errors
-    picture: str | None
-
-
-class Together(StrictModel):
-    """Errors of all logs together."""
-
-    relative_error_percent: Errors
-
-
-class CheckedLog(StrictModel):
-    """One log under every calibration."""
-
-    log: str
-    condition: Figure
-    relative_error_percent: dict[str, Errors | None]
-    left_out: str | None
-    seen_by: list[str]
-
-
-class FoundMass(StrictModel):
-    """Mass of a payload by one calibration, or why it was not found."""
-
-    reason: str = ""
-    mass_kg: Figure = None
-    std_percent: Figure = None
-    std_with_gains_percent: Figure = None
-    error_percent: Figure = None
-
-
-class CheckedPayload(StrictModel):
-    """A weighed payload."""
-
-    log: str
-    payload: str
-    mounting: str
-    weighed_kg: Figure
-    with_bare_runs: bool
-    masses: dict[str, FoundMass]
-
-
-class ValidateReport(StrictModel):
-    """`validate`."""
-
-    cell: str
-    axes: list[str]
-    filter: dict[str, int | float | list[float]]
-    fit_relative_error_percent: Errors
-    logs: list[ValidatedLog]
-    together: Together | None
-    calibrations: list[str]
-    diagnoses: list[Diagnosis]
-    runs: list[CheckedLog]
-    payloads: list[CheckedPayload]
-
-
-class Acknowledged(StrictModel):
-    """A change that was explained."""
-
-    since: str
-    at: str
-    who: str
-    why: str
-
-
-class HistoryPoint(StrictModel):
-    """One calibration of a gain; the columns of `--csv`."""
-
-    axis: str
-    recorded: str
-    gain: float
-    std: float
-    unit: str
-    nameplate: float
-    change_percent: Figure
-    change_sigmas: Figure
-    change_probability: Figure
-    deviation_sigmas: Figure
-    cusum_up: float
-    cusum_down: float
-    trend_sigmas: Figure
-    alarm: str | None
-    baseline: Figure
-    applied_at: str | None
-    applied_by: str | None
-    applied_to: str | None
-    error_percent: Figure
-    holdout_percent: Figure
-    rows: int
-    method: str
-    software: str
-    configuration_sha256: str
-    created: str
-    entered: str
-    digest: str
-
-
-class HistoryAxis(StrictModel):
-    """One gain over time."""
-
-    axis: str
-    unit: str
-    dispersion: Figure
-    alarmed: bool
-    alarm: str | None
-    since: str | None
-    change_percent: Figure
-    change_sigmas: Figure
-    baseline: Figure
-    baseline_std: Figure
-    acknowledged: list[Acknowledged]
-    points: list[HistoryPoint]
-
-
-class HistoryReport(StrictModel):
-    """`history`."""
-
-    cell: str
-    calibrations: int
-    in_force: str | None
-    chart: dict[str, float] = Field(description="limits of the control chart")
-    pattern: str
-    questions: list[str]
-    axes: list[HistoryAxis]
-    audit: dict[str, Any] | None = Field(None, description="with --verify")
+    error_before_percent_axes: list[Figure] | None
+    error_after_percent_axes: list[Figure] | None
+    plans: list[DemoPlan]
+    logs: list[DemoLog]
+    controller_diff: str
+    applied: bool
+    seconds: float
 
 
 REPORTS: dict[str, Any] = {
+    "demo": DemoReport,
     "scan": ScanReport,
     "plan": PlanReport,
     "record": RecordReport,
     "fit": FitReport | CasesReport,
     "residual": ResidualReport,
     "validate": ValidateReport,
+    "report": CertificateReport,
+    "apply": FileChange | DriveChange,
+    "rollback": FileRollback | DriveRollback,
     "info": InfoReport,
     "history": HistoryReport,
+    "recalibrate": DryRunReport | JobReport | RefusedJob,
+    "sign": KeyReport | SignatureReport | SignersReport,
+    "fleet": FleetReport,
+    "salvage": SalvageReport,
+    "import": ImportReport,
+    "export": TableReport | BagReport | UrdfReport,
+    "weigh": WeighReport,
+    "contact": ContactReport,
 }
 """Types of the documents by the verb that prints them."""

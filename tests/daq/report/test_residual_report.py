@@ -22,11 +22,11 @@ from daq.environment import shipped_configurations
 from daq.errors import EffectsRefuted, ExitCode, OutputFailed, UsageError
 from daq.report import residual_page as residual_page_module
 from daq.report.effect_names import WORDS, effect_text, other_axis
+from daq.report.fit_schemas import ResidualReport
 from daq.report.html import page, paragraph, table
 from daq.report.plots import draw_fit
 from daq.report.residual import _gear_sentence, error_change_text, residual_document, summary
 from daq.report.residual_page import DOCUMENT, PAGE, residual_page, save_report
-from daq.report.schemas import ResidualReport
 from daq.report.text import json_text
 from daq.workflow import fit as fit_module
 from daq.workflow.fit import Fit, calibration_of, fit

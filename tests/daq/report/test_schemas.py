@@ -14,10 +14,7 @@ from daq.report.schemas import REPORTS, ErrorReport
 from ident.calibration import Source
 from ident.errors import Diagnosis
 
-UNDESCRIBED = {
-    *("apply", "rollback", "report", "monitor", "explain-emcy", "recalibrate", "sign", "fleet", "salvage", "import"),
-    *("export", "weigh", "contact", "demo"),
-}
+UNDESCRIBED = {"monitor", "explain-emcy"}
 """Verbs with `--json` whose document has no schema yet."""
 
 
