@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from pydantic import BaseModel, TypeAdapter
+from pydantic import TypeAdapter
 from sphinx.application import Sphinx
 
 from daq.cli.app import build_app
@@ -24,6 +24,7 @@ from daq.config.cell_schema import CellModel
 from daq.config.drive import DriveModel
 from daq.config.import_description import ImportDescription
 from daq.errors import DaqError, exit_code
+from daq.report.schemas import REPORTS, ErrorReport
 from daq.simulation.simulation_file import SimulationModel
 from daq.workflow.calibration_file import CalibrationDocument
 from daq.writeback.gates.table import GATES
@@ -32,14 +33,16 @@ from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect
 from ident.errors import IdentificationError
 
-SCHEMAS: dict[str, tuple[str, type[BaseModel]]] = {
+SCHEMAS: dict[str, tuple[str, Any]] = {
     "cell": ("Cell file", CellModel),
     "drive-profile": ("Drive profile", DriveModel),
     "calibration": ("Calibration", CalibrationDocument),
     "import": ("Import description", ImportDescription),
     "simulation": ("Simulation file", SimulationModel),
+    "error": ("Error of any verb under --json", ErrorReport),
+    **{f"report-{verb}": (f"What {verb} prints under --json", model) for verb, model in REPORTS.items()},
 }
-"""File formats by the name of their schema: title and model."""
+"""Title and model of each schema, by its name."""
 FRONT_DOORS = ("ident", "daq", "drivers")
 MARK = re.compile(r"^<!-- generated: ([a-z ]+) -->$", re.MULTILINE)
 
@@ -143,7 +146,7 @@ def schema_list() -> str:
     )
 
 
-def _schema(model: type[BaseModel]) -> dict[str, Any]:
+def _schema(model: Any) -> dict[str, Any]:
     return TypeAdapter(model).json_schema()
 
 

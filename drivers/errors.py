@@ -21,7 +21,7 @@ Where an error ends a motion, each part of the stop that could not be confirmed 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 WHILE = "while "  #: Prefix of the notes that report what a stop, or the closing of a network, could not confirm
@@ -40,11 +40,10 @@ class NamedNode(Protocol):
 Node = int | NamedNode
 
 
-def node_label(node: Node) -> str:
-    """Name a node in a message: "J3 (node 3)", or "node 3" where the axis is not known."""
-    if isinstance(node, int):
-        return f"node {node}"
-    return f"{node.name} (node {node.node_id})" if node.name else f"node {node.node_id}"
+def node_label(node: Node, names: Mapping[int, str] | None = None) -> str:
+    """Name a node in a message: "J3 (node 3)", or "node 3" where the axis is not known; `names` are by node id."""
+    node_id, name = (node, (names or {}).get(node)) if isinstance(node, int) else (node.node_id, node.name)
+    return f"{name} (node {node_id})" if name else f"node {node_id}"
 
 
 class DriverError(Exception):
@@ -108,11 +107,11 @@ class NodeMissing(DriverError):
 class NodeMisplaced(DriverError):
     """A node is heard on another bus than its own."""
 
-    def __init__(self, node_id: int, expected: str, found: str) -> None:
+    def __init__(self, node_id: int, expected: str, found: str, axis: str = "") -> None:
         super().__init__(
-            f"node {node_id} is heard on bus {found}, the cell configuration has it on bus {expected}: it is wired to "
-            "the other bus, two amplifiers have that node id, or both CAN interfaces are on one wire; "
-            "`drivegain scan` shows the nodes of each bus"
+            f"{node_label(node_id, {node_id: axis})} is heard on bus {found}, the cell configuration has it on bus "
+            f"{expected}: it is wired to the other bus, two amplifiers have that node id, or both CAN interfaces are "
+            "on one wire; `drivegain scan` shows the nodes of each bus"
         )
         self.node_id = node_id
         self.expected = expected

@@ -17,9 +17,13 @@ from typing import Any
 import pytest
 import yaml
 from hypothesis import settings
+from pydantic import TypeAdapter
 from xdist.scheduler import LoadFileScheduling
 
+from daq.cli import app, failure
 from daq.config import yaml_file
+from daq.report.schemas import REPORTS, ErrorReport
+from daq.report.text import json_text
 
 # A busy machine is no reason to fail: no test asserts on a clock. And what passed once passes again.
 settings.register_profile("drivegain", deadline=None, derandomize=True)
@@ -93,6 +97,39 @@ def parsed_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(yaml_file, "_Loader", Loader)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def reports_match_their_schemas() -> Iterator[None]:
+    """Hold every document that a verb prints under `--json`, in any test, against its published schema."""
+    running = ""
+    run, spell, describe = app._run, json_text, failure.Failure.document
+
+    def noted(words: list[str], json_wanted: bool) -> int:
+        nonlocal running
+        running = words[0] if words else ""
+        try:
+            return run(words, json_wanted)
+        finally:
+            running = ""
+
+    def spelled(document: Any) -> str:
+        text = spell(document)
+        if running in REPORTS:
+            # Bytes of file names that are not UTF-8 are spelled \\udcff, which not every reader of JSON takes.
+            TypeAdapter(REPORTS[running]).validate_json(text.replace("\\ud", "ud"))
+        return text
+
+    def described(error: failure.Failure) -> dict[str, Any]:
+        document = describe(error)
+        ErrorReport.model_validate(document)
+        return document
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(app, "_run", noted)
+        patch.setattr("daq.cli.verb.json_text", spelled)
+        patch.setattr(failure.Failure, "document", described)
         yield
 
 

@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
-from daq.cli.terminal import WRITTEN, at_most_one, delay_signals, interruptible, write_output
+from daq.cli.terminal import WRITTEN, at_most_one, delay_signals, interruptible, output_console, write_output
 from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
 from daq.environment import login
 from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, DaqError, ExitCode, UsageError
@@ -134,7 +133,7 @@ def apply_to(
         edit = proposal.edit
         known = query_history(declared, edit.subject, request, edit.changes)
         if not json:
-            show(proposal, Console(), known)
+            show(proposal, output_console(), known)
 
         def enter(ledger: Ledger) -> None:
             # A write of an earlier command too, that was killed before it could enter it.
@@ -165,7 +164,7 @@ def _show_outcome(proposal: Proposal[E], written: Written | None, audit: Path | 
     from daq.writeback.drive_target import DriveTarget
     from daq.writeback.gates.gate import Gate
 
-    console = Console(soft_wrap=True, highlight=False, markup=False)
+    console = output_console()
     edit, target = proposal.edit, proposal.target
     if proposal.refusals:
         # The review of a changed base is all that is missing, and this dry run is that review.
@@ -289,10 +288,10 @@ def rollback(
         if json:
             print_json({**describe_file_rollback(written), "audit": None if audit is None else str(audit)})
             return
-        console = Console(soft_wrap=True, highlight=False)
+        console = output_console()
         show_file_rollback(written, console)
         if audit is None:
-            console.print("Not in an audit: neither a cell nor --audit was given.", markup=False)
+            console.print("Not in an audit: neither a cell nor --audit was given.")
 
 
 def rollback_drives(
@@ -304,7 +303,7 @@ def rollback_drives(
     from daq.writeback.drive_target import record_folder
 
     written: Written | None = None
-    console = Console(soft_wrap=True, highlight=False, markup=False)
+    console = output_console()
     with drives_on_the_bus(declared, saving) as drives:
         planned = drives.plan_rollback()
         if not json:

@@ -66,6 +66,7 @@ def fit_verb(
     compare: CompareOption = False,
     holdout: HoldoutOption = None,
     out: OutOption = None,
+    report: Annotated[Path | None, typer.Option("--report", help="Folder for report.html, the certificate.")] = None,
     pictures: PicturesOption = None,
     cell: CellOption = None,
     accept_losses: AcceptLossesOption = False,
@@ -85,11 +86,12 @@ def fit_verb(
 
     if cases is not None:
         other = {"known": known is not Known.MASS, "gains": gains is not Gains.FREE}  # every case has its own
-        at_most_one(cases=cases, method=method, **other, out=out, pictures=pictures)
+        at_most_one(cases=cases, method=method, **other, out=out, report=report, pictures=pictures)
         _fit_cases(logs, holdout or (), None if cell is None else load_cell(cell), essential, cases, json=json)
         return
     check_folder(out)
     check_output(out, (*logs, *(holdout or ()), cell), CALIBRATION)
+    check_report(report)
     with status("identifying"):
         described = None if cell is None else load_cell(cell)
         fixed = gains is Gains.FIXED
@@ -107,6 +109,8 @@ def fit_verb(
             found = replace(essential_fit(found.fitted, essential), payloads=found.payloads)
         calibration = calibration_of_case(found, datetime.now(UTC))
     _save(found.fitted, calibration, out, pictures)
+    if report is not None:
+        _save_certificate(found.fitted, calibration, report)
     comparison = None
     if compare:
         with status("comparing estimators") as report_step:
@@ -114,9 +118,10 @@ def fit_verb(
     if json:
         print_json(fit_document(found, calibration, comparison))
     else:
-        print_view(fit_view(found, calibration, comparison), out, pictures)
-        held_out = [word for log in holdout or () for word in ("--holdout", log)]
-        say_next("drivegain", "residual", *logs, *held_out, "--out", out or "calibration.yaml", "--report", "report")
+        print_view(fit_view(found, calibration, comparison), out, report, pictures)
+        same = [word for log in holdout or () for word in ("--holdout", log)]
+        same += [] if cell is None else ["--cell", cell]
+        say_next("drivegain", "residual", *logs, *same, "--out", out or "calibration.yaml", "--report", "report")
 
 
 def _fit_cases(
@@ -249,6 +254,19 @@ RESIDUAL = Verb(
     residual_verb,
     "drivegain residual unloaded.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml --report report",
 )
+
+
+def _save_certificate(fitted: Fit, calibration: Calibration, folder: Path) -> None:
+    """Write the certificate of a fit as the page of its report."""
+    from daq.cli.terminal import write_output
+    from daq.files import replace_file
+    from daq.report.certificate import certify
+    from daq.report.certificate_page import certificate_page
+    from daq.report.residual_page import PAGE, beside_nameplate
+
+    page = certificate_page(certify(calibration, beside_nameplate(fitted, calibration)))
+    with write_output(folder):
+        replace_file(folder / PAGE, page.encode())
 
 
 def _save(fitted: Fit, calibration: Calibration, out: Path | None, pictures: Path | None) -> None:

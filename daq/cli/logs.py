@@ -14,14 +14,14 @@ NewLogOption = Annotated[Path, typer.Option("--out", help="Log to write (.mcap);
 
 def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: JsonOption = False) -> None:
     """Show what is in a log: role and payload, duration, losses, moves, validity."""
-    from daq.cli.terminal import print_view
-    from daq.report.log import describe_log, log_table
+    from daq.cli.terminal import output_console, print_view
+    from daq.report.log import describe_log, log_lines
 
     description = describe_log(log)
     if json:
         print_json(description)
     else:
-        print_view([log_table(description)])
+        print_view(log_lines(description, output_console().width))
 
 
 INFO = Verb("info", info, "drivegain info loaded.mcap")

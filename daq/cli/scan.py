@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from daq.config.cell import Cell
     from drivers.canopen.network import CanopenNetwork
     from drivers.profiles.profile import Axis
+    from drivers.profiles.scale import ScaleReading
 
 
 def scan_verb(
@@ -28,26 +29,30 @@ def scan_verb(
 ) -> None:
     """List the nodes on the cell's buses with identity, name and state, and compare them with the cell file.
 
-    Every node id is tried on every bus, so that an amplifier on the wrong bus is found. Nothing is changed without
+    Every node id is tried on every bus, so that an amplifier on the wrong bus is found. Nameplate gains are compared
+    with the motors' data in the drives and with the controller's file. Nothing is changed without
     --reset-faults; find out why an axis is in fault before you reset it.
     """
-    from rich.console import Console
-
     from daq.cli.terminal import print_view
     from daq.config.bus import bus_parts, cell_address, drive_axes
     from daq.config.cell_file import load_cell
+    from daq.errors import ConfigurationInconsistent
     from daq.report.bus import current_signals, scan_rows, scan_view
+    from daq.workflow.nameplates import check_nameplates
     from drivers.canopen.network import CanopenNetwork
     from drivers.errors import NodeMissing
     from drivers.profiles.cia402 import State
 
     declared = load_cell(cell)
     found, reset = {}, []
+    scales: dict[str, ScaleReading | None] = {}
     causes: dict[str, str] = {}
     for part in bus_parts(declared):
         axes = tuple(axis for axis in drive_axes(declared) if axis.node_id in part.node_ids)
         with CanopenNetwork(part.address, axes) as network:
             found[part.name] = network.scan(wait_s=wait)
+            here = {node.node_id for node in found[part.name]}
+            scales |= {axis.name: _scale_of(network, axis) for axis in axes if axis.node_id in here}
         in_fault = {node.node_id for node in found[part.name] if node.state is State.FAULT}
         faulty = tuple(axis for axis in axes if axis.node_id in in_fault)
         if reset_faults and faulty:
@@ -57,20 +62,36 @@ def scan_verb(
             with CanopenNetwork(part.address, axes) as network:
                 found[part.name] = network.scan(wait_s=wait)
             reset += [axis.name for axis in faulty]
+    mistyped: list[str] = []
+    try:
+        check_nameplates(cell, declared, [scales.get(name) for name in declared.axis_names])
+    except ConfigurationInconsistent as error:
+        mistyped.append(str(error))
     rows = [row for name, nodes in found.items() for row in scan_rows(declared, nodes, name)]
     if json:
         address = str(cell_address(declared))
-        print_json(
-            {"bus": address, "nodes": rows, "reset": reset, "faults": causes, "current": current_signals(declared)}
-        )
+        signals = current_signals(declared)
+        cause = {"reset": reset, "faults": causes}
+        print_json({"bus": address, "nodes": rows, **cause, "current": signals, "mistyped": mistyped})
     else:
-        print_view(scan_view(declared, rows, causes, Console().width))
+        print_view(scan_view(declared, rows, causes, mistyped))
     absent = {row["node_id"] for row in rows if row["verdict"] == "missing"}
     missing = [axis for axis in drive_axes(declared) if axis.node_id in absent]
     if missing:
         raise NodeMissing(missing, tuple(node.node_id for nodes in found.values() for node in nodes), wait)
-    if not json and all(row["verdict"] == "ok" for row in rows):
+    if not json and not mistyped and all(row["verdict"] == "ok" for row in rows):
         say_next("drivegain", "plan", cell, "--out", "plan.yaml")
+
+
+def _scale_of(network: CanopenNetwork, axis: Axis) -> ScaleReading | None:
+    """Read the scale of a drive's current; None where it cannot be read, which `record` reports."""
+    from drivers.errors import DriverError
+    from drivers.profiles.scale import read_scale
+
+    try:
+        return read_scale(network.link.objects(axis.node_id), axis.profile)
+    except DriverError:
+        return None
 
 
 def _fault_of(network: CanopenNetwork, axis: Axis) -> str:

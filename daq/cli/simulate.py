@@ -198,9 +198,7 @@ def demo(
     import time
     from datetime import UTC, datetime
 
-    from rich.console import Console
-
-    from daq.cli.terminal import print_view, show_steps, write_output
+    from daq.cli.terminal import output_console, print_view, show_steps, write_output
     from daq.files import replace_file
     from daq.report.proposal import show as show_proposal
     from daq.report.text import json_text
@@ -218,7 +216,7 @@ def demo(
         print_json(document)
         return
     print_view(demo_view(outcome))
-    show_proposal(outcome.proposal, Console(highlight=False))
+    show_proposal(outcome.proposal, output_console())
     if outcome.written is not None:
         typer.echo(f"Written to the copy {outcome.written.edit.subject}.")
     typer.echo(f"\nLogs, calibration.yaml, pictures, summary.json and report/report.html are in {out}.")

@@ -151,10 +151,11 @@ def bus_parts(cell: Cell) -> tuple[drivers.BusPart, ...]:
 
     if not cell.buses:
         raise _no_bus(cell, "no bus")
-    return tuple(
-        drivers.BusPart(bus.name, _address(bus), frozenset(axis.node_id for axis in axes if axis.node_id is not None))
-        for bus, axes in cell.wiring
-    )
+    parts = []
+    for bus, axes in cell.wiring:
+        names = {axis.node_id: axis.name for axis in axes if axis.node_id is not None}
+        parts.append(drivers.BusPart(bus.name, _address(bus), frozenset(names), names))
+    return tuple(parts)
 
 
 def bus_loads(cell: Cell) -> tuple[tuple[Bus, BusLoad], ...]:

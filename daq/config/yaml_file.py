@@ -242,11 +242,20 @@ def read_model(document: Document, model: type[Model], folder: Path | None = Non
         # Through JSON, where a list may become a tuple and a word an enum although everything else is strict.
         return model.model_validate_json(json.dumps(document.tree), context=folder)
     except ValidationError as error:
+        page = f"; docs/reference/{model.reference} has every key" if model.reference else ""
+        required = [name for name, field in model.model_fields.items() if field.is_required()]
+        if len(required) > 1 and isinstance(document.tree, dict) and not document.tree.keys() & set(required):
+            raise SchemaMismatch(
+                document.name,
+                found=f"a file of another kind, with {', '.join(list(document.tree)[:MAX_EXPLAINED]) or 'no key'}",
+                expected=f"a file with {', '.join(required)}",
+                remedy=f"give the files in the order of the command's help (CELL comes first){page}",
+            ) from error
         items = error.errors(include_url=False)
         faults = [_fault(item, model) for item in items[:MAX_EXPLAINED]]
         # A list counts as empty when its items are wrong; the faults inside say enough.
         outer = {fault.path[:length] for fault in faults for length in range(len(fault.path))}
-        remedy = "correct the file" + (f"; docs/reference/{model.reference} has every key" if model.reference else "")
+        remedy = f"correct the file{page}"
         if len(items) > len(faults):
             remedy += f" ({len(items) - len(faults)} more faults are not listed)"
         inner = [fault for fault in faults if fault.path not in outer]

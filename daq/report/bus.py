@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich import box
-from rich.cells import cell_len
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from daq.config.bus import bus_loads, frame_bits
 from daq.config.cell import PacingMode
-from daq.report.text import picked, plain_table, printable
+from daq.report.text import picked, plain_table, printable, terminal_text
 from drivers.profiles.cia402 import State, decode
 from drivers.profiles.profile import TapPoint
 
@@ -28,19 +26,17 @@ ENABLED = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTIO
 FAULTY = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 
 
-def scan_view(cell: Cell, rows: list[dict[str, Any]], reset: Mapping[str, str], width: int) -> Iterator[RenderableType]:
-    """Table of the nodes on all buses, and what needs attention; at most `width` columns wide.
+def scan_view(
+    cell: Cell, rows: list[dict[str, Any]], reset: Mapping[str, str], mistyped: Sequence[str] = ()
+) -> Iterator[RenderableType]:
+    """Table of the nodes on all buses, and what needs attention.
 
-    `reset` has the fault of each axis that was reset.
+    `reset` has the fault of each axis that was reset, `mistyped` the nameplates that `plan` and `record` would refuse.
     """
-    table = scan_table(rows, width, several=len({row["bus"] for row in rows}) > 1)
-    yield table
-    shown = {str(column.header).lower() for column in table.columns}
-    if left_out := [heading for heading in _DISPENSABLE if heading not in shown]:
-        yield f"No room for {', '.join(left_out)}; --json has all columns."
+    yield scan_table(rows)
     for row in rows:
         if row["enabled"]:
-            name = f"node {row['node_id']}" + (f" ({printable(row['axis'])})" if row["axis"] else "")
+            name = f"{printable(row['axis'])} (node {row['node_id']})" if row["axis"] else f"node {row['node_id']}"
             yield Text(f"{name} IS ENABLED: its motor has torque and may move at any time.", "bold red")
     for name, fault in reset.items():
         yield Text(f"The fault of {printable(name)} was reset; it has no power. It was {printable(fault)}.")
@@ -50,6 +46,7 @@ def scan_view(cell: Cell, rows: list[dict[str, Any]], reset: Mapping[str, str], 
             "explain-emcy`) shows the cause. Remove it, then reset the fault with --reset-faults; nothing moves.",
             "yellow",
         )
+    yield from (Text(printable(text), "yellow") for text in mistyped)
     if (note := actual_current_note(cell)) is not None:
         yield Text(note, "yellow")
 
@@ -61,7 +58,7 @@ def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[s
     """Rows of the nodes of one bus, configured or found."""
     from drivers.canopen.link import nmt_name  # noqa: PLC0415 - `info` shows currents without the CAN library
 
-    homes = {axis.node_id: axis.bus for axis in cell.axes if axis.node_id is not None}
+    homes = {axis.node_id: axis for axis in cell.axes if axis.node_id is not None}
     axes = {axis.node_id: axis for axis in cell.axes if axis.node_id is not None and axis.bus == bus}
     nodes = {node.node_id: node for node in found}
     rows = []
@@ -72,7 +69,7 @@ def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[s
         if node is None:
             verdict = "missing"
         elif axis is None:
-            verdict = f"belongs on {homes[node_id]}" if node_id in homes else "not configured"
+            verdict = f"belongs on {homes[node_id].bus}" if node_id in homes else "not configured"
         else:
             verdict = "ok" if expected is None or expected == identity else "other identity"
         in_fault = node is not None and node.state in FAULTY
@@ -82,7 +79,7 @@ def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[s
             {
                 "bus": bus,
                 "node_id": node_id,
-                "axis": None if axis is None else axis.name,
+                "axis": homes[node_id].name if node_id in homes else None,
                 **(dict.fromkeys(_IDENTITY) if identity is None else picked(identity, *_IDENTITY)),
                 "device_name": None if node is None else node.device_name,
                 "nmt": None if node is None or node.nmt is None else nmt_name(node.nmt),
@@ -95,37 +92,31 @@ def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[s
     return rows
 
 
-_GAP = 3
-_DISPENSABLE = ("nmt", "vendor", "product", "serial", "state")
-"""Columns left out, in this order, where a terminal is too narrow; `--json` has them all."""
 _POWER = {True: "ENABLED", False: "off", None: "?"}
 
 
-def scan_table(rows: list[dict[str, Any]], width: int = 80, several: bool = False) -> Table:
-    """Table of the nodes, at most `width` columns wide; bus, node, axis, power and verdict are always shown."""
-    columns = {
-        **({"bus": [printable(row["bus"]) for row in rows]} if several else {}),
-        "node": [str(row["node_id"]) for row in rows],
-        "axis": [printable(row["axis"] or "") for row in rows],
-        "vendor": ["" if row["vendor_id"] is None else f"{row['vendor_id']:#x}" for row in rows],
-        "product": ["" if row["product_code"] is None else f"{row['product_code']:#x}" for row in rows],
-        "serial": ["" if row["serial"] is None else str(row["serial"]) for row in rows],
-        "nmt": [(row["nmt"] or "").lower() for row in rows],
-        "state": [(row["state"] or "").lower() for row in rows],
-        "power": [_POWER[row["enabled"]] for row in rows],
-        "verdict": [row["verdict"] for row in rows],
-    }
-    wide = {heading: max(map(cell_len, (heading, *texts))) for heading, texts in columns.items()}
-    for heading in _DISPENSABLE:
-        if sum(wide.values()) + _GAP * (len(wide) - 1) <= width:
-            break
-        del wide[heading], columns[heading]
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-    for heading, least in wide.items():
-        table.add_column(heading.upper() if heading == "nmt" else heading, no_wrap=True, min_width=least)
-    for row, texts in zip(rows, zip(*columns.values(), strict=True), strict=True):
+def scan_table(rows: list[dict[str, Any]]) -> Table:
+    """Table of the nodes; first what decides whether a recording can start, then the identity."""
+    several = len({row["bus"] for row in rows}) > 1
+    headings = ("node", "axis", "power", "verdict", "state", "vendor", "product", "serial", "NMT", "name")
+    columns = (*(("bus",) if several else ()), *headings)
+    table = plain_table(columns, left=range(len(columns)), keys=2 + several)
+    for row in rows:
+        cells = (
+            *((row["bus"],) if several else ()),
+            str(row["node_id"]),
+            row["axis"] or "",
+            _POWER[row["enabled"]],
+            row["verdict"],
+            (row["state"] or "").lower(),
+            "" if row["vendor_id"] is None else f"{row['vendor_id']:#x}",
+            "" if row["product_code"] is None else f"{row['product_code']:#x}",
+            "" if row["serial"] is None else str(row["serial"]),
+            (row["nmt"] or "").lower(),
+            row["device_name"] or "",
+        )
         style = "bold red" if row["enabled"] or row["verdict"] != "ok" else None
-        table.add_row(*map(Text, texts), style=style)
+        table.add_row(*map(terminal_text, cells), style=style)
     return table
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
 from rich.text import Text
 
 from daq.config.cell_file import cell_from_bundle
@@ -18,7 +17,7 @@ from daq.log.conversion import scaling
 from daq.log.metadata import Timing
 from daq.log.reader import LogReader
 from daq.report.bus import current_signals
-from daq.report.text import picked, printable
+from daq.report.text import entry_lines, picked, printable
 from drivers.stream.sample import EventKind
 
 _ROUTINE = {EventKind.MOVE_START, EventKind.MOVE_END, EventKind.NMT, EventKind.STATE}
@@ -111,14 +110,12 @@ def timing_text(timing: Timing) -> str:
     return f"{'resampled to' if timing.resampled else 'uniform at'} {timing.rate_hz:.6g} Hz: {', '.join(parts)}"
 
 
-def log_table(description: Mapping[str, Any]) -> Table:
-    """Table of a log's description, a line each; long values are folded."""
-    table = Table(show_header=False, box=None)
-    table.add_column(no_wrap=True)
-    table.add_column(overflow="fold")
+def log_lines(description: Mapping[str, Any], width: int) -> Iterator[Text]:
+    """Lines of a log's description, at most `width` columns wide where words allow it."""
+    indent = max(map(len, description)) + 2
     for key, value in description.items():
-        table.add_row(key.replace("_", " "), Text(printable(_readable(value))))
-    return table
+        text = printable(_readable(value)).replace("\n", " ")
+        yield from map(Text, entry_lines(key.replace("_", " "), text, indent, width))
 
 
 def _readable(value: Any) -> str:

@@ -9,12 +9,12 @@ from dataclasses import asdict
 from typing import Any
 
 from rich.console import Console
-from rich.syntax import Syntax
 from rich.table import Table
+from rich.text import Text
 
 from daq.ledger.judgement import NOTHING, Spread, judge
 from daq.report.gains import with_deviation
-from daq.report.text import WholeTable, picked, terminal_lines, terminal_text
+from daq.report.text import picked, plain_table, terminal_lines, terminal_text
 from daq.writeback.drive_target import DriveEdit
 from daq.writeback.file_target import FileEdit
 from daq.writeback.request import Edit, GainChange
@@ -34,19 +34,15 @@ def show(proposal: Proposal[E], console: Console, known: Spread = NOTHING) -> No
     console.print()
     if isinstance(edit, DriveEdit):
         for change, value in zip(edit.changes, edit.values, strict=True):
-            console.print(f"{change.key}: {value.value:.9g} -> {change.spelling}", markup=False, highlight=False)
+            console.print(f"{change.key}: {value.value:.9g} -> {change.spelling}")
     if isinstance(edit, FileEdit) and edit.diff:
         _show_diff(terminal_lines(edit.diff), console)
 
 
 def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING, place: str = "in the file") -> Table:
-    """Make the table of old and new gains, with the figures to judge a change by; it fits 80 columns."""
-    table = WholeTable()
-    table.collapse_padding = True
-    table.add_column("axis", no_wrap=True)
-    for heading in (place, "identified ± σ", "σ %", "Δ %", "Δ in σ", "nameplate", "off %"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("unit", no_wrap=True)
+    """Make the table of old and new gains, with the figures to judge a change by."""
+    headings = ("axis", place, "identified ± σ", "σ %", "Δ %", "Δ in σ", "nameplate", "off %", "unit")
+    table = plain_table(headings, left=(0, len(headings) - 1))
     judged = _by_axis(changes, known)
     for change in changes:
         sigmas, beyond_noise = judged.get(change.axis, (math.nan, False))
@@ -163,7 +159,12 @@ def _rollback_diff(edit: Edit) -> str:
 
 
 def _show_diff(diff: str, console: Console) -> None:
-    console.print(Syntax(diff, "diff", background_color="default", word_wrap=True))
+    """Print whole lines, also in a pipe, so that a number is never broken and a line can be copied."""
+    for line in diff.splitlines():
+        console.print(Text(line, style=_DIFF_STYLES.get(line[:1], "")), soft_wrap=True)
+
+
+_DIFF_STYLES = {"+": "green", "-": "red", "@": "cyan"}
 
 
 def _place(edit: Edit) -> str:

@@ -46,13 +46,16 @@ def save_report(
             replace_file(folder / name, text.encode())
 
 
+def beside_nameplate(fitted: Fit, calibration: Calibration) -> Comparison:
+    """Compare the gains of a fit with the nameplate: a fit reads no controller."""
+    unread = "The controller was not read; `drivegain report --cell CELL` compares with its gains."
+    return without_controller(calibration, unread, datetime.fromisoformat(calibration.created), fitted.cell)
+
+
 def residual_page(fitted: Fit, account: Account, calibration: Calibration, comparison: Comparison | None = None) -> str:
     """Build the certificate of a closed loop with the account of its turns folded below."""
     axes = fitted.cell.axis_names
-    if comparison is None:
-        unread = "The controller was not read; `drivegain report --cell CELL` compares with its gains."
-        created = datetime.fromisoformat(calibration.created)
-        comparison = without_controller(calibration, unread, created, fitted.cell)
+    comparison = comparison or beside_nameplate(fitted, calibration)
     errors = [(name, *map(percent_text, (*error.axes, error.total))) for name, error in error_rows(account)]
     sections, before = [], start_of(fitted)
     for step, turn in zip(fitted.steps, account.turns, strict=True):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from textwrap import wrap
 from typing import Any
 
 from rich import box
 from rich.cells import cell_len
-from rich.console import Console, ConsoleOptions, RenderResult
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
@@ -26,48 +27,115 @@ def terminal_text(text: str) -> Text:
 
 
 def terminal_lines(text: str) -> str:
-    """Lines for `rich.syntax`, which reads no markup: control characters except tabs spelled out, line ends as \\n."""
+    """Lines of a diff: control characters except tabs spelled out, line ends as \\n."""
     lines = text.splitlines()
     return "\n".join("".join(c if c.isprintable() or c == "\t" else f"\\x{ord(c):02x}" for c in line) for line in lines)
 
 
 class WholeTable(Table):
-    """Table without a frame that never cuts a value: where it is too wide, each value gets a line of its own."""
+    """Table without a frame that never cuts a value.
 
-    def __init__(self, title: Text | None = None) -> None:
+    Columns that a terminal has no room for follow below, beside the first `keys` columns again. Where not even one of
+    them fits beside those, each value gets a line of its own.
+    """
+
+    def __init__(self, title: Text | None = None, *, keys: int = 1) -> None:
         super().__init__(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+        self._keys = keys
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Render as a table, or as a paragraph a row: heading and value."""
+        """Render as one table, as several below each other, or as a paragraph a row: heading and value."""
         free = options.update(width=_UNBOUNDED, min_width=0, max_width=_UNBOUNDED)
-        cells = [[*column.cells] for column in self.columns]
-        needed = (_GAP - self.collapse_padding) * (len(cells) - 1)
-        for column, values in zip(self.columns, cells, strict=True):
-            widths = [Measurement.get(console, free, value) for value in (column.header, *values)]
-            needed += max(one.maximum if column.no_wrap else one.minimum for one in widths)
-        if needed <= options.max_width:
+        widths = []
+        for column in self.columns:
+            measured = [Measurement.get(console, free, value) for value in (column.header, *column.cells)]
+            widths.append(max(one.maximum if column.no_wrap else one.minimum for one in measured))
+        whole = range(len(widths))
+        self.collapse_padding = self.collapse_padding or self._width(whole, widths) > options.max_width
+        if self._width(whole, widths) <= options.max_width:
             yield from super().__rich_console__(console, options)
             return
         if self.title is not None:
             yield self.title
-        names = [str(column.header) for column in self.columns]
-        indent = max(map(cell_len, names))
-        for number, row in enumerate(zip(*cells, strict=True)):
+        blocks = self._blocks(widths, options.max_width)
+        for number, block in enumerate(blocks):
             if number:
                 yield ""
-            for name, value in zip(names, row, strict=True):
-                yield Text(f"{name}{' ' * (indent - cell_len(name) + 2)}{value}")
+            yield self._only(block)
+        if not blocks:
+            yield from self._paragraphs(options.max_width)
+
+    def _width(self, chosen: Collection[int], widths: list[int]) -> int:
+        return sum(widths[index] for index in chosen) + (_GAP - self.collapse_padding) * (len(chosen) - 1)
+
+    def _blocks(self, widths: list[int], room: int) -> list[list[int]]:
+        """Columns of the tables below each other; none where a column does not fit beside the keys."""
+        keys = list(range(self._keys))
+        blocks = [keys]
+        for index in range(self._keys, len(widths)):
+            if self._width([*keys, index], widths) > room:
+                return []
+            if self._width([*blocks[-1], index], widths) > room:
+                blocks.append(keys)
+            blocks[-1] = [*blocks[-1], index]
+        return blocks
+
+    def _only(self, chosen: list[int]) -> Table:
+        part = Table(box=self.box, show_edge=False, pad_edge=False, collapse_padding=self.collapse_padding)
+        for column in (self.columns[index] for index in chosen):
+            part.add_column(
+                column.header,
+                justify=column.justify,
+                no_wrap=column.no_wrap,
+                overflow=column.overflow,
+                ratio=column.ratio,
+            )
+        cells = [[*self.columns[index].cells] for index in chosen]
+        for row, values in zip(self.rows, zip(*cells, strict=True), strict=True):
+            part.add_row(*values, style=row.style)
+        return part
+
+    def _paragraphs(self, width: int) -> Iterator[RenderableType]:
+        names = [str(column.header) for column in self.columns]
+        indent = max(map(cell_len, names)) + 2
+        values = zip(*(column.cells for column in self.columns), strict=True)
+        for number, (row, cells) in enumerate(zip(self.rows, values, strict=True)):
+            if number:
+                yield ""
+            for name, value in zip(names, cells, strict=True):
+                yield Text("\n".join(entry_lines(name, str(value), indent, width)), style=row.style or "")
 
 
 _UNBOUNDED, _GAP = 10_000, 3  #: Columns of a line
 
 
+def entry_lines(name: str, text: str, indent: int, width: int) -> list[str]:
+    """Lines of a name and its text, broken at spaces alone; a word without room beside the name is below it.
+
+    Args:
+        name: of the entry.
+        text: printable, without line ends.
+        indent: columns of the longest name and the gap behind it.
+        width: columns of a line.
+    """
+    below = max(map(cell_len, text.split()), default=0) > width - indent
+    start = 2 if below else indent
+    broken = wrap(text, max(width - start, 1), break_long_words=False, break_on_hyphens=False)
+    lines = [f"{'':{start}}{line}" for line in broken or [""]]
+    return [name, *lines] if below else [f"{name}{' ' * (indent - cell_len(name))}{lines[0].lstrip()}", *lines[1:]]
+
+
 def plain_table(
-    headings: Iterable[str], *, title: str | None = None, left: Collection[int] = (0,), wrap: Collection[int] = ()
+    headings: Iterable[str],
+    *,
+    title: str | None = None,
+    left: Collection[int] = (0,),
+    wrap: Collection[int] = (),
+    keys: int = 1,
 ) -> Table:
-    """Table without a frame; columns of words are aligned to the left, and cells of `wrap` may be broken into lines."""
+    """Make a `WholeTable`; columns of words are aligned to the left, and cells of `wrap` may be broken into lines."""
     heading = None if title is None else terminal_text(title)
-    table = WholeTable(heading)
+    table = WholeTable(heading, keys=keys)
     for index, name in enumerate(headings):
         table.add_column(terminal_text(name), justify="left" if index in left else "right", no_wrap=index not in wrap)
     return table

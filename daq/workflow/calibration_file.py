@@ -69,12 +69,9 @@ class EffectEntry(StrictModel):
     ambiguity: tuple[str, ...]
 
 
-class CalibrationDocument(StrictModel):
-    """Schema of the whole file; the reader compares the `digests`."""
+class CalibrationBody(StrictModel):
+    """Schema of a calibration, without the envelope of a file."""
 
-    format: Literal["drivegain-calibration"]
-    version: int
-    digests: dict[str, str]
     cell: str
     method: str
     gains: tuple[GainEntry, ...]
@@ -95,6 +92,14 @@ class CalibrationDocument(StrictModel):
     recording_configuration_sha256: str | None = None
     covariance_factor: tuple[tuple[float, ...], ...] | None = None
     diagnoses: tuple[Diagnosis, ...] = ()
+
+
+class CalibrationDocument(CalibrationBody):
+    """Schema of the whole file; the reader compares the `digests`."""
+
+    format: Literal["drivegain-calibration"]
+    version: int
+    digests: dict[str, str]
 
 
 _CLASSES: dict[type, type] = {

@@ -45,13 +45,13 @@ def check_controller(cell_file: Path, cell: Cell) -> None:
     _require_alike(cell_file, cell, list(zip(gains, sources, strict=True)))
 
 
-def check_nameplates(cell_file: Path, cell: Cell, readings: Sequence[ScaleReading]) -> tuple[str, ...]:
+def check_nameplates(cell_file: Path, cell: Cell, readings: Sequence[ScaleReading | None]) -> tuple[str, ...]:
     """Compare each nameplate with the controller's gain, and with N·Kt of the motor's data in the drive (paper eq. 4).
 
     Args:
         cell_file: file of the cell, for the lines.
         cell: content of it.
-        readings: of each drive.
+        readings: of each drive; None for one that does not answer.
 
     Returns:
         Warnings about the recorded currents: no reference, what could not be checked, what differs.
@@ -63,6 +63,9 @@ def check_nameplates(cell_file: Path, cell: Cell, readings: Sequence[ScaleReadin
     axes_by_warning: dict[str, list[str]] = {}
     references = list[Reference | None]()
     for axis, reduction, reading in zip(cell.axes, DriveTrain(cell.ratio).reduction, readings, strict=True):
+        if reading is None:
+            references.append(None)
+            continue
         found, constant = reading.warnings, reading.torque_constant_nm_per_a
         if axis.profile is None or not axis.gain_unit.startswith(("Nm/A", "N/A")):
             found += (f"the gain is in {axis.gain_unit}; the torque constant cannot be checked",)

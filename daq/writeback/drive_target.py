@@ -339,7 +339,7 @@ def content_of(base: tuple[ParameterValue, ...], writes: tuple[ParameterWrite, .
 def _change(gain: Gain, value: ParameterValue, gain_object: GainObject) -> tuple[GainChange, ParameterWrite]:
     """Plan one drive; a gain that is no number leaves the present bits, and a gate refuses it."""
     parameter, factor = gain_object.parameter, gain_object.factor
-    key, word = f"node {value.axis.node_id}, {parameter}", value.word
+    key, word = f"{value.axis.name}, {parameter}", value.word
     planned = None
     if is_writable(gain):
         wanted, std = factor * gain.value, abs(factor) * gain.std

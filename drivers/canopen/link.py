@@ -66,17 +66,17 @@ def nmt_name(state: int | None) -> str:
     return str(NmtState(state)) if state in tuple(NmtState) else f"unknown ({state})"
 
 
-def command_name(identifier: int) -> str:
-    """Describe a frame that only the recorder should send."""
+def command_name(identifier: int, names: Mapping[int, str]) -> str:
+    """Describe a frame that only the recorder should send; `names` of the axes are by node id."""
     if identifier == SYNC_COB_ID:
         return "a SYNC (080h)"
     if identifier == _NMT_COB_ID:
         return "an NMT command (000h)"
     if identifier < SDO_REQUEST:
-        return f"a set-point of node {identifier & 0x7F} ({identifier:03X}h)"
+        return f"a set-point of {node_label(identifier & 0x7F, names)} ({identifier:03X}h)"
     if identifier >= HEARTBEAT:
         return f"a heartbeat with the recorder's own node id {identifier - HEARTBEAT} ({identifier:03X}h)"
-    return f"an SDO request to node {identifier - SDO_REQUEST} ({identifier:03X}h)"
+    return f"an SDO request to {node_label(identifier - SDO_REQUEST, names)} ({identifier:03X}h)"
 
 
 class Link:
@@ -232,7 +232,8 @@ class Link:
         """Count a command, or a heartbeat with our node id, that neither we nor our SYNC producer sent."""
         self.foreign[identifier] = self.foreign.get(identifier, 0) + 1
         if self.foreign[identifier] == 1:  # once: a master would fill the log
-            self._events.append((0, EventKind.BUS_BUSY, identifier, f"{command_name(identifier)} that we did not send"))
+            seen = command_name(identifier, self.names)
+            self._events.append((0, EventKind.BUS_BUSY, identifier, f"{seen} that we did not send"))
 
     def take_events(self, time_ns: int, node_ids: Sequence[int]) -> tuple[CellEvent, ...]:
         """Return the events since the last call in their order; axis is None for nodes that are no axes of ours."""

@@ -244,7 +244,7 @@ class CanopenNetwork:
             BusBusy: a command of another master was among them.
         """
         if self.link.foreign:
-            seen = ", ".join(command_name(identifier) for identifier in sorted(self.link.foreign))
+            seen = ", ".join(command_name(identifier, self.link.names) for identifier in sorted(self.link.foreign))
             raise BusBusy.by_master(self.link.address, seen)
 
     def guard(self) -> None:

@@ -169,7 +169,8 @@ class Watch:
             self._on_event(event)
             if event.kind is EventKind.BUS_BUSY and event.code < SDO_REQUEST:
                 # A reader only disturbs, and is reported; a device that sends commands could move the robot.
-                self.faults.append(BusBusy.by_master(self._link.address, command_name(event.code)))
+                seen = command_name(event.code, self._link.names)
+                self.faults.append(BusBusy.by_master(self._link.address, seen))
             elif event.kind is EventKind.BUS_BUSY and event.code >= HEARTBEAT:
                 self.faults.append(BusBusy.by_heartbeat(self._link.address, event.code - HEARTBEAT))
             if event.axis is None:

@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import select
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import groupby
 
 import can
 
 from drivers.canopen.bus import BusAddress, open_bus, send_burst
-from drivers.errors import BusError, NodeMisplaced
+from drivers.errors import BusError, NodeMisplaced, node_label
 from drivers.stream.socketcan import CapturedMessage, Losses, losses_of, remarks_of
 
 ALTERNATION_S = 0.0005  #: Time to wait at one bus while another may receive, where one of them has no file descriptor
@@ -38,6 +38,7 @@ class BusPart:
     name: str  #: for messages
     address: BusAddress  #: of the bus
     node_ids: frozenset[int]  #: of the amplifiers on it
+    axis_names: Mapping[int, str] = field(default_factory=dict, compare=False)  #: by node id, for messages
 
     def __str__(self) -> str:
         return f"{self.name} ({self.address})"
@@ -80,8 +81,8 @@ def open_cell_bus(address: CellAddress) -> can.BusABC:
     for part in address.parts:
         for node_id in part.node_ids:
             if (other := homes.setdefault(node_id, part)) is not part:
-                reason = f"node {node_id} is on {other.name} and on {part.name}; give one of the two another node id"
-                raise BusError(str(address), reason)
+                shared = f"{node_label(node_id, part.axis_names)} is on {other.name} and on {part.name}"
+                raise BusError(str(address), f"{shared}; give one of the two another node id")
     ends: list[can.BusABC] = []
     for part in address.parts:
         try:
@@ -107,6 +108,7 @@ class SplitBus(can.BusABC):
         self._ends = tuple(ends)
         self._names = tuple(map(str, address.parts))
         self._homes = {node_id: index for index, part in enumerate(address.parts) for node_id in part.node_ids}
+        self._axis_names = {node_id: name for part in address.parts for node_id, name in part.axis_names.items()}
         self._clock = clock
         self._waiting: list[can.Message | None] = [None] * len(self._ends)
         self._failed: set[int] = set()
@@ -220,7 +222,7 @@ class SplitBus(can.BusABC):
         home = self._homes.get(node_id, index)
         if home != index and (node_id, index) not in self._misplaced:
             self._misplaced.add((node_id, index))
-            raise NodeMisplaced(node_id, self._names[home], self._names[index])
+            raise NodeMisplaced(node_id, self._names[home], self._names[index], self._axis_names.get(node_id, ""))
         return home == index
 
     def _wait(self, left_s: float | None) -> None:

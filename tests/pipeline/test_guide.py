@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from daq.cli.app import main
+from tests.pipeline.next_step import next_step
 from tests.pipeline.transcript import Command, commands_of, shows
 
 PORT = 29536
@@ -62,19 +63,23 @@ def test_the_guide_is_followed_to_the_letter(
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.chdir(tmp_path)
-    walk(list(commands), 0, capfd)
+    named: set[str | None] = set()
+    walk(list(commands), 0, capfd, named)
+    assert named == {None, "plan", "record", "fit", "validate"}
 
 
-def walk(commands: list[Command], status: int, capfd: pytest.CaptureFixture[str]) -> None:
-    """One command after the other, each seeing the exit code of the one before."""
+def walk(commands: list[Command], status: int, capfd: pytest.CaptureFixture[str], named: set[str | None]) -> None:
+    """One command after the other, each seeing the exit code of the one before; `named` gets the next steps."""
     for number, command in enumerate(commands):
         if command.background:
             with second_terminal(command):
-                walk(commands[number + 1 :], status, capfd)
+                walk(commands[number + 1 :], status, capfd, named)
             return
         status, output = first_terminal(command.text, status, capfd)
         where = f"docs/tutorial/guide.md, line {command.line}: $ {command.text}\n{output}"
         assert "Traceback" not in output, where
+        if status == 0:
+            named.add(next_step(output))
         missing = shows(command.seen, output)
         assert missing is None, f"{where}\n--- the page also shows: {missing}"
 

@@ -8,6 +8,8 @@ import pytest
 
 from daq.cli.app import main
 from daq.errors import ExitCode
+from daq.workflow.calibration_file import load_calibration
+from tests.pipeline.next_step import next_step
 
 
 @pytest.fixture(scope="module")
@@ -43,10 +45,21 @@ def test_no_output_over_an_input_or_another_file(
     assert cell.read_bytes() == (checkout / "configs" / "cells" / "demo.yaml").read_bytes()
 
 
-def test_an_earlier_calibration_may_be_replaced(copied_log: Path, tmp_path: Path) -> None:
-    out = tmp_path / "calibration.yaml"
+def test_an_earlier_calibration_and_its_certificate_may_be_replaced(
+    copied_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, report = tmp_path / "calibration.yaml", tmp_path / "report"
+    fit = ["fit", str(copied_log), "--gains", "fixed", "--out", str(out), "--report", str(report)]
     for _ in range(2):
-        assert main(["fit", str(copied_log), "--gains", "fixed", "--out", str(out)]) == ExitCode.OK
+        assert main(fit) == ExitCode.OK
+    said = capsys.readouterr()
+    assert f"Written: {report}/" in said.out
+    assert next_step(said.err.splitlines()[-1]) == "residual"
+    page = (report / "report.html").read_text()
+    assert all(f"{gain.value:.4g}" in page for gain in load_calibration(out).gains)
+    (report / "report.html").write_text("mine")
+    assert main(fit) == ExitCode.USAGE
+    assert (report / "report.html").read_text() == "mine"
 
 
 def test_one_recording_counts_once(copied_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -234,7 +234,7 @@ def _spliced(text: str, scalars: Sequence[Scalar], spelling: Mapping[str, str]) 
     return text
 
 
-CORRECT_KEY = "correct `controller.gains` of the cell configuration"
+CORRECT_KEY = "is this the controller's file? then correct `controller.gains` of the cell configuration"
 
 
 def unfit(

@@ -83,6 +83,35 @@ def bench(tmp_path: Path) -> Bench:
     return Bench(cell, controllers / "demo.yaml", tmp_path / "calibration.yaml")
 
 
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
+        (("cell", "controller"), ("controllers/demo.yaml", "no calibration", "`drivegain fit` wrote")),
+        (
+            ("calibration", "cell"),
+            ("calibration.yaml", "file of another kind, with format, version", "CELL comes first"),
+        ),
+        (("controller", "calibration"), ("demo.yaml", "file of another kind, with controller", "CELL comes first")),
+        (
+            ("cell", "calibration", "--to", "calibration"),
+            ("drives.J1.gain", "no key 'drives'", "the controller's file?"),
+        ),
+        (("cell", "calibration", "--to", "cell"), ("drives.J1.gain", "no key 'drives'", "the controller's file?")),
+    ],
+)
+def test_exchanged_files_are_named_and_stay_as_they_are(
+    bench: Bench, order: tuple[str, ...], words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = {"cell": bench.cell, "calibration": bench.calibration, "controller": bench.controller}
+    before = {path: path.read_bytes() for path in files.values()}
+    assert main(["apply", *(str(files.get(word, word)) for word in order), "--yes"]) != ExitCode.OK
+    said = capsys.readouterr().err
+    assert all(f"{label}:" in said for label in ("found", "expected", "do"))
+    assert all(word in said for word in words)
+    assert {path: path.read_bytes() for path in files.values()} == before
+    assert not bench.audit.exists()
+
+
 def test_a_dry_run_is_a_table_a_diff_and_no_trace(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     before = bench.controller.read_bytes()
     assert bench.apply() == ExitCode.OK

@@ -16,6 +16,7 @@ from daq.config.cell import Cell
 from daq.errors import BusTaken, CalibrationRefused, UsageError
 from daq.ledger.audit import AuditAction, read
 from daq.ledger.store import HistoryStore
+from daq.report.controller_schemas import DriveChange, DriveRollback
 from daq.workflow.calibration_file import encode
 from daq.workflow.safeguards import bus_lock
 from drivers.canopen.bus import BusAddress
@@ -46,7 +47,7 @@ def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: p
     apply_in_drives(cell)
     shown = capsys.readouterr().out
     assert "in the drive" in shown
-    assert "node 4, 2003h:01: -11520 -> -9210" in shown
+    assert "J4, 2003h:01: -11520 -> -9210" in shown
     assert "Dry run, nothing was written." in shown
     assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
     base = shown.split("--base ")[1].split()[0]
@@ -108,13 +109,17 @@ def test_a_program_gets_all_of_it(cell: Cell, capsys: pytest.CaptureFixture[str]
     assert (reviewed["applied"], reviewed["refusals"]) == (False, [])
     assert reviewed["changes"][3]["new"] == -9.21
     apply_in_drives(cell, as_json=True, yes=True, saving=Saving.RAM)
-    written = json.loads(capsys.readouterr().out)
+    text = capsys.readouterr().out
+    written = json.loads(text)
+    DriveChange.model_validate_json(text)
     assert (written["applied"], written["saved"]) == (True, False)
     assert written["base_sha256"] == reviewed["base_sha256"]
     assert Path(written["record"]).is_file()
     for yes in (False, True):
         _back(cell, yes=yes, as_json=True)
-        document = json.loads(capsys.readouterr().out)
+        text = capsys.readouterr().out
+        document = json.loads(text)
+        DriveRollback.model_validate_json(text)
         assert (document["source"], document["restored"]) == (written["record"], yes)
         assert document["changes"][3] == {"axis": "J4", "object": "2003h:01", "old": -9210.0, "new": -11520.0}
 

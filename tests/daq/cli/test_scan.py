@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,6 +24,7 @@ from drivers.canopen.scan import FoundNode
 from drivers.profiles.profile import Identity
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import ErrorCode, PowerState
+from ident.model.model import DriveTrain
 from tests.two_buses import on_two_buses
 
 
@@ -38,7 +41,7 @@ def _node(node_id: int, statusword: int | None, serial: int | None = None) -> Fo
 
 def _shown(cell: Cell, nodes: tuple[FoundNode, ...], width: int) -> str:
     out = io.StringIO()
-    Console(file=out, width=width, soft_wrap=True).print(scan_table(scan_rows(cell, nodes, "demo"), width))
+    Console(file=out, width=width, soft_wrap=True).print(scan_table(scan_rows(cell, nodes, "demo")))
     return out.getvalue()
 
 
@@ -68,16 +71,21 @@ def test_an_enabled_axis_is_shouted(cell: Cell, statusword: int | None, enabled:
         assert "…" not in text
 
 
-def test_a_narrow_terminal_gets_fewer_columns_and_whole_words(cell: Cell) -> None:
+def test_a_narrow_terminal_gets_every_column_and_whole_words(cell: Cell) -> None:
     nodes = tuple(_node(number, 0x237) for number in range(1, 7))
     for width in (50, 80, 200):
-        lines = _shown(cell, nodes, width).splitlines()
-        assert max(cell_len(line.rstrip()) for line in lines) <= width
-        assert sum("ENABLED" in line for line in lines) == 6
-    rows = scan_rows(cell, nodes, "demo")
-    said = {width: [str(part) for part in scan_view(cell, rows, {}, width)] for width in (80, 200)}
-    assert "No room for nmt; --json has all columns." in said[80]
-    assert not any("No room" in part for part in said[200])
+        text = _shown(cell, nodes, width)
+        assert max(cell_len(line.rstrip()) for line in text.splitlines()) <= width
+        assert text.count("ENABLED") == 6
+        assert text.count("pre-operational") == 6
+        assert all(str(1000 + number) in text for number in range(1, 7))
+
+
+def test_a_message_names_the_axis_first(cell: Cell) -> None:
+    rows = scan_rows(cell, (_node(3, 0x237), _node(9, 0x237)), "demo")
+    said = [str(part) for part in scan_view(cell, rows, {})]
+    assert said[1].startswith("J3 (node 3) IS ENABLED")
+    assert said[2].startswith("node 9 IS ENABLED")
 
 
 def test_identity_and_power_are_distinguished(cell: Cell) -> None:
@@ -113,6 +121,29 @@ def test_a_fault_is_reset_when_a_person_says_so_and_nothing_gets_power(
         assert "was reset" not in capsys.readouterr().out
 
 
+def test_a_mistyped_nameplate_is_reported_with_its_line(
+    checkout: Path, cell: Cell, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """25.65 of J3 is written as mNm: the motor's data in the drive and the controller's file contradict it."""
+    configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
+    file = configs / "cells/demo.yaml"
+    file.write_text(file.read_text().replace("25.65", "25650"))
+    line = 1 + next(n for n, text in enumerate(file.read_text().splitlines()) if "25650" in text)
+    spec = load_simulation(shipped_simulation("clean"))
+    third, reduction = spec.axes[2], float(DriveTrain(cell.ratio).reduction[2])
+    entered = replace(third, entered_torque_nm=25.65 / abs(reduction) * third.rated_current_a)
+    spec = replace(spec, axes=(*spec.axes[:2], entered, *spec.axes[3:]))
+    with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus):
+        assert main(["scan", str(file)]) == ExitCode.OK
+        shown = capsys.readouterr()
+        (configs / "controllers/demo.yaml").unlink()
+        assert main(["scan", str(file), "--json"]) == ExitCode.OK
+        (by_drive,) = json.loads(capsys.readouterr().out)["mistyped"]
+    assert f"demo.yaml:{line}: axes[2].nameplate_gain_nm_per_a: found 25650 Nm/A, while it is 25.65 by" in shown.out
+    assert "Next" not in shown.err
+    assert "by N·Kt of the drive's motor" in by_drive
+
+
 @pytest.fixture(scope="module")
 def two(checkout: Path) -> Cell:
     """The demo cell on two buses."""
@@ -127,13 +158,13 @@ def test_a_node_is_reported_where_it_is_and_where_it_belongs(two: Cell) -> None:
         ("left", 1, "J1", "ok"),
         ("left", 2, "J2", "ok"),
         ("left", 3, "J3", "missing"),
-        ("left", 4, None, "belongs on right"),
+        ("left", 4, "J4", "belongs on right"),
         ("left", 9, None, "not configured"),
     ]
     right = scan_rows(two, tuple(_node(number, 0x250) for number in (4, 5, 6)), "right")
     assert [row["verdict"] for row in right] == ["ok"] * 3
     out = io.StringIO()
-    Console(file=out, width=50, soft_wrap=True).print(scan_table(left + right, 50, several=True))
+    Console(file=out, width=200, soft_wrap=True).print(scan_table(left + right))
     heading, _, *lines = out.getvalue().splitlines()
     assert heading.split()[:2] == ["bus", "node"]
     assert [line.split()[0] for line in lines if line.strip()] == ["left"] * 5 + ["right"] * 3

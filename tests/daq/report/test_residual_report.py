@@ -22,6 +22,7 @@ from daq.environment import shipped_configurations
 from daq.errors import EffectsRefuted, ExitCode, OutputFailed, UsageError
 from daq.report import residual_page as residual_page_module
 from daq.report.effect_names import WORDS, effect_text, other_axis
+from daq.report.fit_schemas import ResidualReport
 from daq.report.html import page, paragraph, table
 from daq.report.plots import draw_fit
 from daq.report.residual import _gear_sentence, error_change_text, residual_document, summary
@@ -293,6 +294,7 @@ def test_the_document_is_complete_and_described(closed: Closed, checkout: Path) 
         assert f"`{key}`" in described, key
     assert document["filter"]["position_cutoff_hz"] == closed.fitted.cell.conditioning.position_cutoff_hz
     assert set(document["before"]) == set(document["after"]) == set(turn["before"])
+    ResidualReport.model_validate_json(json_text(document))
 
 
 def test_what_to_check_comes_first(closed: Closed) -> None:

@@ -17,6 +17,7 @@ from ident.calibration import AcceptedEffect, Calibration
 from ident.data.run import Run
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import demo_content, samples, write
+from tests.pipeline.next_step import next_step
 
 
 def test_the_file_gives_the_errors_of_the_fit(real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
@@ -40,7 +41,8 @@ def test_the_file_gives_the_errors_of_the_fit(real: tuple[Path, Path], capsys: p
 def test_text_and_picture(real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, log = real
     assert main(["validate", str(file), str(log), "--pictures", str(tmp_path / "new" / "folder")]) == 0
-    text = capsys.readouterr().out
+    text, said = capsys.readouterr()
+    assert next_step(said) == "apply"
     assert f"{load_calibration(file).relative_error_percent.total:.2f}" in text
     assert "seen by the fit" in text
     assert text.splitlines()[-1] == f"Written: {tmp_path / 'new' / 'folder' / 'tx40.png'}"

@@ -69,7 +69,7 @@ class Pair:
         self.left, self.right = (Wire(name, self.log, self.clock) for name in NAMES)
         self.address = SplitAddress(
             tuple(
-                BusPart(name, BusAddress("scripted", name), nodes)
+                BusPart(name, BusAddress("scripted", name), nodes, {1: "J1"})
                 for name, nodes in zip(NAMES, (LEFT, RIGHT), strict=True)
             )
         )
@@ -285,7 +285,7 @@ def test_a_controller_that_went_off_its_bus_is_named(pair: Pair) -> None:
 def test_a_node_on_the_other_bus_is_reported_once_and_not_believed(pair: Pair) -> None:
     pair.right.coming.extend(frame(0x181, data=bytes(8)) for _ in range(3))
     pair.left.coming.append(frame(0x181, 1.0, b"mine"))
-    with pytest.raises(NodeMisplaced, match=r"node 1 is heard on bus right .* has it on bus left"):
+    with pytest.raises(NodeMisplaced, match=r"J1 \(node 1\) is heard on bus right .* has it on bus left"):
         pair.bus.recv(0.0)
     heard = pair.bus.recv(0.0)
     assert heard is not None

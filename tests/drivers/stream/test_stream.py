@@ -549,7 +549,7 @@ def test_set_points_of_another_master_are_a_fault(lockstep: Prepared) -> None:
     bus.inject(can.Message(arbitration_id=0x402, is_extended_id=False, data=bytes(6)))
     next(stream)
     assert [event.code for event in events if event.kind is EventKind.BUS_BUSY] == [0x402]
-    with pytest.raises(BusBusy, match=r"a set-point of node 2 \(402h\)"):
+    with pytest.raises(BusBusy, match=r"a set-point of J2 \(node 2\) \(402h\)"):
         next(stream)
     assert stream.statistics.surplus == 0
 

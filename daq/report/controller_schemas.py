@@ -1,0 +1,236 @@
+"""JSON Schema of what `apply`, `rollback`, `report` and `history` print under `--json`."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field
+
+from daq.config.yaml_file import StrictModel
+from daq.report.fit_schemas import Errors, Figure
+
+
+class Refused(StrictModel):
+    """A check that failed."""
+
+    gate: str
+    subject: str
+    found: str
+    expected: str
+    remedy: str
+
+
+class FileGain(StrictModel):
+    """A gain in the controller's file and its planned value."""
+
+    axis: str
+    key: str
+    line: int
+    old: float
+    new: float
+    change_percent: Figure
+    change_sigmas: Figure
+    significant: bool
+    std_percent: Figure
+    nameplate: float
+    nameplate_percent: Figure
+    unit: str
+
+
+class FileChange(StrictModel):
+    """`apply` to the controller's file."""
+
+    file: str
+    base_sha256: str
+    base: str = Field(description="BEFORE-AFTER of this change, for --base")
+    applied: bool
+    backup: str | None
+    changes: list[FileGain]
+    refusals: list[Refused]
+    diff: str
+
+
+class DriveGain(StrictModel):
+    """An object in a drive and its planned value."""
+
+    axis: str
+    object: str
+    old: float
+    new: float
+    std: float
+    nameplate: float
+    unit: str
+
+
+class DriveChange(StrictModel):
+    """`apply --drives`; the last three are there once the drives are written."""
+
+    cell: str | None
+    base_sha256: str
+    base: str
+    applied: bool
+    changes: list[DriveGain]
+    refusals: list[Refused]
+    record: str = ""
+    source: str | None = None
+    saved: bool = False
+
+
+class FileRollback(StrictModel):
+    """`rollback` of the controller's file."""
+
+    file: str
+    restored: str = Field(description="backup that was restored")
+    backup: str | None = Field(description="of the content before")
+    diff: str
+    audit: str | None
+
+
+class RestoredObject(StrictModel):
+    """An object in a drive before and after."""
+
+    axis: str
+    object: str
+    old: float
+    new: float
+
+
+class DriveRollback(StrictModel):
+    """`rollback --drives`; the last two are there once the drives are written."""
+
+    drives: str
+    source: str
+    restored: bool
+    changes: list[RestoredObject]
+    record: str = ""
+    saved: bool = False
+
+
+class CertifiedGain(StrictModel):
+    """A gain beside the one in the controller, or beside the nameplate."""
+
+    axis: str
+    key: str
+    line: int
+    old: Figure
+    new: float
+    std: float
+    std_percent: Figure
+    unit: str
+    nameplate: float
+    change_percent: Figure
+    written: str | None
+    allowed_percent: list[Figure] = Field(description="limits of the change; null: none")
+    sigmas: Figure
+    significant: bool
+    verdict: str
+
+
+class CertifiedEffect(StrictModel):
+    """An effect in words."""
+
+    axis: str
+    effect: str
+    size: str
+    error_before_percent: Figure
+    error_after_percent: Figure
+    ambiguity: list[str]
+
+
+class EarlierCalibration(StrictModel):
+    """An earlier calibration, and the gains beside it."""
+
+    created: str
+    axes: list[CertifiedGain]
+    holdout_error_percent: Errors | None
+
+
+class CertificateReport(StrictModel):
+    """`report`: the numbers of the certificate."""
+
+    format: Literal["drivegain-certificate"]
+    version: Literal[1]
+    cell: str
+    identity: dict[str, str]
+    verdict: str
+    sentence: str
+    controller: str | None
+    controller_unread: str | None
+    axes: list[CertifiedGain]
+    refusals: list[Refused]
+    holdout_error_percent: Errors | None
+    nameplate_holdout_error_percent: Errors | None
+    relative_error_percent: Errors
+    effects: list[CertifiedEffect]
+    beside: EarlierCalibration | None
+
+
+class Acknowledged(StrictModel):
+    """A change that was explained."""
+
+    since: str
+    at: str
+    who: str
+    why: str
+
+
+class HistoryPoint(StrictModel):
+    """One calibration of a gain; the columns of `--csv`."""
+
+    axis: str
+    recorded: str
+    gain: float
+    std: float
+    unit: str
+    nameplate: float
+    change_percent: Figure
+    change_sigmas: Figure
+    change_probability: Figure
+    deviation_sigmas: Figure
+    cusum_up: float
+    cusum_down: float
+    trend_sigmas: Figure
+    alarm: str | None
+    baseline: Figure
+    applied_at: str | None
+    applied_by: str | None
+    applied_to: str | None
+    error_percent: Figure
+    holdout_percent: Figure
+    rows: int
+    method: str
+    software: str
+    configuration_sha256: str
+    created: str
+    entered: str
+    digest: str
+
+
+class HistoryAxis(StrictModel):
+    """One gain over time."""
+
+    axis: str
+    unit: str
+    dispersion: Figure
+    alarmed: bool
+    alarm: str | None
+    since: str | None
+    change_percent: Figure
+    change_sigmas: Figure
+    baseline: Figure
+    baseline_std: Figure
+    acknowledged: list[Acknowledged]
+    points: list[HistoryPoint]
+
+
+class HistoryReport(StrictModel):
+    """`history`."""
+
+    cell: str
+    calibrations: int
+    in_force: str | None
+    chart: dict[str, float] = Field(description="limits of the control chart")
+    pattern: str
+    questions: list[str]
+    axes: list[HistoryAxis]
+    audit: dict[str, Any] | None = Field(None, description="with --verify")

@@ -1,0 +1,425 @@
+"""JSON Schema of what `fit`, `residual`, `validate`, `weigh` and `contact` print under `--json`.
+
+docs/reference/residual-json.md describes the keys of `residual`.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from daq.config.yaml_file import StrictModel
+from daq.workflow.calibration_file import CalibrationBody
+from ident.errors import Diagnosis
+
+Figure = float | None  #: null where it is not known
+
+
+class Errors(StrictModel):
+    """Relative errors [%], null for an axis that did not move."""
+
+    axes: list[Figure]
+    total: Figure
+
+
+class ComparedGain(StrictModel):
+    """A gain by another estimator."""
+
+    axis: str
+    value: float
+    std_percent: Figure
+
+
+class ComparedFit(StrictModel):
+    """The paper's total least squares on the same rows."""
+
+    gains: list[ComparedGain]
+    condition: Figure
+
+
+class OwnTorque(StrictModel):
+    """Slope of the drive's own torque over the current."""
+
+    axis: str
+    slope: Figure
+    std: Figure = None
+    ratio: Figure = None
+    ratio_std: Figure = None
+    readings: int = 0
+
+
+class RemovedParameter(StrictModel):
+    """Parameter that is not essential."""
+
+    name: str
+    std_percent: Figure
+
+
+class GainWords(StrictModel):
+    """Verdict on how well the data show a gain."""
+
+    axis: str
+    std_percent: Figure
+    verdict: str
+    seen_by: list[str]
+    words: str
+
+
+class Trial(StrictModel):
+    """One estimator under one filter."""
+
+    estimator: str
+    position_cutoff_hz: float
+    decimation_cutoff_hz: float
+    gains: list[ComparedGain] | None
+    relative_error_percent: Figure = None
+    reason: str = ""
+
+
+class FitReport(CalibrationBody):
+    """`fit`."""
+
+    compared: dict[Literal["tls"], ComparedFit]
+    torque_channel: tuple[OwnTorque, ...] = ()
+    removed: list[RemovedParameter]
+    verdicts: list[GainWords]
+    comparison: tuple[Trial, ...] = ()
+
+
+class CaseReport(CalibrationBody):
+    """One case of the paper."""
+
+    title: str
+    known: str
+    removed: list[RemovedParameter]
+
+
+class CasesReport(StrictModel):
+    """`fit --cases`."""
+
+    cases: dict[str, CaseReport]
+
+
+class MotorNoise(StrictModel):
+    """Noise floor of one motor."""
+
+    axis: str
+    noise: float = Field(description="in the unit of the current reference")
+    source: str
+    std_percent: Figure
+    dwells: int | None
+    pairs: int | None
+    degrees_of_freedom: Figure
+    left: Figure = Field(description="what the last model leaves in motion")
+    refuted: bool
+
+
+class NoiseFloor(StrictModel):
+    """Error that noise alone would leave."""
+
+    motors: list[MotorNoise | None]
+    relative_error_percent: Errors
+    holdout_error_percent: Errors | None
+
+
+class Skew(StrictModel):
+    """Delay of currents against positions [s]."""
+
+    seconds: float
+    std: float
+
+
+class GearLossEntry(StrictModel):
+    """Which side of a gear drives, and its loss."""
+
+    axis: str
+    motoring_rows: Figure
+    motoring_torque: Figure
+    loss: Figure
+    loss_std: Figure
+    efficiency: Figure
+    gain_factor: Figure
+    hidden_shift: Figure
+    gain_carries_it: bool
+
+
+class LeftOutRun(StrictModel):
+    """Error of one run by a fit of the others, or why there is none."""
+
+    run: str
+    error_percent: Errors | None
+    reason: str | None
+
+
+class LeftOutRuns(StrictModel):
+    """Errors of runs left out in turn."""
+
+    error_percent: Errors | None
+    runs: list[LeftOutRun]
+
+
+class ModelErrors(StrictModel):
+    """Errors of one model."""
+
+    relative_error_percent: Errors
+    cross_validated_error_percent: Errors
+    left_out_runs: LeftOutRuns | None
+    holdout_error_percent: Errors | None
+
+
+class ChangedGain(StrictModel):
+    """A gain before and after effects."""
+
+    axis: str
+    unit: str
+    before: float
+    before_std: Figure
+    after: float
+    after_std: Figure
+    choice_std: Figure
+    change_percent: Figure
+    change_std_percent: Figure
+    significant: bool
+
+
+class Coefficient(StrictModel):
+    """Linear parameter of an effect."""
+
+    name: str
+    value: float
+    std: Figure
+    unit: str
+
+
+class PlacedEffectEntry(StrictModel):
+    """An effect on an axis."""
+
+    effect: str
+    axis: str
+    settings: dict[str, float]
+    coefficients: list[Coefficient]
+
+
+class FindingEntry(PlacedEffectEntry):
+    """Result of testing one effect on one axis."""
+
+    variable: str
+    probability: float
+    folds_better: float
+    explained: Figure
+    error_before_percent: Figure
+    error_after_percent: Figure
+    error_fall: Figure
+    held_out_fall: Figure
+    passed: bool
+    share_of_excess: Figure
+    refusals: list[str]
+    ambiguity: list[str] | None
+
+
+class AsideEntry(FindingEntry):
+    """Finding that passed and did not join the model."""
+
+    reason: str
+
+
+class DetectionLimit(StrictModel):
+    """Torque that an effect needs to be detected, root mean square in motion."""
+
+    axis: str
+    rms: Figure
+    unit: str
+
+
+class TurnEntry(StrictModel):
+    """One turn of the loop."""
+
+    accepted: FindingEntry | None
+    added: list[PlacedEffectEntry]
+    removed: list[str]
+    before: ModelErrors | None
+    after: ModelErrors | None
+    gain_changes: list[ChangedGain] | None
+    findings: list[FindingEntry]
+    structures: list[FindingEntry]
+    set_aside: list[AsideEntry]
+    detection_limits: list[DetectionLimit]
+
+
+class ResidualReport(CalibrationBody):
+    """`residual`, and the body of `residual.json`."""
+
+    summary: list[str]
+    axes: list[str]
+    metric: str
+    noise_floor: NoiseFloor
+    time_skew: Skew | None
+    gear_loss: list[GearLossEntry]
+    before: ModelErrors
+    after: ModelErrors
+    gain_changes: list[ChangedGain]
+    worse_holdout: bool | None
+    turns: list[TurnEntry]
+
+
+class ValidatedLog(StrictModel):
+    """Errors of one log."""
+
+    log: str
+    sha256: str
+    seen_by_fit: bool
+    partial: bool
+    held_out: bool
+    same_configuration: bool
+    rows: int
+    relative_error_percent: Errors
+    picture: str | None
+
+
+class Together(StrictModel):
+    """Errors of all logs together."""
+
+    relative_error_percent: Errors
+
+
+class CheckedLog(StrictModel):
+    """One log under every calibration."""
+
+    log: str
+    condition: Figure
+    relative_error_percent: dict[str, Errors | None]
+    left_out: str | None
+    seen_by: list[str]
+
+
+class FoundMass(StrictModel):
+    """Mass of a payload by one calibration, or why it was not found."""
+
+    reason: str = ""
+    mass_kg: Figure = None
+    std_percent: Figure = None
+    std_with_gains_percent: Figure = None
+    error_percent: Figure = None
+
+
+class CheckedPayload(StrictModel):
+    """A weighed payload."""
+
+    log: str
+    payload: str
+    mounting: str
+    weighed_kg: Figure
+    with_bare_runs: bool
+    masses: dict[str, FoundMass]
+
+
+class ValidateReport(StrictModel):
+    """`validate`."""
+
+    cell: str
+    axes: list[str]
+    filter: dict[str, int | float | list[float]]
+    fit_relative_error_percent: Errors
+    logs: list[ValidatedLog]
+    together: Together | None
+    calibrations: list[str]
+    diagnoses: list[Diagnosis]
+    runs: list[CheckedLog]
+    payloads: list[CheckedPayload]
+
+
+class WeighedValue(StrictModel):
+    """A number and its σ."""
+
+    value: Figure
+    std: Figure
+
+
+class WeighedValues(StrictModel):
+    """Numbers and their σ."""
+
+    value: list[Figure]
+    std: list[Figure]
+
+
+class AddedMoves(StrictModel):
+    """Moves that would show a parameter."""
+
+    words: str
+    seconds: float
+    std: Figure
+
+
+class WeighedParameter(StrictModel):
+    """One of the ten parameters of a body."""
+
+    name: str
+    unit: str
+    value: Figure
+    std: Figure
+    std_of_moves: Figure
+    identifiable: bool
+    add: AddedMoves | None
+
+
+class WeighReport(StrictModel):
+    """`weigh`."""
+
+    cell: str
+    logs: list[str]
+    bare: list[str]
+    declared_kg: Figure
+    mass_kg: WeighedValue
+    centre_m: WeighedValues
+    inertia_about_centre_kg_m2: WeighedValues
+    parameters: list[WeighedParameter]
+    relative_error_percent: Errors
+    moves: int
+    complete: bool
+
+
+class ContactAxis(StrictModel):
+    """Band and threshold of one axis; medians over the motion in `unit`."""
+
+    axis: str
+    unit: str
+    scale: list[Figure]
+    band_over_scale: Figure
+    threshold_over_scale: Figure
+    correlation_s: Figure
+    quiet_s: Figure
+    band: Figure
+    threshold: Figure
+    largest: Figure
+
+
+class ContactEntry(StrictModel):
+    """A stretch beyond the threshold."""
+
+    axis: str
+    start_s: float
+    end_s: float
+    peak: float
+    peak_over_threshold: float
+
+
+class NotJudged(StrictModel):
+    """An axis that cannot show a contact."""
+
+    axis: str
+    reason: str
+
+
+class ContactReport(StrictModel):
+    """`contact`."""
+
+    cell: str
+    log: str
+    band_from_this_log: bool
+    stretches_left_out: int
+    alarms_per_hour: float
+    axes: list[ContactAxis]
+    contacts: list[ContactEntry]
+    not_judged: list[NotJudged]
+    picture: str | None

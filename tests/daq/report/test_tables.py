@@ -1,0 +1,295 @@
+"""Every table of the command line on a terminal of 80 columns and in a pipe: each number is whole."""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.cells import cell_len
+from rich.console import Console, Group, RenderableType
+from rich.table import Table
+
+from daq.cli.terminal import PIPE_COLUMNS
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.jobs.cell_fit import Failure, Summary
+from daq.jobs.fleet import FleetRow
+from daq.ledger.judgement import NOTHING
+from daq.ledger.store import HistoryStore
+from daq.ledger.watch import Series, watch
+from daq.report import bus, fit, fleet, gains, history, paper_tables, proposal, residual, urdf, validation, weighing
+from daq.report.log import log_lines
+from daq.report.text import WholeTable
+from daq.workflow.validate import DataUse
+from daq.writeback.request import GainChange
+from ident.calibration import Gain
+from ident.data.conditioning import Conditioning
+from ident.data.torque_channel import TorqueSlope
+from ident.estimators.comparison import ESTIMATORS, Comparison, EstimatorTrial
+from ident.estimators.estimate import RelativeError
+from tests.daq.calibrations import demo_calibration
+from tests.daq.histories import fill
+
+AXES = tuple(f"gantry-axis-number-{number}" for number in range(1, 15))
+GAINS = tuple(Gain(axis, -1234.5 - n, 0.0123 + 0.001 * n, "Nm/A", -1200.25 - n) for n, axis in enumerate(AXES))
+ERROR = RelativeError(tuple(10.25 + n for n in range(14)), 12.34)
+CALIBRATION = replace(demo_calibration(), gains=GAINS, relative_error_percent=ERROR)
+
+
+@pytest.fixture(scope="module")
+def cell(checkout: Path) -> Cell:
+    """The demo cell, with long names."""
+    demo = load_cell(checkout / "configs/cells/demo.yaml")
+    return replace(demo, axes=tuple(replace(axis, name=name) for axis, name in zip(demo.axes, AXES, strict=False)))
+
+
+@pytest.fixture(scope="module")
+def series(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, tuple[Series, ...], dict[str, str]]:
+    """Entries of a history, its series, and what was done with each calibration."""
+    with HistoryStore(tmp_path_factory.mktemp("tables") / "history.sqlite") as store:
+        fill(store, 6, lambda week: (1.0, 1.0, 1.0, 1.0 + 0.01 * week, 1.0, 1.0))
+        entries = store.entries()
+    actions = {entry.digest: "applied by somebody with quite a long name, rolled back by another" for entry in entries}
+    return entries, watch(entries, ()), actions
+
+
+def _scan(cell: Cell, _: Any) -> Iterator[RenderableType]:
+    row = {
+        "vendor_id": 0xFFFFFFFF,
+        "product_code": 0xFFFFFFFE,
+        "serial": 4294967295,
+        "device_name": "servo amplifier 48 V 12 A, revision 7",
+        "nmt": "PRE-OPERATIONAL",
+        "state": "SWITCH ON DISABLED",
+        "enabled": True,
+        "verdict": "belongs on right, in fault",
+    }
+    yield bus.scan_table([{"bus": f"bus-{n % 2}", "node_id": 101 + n, "axis": AXES[n], **row} for n in range(14)])
+
+
+def _monitor(cell: Cell, _: Any) -> Iterator[RenderableType]:
+    axis = {
+        "unit": "deg",
+        "current_raw": -32768,
+        "current_a": -12.345,
+        "state": "FAULT REACTION ACTIVE",
+        "enabled": True,
+        "silent": False,
+        "rate_hz": 1000.1,
+        "lost": 12345678,
+    }
+    axes = [{"axis": name, "position": -179.123 - n, **axis} for n, name in enumerate(AXES)]
+    document = {"cell": "demo", "source": "asked", "recorder": False, "axes": axes, "events": [], "buses": []}
+    yield bus.monitor_view({**document, "frames_per_s": 12345.0, "sync_hz": 1000.0})
+
+
+def _comparison(cell: Cell, _: Any) -> Iterable[RenderableType]:
+    values = np.array([gain.value for gain in GAINS])
+    trials = tuple(EstimatorTrial(name, 40.0, 20.0, values, np.full(14, 12.34), 123.45) for name in ESTIMATORS)
+    return fit.comparison_tables(Comparison(trials), AXES)
+
+
+def _turns(cell: Cell, _: Any) -> Iterator[RenderableType]:
+    finding = SimpleNamespace(
+        effect=SimpleNamespace(name="position-dependent-friction"),
+        axis=5,
+        probability=0.123,
+        folds_better=0.99,
+        explained=0.123,
+        error_before_percent=123.45,
+        error_after_percent=112.34,
+        passed=True,
+    )
+    step = SimpleNamespace(findings=(finding,) * 6, set_aside=(), accepted=None)
+    fitted: Any = SimpleNamespace(steps=(step,), cell=cell)
+    return residual.turns_view(fitted)
+
+
+def _validation(cell: Cell, _: Any) -> Iterator[RenderableType]:
+    measured = np.random.default_rng(1).normal(size=(14, 50))
+    one: Any = SimpleNamespace(
+        run="a run with a long name, 2026-03-02",
+        log=Path("run.mcap"),
+        error=ERROR,
+        data_use=DataUse.HOLDOUT,
+        same_configuration=True,
+        measured_nm=measured,
+        predicted_nm=0.9 * measured,
+        use=np.ones(measured.shape, dtype=bool),
+    )
+    checked = SimpleNamespace(run="run-1", condition=1234.0, left_out="")
+    found: Any = SimpleNamespace(
+        validations=(one, one), diagnoses=(), runs=(checked,) * 12, calibrations=("ml",), weighed=()
+    )
+    return validation.validation_view(replace(CALIBRATION, filter=Conditioning().document()), found)
+
+
+def _weighed(cell: Cell, _: Any) -> Iterator[RenderableType]:
+    body: Any = SimpleNamespace(
+        centre_m=(np.full(3, -0.12345), np.full(3, 0.000123)),
+        inertia_kg_m2=(np.full(6, 0.0123456), np.full(6, 0.00000123)),
+        mass_kg=12.34567,
+        mass_std_kg=0.00123,
+        complete=True,
+        moves=123,
+        error=ERROR,
+        values=np.linspace(-0.0123456, 12.3, 10),
+        std=np.full(10, 0.00000123),
+        identifiable=np.ones(10, dtype=bool),
+    )
+    found: Any = SimpleNamespace(body=body, declared_kg=12.3, bare=(), help=())
+    return weighing.weighed_view(found)
+
+
+def _contact(cell: Cell, _: Any) -> Iterator[RenderableType]:
+    contact = SimpleNamespace(axis=2, start_s=12345.67, end_s=12346.78, peak_nm=-1234.0, peak_over_threshold=12.34)
+    n = len(cell.axes)
+    ones = np.ones((n, 9))
+    band = SimpleNamespace(quiet_s=np.full(n, 12345.0), threshold=np.ones(n), alarms_per_hour=0.1)
+    band.correlation_s = np.ones(n)
+    found: Any = SimpleNamespace(
+        band=band,
+        band_nm=1.234e4 * ones,
+        threshold_nm=2.345e4 * ones,
+        torque_nm=3.456e5 * ones,
+        use=ones > 0,
+        left_out=0,
+        from_itself=False,
+        contacts=(contact,) * 20,
+        time_s=np.arange(9.0),
+    )
+    return weighing.contact_view(found, cell)
+
+
+def _urdf(cell: Cell, _: Any) -> Iterator[RenderableType]:
+    body = SimpleNamespace(centre_m=(-1.234, 2.345, -3.456), mass_kg=123.0)
+    update: Any = SimpleNamespace(body=body, damping=1.23e-5, friction=4.56e-5)
+    parameters = SimpleNamespace(
+        torque_change_percent=ERROR,
+        exact=True,
+        model=SimpleNamespace(robot=SimpleNamespace(joints=()), drive_train=SimpleNamespace(coupled=())),
+    )
+    robot: Any = SimpleNamespace(parameters=parameters, prior=SimpleNamespace(assumed=()))
+    updated: Any = SimpleNamespace(links={axis: f"link-of-{axis}" for axis in AXES}, merged=())
+    return urdf.urdf_view(CALIBRATION, robot, dict.fromkeys(AXES, update), updated, None)
+
+
+def _fleet(cell: Cell, _: Any) -> Iterator[RenderableType]:
+    summary = Summary(GAINS, (("load-friction", AXES[3]),), 3.21, held_out=False, partial=True)
+    results: tuple[Summary | Failure, ...] = (summary, Failure("DataUnfit", "run-17.mcap lost 1234 samples", 4))
+    names = ("press-4-in-hall-12-line-7", "gantry-23")
+    return fleet.fleet_view(
+        [FleetRow(name, "c" * 64, (), (), one, 1234.56) for name, one in zip(names, results, strict=True)]
+    )
+
+
+def _changes(cell: Cell, _: Any) -> Iterator[RenderableType]:
+    changes = tuple(
+        GainChange(one.axis, "drives.gain", n, one.nameplate, one.value, one.std, one.unit, one.nameplate, "1")
+        for n, one in enumerate(GAINS)
+    )
+    yield proposal.change_table(changes, NOTHING)
+
+
+def _paper(cell: Cell, _: Any) -> Iterator[RenderableType]:
+    return paper_tables.PaperTable(
+        "Table 1", ("parameter", *("10 CAD: value",) * 6), (("zz1", *("1.2345678",) * 6),)
+    ).view()
+
+
+EXAMPLES: dict[str, Callable[[Cell, Any], Iterable[RenderableType]]] = {
+    "bus.monitor_view": _monitor,
+    "bus.scan_table": _scan,
+    "fit.comparison_tables": _comparison,
+    "fit.error_table": lambda _cell, _: [fit.error_table("Error", AXES, {"held out, before": ERROR})],
+    "fleet.fleet_view": _fleet,
+    "gains.gain_table": lambda _cell, _: [gains.gain_table(GAINS, dict.fromkeys(AXES, -1230.5), title="Gains")],
+    "gains.torque_table": lambda _cell, _: [gains.torque_table([TorqueSlope(-1250.0, 0.0123, 98765)] * 14, GAINS)],
+    "history.axis_table": lambda _cell, known: [history.axis_table(known[1][3], known[2])],
+    "history.calibration_table": lambda _cell, known: [history.calibration_table(*known)],
+    "history.gain_table": lambda _cell, known: [history.gain_table(known[1])],
+    "paper_tables.view": _paper,
+    "proposal.change_table": _changes,
+    "residual.turns_view": _turns,
+    "urdf.urdf_view": _urdf,
+    "validation.validation_view": _validation,
+    "weighing.contact_view": _contact,
+    "weighing.weighed_view": _weighed,
+}
+"""One for each function that makes a table, by file and name."""
+
+
+def _calls(tree: ast.AST) -> set[str]:
+    return {node.func.id for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
+
+
+def test_every_function_that_makes_a_table_has_an_example(checkout: Path) -> None:
+    makers, others = set(), set()
+    for path in (checkout / "daq").rglob("*.py"):
+        if path == checkout / "daq/report/text.py":
+            continue
+        source = path.read_text(encoding="utf-8")
+        tree = ast.parse(source)
+        functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+        makers |= {f"{path.stem}.{one.name}" for one in functions if {"plain_table", "WholeTable"} & _calls(one)}
+        if "rich.table" in source and "Table" in _calls(tree):
+            others.add(path.name)
+    assert makers == EXAMPLES.keys()
+    assert others == set(), "use plain_table of daq/report/text.py, whose tables never cut a value"
+
+
+def _tables(parts: Iterable[RenderableType]) -> Iterator[Table]:
+    for part in parts:
+        if isinstance(part, Group):
+            yield from _tables(part.renderables)
+        elif isinstance(part, Table):
+            yield part
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_every_number_of_a_table_is_whole_at_80_columns_and_in_a_pipe(name: str, cell: Cell, series: Any) -> None:
+    tables = list(_tables(EXAMPLES[name](cell, series)))
+    assert tables
+    for table in tables:
+        assert isinstance(table, WholeTable)
+        words = [
+            word for column in table.columns for value in (column.header, *column.cells) for word in str(value).split()
+        ]
+        for width, terminal in ((80, True), (PIPE_COLUMNS, False)):
+            out = io.StringIO()
+            console = Console(
+                file=out, width=width, force_terminal=terminal, color_system=None, soft_wrap=True, highlight=False
+            )
+            console.print(table)
+            shown = out.getvalue()
+            assert "…" not in shown
+            assert [word for word in words if re.search(r"\d", word) and word not in shown] == []
+            assert max(cell_len(line.rstrip()) for line in shown.splitlines()) <= width
+
+
+def test_a_row_keeps_its_style_in_every_form() -> None:
+    for width in (20, 40, 80):
+        out = io.StringIO()
+        table = WholeTable()
+        for heading in ("axis", "state", "another"):
+            table.add_column(heading, no_wrap=True)
+        table.add_row("J1", "x" * 15, "y" * 15, style="bold red")
+        Console(file=out, width=width, force_terminal=True, color_system="standard", soft_wrap=True).print(table)
+        assert out.getvalue().count("\x1b[1;31m") >= 2
+
+
+def test_a_log_is_described_in_whole_words() -> None:
+    digest = "0123456789abcdef" * 4
+    described = {"sha256": digest, "stamped_duration_s": 12345.678, "missing": {f"J{n}": 100 + n for n in range(40)}}
+    lines = [str(line) for line in log_lines(described, 80)]
+    assert max(map(cell_len, lines)) <= 80
+    assert f"  {digest}" in lines
+    assert all(f"J{n} {100 + n}" in " ".join("\n".join(lines).split()) for n in range(40))
