@@ -11,16 +11,20 @@ root mean square of the current predicted so far in motion. It is the size that 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from daq.config.cell import Cell, model_of
+from daq.errors import DaqError
+from daq.workflow.feed import RunFacts
 from daq.workflow.validate import check_cell, conditioning_of, unpredictable
 from ident.arrays import FloatArray, IntArray
 from ident.calibration import Calibration
 from ident.data.conditioning import central_differences, decimator, low_pass
 from ident.data.dataset import planned
+from ident.errors import IdentificationError
 from ident.model.bodies import Payload
 from ident.model.robot import Motion
 from ident.prediction import predict_current
@@ -71,17 +75,26 @@ class Predictor:
         self._squares, self._count = np.zeros(len(cell.axes)), np.zeros(len(cell.axes))
         self._cycle, self._position, self._current = -1, np.zeros((0, 0)), np.zeros((0, 0))
 
-    def take(self, cycle: int, position_rad: FloatArray, current: FloatArray) -> Rows | None:
-        """Take consecutive samples, the first of the given cycle; returns the rows that are complete now.
+    def take(self, cycle: IntArray, position_rad: FloatArray, current: FloatArray) -> list[Rows]:
+        """Take samples in their order; returns the rows that are complete now.
 
         Args:
-            cycle: a gap after the samples before begins a new window.
+            cycle: of each sample, shape (k,); a gap begins a new window.
             position_rad: joint positions [rad; m of a prismatic joint], shape (k, n).
             current: of the motors, shape (k, n).
 
         Raises:
             IdentificationError: the calibration cannot predict this motion.
         """
+        edges = [0, *(np.flatnonzero(np.diff(cycle) != 1) + 1).tolist(), len(cycle)]
+        parts = [
+            self._take(int(cycle[begin]), position_rad[begin:end], current[begin:end])
+            for begin, end in pairwise(edges)
+            if end > begin
+        ]
+        return [part for part in parts if part is not None]
+
+    def _take(self, cycle: int, position_rad: FloatArray, current: FloatArray) -> Rows | None:
         if cycle != self._cycle + len(self._position) or not len(self._position):
             self._cycle, self._position, self._current = cycle, position_rad, current
         else:
@@ -114,6 +127,23 @@ class Predictor:
         band = self._share * np.sqrt(self._squares / np.maximum(self._count, 1.0))
         predicted = np.where(still, np.nan, predicted)
         return Rows(self._cycle + 1 + centres[whole], predicted.T, (measured - predicted).T, band)
+
+
+def predictor_of(calibration: Calibration, cell: Cell, run: RunFacts) -> tuple[Predictor | None, str]:
+    """Return the predictor of a run, and why it predicts nothing, empty if it does."""
+    if run.axes != cell.axis_names:
+        return None, "no prediction: the run has other axes than the cell file"
+    payload = next((one.payload for one in cell.payloads if one.name == run.payload), None)
+    try:
+        if run.rate_hz < 2.0 * (passed_hz := conditioning_of(calibration).position_cutoff_hz):
+            return None, (
+                f"no prediction: {run.rate_hz:.3g} positions a second are too few for velocity and acceleration; the "
+                f"fit's filter passes {passed_hz:g} Hz"
+            )
+        found = Predictor(calibration, cell, payload, run.rate_hz)
+    except (DaqError, IdentificationError) as error:
+        return None, f"no prediction: {error}"
+    return found, found.problem
 
 
 def _identified(calibration: Calibration, mounting: str) -> set[str]:

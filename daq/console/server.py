@@ -15,6 +15,7 @@ import secrets
 import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
+from dataclasses import asdict
 from importlib.resources import files
 from math import isfinite
 from typing import Any
@@ -182,7 +183,7 @@ class Page:
                 message: dict[str, Any] = {}
                 if epoch != live.epoch:
                     epoch, seen = live.epoch, [0, 0, 0]
-                    message["run"] = live.run
+                    message["run"] = None if live.run is None else asdict(live.run)
                 rings = {"points": live.points, "rows": live.rows, "events": live.events}
                 for place, (name, ring) in enumerate(rings.items()):
                     if new := ring.since(seen[place]):

@@ -36,7 +36,7 @@ def cell_file(tmp_path: Path) -> Path:
 def _console(cell_file: Path, feed: Feed) -> socket.socket:
     console = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     console.settimeout(10)
-    console.connect(socket_names(cell_file)[0])
+    console.connect(socket_names(cell_file).feed)
     while not feed._new:  # the feed's thread has accepted it
         time.sleep(0.001)
     return console
@@ -97,7 +97,7 @@ def test_a_stop_is_acknowledged_and_its_end_reported_while_the_curves_stall(cell
         recording = Recording(feed, cell, cell_file)
         with _console(cell_file, feed):
             recording.run(60_000)
-            asking.connect(socket_names(cell_file)[1])
+            asking.connect(socket_names(cell_file).stop)
             asking.sendall(STOP)
             assert asking.recv(len(ACCEPTED)) == ACCEPTED
             assert stopped.wait(10)
@@ -108,7 +108,7 @@ def test_a_stop_is_acknowledged_and_its_end_reported_while_the_curves_stall(cell
 def test_another_word_stops_nothing(cell_file: Path) -> None:
     with Feed(cell_file, stop=lambda: pytest.fail("stopped")), socket.socket(socket.AF_UNIX) as asking:
         asking.settimeout(10)
-        asking.connect(socket_names(cell_file)[1])
+        asking.connect(socket_names(cell_file).stop)
         asking.sendall(b"GET /")
         assert asking.recv(10) == b""
 
