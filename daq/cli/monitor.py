@@ -173,8 +173,10 @@ class _Watch:
     def _take_events(self, events: tuple[CellEvent, ...]) -> None:
         from drivers.stream.sample import EventKind
 
-        self._events.extend(events)
         for event in events:
+            if event.kind is EventKind.BUS_BUSY:
+                continue  # another master is no event here: the head line names it
+            self._events.append(event)
             if event.axis is not None and event.kind in (EventKind.EMCY, EventKind.EMCY_RESET):
                 self._codes[event.axis] = event.code if event.kind is EventKind.EMCY else 0
             if self._facts is not None:
