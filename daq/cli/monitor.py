@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -95,7 +96,7 @@ def monitor_verb(
 
 @dataclass(frozen=True, slots=True)
 class _Source:
-    """What the samples depend on; when it changes, curves and prediction begin anew."""
+    """Origin and scale of the samples; when they change, curves and prediction begin anew."""
 
     reading: str
     recorded: bool  #: the facts are those of a recorder
@@ -119,7 +120,8 @@ class _Watch:
 
         self._cell_file, self._cell, self._network, self._feed = cell_file, cell, network, feed
         self._calibration, self._payload = calibration, payload
-        self._monitor = CellMonitor(network.link, network.axes, self._take)
+        offset_ns = time.time_ns() - network.link.clock()
+        self._monitor = CellMonitor(network.link, network.axes, self._take, offset_ns)
         self._ampere: list[float | None] = [None] * len(network.axes)
         self._events: deque[CellEvent] = deque(maxlen=5)
         self._unscaled = set(range(len(network.axes)))  # axes whose scale was not asked for yet

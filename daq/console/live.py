@@ -71,6 +71,25 @@ class Ring:
         return [] if new <= 0 else [self._entries[index] for index in range(-new, 0)]
 
 
+class Reader:
+    """Keeps the place of one reader in the curves."""
+
+    def __init__(self, live: Live) -> None:
+        self._live, self._epoch, self._seen = live, -1, [0, 0, 0]
+
+    def news(self) -> tuple[bool, dict[str, list[Any]]]:
+        """Return whether another run has begun, and the new points, rows and events."""
+        live, begun = self._live, self._epoch != self._live.epoch
+        if begun:
+            self._epoch, self._seen = live.epoch, [0, 0, 0]
+        found = {}
+        for place, (name, ring) in enumerate((("points", live.points), ("rows", live.rows), ("events", live.events))):
+            if new := ring.since(self._seen[place]):
+                found[name] = new
+            self._seen[place] = ring.end
+        return begun, found
+
+
 class Live:
     """The cell as the feed shows it. All of it runs in one event loop."""
 
@@ -98,7 +117,7 @@ class Live:
         self._number: int | None = None
         self._last: Any = None
         self._words = [0] * len(self.cell.axes)
-        self._origin_ns: int | None = None
+        self.origin_ns: int | None = None  #: Time of the points' zero [ns since 1970]
         self._predictor: Predictor | None = None
         self._band = [nan] * len(self.cell.axes)
         self._rate: deque[tuple[float, int]] = deque(maxlen=50)
@@ -147,8 +166,8 @@ class Live:
 
     def _shown(self, event: dict[str, Any]) -> dict[str, Any]:
         """Return an event for the page: time since the start of the run, axis by name, and the remedy."""
-        if self._origin_ns is None:
-            self._origin_ns = event["time_ns"]
+        if self.origin_ns is None:
+            self.origin_ns = event["time_ns"]
         kind = EventKind(event["kind"])
         if kind is EventKind.MOVE_END:
             self.done = max(self.done, event["code"] + 1)
@@ -156,16 +175,16 @@ class Live:
             # The stop after a fault has no samples, but its states are events.
             self._words[event["axis"]] = event["code"]
         axis = None if event["axis"] is None else self.cell.axis_names[event["axis"]]
-        time_s = 1e-9 * (event["time_ns"] - self._origin_ns)
+        time_s = 1e-9 * (event["time_ns"] - self.origin_ns)
         return {"time_s": round(time_s, 6), **event_document(kind, event["code"], axis, event["text"])}
 
     def _take_samples(self, samples: Any) -> None:
-        if self._origin_ns is None:
-            self._origin_ns = int(samples["time_ns"][0])
+        if self.origin_ns is None:
+            self.origin_ns = int(samples["time_ns"][0])
         position = self._scale.joint_position(samples["position_counts"].astype(np.int64))
         current = samples["current_raw"] * self._scale.current_per_unit
         shown = samples["cycle"] % self._every == 0
-        times = 1e-9 * (samples["time_ns"] - self._origin_ns)
+        times = 1e-9 * (samples["time_ns"] - self.origin_ns)
         self.points.add(np.column_stack((times, position / self._unit, current))[shown].tolist())
         self._last, self._words = samples[-1], samples[-1]["statusword"].tolist()
         if self._predictor is not None and not self.remark:

@@ -35,4 +35,7 @@ def event_document(kind: EventKind, code: int, axis: str | None, text: str) -> d
     remedy = remedy_of(code) if kind is EventKind.EMCY else REMEDIES.get(kind, "")
     # The axis is shown beside the text.
     shown = text if axis is None else re.sub(rf"^{re.escape(axis)}( \(node \d+\))?: ", "", text)
-    return {"axis": axis, "kind": kind.value, "text": shown, "remedy": remedy, "alarm": kind in ALARMING}
+    return {
+        **{"axis": axis, "kind": kind.value, "code": code},
+        **{"text": shown, "remedy": remedy, "alarm": kind in ALARMING},
+    }

@@ -126,7 +126,11 @@ class CellMonitor:
     """Reads a bus and, where no other master is on it, its axes by SDO; nothing else may read the link meanwhile."""
 
     def __init__(
-        self, link: Link, axes: tuple[Axis, ...], on_sample: Callable[[Sample], None] = lambda _sample: None
+        self,
+        link: Link,
+        axes: tuple[Axis, ...],
+        on_sample: Callable[[Sample], None] = lambda _sample: None,
+        wall_minus_monotonic_ns: int = 0,
     ) -> None:
         """Store the arguments.
 
@@ -134,10 +138,11 @@ class CellMonitor:
             link: open bus.
             axes: of the cell.
             on_sample: receives every sample while the bus is watched. An axis that did not answer is marked missing.
+            wall_minus_monotonic_ns: offset of the stamps of samples and events from the link's clock [ns].
         """
         self.period_ns: int | None = None
         """Period of SYNC; SYNCs that this program missed then leave a gap in the samples' cycles. None counts SYNCs."""
-        self._link, self._on_sample = link, on_sample
+        self._link, self._on_sample, self._offset_ns = link, on_sample, wall_minus_monotonic_ns
         self._axes = tuple(_AxisWatch(axis) for axis in axes)
         self._by_cob_id = {cob_id: axis for axis in self._axes for cob_id in axis.slots}
         self._by_node = {axis.node_id: axis for axis in self._axes}
@@ -181,7 +186,7 @@ class CellMonitor:
         frames = tuple(tuple(self._frames[bus, length] for length in range(9)) for bus in range(len(self._buses)))
         sync_hz, self._syncs = self._syncs / lasted_s, 0
         self._frames.clear()
-        events = self._link.take_events(now_ns, tuple(self._by_node))
+        events = self._link.take_events(now_ns + self._offset_ns, tuple(self._by_node))
         return CellReading(self.source, lasted_s, tuple(axes), sync_hz, frames, events)
 
     def pause(self) -> None:
@@ -255,5 +260,5 @@ class CellMonitor:
         columns = zip(*([value or 0 for value in axis.values] for axis in self._axes), strict=True)
         position, current, statusword = columns
         bits = sum(1 << number for number, absent in enumerate(missing) if absent)
-        self._on_sample(Sample(self._cycle, time_ns, position, current, statusword, bits))
+        self._on_sample(Sample(self._cycle, time_ns + self._offset_ns, position, current, statusword, bits))
         self._cycle += 1

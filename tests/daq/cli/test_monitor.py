@@ -80,7 +80,7 @@ class QuietBus(can.BusABC):
 
 @dataclass(frozen=True)
 class Network:
-    """What a monitor needs of a network."""
+    """The part of a network that a monitor needs."""
 
     link: Link
     axes: tuple[Axis, ...]
@@ -348,7 +348,7 @@ def _moving(bus: QuietBus, seconds: float, factor: float) -> RunFacts:
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.2])
-def test_the_predicted_current_stands_beside_the_measured_one_and_only_a_wrong_gain_is_coloured(
+def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong_gain_is_coloured(
     bus: QuietBus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factor: float
 ) -> None:
     calibration = predicting_calibration()

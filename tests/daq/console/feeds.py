@@ -98,17 +98,17 @@ class WatchedLive(Live):
     def take(self, packet: bytes) -> None:
         """Take a packet."""
         super().take(packet)
-        self._tell()
+        self._notify()
 
     def _clear(self, phase: str, run: RunFacts | None) -> None:
         super()._clear(phase, run)
-        self._tell()
+        self._notify()
 
     def _finish(self, end: dict[str, Any]) -> None:
         super()._finish(end)
-        self._tell()
+        self._notify()
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         with self.changed:
             self.changed.notify_all()
 
