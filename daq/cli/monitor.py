@@ -116,12 +116,13 @@ class _Watch:
         payload: str | None,
     ) -> None:
         from daq.config.cell import PacingMode
+        from daq.workflow.safeguards import bus_taken
         from drivers.stream.monitor import CellMonitor
 
         self._cell_file, self._cell, self._network, self._feed = cell_file, cell, network, feed
         self._calibration, self._payload = calibration, payload
         offset_ns = time.time_ns() - network.link.clock()
-        self._monitor = CellMonitor(network.link, network.axes, self._take, offset_ns)
+        self._monitor = CellMonitor(network.link, network.axes, self._take, offset_ns, taken=lambda: bus_taken(cell))
         self._ampere: list[float | None] = [None] * len(network.axes)
         self._events: deque[CellEvent] = deque(maxlen=5)
         self._unscaled = set(range(len(network.axes)))  # axes whose scale was not asked for yet
@@ -137,12 +138,13 @@ class _Watch:
 
     def listen(self, seconds: float) -> None:
         """Listen for another master; its samples count for the first reading."""
+        from daq.workflow.safeguards import bus_taken
         from drivers.stream.sample import EventKind
 
         reading = self._monitor.watch(seconds)
         # At the start a node's presence is no news; an error is.
         self._take_events(tuple(event for event in reading.events if event.kind is not EventKind.NMT))
-        self._follow(reading)
+        self._follow(reading, bus_taken(self._cell))
 
     def read(self, interval_s: float) -> dict[str, Any]:
         """Read the bus for a time; returns the document of what is shown."""
@@ -151,8 +153,10 @@ class _Watch:
 
         reading = self._monitor.watch(interval_s)
         self._take_events(reading.events)
-        self._query(reading)
-        self._follow(reading)
+        recorder = bus_taken(self._cell)
+        if not recorder:
+            self._query(reading)
+        self._follow(reading, recorder)
         self._predict()
         return monitor_document(
             self._cell,
@@ -160,7 +164,7 @@ class _Watch:
             self._ampere,
             self._events,
             faults=self._faults(),
-            recorder=bus_taken(self._cell),
+            recorder=recorder,
             prediction=self._prediction(),
         )
 
@@ -214,18 +218,17 @@ class _Watch:
 
         return {self._cell.axis_names[axis]: explain(code) for axis, code in self._codes.items() if code}
 
-    def _follow(self, reading: CellReading) -> None:
+    def _follow(self, reading: CellReading, recorder: bool) -> None:
         """Begin anew where the source of the samples has changed."""
         from daq.errors import LogIncomplete
         from daq.workflow.feed import facts_of_recorder
-        from daq.workflow.safeguards import bus_taken
         from drivers.stream.monitor import ReadingSource
 
         if reading.source is ReadingSource.OVERHEARD and reading.sync_hz == 0.0:
             self._facts, self._source, self._remark = None, None, "no prediction: there is no SYNC"
             self._samples.clear()
             return
-        recorder = reading.source is ReadingSource.OVERHEARD and bus_taken(self._cell)
+        recorder = recorder and reading.source is ReadingSource.OVERHEARD
         recorded = self._source is not None and self._source.recorded and recorder
         run = facts_of_recorder(self._cell_file, FACTS_S) if recorder and not recorded else None
         if run is not None:

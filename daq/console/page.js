@@ -199,8 +199,8 @@ function showStatus(status) {
     ["Samples", String(status.samples)],
     ["SYNC cycles lost", String(status.lost), status.lost > 0],
     ["Missing answers", String(status.missing), status.missing > 0],
-    ["SYNC rate", running || watching ? `${number(status.rate_hz, 0)} Hz` : "–"],
-    ["Bus load, computed", running && loads ? loads : "–"],
+    ["Sample rate", running || watching ? `${number(status.rate_hz, 0)} Hz` : "–"],
+    ["Bus load, computed", (running || watching) && loads ? loads : "–"],
     ["Disk free", status.free_bytes === null ? "–" : `${number(status.free_bytes / 1e9, 1)} GB`],
     ["Packets this page missed", String(status.dropped)],
   ];

@@ -131,6 +131,7 @@ class CellMonitor:
         axes: tuple[Axis, ...],
         on_sample: Callable[[Sample], None] = lambda _sample: None,
         wall_minus_monotonic_ns: int = 0,
+        taken: Callable[[], bool] = lambda: False,
     ) -> None:
         """Store the arguments.
 
@@ -139,10 +140,13 @@ class CellMonitor:
             axes: of the cell.
             on_sample: receives every sample while the bus is watched. An axis that did not answer is marked missing.
             wall_minus_monotonic_ns: offset of the stamps of samples and events from the link's clock [ns].
+            taken: whether a recorder has taken the bus and listens before it sends; from then on nothing is sent, since
+                it would refuse to begin.
         """
         self.period_ns: int | None = None
         """Period of SYNC; SYNCs that this program missed then leave a gap in the samples' cycles. None counts SYNCs."""
         self._link, self._on_sample, self._offset_ns = link, on_sample, wall_minus_monotonic_ns
+        self._taken = taken
         self._axes = tuple(_AxisWatch(axis) for axis in axes)
         self._by_cob_id = {cob_id: axis for axis in self._axes for cob_id in axis.slots}
         self._by_node = {axis.node_id: axis for axis in self._axes}
@@ -196,10 +200,11 @@ class CellMonitor:
 
     def _ask(self) -> None:
         now_ns = self._link.clock()
-        for axis in self._axes:
-            entry = axis.next_request(now_ns)
-            if entry is None:
-                continue
+        due = [(axis, entry) for axis in self._axes if (entry := axis.next_request(now_ns)) is not None]
+        if due and self._taken():
+            self._lead()
+            return
+        for axis, entry in due:
             data = struct.pack("<BHB4x", _UPLOAD, entry.index, entry.subindex)
             request = can.Message(arbitration_id=0x600 + axis.node_id, is_extended_id=False, data=data)
             self._link.send((request,))
@@ -229,7 +234,7 @@ class CellMonitor:
             self._link.dispatch(message)
 
     def _lead(self) -> None:
-        """Note a command of another master."""
+        """Note that there is another master."""
         if self.source is ReadingSource.ASKED:
             self.pause()
             for axis in self._axes:

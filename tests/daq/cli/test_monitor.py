@@ -209,6 +209,18 @@ def test_asking_ends_when_another_master_speaks(bus: QuietBus, identifier: int) 
     assert len(bus.sent) == asked + 6
 
 
+def test_nothing_is_sent_once_a_recorder_has_the_bus(bus: QuietBus) -> None:
+    """It listens before its first frame, and would refuse to begin."""
+    held: list[bool] = []
+    monitor = CellMonitor(_link(bus), drive_axes(CELL), taken=lambda: bool(held))
+    monitor.watch(QUIET_S + 0.5)
+    asked = len(bus.sent)
+    assert asked > 0
+    held.append(True)
+    assert monitor.watch(1.0).source is ReadingSource.OVERHEARD
+    assert len(bus.sent) == asked
+
+
 def test_a_late_answer_to_another_client_is_no_reading(bus: QuietBus) -> None:
     monitor = _monitor(bus)
     monitor.watch(QUIET_S + 0.01)
