@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from ident.calibration import Calibration
 
 FACTS_S = 0.1  #: Time for a recorder to name its run; it sends to a new console within 20 ms
+KEPT_EVENTS = 5  #: Alarming events, and others
 SAME_RATE = 0.01  #: Largest relative difference at which SYNC is taken to have the cell file's period
 
 
@@ -124,7 +125,8 @@ class _Watch:
         offset_ns = time.time_ns() - network.link.clock()
         self._monitor = CellMonitor(network.link, network.axes, self._take, offset_ns, taken=lambda: bus_taken(cell))
         self._ampere: list[float | None] = [None] * len(network.axes)
-        self._events: deque[CellEvent] = deque(maxlen=5)
+        self._events: deque[CellEvent] = deque(maxlen=KEPT_EVENTS)
+        self._alarms: deque[CellEvent] = deque(maxlen=KEPT_EVENTS)  # which other events do not displace
         self._unscaled = set(range(len(network.axes)))  # axes whose scale was not asked for yet
         self._lockstep = cell.sync is not None and cell.sync.pacing is PacingMode.LOCKSTEP
         self._codes: dict[int, int] = {}  # last error code of each axis that is in fault
@@ -162,7 +164,7 @@ class _Watch:
             self._cell,
             reading,
             self._ampere,
-            self._events,
+            sorted((*self._alarms, *self._events), key=lambda event: event.time_ns),
             faults=self._faults(),
             recorder=recorder,
             prediction=self._prediction(),
@@ -177,12 +179,13 @@ class _Watch:
             self._feed.sample(sample)
 
     def _take_events(self, events: tuple[CellEvent, ...]) -> None:
+        from daq.report.events import ALARMING
         from drivers.stream.sample import EventKind
 
         for event in events:
             if event.kind is EventKind.BUS_BUSY:
                 continue  # another master is no event here: the head line names it
-            self._events.append(event)
+            (self._alarms if event.kind in ALARMING else self._events).append(event)
             if event.axis is not None and event.kind in (EventKind.EMCY, EventKind.EMCY_RESET):
                 self._codes[event.axis] = event.code if event.kind is EventKind.EMCY else 0
             if self._facts is not None:
@@ -212,6 +215,17 @@ class _Watch:
             if in_fault and number not in self._codes:
                 self._monitor.pause()
                 self._codes[number] = error_code(self._network, axis)
+                self._publish_fault(number)
+
+    def _publish_fault(self, axis: int) -> None:
+        """Show an error to the console that it cannot know: of before the run, or read from the drive."""
+        from drivers.canopen.emcy import explain
+        from drivers.stream.sample import CellEvent, EventKind
+
+        code = self._codes[axis]
+        if code and self._facts is not None:
+            text = f"in fault: {explain(code).hex} {explain(code).text}"
+            self._feed.event(CellEvent(time.time_ns(), axis, EventKind.EMCY, code, text))
 
     def _faults(self) -> dict[str, ErrorCode]:
         from drivers.canopen.emcy import explain
@@ -285,6 +299,8 @@ class _Watch:
         self._monitor.period_ns = None if self._lockstep else round(1e9 / facts.rate_hz)
         self._facts, self._count, self._missing = facts, 0, [0] * len(facts.axes)
         self._feed.begin(facts, self._statistics)
+        for axis in self._codes:
+            self._publish_fault(axis)
         self._predictor = self._recent = None
         if self._calibration is not None:
             self._predictor, self._remark = predictor_of(self._calibration, self._cell, facts)

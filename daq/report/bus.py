@@ -156,6 +156,8 @@ def monitor_document(
     """
     from drivers.canopen.link import nmt_name  # noqa: PLC0415 - as above
 
+    # While another master prepares, it sends no SYNC, and no axis has to answer.
+    addressed = reading.source.value == "asked" or reading.sync_hz > 0.0
     axes: list[dict[str, Any]] = []
     for declared, axis, position, ampere_per_unit in zip(
         cell.axes, reading.axes, joint_positions(cell, reading), ampere, strict=True
@@ -177,7 +179,7 @@ def monitor_document(
                 "statusword": word,
                 "nmt": None if axis.nmt is None else nmt_name(axis.nmt),
                 **picked(axis, "rate_hz", "lost"),
-                "silent": axis.rate_hz == 0.0,
+                "silent": axis.rate_hz == 0.0 and addressed,
                 "fault": asdict(faults[declared.name]) if state in FAULTY and declared.name in faults else None,
                 "prediction": prediction["axes"][len(axes)] if prediction is not None and prediction["axes"] else None,
             }

@@ -110,9 +110,9 @@ def _monitor(bus: QuietBus, samples: list[Sample] | None = None) -> CellMonitor:
     return CellMonitor(_link(bus), drive_axes(CELL), kept.append)
 
 
-def _watch(bus: QuietBus, cell_file: Path, calibration: Calibration | None = None) -> _Watch:
+def _watch(bus: QuietBus, cell_file: Path, calibration: Calibration | None = None, feed: Feed | None = None) -> _Watch:
     network = cast(CanopenNetwork, Network(_link(bus), drive_axes(CELL)))
-    return _Watch(cell_file, CELL, network, Feed(cell_file, stop=None), calibration, None)
+    return _Watch(cell_file, CELL, network, feed or Feed(cell_file, stop=None), calibration, None)
 
 
 def _answers(at_ns: int, cycle: int, silent: int | None = None) -> list[tuple[int, can.Message]]:
@@ -384,7 +384,9 @@ def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong
     coloured = [line for line in out.getvalue().splitlines() if "33m" in line]
     assert [line.split("J")[1][0] for line in coloured] == (["4"] if factor > 1.0 else [])
     bus.coming.clear()
-    assert watch.read(0.5)["prediction"]["remark"] == "no prediction: there is no SYNC"
+    document = watch.read(0.5)
+    assert document["prediction"]["remark"] == "no prediction: there is no SYNC"
+    assert not any(axis["silent"] for axis in document["axes"])  # nobody has asked them
 
 
 def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_remedy(
@@ -399,7 +401,8 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
         bus.coming.append((bus.clock.now_ns, _frame(msg.arbitration_id - 0x80, reply)))
 
     bus.send = answer  # type: ignore[method-assign]
-    watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration())
+    feed = Feed(tmp_path / "cell.yaml", stop=None)
+    watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), feed)
     watch.listen(QUIET_S)
     document = watch.read(0.5)
     assert document["source"] == "asked"
@@ -410,7 +413,11 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
     out = io.StringIO()
     Console(file=out, width=200).print(monitor_view(document))
     assert "J3 is in fault: 7305h incremental sensor 1 fault; check the plugs and cables of encoder" in out.getvalue()
+    # A console gets it too, however late it comes.
+    assert [(event["axis"], event["code"]) for event in feed._events] == [(2, 0x7305)]
     bus.coming.append((bus.clock.now_ns, _frame(0x82, struct.pack("<HB5x", 0x3210, 1))))
-    notice = watch.read(0.5)["notices"][-1]
+    for node in range(1, 7):  # other events do not displace it
+        bus.coming.append((bus.clock.now_ns, _frame(0x700 + node, b"\x05")))
+    (notice,) = (one for one in watch.read(0.5)["notices"] if one["alarm"])
     assert notice == event_document(EventKind.EMCY, 0x3210, "J2", notice["text"])
     assert notice["text"].startswith("EMCY 3210h") and notice["remedy"] == remedy_of(0x3210)
