@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 FACTS_S = 0.1  #: Time for a recorder to name its run; it sends to a new console within 20 ms
 KEPT_EVENTS = 5  #: Alarming events, and others
-SAME_RATE = 0.01  #: Largest relative difference at which SYNC is taken to have the cell file's period
+SAME_RATE = 0.01  #: Largest relative difference at which two rates of SYNC are the same
+CHANGED_RATE = 0.1  #: Relative difference at which it is another one, beside lost SYNCs
 
 
 def monitor_verb(
@@ -101,6 +102,7 @@ class _Source:
 
     reading: str
     recorded: bool  #: the facts are those of a recorder
+    rate_hz: float | None  #: of the samples, None where a recorder names it
     ampere: tuple[float | None, ...]
 
 
@@ -137,6 +139,7 @@ class _Watch:
         self._predictor: Predictor | None = None
         self._recent: Recent | None = None
         self._remark = ""
+        self._sync_hz = 0.0  # of the last reading
 
     def listen(self, seconds: float) -> None:
         """Listen for another master; its samples count for the first reading."""
@@ -247,33 +250,46 @@ class _Watch:
         run = facts_of_recorder(self._cell_file, FACTS_S) if recorder and not recorded else None
         if run is not None:
             self._ampere = [value if isfinite(value) else None for value in run.current_per_unit]
-        source = _Source(reading.source.value, recorded or run is not None, tuple(self._ampere))
-        if source == self._source:
+        recorded = recorded or run is not None
+        rate_hz = None if recorded else self._rate_hz(reading)
+        source = _Source(reading.source.value, recorded, rate_hz, tuple(self._ampere))
+        if source == self._source or (rate_hz is None and not recorded):
             return
         if self._source is not None:
             self._samples.clear()  # they are of another rate
         self._source = source
         try:
-            self._begin(self._own_facts(reading) if run is None else replace(run, log=None, moves=0))
+            self._begin(self._own_facts(reading, rate_hz or 0.0) if run is None else replace(run, log=None, moves=0))
         except LogIncomplete as error:
             self._facts, self._remark = None, str(error)
 
-    def _own_facts(self, reading: CellReading) -> RunFacts:
+    def _rate_hz(self, reading: CellReading) -> float | None:
+        """Rate of the samples; None where SYNC began or changed within a reading, whose count is then not its rate."""
+        from drivers.stream.monitor import READING_S, ReadingSource
+
+        if reading.source is ReadingSource.ASKED:
+            return 1.0 / READING_S
+        sync = self._cell.sync
+        declared_hz = 0.0 if sync is None else 1e6 / sync.period_us
+        if self._lockstep:
+            return declared_hz
+        before_hz, self._sync_hz = self._sync_hz, reading.sync_hz
+        counting_hz = 2.0 / reading.seconds  # error of a count of SYNCs
+        known_hz = 0.0 if self._source is None else self._source.rate_hz or 0.0
+        if abs(reading.sync_hz - known_hz) < CHANGED_RATE * known_hz + counting_hz:
+            return known_hz
+        if abs(reading.sync_hz - before_hz) > SAME_RATE * before_hz + counting_hz:
+            return None
+        same = abs(reading.sync_hz - declared_hz) < SAME_RATE * declared_hz + counting_hz
+        return declared_hz if same else reading.sync_hz
+
+    def _own_facts(self, reading: CellReading, rate_hz: float) -> RunFacts:
         """Facts of a run that no recorder names."""
         from daq.log.conversion import scaling
         from daq.log.metadata import AxisReadback, Readback
         from daq.report.bus import bus_loads_percent
         from daq.workflow.feed import RunFacts
-        from drivers.stream.monitor import READING_S, ReadingSource
 
-        sync = self._cell.sync
-        declared_hz = 0.0 if sync is None else 1e6 / sync.period_us
-        if reading.source is ReadingSource.ASKED:
-            rate_hz = 1.0 / READING_S
-        elif self._lockstep or abs(reading.sync_hz - declared_hz) < SAME_RATE * declared_hz:
-            rate_hz = declared_hz
-        else:
-            rate_hz = reading.sync_hz
         units = (nan if ampere is None else ampere for ampere in self._ampere)
         answers = zip(self._cell.axis_names, units, strict=True)
         scale = scaling(self._cell, Readback(tuple(AxisReadback(name, unit) for name, unit in answers)))

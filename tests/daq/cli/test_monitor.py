@@ -20,7 +20,7 @@ from rich.console import Console
 from daq.cli.app import main
 from daq.cli.monitor import _Watch
 from daq.config.bus import answer_us, drive_axes
-from daq.config.cell import Cell, model_of
+from daq.config.cell import Cell, PacingMode, model_of
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
 from daq.report.bus import bus_loads_percent, joint_positions, monitor_document, monitor_view
@@ -110,9 +110,15 @@ def _monitor(bus: QuietBus, samples: list[Sample] | None = None) -> CellMonitor:
     return CellMonitor(_link(bus), drive_axes(CELL), kept.append)
 
 
-def _watch(bus: QuietBus, cell_file: Path, calibration: Calibration | None = None, feed: Feed | None = None) -> _Watch:
+def _watch(
+    bus: QuietBus,
+    cell_file: Path,
+    calibration: Calibration | None = None,
+    feed: Feed | None = None,
+    cell: Cell = CELL,
+) -> _Watch:
     network = cast(CanopenNetwork, Network(_link(bus), drive_axes(CELL)))
-    return _Watch(cell_file, CELL, network, feed or Feed(cell_file, stop=None), calibration, None)
+    return _Watch(cell_file, cell, network, feed or Feed(cell_file, stop=None), calibration, None)
 
 
 def _answers(at_ns: int, cycle: int, silent: int | None = None) -> list[tuple[int, can.Message]]:
@@ -387,6 +393,23 @@ def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong
     document = watch.read(0.5)
     assert document["prediction"]["remark"] == "no prediction: there is no SYNC"
     assert not any(axis["silent"] for axis in document["axes"])  # nobody has asked them
+
+
+def test_the_rate_of_another_master_is_measured_once_its_sync_is_steady(bus: QuietBus, tmp_path: Path) -> None:
+    """Its drives' current has no known scale: what is predicted has no measured current beside it."""
+    bus.clock.now_ns += 300_000_000
+    _moving(bus, 4.0, 1.0)
+    bus.clock.now_ns -= 300_000_000  # it begins within the first reading
+    assert CELL.sync is not None
+    timed = replace(CELL, sync=replace(CELL.sync, pacing=PacingMode.TIMED))
+    watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), cell=timed)
+    watch.listen(0.5)
+    assert watch._facts is None
+    documents = [watch.read(0.5) for _ in range(6)]
+    assert watch._facts is not None
+    assert watch._facts.rate_hz == pytest.approx(PREDICTED_HZ, rel=0.01)
+    predictions = [axis["prediction"] for axis in documents[-1]["axes"]]
+    assert all(found["measured"] is None and found["residual_rms"] is None for found in predictions)
 
 
 def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_remedy(
