@@ -42,7 +42,7 @@ BY_JOB = {
         Listed("rollback", "daq.cli.apply:ROLLBACK", "Undo the last write."),
     ),
     Job.LOOK: (
-        Listed("monitor", "daq.cli.scan:MONITOR", "Show the state of the axes; nothing is changed."),
+        Listed("monitor", "daq.cli.monitor:MONITOR", "Show the state of the axes; nothing is changed."),
         Listed("console", "daq.cli.console:CONSOLE", "Show the cell live on a page, with a stop button."),
         Listed("info", "daq.cli.logs:INFO", "Show what is in a log."),
         Listed("history", "daq.cli.history:HISTORY", "Show the calibrations of a cell and any drift."),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
@@ -22,20 +22,21 @@ def console_verb(
         Path | None, typer.Option(help="Folder of a report; that of the last session by default.")
     ] = None,
     port: Annotated[int, typer.Option(help="Port on 127.0.0.1; 0 takes a free one.", min=0, max=65535)] = 0,
+    foxglove: Annotated[
+        int | None,
+        typer.Option(
+            metavar="PORT", help="Also stream to Foxglove; all programs of this computer can read it.", min=0, max=65535
+        ),
+    ] = None,
 ) -> None:
-    """Serve a page that shows the cell while it is recorded; open the address that is printed.
+    """Serve a page that shows the cell while `record`, `recalibrate` or `monitor` runs; open the printed address.
 
     The page reads only, but for a stop button, which does what Ctrl-C does to `record` and `recalibrate` and is no
     safety function. It never opens the bus, and cannot delay a recording. Ctrl-C ends the page alone.
     """
-    missing = [package for package in ("starlette", "uvicorn") if find_spec(package) is None]
-    if missing:
-        raise ConfigurationMissing(
-            "the console",
-            found=f"no package {' and '.join(missing)}",
-            expected="the web server of the optional extra `console`",
-            remedy="pip install 'drivegain[console]'",
-        )
+    _require("the web server", "console", "starlette", "uvicorn")
+    if foxglove is not None:
+        _require("the stream's server", "foxglove", "foxglove")
     from daq.config.cell_file import load_cell
     from daq.console.live import Live
     from daq.console.results import Results
@@ -46,19 +47,37 @@ def console_verb(
     known = results.calibration()
     live = Live(cell, declared)
     live.calibration = None if known is None else known[1]
-    try:
-        listener = listen(port)
-    except OSError as error:
-        raise UsageError(
-            f"--port {port}",
-            found=str(error.strerror or error),
-            expected="a free port on 127.0.0.1",
-            remedy="end the other program, or leave --port out",
-        ) from error
-    with listener, suppress(KeyboardInterrupt):
+    beside = []
+    with suppress(KeyboardInterrupt), ExitStack() as closing:
+        try:
+            listener = closing.enter_context(listen(port))
+            if foxglove is not None:
+                from daq.console.stream import FoxgloveStream
+
+                stream = FoxgloveStream(live, foxglove)
+                beside.append(stream.follow)
+                typer.echo(f"In Foxglove, open the connection ws://127.0.0.1:{stream.port}")
+        except (OSError, RuntimeError) as error:
+            raise UsageError(
+                f"--port {port}" + ("" if foxglove is None else f" or --foxglove {foxglove}"),
+                found=str(getattr(error, "strerror", None) or error),
+                expected="a free port on 127.0.0.1",
+                remedy="end the other program, or choose another port",
+            ) from error
         port, token = listener.getsockname()[1], new_token()
         typer.echo(f"Open http://127.0.0.1:{port}/{token}/ in a browser on this computer; Ctrl-C ends the page.")
-        server_of(Page(declared, live, results), token, port).run(sockets=[listener])
+        server_of(Page(declared, live, results, *beside), token, port).run(sockets=[listener])
+
+
+def _require(purpose: str, extra: str, *packages: str) -> None:
+    missing = [package for package in packages if find_spec(package) is None]
+    if missing:
+        raise ConfigurationMissing(
+            "the console",
+            found=f"no package {' and '.join(missing)}",
+            expected=f"{purpose} of the optional extra `{extra}`",
+            remedy=f"pip install 'drivegain[{extra}]'",
+        )
 
 
 CONSOLE = Verb("console", console_verb, "drivegain console CELL --calibration calibration.yaml")

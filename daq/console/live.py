@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
-import re
 import shutil
 import socket
 import time
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
-from itertools import pairwise
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -19,21 +17,20 @@ from typing import Any
 import numpy as np
 
 from daq.config.cell import Cell
-from daq.console.prediction import Predictor
-from daq.errors import DaqError
-from daq.log.conversion import SiScaling
+from daq.console.prediction import Predictor, predictor_of
 from daq.report.bus import ENABLED, FAULTY
+from daq.report.events import event_document
 from daq.workflow.feed import (
     ACCEPTED,
     HEAD,
     LARGEST_PACKET,
     SAMPLES,
     STOP,
-    of_this_user,
+    RunFacts,
+    connected,
     sample_dtype,
     socket_names,
 )
-from drivers.canopen.emcy import remedy_of
 from drivers.profiles.cia402 import decode
 from drivers.stream.sample import EventKind
 from ident.arrays import FloatArray
@@ -54,21 +51,6 @@ GONE = (
     "the recorder is gone without a word: it was killed or has crashed. The amplifiers stop by themselves where they "
     "supervise its heartbeat (1016h); look at the robot, and use the emergency stop if it moves"
 )
-REMEDIES = {
-    EventKind.HEARTBEAT_LOST: "check the drive's power and its cable; `drivegain scan` shows which nodes answer",
-    EventKind.FOLLOWING_ERROR: "check brake, load and collision; use slower moves (`record --speed 0.5`)",
-    EventKind.LIMIT: "check limit switches and current limits, or use slower moves",
-    EventKind.SAMPLE_LOST: "check the load of bus and computer; the run is marked invalid, record it again",
-    EventKind.BUS_BUSY: "end the other program on this bus",
-    EventKind.BUS_LOST: "check the CAN interface and its cable",
-    EventKind.BUS_PASSIVE: "check the bus's cable and its two terminating resistors",
-    EventKind.FRAMES_DROPPED: "reduce the load of this computer; the run is marked invalid, record it again",
-    EventKind.SYNC_LOST: "check the device that produces SYNC",
-    EventKind.PDO_LENGTH: "did another program change the mapping, or does another device use this identifier?",
-    EventKind.FROZEN: "check the encoder and the motor cable; restart the drive",
-    EventKind.STOP_UNCONFIRMED: "look at this axis; use the emergency stop if it moves",
-}
-ALARMING = frozenset(REMEDIES) | {EventKind.EMCY}
 
 
 class Ring:
@@ -89,6 +71,25 @@ class Ring:
         return [] if new <= 0 else [self._entries[index] for index in range(-new, 0)]
 
 
+class Reader:
+    """Keeps the place of one reader in the curves."""
+
+    def __init__(self, live: Live) -> None:
+        self._live, self._epoch, self._seen = live, -1, [0, 0, 0]
+
+    def news(self) -> tuple[bool, dict[str, list[Any]]]:
+        """Return whether another run has begun, and the new points, rows and events."""
+        live, begun = self._live, self._epoch != self._live.epoch
+        if begun:
+            self._epoch, self._seen = live.epoch, [0, 0, 0]
+        found = {}
+        for place, (name, ring) in enumerate((("points", live.points), ("rows", live.rows), ("events", live.events))):
+            if new := ring.since(self._seen[place]):
+                found[name] = new
+            self._seen[place] = ring.end
+        return begun, found
+
+
 class Live:
     """The cell as the feed shows it. All of it runs in one event loop."""
 
@@ -96,24 +97,27 @@ class Live:
         self.cell = cell
         self.calibration: Calibration | None = None
         self.epoch = 0  #: Number of the run; readers begin anew when it changes
-        self.run: dict[str, Any] | None = None  #: Facts of the run, as in the feed
-        self.phase = "waiting"  #: waiting, running or ended
+        self.run: RunFacts | None = None
+        self.phase = "waiting"  #: Also running (a recorder), watching (a monitor) and ended
         self.end: dict[str, Any] | None = None  #: How the program ended
         self.stop_state: dict[str, Any] | None = None  #: Of the last stop
         self.remark = ""  #: Why there is no prediction
         self._file = cell_file
         self._tasks: set[asyncio.Task[None]] = set()
-        self._clear(None)
+        self.result: dict[str, Any] | None = None
+        self._clear("waiting", None)
 
-    def _clear(self, run: dict[str, Any] | None) -> None:
+    def _clear(self, phase: str, run: RunFacts | None) -> None:
         self.epoch += 1
-        self.run, self.result, self.end, self.remark = run, None, None, ""
+        self.phase, self.run, self.remark = phase, run, ""
+        if phase != "watching":  # how the last recording ended stays on the page
+            self.result = self.end = None
         self.points, self.rows, self.events = Ring(KEPT_POINTS), Ring(KEPT_POINTS), Ring(KEPT_EVENTS)
         self.samples = self.lost = self.missing = self.dropped = self.done = 0
         self._number: int | None = None
         self._last: Any = None
         self._words = [0] * len(self.cell.axes)
-        self._origin_ns: int | None = None
+        self.origin_ns: int | None = None  #: Time of the points' zero [ns since 1970]
         self._predictor: Predictor | None = None
         self._band = [nan] * len(self.cell.axes)
         self._rate: deque[tuple[float, int]] = deque(maxlen=50)
@@ -122,20 +126,13 @@ class Live:
         self._every = 1
         if run is None:
             return
-        self._every = max(1, round(run["rate_hz"] / POINTS_HZ))
-        self._dtype = sample_dtype(len(run["axes"]))
-        arrays = (np.array(run[key]) for key in ("rad_per_count", "to_joint", "offset_rad", "current_per_unit"))
-        self._scale = SiScaling(*arrays)
+        self._every = max(1, round(run.rate_hz / POINTS_HZ))
+        self._dtype, self._scale = sample_dtype(len(run.axes)), run.scaling
         self._unit = np.array([axis.unit.si for axis in self.cell.axes])
-        if tuple(run["axes"]) != self.cell.axis_names:
+        if run.axes != self.cell.axis_names:
             self.remark = "the run has other axes than the cell file: restart the console"
         elif self.calibration is not None:
-            payload = next((one.payload for one in self.cell.payloads if one.name == run["payload"]), None)
-            try:
-                self._predictor = Predictor(self.calibration, self.cell, payload, run["rate_hz"])
-                self.remark = self._predictor.problem
-            except (DaqError, IdentificationError) as error:
-                self.remark = f"no prediction: {error}"
+            self._predictor, self.remark = predictor_of(self.calibration, self.cell, run)
 
     def take(self, packet: bytes) -> None:
         """Process one packet of the feed."""
@@ -153,19 +150,24 @@ class Live:
 
     def _take_text(self, message: dict[str, Any]) -> None:
         if message.get("run") is not None:
-            before = self._number
-            self._clear(message["run"])
-            self.phase, self._number = "running", before
+            before, run = self._number, RunFacts.of(message["run"])
+            self._clear("watching" if run.log is None else "running", run)
+            self._number = before
         self.events.add([self._shown(event) for event in message.get("events", ())])
         if message.get("result") is not None:
             self.result = message["result"]
         if message.get("end") is not None:
-            self.phase, self.end = "ended", message["end"]
+            self._finish(message["end"])
+
+    def _finish(self, end: dict[str, Any]) -> None:
+        if self.phase != "watching":  # a monitor's end says nothing of the axes
+            self.end = end
+        self.phase = "ended"
 
     def _shown(self, event: dict[str, Any]) -> dict[str, Any]:
         """Return an event for the page: time since the start of the run, axis by name, and the remedy."""
-        if self._origin_ns is None:
-            self._origin_ns = event["time_ns"]
+        if self.origin_ns is None:
+            self.origin_ns = event["time_ns"]
         kind = EventKind(event["kind"])
         if kind is EventKind.MOVE_END:
             self.done = max(self.done, event["code"] + 1)
@@ -173,22 +175,16 @@ class Live:
             # The stop after a fault has no samples, but its states are events.
             self._words[event["axis"]] = event["code"]
         axis = None if event["axis"] is None else self.cell.axis_names[event["axis"]]
-        remedy = remedy_of(event["code"]) if kind is EventKind.EMCY else REMEDIES.get(kind, "")
-        # The axis is shown beside the text.
-        text = event["text"] if axis is None else re.sub(rf"^{re.escape(axis)}( \(node \d+\))?: ", "", event["text"])
-        time_s = 1e-9 * (event["time_ns"] - self._origin_ns)
-        return {
-            **{"time_s": round(time_s, 6), "axis": axis, "kind": kind.value, "text": text},
-            **{"remedy": remedy, "alarm": kind in ALARMING},
-        }
+        time_s = 1e-9 * (event["time_ns"] - self.origin_ns)
+        return {"time_s": round(time_s, 6), **event_document(kind, event["code"], axis, event["text"])}
 
     def _take_samples(self, samples: Any) -> None:
-        if self._origin_ns is None:
-            self._origin_ns = int(samples["time_ns"][0])
+        if self.origin_ns is None:
+            self.origin_ns = int(samples["time_ns"][0])
         position = self._scale.joint_position(samples["position_counts"].astype(np.int64))
         current = samples["current_raw"] * self._scale.current_per_unit
         shown = samples["cycle"] % self._every == 0
-        times = 1e-9 * (samples["time_ns"] - self._origin_ns)
+        times = 1e-9 * (samples["time_ns"] - self.origin_ns)
         self.points.add(np.column_stack((times, position / self._unit, current))[shown].tolist())
         self._last, self._words = samples[-1], samples[-1]["statusword"].tolist()
         if self._predictor is not None and not self.remark:
@@ -196,31 +192,26 @@ class Live:
 
     def _predict(self, samples: Any, position: FloatArray, current: FloatArray, last_s: float) -> None:
         assert self._predictor is not None and self.run is not None
-        last = int(samples["cycle"][-1])
-        gaps = np.flatnonzero(np.diff(samples["cycle"].astype(np.int64)) != 1) + 1
-        edges = [0, *gaps.tolist(), len(samples)]
+        cycle, whole = samples["cycle"].astype(np.int64), samples["missing"] == 0
         try:
-            for begin, end in pairwise(edges):
-                first = int(samples["cycle"][begin])
-                rows = self._predictor.take(first, position[begin:end], current[begin:end])
-                if rows is not None:
-                    times = last_s - (last - rows.cycle) / self.run["rate_hz"]
-                    self.rows.add(np.column_stack((times, rows.predicted, rows.residual)).tolist())
-                    self._band = rows.band.tolist()
+            for rows in self._predictor.take(cycle[whole], position[whole], current[whole]):
+                times = last_s - (cycle[-1] - rows.cycle) / self.run.rate_hz
+                self.rows.add(np.column_stack((times, rows.predicted, rows.residual)).tolist())
+                self._band = rows.band.tolist()
         except IdentificationError as error:
             self.remark = f"no prediction: {error}"
 
     def status(self) -> dict[str, Any]:
         """Return everything that is shown as a number or a word."""
-        share = 0.0 if self.run is None else self.rate_hz / self.run["rate_hz"]
+        share = 0.0 if self.run is None else self.rate_hz / self.run.rate_hz
         return {
             "phase": self.phase,
             "axes": [] if self._last is None else self._axes(self._last),
             **{"samples": self.samples, "lost": self.lost, "missing": self.missing, "dropped": self.dropped},
             "rate_hz": round(self.rate_hz, 1),
-            "moves": 0 if self.run is None else self.run["moves"],
+            "moves": 0 if self.run is None else self.run.moves,
             "done": self.done,
-            "bus_load": {} if self.run is None else {bus: share * load for bus, load in self.run["bus_load"].items()},
+            "bus_load": {} if self.run is None else {bus: share * load for bus, load in self.run.bus_load.items()},
             "free_bytes": self._free_bytes(),
             "band": self._band,
             **{"remark": self.remark, "result": self.result, "end": self.end, "stop": self.stop_state},
@@ -244,33 +235,46 @@ class Live:
     @property
     def rate_hz(self) -> float:
         """Samples a second by this computer's clock, over the last packets."""
-        if len(self._rate) < 2 or self.phase != "running":
+        if len(self._rate) < 2 or self.phase not in ("running", "watching"):
             return 0.0
         (begin_s, first), (end_s, last) = self._rate[0], self._rate[-1]
         return (last - first) / max(end_s - begin_s, 1e-3)
 
     def _free_bytes(self) -> int | None:
-        if self.run is not None and time.monotonic() - self._free_s > DISK_S:
+        if self.run is not None and self.run.log is not None and time.monotonic() - self._free_s > DISK_S:
             self._free, self._free_s = None, time.monotonic()
             with suppress(OSError):
-                self._free = shutil.disk_usage(Path(self.run["log"]).parent).free
+                self._free = shutil.disk_usage(Path(self.run.log).parent).free
         return self._free
 
     async def follow(self) -> None:
-        """Follow the recorders of the cell, one after the other, for ever."""
+        """Follow the recorders of the cell, one after the other, for ever, and a monitor while there is none."""
+        names = socket_names(self._file)
         while True:
-            connection = _connected(socket_names(self._file)[0], socket.SOCK_SEQPACKET, 0.0)
-            if connection is not None:
-                with connection:
-                    await self._read(connection)
+            for name, phase in ((names.feed, "running"), (names.monitor, "watching")):
+                connection = connected(name, socket.SOCK_SEQPACKET, 0.0)
+                if connection is not None:
+                    with connection:
+                        await self._read(connection, phase)
+                    break
             await asyncio.sleep(RETRY_S)
 
-    async def _read(self, connection: socket.socket) -> None:
-        """Take what has come, READ_S after READ_S: waiting for each packet would cost as much as taking it."""
-        self._clear(None)
-        self.phase = "running"
+    async def _read(self, connection: socket.socket, phase: str) -> None:
+        """Take what has come, READ_S after READ_S: waiting for each packet would cost as much as taking it.
+
+        A monitor is left when a recorder begins.
+        """
+        self._clear(phase, None)
+        looked_s = time.monotonic()
         with suppress(OSError):
             while True:
+                if phase == "watching" and time.monotonic() - looked_s > RETRY_S:
+                    looked_s = time.monotonic()
+                    recorder = connected(socket_names(self._file).feed, socket.SOCK_SEQPACKET, 0.0)
+                    if recorder is not None:
+                        with recorder:
+                            await self._read(recorder, "running")
+                        return
                 for _ in range(LARGEST_TURN):
                     try:
                         packet = connection.recv(LARGEST_PACKET)
@@ -280,14 +284,14 @@ class Live:
                         raise ConnectionResetError
                     self.take(packet)
                 await asyncio.sleep(READ_S)
-        if self.phase == "running":
-            self.phase, self.end = "ended", {"ok": False, "axes_stopped": False, "text": GONE}
+        if self.phase != "ended":
+            self._finish({"ok": False, "axes_stopped": False, "text": GONE})
 
     async def stop(self) -> dict[str, Any]:
         """Ask the recorder to stop its axes, and return its answer; how it ended comes later, in `stop_state`."""
         asked = time.strftime("%H:%M:%S")
-        place = socket_names(self._file)[1]
-        connection = await asyncio.to_thread(_connected, place, socket.SOCK_STREAM, STOP_ACCEPTED_S)
+        place = socket_names(self._file).stop
+        connection = await asyncio.to_thread(connected, place, socket.SOCK_STREAM, STOP_ACCEPTED_S)
         answer = b"" if connection is None else await asyncio.to_thread(_ask, connection)
         if connection is None or answer != ACCEPTED:
             found = "no recorder of this cell runs" if connection is None else "the recorder did not answer"
@@ -308,18 +312,6 @@ class Live:
         sure = bool(ended.get("axes_stopped"))
         text = "the recorder has ended, its axes are stopped" if sure else f"NOT CONFIRMED: {ended.get('text', GONE)}"
         self.stop_state = {"accepted": True, "at": asked, "text": text, "axes_stopped": sure}
-
-
-def _connected(name: str, kind: int, timeout_s: float) -> socket.socket | None:
-    """Connect to a socket of a program of this user; None where there is none."""
-    connection = socket.socket(socket.AF_UNIX, kind)
-    connection.settimeout(timeout_s)
-    with suppress(OSError):
-        connection.connect(name)
-        if of_this_user(connection):
-            return connection
-    connection.close()
-    return None
 
 
 def _ask(connection: socket.socket) -> bytes:

@@ -180,6 +180,7 @@ function drawAll() {
 const PHASES = {
   waiting: "No recording runs. Start one in a terminal: drivegain record or drivegain recalibrate.",
   running: "The drives are prepared…",
+  watching: "drivegain monitor watches; nothing is recorded.",
   ended: "The last run has ended.",
 };
 
@@ -188,8 +189,9 @@ function showStatus(status) {
   const running = status.phase === "running";
   byId("phase").textContent = running && run ? "Recording" : PHASES[status.phase];
   byId("stop").disabled = !running;
-  byId("log").textContent = run ? run.log.split("/").at(-1) : "no run yet";
-  byId("log").title = run ? run.log : "";
+  const watching = status.phase === "watching";
+  byId("log").textContent = run && run.log ? run.log.split("/").at(-1) : watching ? "no recording" : "no run yet";
+  byId("log").title = run && run.log ? run.log : "";
   byId("moves").value = status.moves ? status.done / status.moves : 0;
   byId("done").textContent = status.moves ? `${status.done} of ${status.moves} moves` : "";
   const loads = Object.entries(status.bus_load).map(([bus, load]) => `${bus} ${number(100 * load, 0)} %`).join(", ");
@@ -197,8 +199,8 @@ function showStatus(status) {
     ["Samples", String(status.samples)],
     ["SYNC cycles lost", String(status.lost), status.lost > 0],
     ["Missing answers", String(status.missing), status.missing > 0],
-    ["SYNC rate", running ? `${number(status.rate_hz, 0)} Hz` : "–"],
-    ["Bus load, computed", running && loads ? loads : "–"],
+    ["Sample rate", running || watching ? `${number(status.rate_hz, 0)} Hz` : "–"],
+    ["Bus load, computed", (running || watching) && loads ? loads : "–"],
     ["Disk free", status.free_bytes === null ? "–" : `${number(status.free_bytes / 1e9, 1)} GB`],
     ["Packets this page missed", String(status.dropped)],
   ];

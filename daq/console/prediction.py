@@ -4,29 +4,39 @@ The filters are those of the fit, applied to the last samples: a low-pass withou
 positions, one decimator for predicted and measured current. A row is given once all samples of its window are there,
 some 0.4 s later. At standstill there is none: stiction hides any current below it.
 
+The console draws the rows; `drivegain monitor` shows those of the last RECENT_S, and points out an axis with more than
+half of them outside the band. A single row is outside often enough: at each reversal the model's friction errs.
+
 *Band.* Twice the calibration's relative error of the axis on its held-out runs (of the fit, without any), times the
 root mean square of the current predicted so far in motion. It is the size that residuals had, not a limit for alarms.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from daq.config.cell import Cell, model_of
+from daq.errors import DaqError
+from daq.workflow.feed import RunFacts
 from daq.workflow.validate import check_cell, conditioning_of, unpredictable
 from ident.arrays import FloatArray, IntArray
 from ident.calibration import Calibration
 from ident.data.conditioning import central_differences, decimator, low_pass
 from ident.data.dataset import planned
+from ident.errors import IdentificationError
 from ident.model.bodies import Payload
 from ident.model.robot import Motion
 from ident.prediction import predict_current
 
 EDGE_S = 0.15  #: Of a window, where the low-pass is not yet what it is over a whole run (to 2·10⁻⁵ at 40 Hz)
 STEP_S = 0.2  #: Samples that are predicted at once: each prediction costs 2 ms, and most of it is not for the samples
+RECENT_S = 10.0  #: Of the rows that are judged together
+LEAST_S = 2.0  #: Of motion before they are judged
 STANDSTILL_SHARE = 0.01  #: Of the speed limit, where the calibration's filter has no standstill speeds
 
 
@@ -38,6 +48,55 @@ class Rows:
     predicted: FloatArray  #: current reference [unit of the gains' current], shape (r, n)
     residual: FloatArray  #: measured minus predicted, both filtered, shape (r, n)
     band: FloatArray  #: half the band of each motor, shape (n,)
+
+
+@dataclass(frozen=True, slots=True)
+class RecentCurrent:
+    """Current of one motor lately [unit of the gains' current]."""
+
+    measured: float | None  #: filtered, at the last row; None at standstill, or where the scale is unknown
+    predicted: float | None  #: at the same moment; None at standstill
+    band: float  #: half the band
+    residual_rms: float | None  #: over the last RECENT_S of motion; None without any
+    outside_share: float  #: share of these rows whose residual is outside the band
+    conspicuous: bool  #: more than half of at least LEAST_S of motion are
+
+
+class Recent:
+    """Keeps the rows of the last RECENT_S."""
+
+    def __init__(self, rows_hz: float) -> None:
+        self._rows_hz = rows_hz
+        self._rows: deque[Rows] = deque()
+
+    def add(self, rows: Rows) -> None:
+        """Take the newest rows."""
+        self._rows.append(rows)
+        while sum(len(one.cycle) for one in self._rows) > RECENT_S * self._rows_hz:
+            self._rows.popleft()
+
+    def axes(self) -> list[RecentCurrent]:
+        """Return the current of each motor; empty without rows."""
+        if not self._rows:
+            return []
+        last, residual = self._rows[-1], np.concatenate([one.residual for one in self._rows])
+        found = []
+        for predicted, left, band, column in zip(
+            last.predicted[-1], last.residual[-1], last.band, residual.T, strict=True
+        ):
+            moving = column[np.isfinite(column)]
+            share = float(np.mean(np.abs(moving) > band)) if len(moving) else 0.0
+            found.append(
+                RecentCurrent(
+                    measured=float(predicted + left) if np.isfinite(left) else None,
+                    predicted=float(predicted) if np.isfinite(predicted) else None,
+                    band=float(band),
+                    residual_rms=float(np.sqrt(np.mean(moving**2))) if len(moving) else None,
+                    outside_share=share,
+                    conspicuous=share > 0.5 and len(moving) >= LEAST_S * self._rows_hz,
+                )
+            )
+        return found
 
 
 class Predictor:
@@ -62,6 +121,7 @@ class Predictor:
         self._conditioning, self._rate_hz = conditioning_of(calibration), rate_hz
         self._filter = decimator(rate_hz, self._conditioning.decimation_cutoff_hz)
         edge = round(EDGE_S * rate_hz)
+        self.rows_hz = rate_hz / self._filter.factor
         self._step = max(1, round(STEP_S * rate_hz))
         self._margin = self._filter.half + -(-edge // self._filter.factor) * self._filter.factor
         limits = [STANDSTILL_SHARE * axis.limits.velocity for axis in cell.axes]
@@ -71,17 +131,26 @@ class Predictor:
         self._squares, self._count = np.zeros(len(cell.axes)), np.zeros(len(cell.axes))
         self._cycle, self._position, self._current = -1, np.zeros((0, 0)), np.zeros((0, 0))
 
-    def take(self, cycle: int, position_rad: FloatArray, current: FloatArray) -> Rows | None:
-        """Take consecutive samples, the first of the given cycle; returns the rows that are complete now.
+    def take(self, cycle: IntArray, position_rad: FloatArray, current: FloatArray) -> list[Rows]:
+        """Take samples in their order; returns the rows that are complete now.
 
         Args:
-            cycle: a gap after the samples before begins a new window.
+            cycle: of each sample, shape (k,); a gap begins a new window.
             position_rad: joint positions [rad; m of a prismatic joint], shape (k, n).
             current: of the motors, shape (k, n).
 
         Raises:
             IdentificationError: the calibration cannot predict this motion.
         """
+        edges = [0, *(np.flatnonzero(np.diff(cycle) != 1) + 1).tolist(), len(cycle)]
+        parts = [
+            self._take(int(cycle[begin]), position_rad[begin:end], current[begin:end])
+            for begin, end in pairwise(edges)
+            if end > begin
+        ]
+        return [part for part in parts if part is not None]
+
+    def _take(self, cycle: int, position_rad: FloatArray, current: FloatArray) -> Rows | None:
         if cycle != self._cycle + len(self._position) or not len(self._position):
             self._cycle, self._position, self._current = cycle, position_rad, current
         else:
@@ -114,6 +183,23 @@ class Predictor:
         band = self._share * np.sqrt(self._squares / np.maximum(self._count, 1.0))
         predicted = np.where(still, np.nan, predicted)
         return Rows(self._cycle + 1 + centres[whole], predicted.T, (measured - predicted).T, band)
+
+
+def predictor_of(calibration: Calibration, cell: Cell, run: RunFacts) -> tuple[Predictor | None, str]:
+    """Return the predictor of a run, and why it predicts nothing, empty if it does."""
+    if run.axes != cell.axis_names:
+        return None, "no prediction: the run has other axes than the cell file"
+    payload = next((one.payload for one in cell.payloads if one.name == run.payload), None)
+    try:
+        if run.rate_hz < 2.0 * (passed_hz := conditioning_of(calibration).position_cutoff_hz):
+            return None, (
+                f"no prediction: {run.rate_hz:.3g} positions a second are too few for velocity and acceleration; the "
+                f"fit's filter passes {passed_hz:g} Hz"
+            )
+        found = Predictor(calibration, cell, payload, run.rate_hz)
+    except (DaqError, IdentificationError) as error:
+        return None, f"no prediction: {error}"
+    return found, found.problem
 
 
 def _identified(calibration: Calibration, mounting: str) -> set[str]:

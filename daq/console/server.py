@@ -13,8 +13,9 @@ import hmac
 import json
 import secrets
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager, suppress
+from dataclasses import asdict
 from importlib.resources import files
 from math import isfinite
 from typing import Any
@@ -28,7 +29,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from daq.config.cell import Cell
-from daq.console.live import Live
+from daq.console.live import Live, Reader
 from daq.console.results import Results
 from daq.errors import DaqError
 
@@ -94,8 +95,11 @@ class Guard:
 class Page:
     """The answers."""
 
-    def __init__(self, cell: Cell, live: Live, results: Results) -> None:
-        self._cell, self._live, self._results = cell, live, results
+    def __init__(
+        self, cell: Cell, live: Live, results: Results, *beside: Callable[[], Coroutine[Any, Any, None]]
+    ) -> None:
+        """Store the arguments; what is given after the results runs beside the server."""
+        self._cell, self._live, self._results, self._beside = cell, live, results, beside
         self._document: dict[str, Any] = {}
         self.over: Callable[[], bool] = lambda: False  #: Whether the server ends
         self._readers = 0
@@ -116,7 +120,7 @@ class Page:
 
     @asynccontextmanager
     async def _background(self, _: Starlette) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(self._live.follow()), asyncio.create_task(self._look())]
+        tasks = [asyncio.create_task(one()) for one in (self._live.follow, self._look, *self._beside)]
         yield
         for task in tasks:
             task.cancel()
@@ -175,19 +179,14 @@ class Page:
         return StreamingResponse(self._messages(), media_type="text/event-stream")
 
     async def _messages(self) -> AsyncIterator[bytes]:
-        live, epoch, seen, before = self._live, -1, [0, 0, 0], b""
+        live, reader, before = self._live, Reader(self._live), b""
         self._readers += 1
         try:
             while not self.over():
-                message: dict[str, Any] = {}
-                if epoch != live.epoch:
-                    epoch, seen = live.epoch, [0, 0, 0]
-                    message["run"] = live.run
-                rings = {"points": live.points, "rows": live.rows, "events": live.events}
-                for place, (name, ring) in enumerate(rings.items()):
-                    if new := ring.since(seen[place]):
-                        message[name] = new
-                    seen[place] = ring.end
+                begun, news = reader.news()
+                message: dict[str, Any] = {**news}
+                if begun:
+                    message["run"] = None if live.run is None else asdict(live.run)
                 status = _json(live.status())
                 if message or status != before:
                     before = status

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,14 +14,17 @@ from rich.text import Text
 
 from daq.config.bus import bus_loads, frame_bits
 from daq.config.cell import PacingMode
+from daq.report.events import event_document
 from daq.report.text import picked, plain_table, printable, terminal_text
 from drivers.profiles.cia402 import State, decode
 from drivers.profiles.profile import TapPoint
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
+    from drivers.canopen.emcy import ErrorCode
     from drivers.canopen.scan import FoundNode
     from drivers.stream.monitor import CellReading
+    from drivers.stream.sample import CellEvent
 
 ENABLED = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
 """States in which the drive function is enabled and the motor has torque (CiA 402-2, finite state automaton)."""
@@ -121,19 +126,30 @@ def scan_table(rows: list[dict[str, Any]]) -> Table:
 
 
 def monitor_document(
-    cell: Cell, reading: CellReading, ampere: list[float | None], events: list[str], *, recorder: bool = False
+    cell: Cell,
+    reading: CellReading,
+    ampere: Sequence[float | None],
+    events: Iterable[CellEvent],
+    *,
+    faults: Mapping[str, ErrorCode] = MappingProxyType({}),
+    recorder: bool = False,
+    prediction: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """JSON document of one reading of the bus.
 
     Args:
         cell, reading: the cell, and what was read from its buses.
         ampere: amperes per raw unit of each axis' current, None where unknown.
-        events: texts of recent events, oldest first.
+        events: recent events, oldest first.
+        faults: error code of axes in fault, by name.
         recorder: whether a recording or job of drivegain on this computer has the bus.
+        prediction: `remark`, `payload` and the currents of the `axes`, if any, by a calibration; None without one.
     """
     from drivers.canopen.link import nmt_name  # noqa: PLC0415 - as above
 
-    axes = []
+    # While another master prepares, it sends no SYNC, and no axis has to answer.
+    addressed = reading.source.value == "asked" or reading.sync_hz > 0.0
+    axes: list[dict[str, Any]] = []
     for declared, axis, position, ampere_per_unit in zip(
         cell.axes, reading.axes, joint_positions(cell, reading), ampere, strict=True
     ):
@@ -150,13 +166,16 @@ def monitor_document(
                 "current_raw": raw,
                 "state": None if state is None else str(state),
                 "enabled": None if state is None else state in ENABLED,
+                "in_fault": state in FAULTY,
                 "statusword": word,
                 "nmt": None if axis.nmt is None else nmt_name(axis.nmt),
                 **picked(axis, "rate_hz", "lost"),
-                "silent": axis.rate_hz == 0.0,
+                "silent": axis.rate_hz == 0.0 and addressed,
+                "fault": asdict(faults[declared.name]) if state in FAULTY and declared.name in faults else None,
+                "prediction": prediction["axes"][len(axes)] if prediction is not None and prediction["axes"] else None,
             }
         )
-    loads = bus_loads_percent(cell, reading)
+    loads, shown = bus_loads_percent(cell, reading), tuple(events)
     return {
         "cell": cell.name,
         "source": reading.source.value,
@@ -166,7 +185,14 @@ def monitor_document(
         "bus_load_percent": max(loads),
         "buses": [{"bus": bus.name, "load_percent": load} for bus, load in zip(cell.buses, loads, strict=True)],
         "axes": axes,
-        "events": events,
+        "prediction": None if prediction is None else {key: prediction[key] for key in ("payload", "remark")},
+        "events": [event.text for event in shown],
+        "notices": [
+            event_document(
+                event.kind, event.code, None if event.axis is None else cell.axis_names[event.axis], event.text
+            )
+            for event in shown
+        ],
     }
 
 
@@ -204,11 +230,13 @@ _SOURCE_TEXT = {
     "recorder": "drivegain's recorder leads this bus; its traffic is read and nothing is sent",
     "asked": "no other master: the axes are queried, nothing is written",
 }
+_FAULT_UNKNOWN = "the drive names no error code; find the cause, then `drivegain scan CELL --reset-faults`"
 
 
 def monitor_view(document: dict[str, Any]) -> Group:
-    """Table of the axes, with the load of the buses and recent events, from `monitor_document`."""
+    """Tables of the axes, with the load of the buses and recent events, from `monitor_document`."""
     table = plain_table(("axis", "position", "current", "state", "rate Hz", "lost"), left=(0, 3))
+    faults = []
     for axis in document["axes"]:
         position = "?" if axis["position"] is None else f"{axis['position']:.3f} {axis['unit']}"
         current = "?" if axis["current_raw"] is None else f"{axis['current_raw']:+d} raw"
@@ -216,17 +244,54 @@ def monitor_view(document: dict[str, Any]) -> Group:
             current = f"{axis['current_a']:+.3f} A"
         note, style = (" (ENABLED)", "bold green") if axis["enabled"] else ("", None)
         if axis["state"] in _ALARMING:
-            note, style = f"{note} (see the events below, or `drivegain scan --reset-faults`)", "bold red"
+            style = "bold red"
         if axis["silent"]:
             note, style = " (SILENT)", "bold red"
         state = (axis["state"] or "?").lower() + note
         cells = (printable(axis["axis"]), position, current, state, f"{axis['rate_hz']:.1f}", str(axis["lost"]))
         table.add_row(*map(Text, cells), style=style)
+        if axis["in_fault"]:
+            fault = axis["fault"]
+            text = _FAULT_UNKNOWN if fault is None else f"{fault['hex']} {fault['text']}; {fault['remedy']}"
+            faults.append(Text(f"{printable(axis['axis'])} is in fault: {text}", "bold red"))
     source = "recorder" if document["source"] == "overheard" and document["recorder"] else document["source"]
     head = Text(printable(f"{document['cell']}: {_SOURCE_TEXT[source]}"))
     loads = ", ".join(f"{printable(bus['bus'])} {bus['load_percent']:.1f} % at worst" for bus in document["buses"])
     load = Text(f"{loads}, {document['frames_per_s']:.0f} frames/s, SYNC {document['sync_hz']:.1f} Hz")
-    return Group(head, table, load, *(Text(printable(event), "yellow") for event in document["events"]))
+    return Group(head, table, load, *_prediction_view(document), *faults, *map(_notice, document["notices"]))
+
+
+def _prediction_view(document: dict[str, Any]) -> Iterator[RenderableType]:
+    """Measured beside predicted current, or why there is none; nothing without a calibration."""
+    if document["prediction"] is None:
+        return
+    remark, payload = document["prediction"]["remark"], document["prediction"]["payload"]
+    if remark:
+        yield Text(printable(remark))
+    if not any(axis["prediction"] for axis in document["axes"]):
+        return
+    table = plain_table(("axis", "measured A", "predicted A", "± band", "residual rms", "outside"))
+    for axis in document["axes"]:
+        found = axis["prediction"]
+        values = [
+            "at rest" if value is None and name == "predicted" else "-" if value is None else f"{value:+.3f}"
+            for name, value in ((name, found[name]) for name in ("measured", "predicted"))
+        ]
+        rms = "-" if found["residual_rms"] is None else f"{found['residual_rms']:.3f}"
+        cells = (printable(axis["axis"]), *values, f"{found['band']:.3f}", rms, f"{100 * found['outside_share']:.0f} %")
+        table.add_row(*map(Text, cells), style="bold yellow" if found["conspicuous"] else None)
+    carried = "without payload" if payload is None else f"with payload {printable(payload)}"
+    yield Text(
+        f"Currents of half a second ago, filtered as in the fit, {carried}; residual of the last 10 s of motion:"
+    )
+    yield table
+
+
+def _notice(notice: dict[str, Any]) -> Text:
+    """One event, with its remedy where it is alarming."""
+    where = "" if notice["axis"] is None else f"{notice['axis']}: "
+    remedy = f"; {notice['remedy']}" if notice["remedy"] else ""
+    return Text(printable(f"{where}{notice['text']}{remedy}"), "yellow" if notice["alarm"] else "")
 
 
 def current_signals(cell: Cell) -> dict[str, str]:

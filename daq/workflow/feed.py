@@ -1,9 +1,10 @@
 """The feed of a recording: every sample and event for consoles that may be slow, and a stop that is acknowledged.
 
-The recorder publishes and never waits. A packet of a Unix SEQPACKET socket is sent without blocking: where a console
-does not read, packets are dropped, the console sees from their numbers how many, and the recording goes on. A second
-socket takes the stop, so that it works while the curves are stalled. Both are in Linux's abstract namespace: they leave
-no file and end with the process. Only processes of the same user, or of root, are served.
+`drivegain monitor` publishes in the same way at an address of its own, and takes no stop. A publisher never waits. A
+packet of a Unix SEQPACKET socket is sent without blocking: where a console does not read, packets are dropped, the
+console sees from their numbers how many, and the recording goes on. A second socket takes the stop, so that it works
+while the curves are stalled. All are in Linux's abstract namespace: they leave no file and end with the process. Only
+processes of the same user, or of root, are served.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import struct
 import threading
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
@@ -26,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from daq.log.conversion import SiScaling
 from daq.log.metadata import RunStatistics
 from drivers.errors import WHILE
 from drivers.stream.sample import CellEvent, Sample
@@ -49,23 +51,65 @@ class RunFacts:
     """Facts of a run that a console needs to show its samples; lists have one entry an axis."""
 
     run_id: str  #: of the log
-    log: str  #: its path
+    log: str | None  #: its path; None for `drivegain monitor`, which writes none
     axes: tuple[str, ...]  #: names
     rate_hz: float  #: of the samples
     moves: int  #: in the plan
     rad_per_count: list[float]  #: motor angle of a count [rad]
-    current_per_unit: list[float]  #: current of a raw unit, in the current's unit of the gains
+    current_per_unit: list[float]  #: current of a raw unit, in the current's unit of the gains; NaN where unknown
     to_joint: list[list[float]]  #: R⁻¹, shape (n, n)
     offset_rad: list[float]  #: joint positions at zero counts [rad; m of a prismatic joint]
     payload: str | None  #: name in the cell file
     bus_load: dict[str, float]  #: mean load of each bus at this rate, as a share
 
+    @classmethod
+    def of(cls, document: dict[str, Any]) -> RunFacts:
+        """Return the facts in a packet's object."""
+        return cls(**{**document, "axes": tuple(document["axes"])})
 
-def socket_names(cell_file: Path) -> tuple[str, str]:
-    """Return the addresses of feed and stop for a cell file, in the abstract namespace."""
+    @property
+    def scaling(self) -> SiScaling:
+        """Factors from raw numbers to SI."""
+        return SiScaling(*map(np.array, (self.rad_per_count, self.to_joint, self.offset_rad, self.current_per_unit)))
+
+
+@dataclass(frozen=True, slots=True)
+class SocketNames:
+    """Addresses for one cell file, in the abstract namespace."""
+
+    feed: str  #: of a recorder's samples and events
+    stop: str  #: of a recorder
+    monitor: str  #: of a monitor's samples and events
+
+
+def socket_names(cell_file: Path) -> SocketNames:
+    """Return the addresses for a cell file."""
     digest = hashlib.sha256(str(cell_file.resolve()).encode()).hexdigest()[:24]
-    name = f"\0drivegain-{digest}"
-    return f"{name}-feed", f"{name}-stop"
+    return SocketNames(*(f"\0drivegain-{digest}-{name}" for name in ("feed", "stop", "monitor")))
+
+
+def connected(name: str, kind: int, timeout_s: float) -> socket.socket | None:
+    """Connect to a socket of a program of this user; None where there is none."""
+    connection = socket.socket(socket.AF_UNIX, kind)
+    connection.settimeout(timeout_s)
+    with suppress(OSError):
+        connection.connect(name)
+        if of_this_user(connection):
+            return connection
+    connection.close()
+    return None
+
+
+def facts_of_recorder(cell_file: Path, within_s: float) -> RunFacts | None:
+    """Return the facts of the run that a recorder publishes now; None without one in that time."""
+    connection = connected(socket_names(cell_file).feed, socket.SOCK_SEQPACKET, within_s)
+    if connection is None:
+        return None
+    with connection, suppress(OSError):
+        packet = connection.recv(LARGEST_PACKET)  # a new console first gets what it missed
+        if packet and HEAD.unpack_from(packet)[0] == TEXT and (run := json.loads(packet[HEAD.size :]).get("run")):
+            return RunFacts.of(run)
+    return None
 
 
 def sample_struct(axes: int) -> struct.Struct:
@@ -107,12 +151,12 @@ class Feed:
     Where its addresses are taken, by another program on this cell, nothing is published and `remark` says so.
     """
 
-    def __init__(self, cell_file: Path, stop: Callable[[], None] = interrupt_main_thread) -> None:
+    def __init__(self, cell_file: Path, stop: Callable[[], None] | None = interrupt_main_thread) -> None:
         """Store the arguments.
 
         Args:
             cell_file: of the cell; consoles of the same file find the feed.
-            stop: does what a stop asks for, in another thread than the caller's.
+            stop: does what a stop asks for, in another thread than the caller's; None for a monitor, which takes none.
         """
         self.remark = ""
         self._names, self._stop = socket_names(cell_file), stop
@@ -131,9 +175,10 @@ class Feed:
 
     def __enter__(self) -> Feed:
         """Begin to listen for consoles and stops, in a thread that waits."""
-        kinds = (socket.SOCK_SEQPACKET, socket.SOCK_STREAM)
+        names, packets, stream = self._names, socket.SOCK_SEQPACKET, socket.SOCK_STREAM
+        places = ((names.monitor, packets),) if self._stop is None else ((names.feed, packets), (names.stop, stream))
         try:
-            for name, kind in zip(self._names, kinds, strict=True):
+            for name, kind in places:
                 listener = socket.socket(socket.AF_UNIX, kind)
                 self._listening.append(listener)
                 listener.bind(name)
@@ -242,33 +287,34 @@ class Feed:
 
     def _wait(self) -> None:
         """Accept consoles and stops until the listeners are shut down."""
-        feed, stop = self._listening
-        with feed, stop:
-            self._accept_all(feed, stop)
+        with ExitStack() as closing:
+            for listener in self._listening:
+                closing.enter_context(listener)
+            self._accept_all()
 
-    def _accept_all(self, feed: socket.socket, stop: socket.socket) -> None:
+    def _accept_all(self) -> None:
         while True:
-            ready, _, _ = select.select((feed, stop), (), ())
+            ready, _, _ = select.select(self._listening, (), ())
             try:
                 connection, _ = ready[0].accept()
             except OSError:
                 return
             if not of_this_user(connection):
                 connection.close()
-            elif ready[0] is feed:
+            elif ready[0] is self._listening[0]:
                 with suppress(OSError):
                     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
                 self._new.append(connection)
-            else:
-                self._take_stop(connection)
+            elif self._stop is not None:
+                self._take_stop(connection, self._stop)
 
-    def _take_stop(self, connection: socket.socket) -> None:
+    def _take_stop(self, connection: socket.socket, stop: Callable[[], None]) -> None:
         connection.settimeout(REQUEST_S)
         try:
             if connection.recv(len(STOP), socket.MSG_WAITALL) != STOP:
                 connection.close()
                 return
-            self._stop()
+            stop()
             # It receives the outcome of the stop when the program ends.
             self._stopping.append(connection)
             connection.send(ACCEPTED)

@@ -6,6 +6,7 @@ upper digit.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 _LINES = Path(__file__).with_name("emcy.txt").read_text(encoding="utf-8").splitlines()
@@ -25,6 +26,21 @@ _REMEDIES = {
     0x9: "check the device that the drive watches from outside, and its cable",
 }
 """First remedy of each class of CiA 301, by its digit."""
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorCode:
+    """An error code in words."""
+
+    code: int  #: of EMCY or 603Fh
+    hex: str  #: as manuals write it, such as 8611h
+    text: str  #: meaning
+    remedy: str  #: what to try first
+
+
+def explain(code: int) -> ErrorCode:
+    """Return meaning and first remedy of an error code of 16 bits."""
+    return ErrorCode(code, f"{code:04X}h", describe(code), remedy_of(code))
 
 
 def remedy_of(code: int) -> str:

@@ -1,13 +1,15 @@
 """Watch a cell without changing it: reports of its axes, their rate, and the load of the bus.
 
-While another master is on the bus, nothing is sent: its SYNC and the answers in our mapping are overheard. On a quiet
-bus the axes are read by SDO uploads, one open request a node. Nothing is ever written.
+While another master is on the bus, nothing is sent: its SYNC and the answers in our mapping are overheard, each cycle a
+`Sample`. On a quiet bus the axes are read by SDO uploads, one open request a node; then a sample has the last values of
+all axes, READING_S after READING_S. Nothing is ever written.
 """
 
 from __future__ import annotations
 
 import struct
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -18,7 +20,7 @@ from drivers.canopen.link import SYNC_COB_ID, Link
 from drivers.canopen.pdo import feedback_entries
 from drivers.profiles.profile import Axis, ObjectEntry
 from drivers.stream.answers import slots_of
-from drivers.stream.sample import CellEvent
+from drivers.stream.sample import CellEvent, Sample
 from drivers.stream.split_bus import SplitAddress
 
 QUIET_S = 2.0  #: Silence of other masters after which the axes are read by SDO
@@ -72,6 +74,7 @@ class _AxisWatch:
         self.seen: set[int] = set()
         self.followed = False
         self.readings = self.lost = 0
+        self.complete_ns: int | None = None  # when the last complete reading by SDO came
         self.asked = -1
         self.open_until_ns: int | None = None
         self.due_ns = 0
@@ -91,7 +94,7 @@ class _AxisWatch:
         self.followed = self.followed or self.seen == self.slots.keys()
         self.seen.clear()
 
-    def answer(self, data: bytes) -> None:
+    def answer(self, data: bytes, now_ns: int) -> None:
         entry = self.entries[self.asked]
         if self.open_until_ns is None or data[1:4] != struct.pack("<HB", entry.index, entry.subindex):
             return  # an answer to another program
@@ -99,7 +102,9 @@ class _AxisWatch:
         length = _EXPEDITED.get(data[0], 0)
         if 8 * length >= entry.bits:
             self.values[self.asked] = int.from_bytes(data[4 : 4 + entry.bits // 8], "little", signed=entry.signed)
-            self.readings += self.asked == len(self.entries) - 1
+            if self.asked == len(self.entries) - 1:
+                self.readings += 1
+                self.complete_ns = now_ns
 
     def next_request(self, now_ns: int) -> ObjectEntry | None:
         if self.open_until_ns is not None:
@@ -120,8 +125,28 @@ class _AxisWatch:
 class CellMonitor:
     """Reads a bus and, where no other master is on it, its axes by SDO; nothing else may read the link meanwhile."""
 
-    def __init__(self, link: Link, axes: tuple[Axis, ...]) -> None:
-        self._link = link
+    def __init__(
+        self,
+        link: Link,
+        axes: tuple[Axis, ...],
+        on_sample: Callable[[Sample], None] = lambda _sample: None,
+        wall_minus_monotonic_ns: int = 0,
+        taken: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Store the arguments.
+
+        Args:
+            link: open bus.
+            axes: of the cell.
+            on_sample: receives every sample while the bus is watched. An axis that did not answer is marked missing.
+            wall_minus_monotonic_ns: offset of the stamps of samples and events from the link's clock [ns].
+            taken: whether a recorder has taken the bus and listens before it sends; from then on nothing is sent, since
+                it would refuse to begin.
+        """
+        self.period_ns: int | None = None
+        """Period of SYNC; SYNCs that this program missed then leave a gap in the samples' cycles. None counts SYNCs."""
+        self._link, self._on_sample, self._offset_ns = link, on_sample, wall_minus_monotonic_ns
+        self._taken = taken
         self._axes = tuple(_AxisWatch(axis) for axis in axes)
         self._by_cob_id = {cob_id: axis for axis in self._axes for cob_id in axis.slots}
         self._by_node = {axis.node_id: axis for axis in self._axes}
@@ -129,6 +154,9 @@ class CellMonitor:
         self._buses = ("",) if self._split is None else tuple(map(str, self._split.parts))
         self._frames: Counter[tuple[int, int]] = Counter()
         self._syncs = 0
+        self._cycle = 0
+        self._sync: tuple[int, float] | None = None  # clock and stamp of the last SYNC, until its sample is complete
+        self._sample_due_ns = 0
         self._master_ns: int | None = None
         self._began_ns = self._since_ns = link.clock()
 
@@ -146,6 +174,7 @@ class CellMonitor:
             while (left_ns := deadline_ns - clock()) > 0:
                 if self.source is ReadingSource.ASKED:
                     self._ask()
+                    self._sample_asked(clock())
                 message = self._link.bus.recv(min(left_ns * 1e-9, READING_S / 10))
                 if message is not None:
                     self._hear(message)
@@ -161,7 +190,7 @@ class CellMonitor:
         frames = tuple(tuple(self._frames[bus, length] for length in range(9)) for bus in range(len(self._buses)))
         sync_hz, self._syncs = self._syncs / lasted_s, 0
         self._frames.clear()
-        events = self._link.take_events(now_ns, tuple(self._by_node))
+        events = self._link.take_events(now_ns + self._offset_ns, tuple(self._by_node))
         return CellReading(self.source, lasted_s, tuple(axes), sync_hz, frames, events)
 
     def pause(self) -> None:
@@ -171,10 +200,11 @@ class CellMonitor:
 
     def _ask(self) -> None:
         now_ns = self._link.clock()
-        for axis in self._axes:
-            entry = axis.next_request(now_ns)
-            if entry is None:
-                continue
+        due = [(axis, entry) for axis in self._axes if (entry := axis.next_request(now_ns)) is not None]
+        if due and self._taken():
+            self._lead()
+            return
+        for axis, entry in due:
             data = struct.pack("<BHB4x", _UPLOAD, entry.index, entry.subindex)
             request = can.Message(arbitration_id=0x600 + axis.node_id, is_extended_id=False, data=data)
             self._link.send((request,))
@@ -191,6 +221,7 @@ class CellMonitor:
         if identifier == SYNC_COB_ID:
             self._syncs += 1
             self._lead()
+            self._sample_overheard(message.timestamp)
             for axis in self._axes:
                 axis.sync()
         elif identifier == 0 or 0x600 <= identifier < 0x680:
@@ -198,15 +229,41 @@ class CellMonitor:
         elif identifier in self._by_cob_id:
             self._by_cob_id[identifier].hear(identifier, bytes(message.data))
         elif 0x580 <= identifier < 0x600 and len(message.data) == 8 and identifier - 0x580 in self._by_node:
-            self._by_node[identifier - 0x580].answer(bytes(message.data))
+            self._by_node[identifier - 0x580].answer(bytes(message.data), self._link.clock())
         else:
             self._link.dispatch(message)
 
     def _lead(self) -> None:
-        """Note a command of another master."""
+        """Note that there is another master."""
         if self.source is ReadingSource.ASKED:
             self.pause()
             for axis in self._axes:
                 axis.followed = False
                 axis.seen.clear()
         self._master_ns = self._link.clock()
+
+    def _sample_overheard(self, stamp_s: float) -> None:
+        """Complete the sample of the SYNC before this one, which has the given time stamp."""
+        before, self._sync = self._sync, (self._link.clock(), stamp_s)
+        if before is None:
+            return
+        self._emit(before[0], [axis.seen != axis.slots.keys() for axis in self._axes])
+        if self.period_ns is not None:
+            # Frames without time stamps all have 0: their cycles are counted.
+            self._cycle += max(0, round((stamp_s - before[1]) * 1e9 / self.period_ns) - 1)
+
+    def _sample_asked(self, now_ns: int) -> None:
+        """Make a sample of the last values, if it is due."""
+        self._sync = None
+        if now_ns < self._sample_due_ns:
+            return
+        self._sample_due_ns = now_ns + round(READING_S * 1e9)
+        oldest_ns = now_ns - round((2 * READING_S + ANSWER_S) * 1e9)
+        self._emit(now_ns, [axis.complete_ns is None or axis.complete_ns < oldest_ns for axis in self._axes])
+
+    def _emit(self, time_ns: int, missing: list[bool]) -> None:
+        columns = zip(*([value or 0 for value in axis.values] for axis in self._axes), strict=True)
+        position, current, statusword = columns
+        bits = sum(1 << number for number, absent in enumerate(missing) if absent)
+        self._on_sample(Sample(self._cycle, time_ns + self._offset_ns, position, current, statusword, bits))
+        self._cycle += 1

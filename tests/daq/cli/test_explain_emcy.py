@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from daq.cli.app import main
 from daq.cli.scan import read_code
 from daq.errors import ExitCode
+from drivers.canopen.emcy import remedy_of
 
 
 @settings(deadline=None)
@@ -40,6 +41,7 @@ def test_codes_of_the_standards_and_of_makers(
     document = json.loads(capsys.readouterr().out)
     assert (document["code"], document["standard"]) == (read_code(code), standard)
     assert words in document["text"]
+    assert document["remedy"] == remedy_of(read_code(code))
 
 
 @pytest.mark.parametrize("code", ["", "8g11", "12345", "-1", "0x", "eight"])

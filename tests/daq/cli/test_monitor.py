@@ -6,7 +6,9 @@ import io
 import json
 import struct
 from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import can
 import numpy as np
@@ -16,18 +18,31 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from daq.cli.app import main
+from daq.cli.monitor import _Watch
 from daq.config.bus import answer_us, drive_axes
-from daq.config.cell import Cell
+from daq.config.cell import Cell, PacingMode, model_of
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
 from daq.report.bus import bus_loads_percent, joint_positions, monitor_document, monitor_view
+from daq.report.events import event_document
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from daq.workflow.feed import Feed, RunFacts
 from daq.workflow.safeguards import bus_lock, bus_taken
 from drivers.canopen.bus import BusAddress, open_bus
+from drivers.canopen.emcy import explain, remedy_of
 from drivers.canopen.link import Link
+from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
+from drivers.profiles.profile import Axis
 from drivers.simulation.cell import SimulatedCell
 from drivers.stream.monitor import ANSWER_S, QUIET_S, READING_S, AxisReading, CellMonitor, CellReading, ReadingSource
+from drivers.stream.sample import CellEvent, EventKind, Sample
+from ident.arrays import FloatArray
+from ident.calibration import Calibration
+from ident.data.dataset import planned
+from ident.model.robot import Motion
+from ident.prediction import predict_current
+from tests.daq.console.feeds import facts, predicting_calibration
 from tests.drivers.scripted import FakeClock
 
 CHECKOUT = Path(__file__).parents[3]
@@ -63,6 +78,14 @@ class QuietBus(can.BusABC):
         self._is_shutdown = True
 
 
+@dataclass(frozen=True)
+class Network:
+    """The part of a network that a monitor needs."""
+
+    link: Link
+    axes: tuple[Axis, ...]
+
+
 def _frame(identifier: int, data: bytes = b"") -> can.Message:
     return can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
 
@@ -75,10 +98,27 @@ def bus() -> Iterator[QuietBus]:
     made.shutdown()
 
 
-def _monitor(bus: QuietBus) -> CellMonitor:
+def _link(bus: QuietBus) -> Link:
     link = Link(ADDRESS, SdoPolicy(), bus.clock, lambda _address: bus)
+    link.names = {axis.node_id: axis.name for axis in drive_axes(CELL)}
     link.open()
-    return CellMonitor(link, drive_axes(CELL))
+    return link
+
+
+def _monitor(bus: QuietBus, samples: list[Sample] | None = None) -> CellMonitor:
+    kept: list[Sample] = [] if samples is None else samples
+    return CellMonitor(_link(bus), drive_axes(CELL), kept.append)
+
+
+def _watch(
+    bus: QuietBus,
+    cell_file: Path,
+    calibration: Calibration | None = None,
+    feed: Feed | None = None,
+    cell: Cell = CELL,
+) -> _Watch:
+    network = cast(CanopenNetwork, Network(_link(bus), drive_axes(CELL)))
+    return _Watch(cell_file, cell, network, feed or Feed(cell_file, stop=None), calibration, None)
 
 
 def _answers(at_ns: int, cycle: int, silent: int | None = None) -> list[tuple[int, can.Message]]:
@@ -109,6 +149,26 @@ def test_nothing_is_sent_while_another_master_leads_and_its_losses_are_counted(b
     assert bus_loads_percent(CELL, reading)[0] == pytest.approx(answer_us(profiles, 1_000_000) / 100.0, rel=0.01)
 
 
+def test_each_overheard_cycle_is_a_sample_and_a_gap_is_counted(bus: QuietBus) -> None:
+    samples: list[Sample] = []
+    monitor = _monitor(bus, samples)
+    monitor.period_ns = 10_000_000
+    start = bus.clock.now_ns
+    for cycle in (*range(20), *range(25, 40)):  # five SYNCs that this program missed
+        frames = _answers(start + (cycle + 1) * 10_000_000, cycle, silent=3 if cycle == 30 else None)
+        frames[0][1].timestamp = 1.7e9 + 0.01 * cycle
+        bus.coming += frames
+    monitor.watch(0.5)
+    assert [sample.cycle for sample in samples] == [*range(20), *range(25, 39)]  # the last may still be answered
+    assert [sample.cycle for sample in samples if sample.missing] == [30]
+    assert samples[25].missing == 0b100
+    for sample in samples:
+        position = [1000 * node + sample.cycle for node in range(1, 7)]
+        assert sample.missing or list(sample.position_counts) == position
+        assert sample.current_raw == (-1, -2, -3, -4, -5, -6)
+        assert sample.statusword == (0x1237,) * 6
+
+
 def test_a_quiet_bus_is_asked_by_uploads_alone_and_silence_is_counted(bus: QuietBus) -> None:
     monitor = _monitor(bus)
     monitor.watch(QUIET_S - 0.01)
@@ -122,7 +182,8 @@ def test_a_quiet_bus_is_asked_by_uploads_alone_and_silence_is_counted(bus: Quiet
 
 def test_asking_leaves_the_bus_to_others(bus: QuietBus) -> None:
     """Every request is answered at once; still a reading is asked for ten times a second and no more."""
-    monitor = _monitor(bus)
+    samples: list[Sample] = []
+    monitor = _monitor(bus, samples)
     monitor.watch(QUIET_S)
     answered = 0
 
@@ -137,6 +198,8 @@ def test_asking_leaves_the_bus_to_others(bus: QuietBus) -> None:
     assert all(axis.rate_hz == pytest.approx(1 / READING_S, rel=0.15) for axis in reading.axes)
     assert answered == pytest.approx(6 * 3 * 5.0 / READING_S, rel=0.15)
     assert bus_loads_percent(CELL, reading)[0] < 6.0
+    assert len(samples) == pytest.approx(5.0 / READING_S, rel=0.15)
+    assert {sample.missing for sample in samples[5:]} == {0}
 
 
 @pytest.mark.parametrize("identifier", [0x000, 0x080, 0x601])
@@ -150,6 +213,18 @@ def test_asking_ends_when_another_master_speaks(bus: QuietBus, identifier: int) 
     asked = len(bus.sent)
     monitor.watch(0.1)
     assert len(bus.sent) == asked + 6
+
+
+def test_nothing_is_sent_once_a_recorder_has_the_bus(bus: QuietBus) -> None:
+    """It listens before its first frame, and would refuse to begin."""
+    held: list[bool] = []
+    monitor = CellMonitor(_link(bus), drive_axes(CELL), taken=lambda: bool(held))
+    monitor.watch(QUIET_S + 0.5)
+    asked = len(bus.sent)
+    assert asked > 0
+    held.append(True)
+    assert monitor.watch(1.0).source is ReadingSource.OVERHEARD
+    assert len(bus.sent) == asked
 
 
 def test_a_late_answer_to_another_client_is_no_reading(bus: QuietBus) -> None:
@@ -186,7 +261,8 @@ def test_what_is_not_known_is_shown_as_that() -> None:
     dead = AxisReading(None, None, None, None, 0.0, 3)
     reading = _reading([0] * 6)
     reading = CellReading(reading.source, 0.5, (*reading.axes[:5], dead), 0.0, ((0,) * 9,), ())
-    document = monitor_document(CELL, reading, [0.002, None, None, None, None, None], ["a\x1b[2Jb"])
+    event = CellEvent(0, None, EventKind.CONTROLLER, 0, "a\x1b[2Jb")
+    document = monitor_document(CELL, reading, [0.002, None, None, None, None, None], [event])
     Console(file=out, width=100).print(monitor_view(document))
     text = out.getvalue()
     assert "+0.010 A" in text
@@ -260,3 +336,111 @@ def test_our_own_recorder_is_no_other_master(tmp_path: Path) -> None:
     assert "drivegain's recorder" in said[1]
     assert "another master" not in said[1]
     assert "--reset-faults" in said[0]
+
+
+PREDICTED_HZ = 250.0
+
+
+def _moving(bus: QuietBus, seconds: float, factor: float) -> RunFacts:
+    """Let all motors move under SYNC with the currents of a known calibration, the fourth times a factor."""
+    calibration, model = predicting_calibration(), model_of(CELL)
+    time_s = np.arange(round(seconds * PREDICTED_HZ)) / PREDICTED_HZ
+    omega: FloatArray = 2.0 * np.pi * np.linspace(0.5, 1.0, 6)
+    phase = omega * time_s[:, None]
+    motion = Motion(0.5 * np.sin(phase), 0.5 * omega * np.cos(phase), -0.5 * omega**2 * np.sin(phase))
+    current = predict_current(calibration, model, planned(motion, PREDICTED_HZ, None))
+    current[:, 3] *= factor
+    run = replace(facts(CELL, Path("run.mcap")), rate_hz=PREDICTED_HZ)
+    # Fine enough that an acceleration shows no count; 16 bits hold the currents.
+    run = replace(run, rad_per_count=[1e-7] * 6, current_per_unit=(np.abs(current).max(axis=0) / 3e4).tolist())
+    counts = np.rint(motion.position_rad / 1e-7).astype(int)
+    raw = np.rint(current / run.current_per_unit).astype(int)
+    start = bus.clock.now_ns
+    for cycle in range(len(time_s)):
+        at_ns = start + round((cycle + 1) * 1e9 / PREDICTED_HZ)
+        bus.coming.append((at_ns, _frame(0x80)))
+        for node in range(1, 7):
+            data = struct.pack("<ihH", counts[cycle, node - 1], raw[cycle, node - 1], 0x1237)
+            bus.coming.append((at_ns + 1000 * node, _frame(0x180 + node, data)))
+    return run
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.2])
+def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong_gain_is_coloured(
+    bus: QuietBus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factor: float
+) -> None:
+    calibration = predicting_calibration()
+    run = _moving(bus, 6.0, factor)
+    monkeypatch.setattr("daq.workflow.safeguards.bus_taken", lambda _cell: True)
+    monkeypatch.setattr("daq.workflow.feed.facts_of_recorder", lambda *_: run)
+    watch = _watch(bus, tmp_path / "cell.yaml", calibration)
+    watch.listen(2.0)
+    document = [watch.read(0.5) for _ in range(7)][-1]
+    assert document["recorder"]
+    assert document["prediction"] == {"payload": None, "remark": ""}
+    predictions = [axis["prediction"] for axis in document["axes"]]
+    assert [found["conspicuous"] for found in predictions] == [False, False, False, factor > 1.0, False, False]
+    for number, found in enumerate(predictions):
+        wrong = factor > 1.0 and number == 3
+        assert found["outside_share"] > 0.8 if wrong else found["residual_rms"] < 0.1 * found["band"]
+        if found["predicted"] is not None:
+            assert found["measured"] == pytest.approx(found["predicted"] * (factor if wrong else 1.0), abs=0.01)
+    out = io.StringIO()
+    Console(file=out, width=80, force_terminal=True, color_system="standard").print(monitor_view(document))
+    coloured = [line for line in out.getvalue().splitlines() if "33m" in line]
+    assert [line.split("J")[1][0] for line in coloured] == (["4"] if factor > 1.0 else [])
+    bus.coming.clear()
+    document = watch.read(0.5)
+    assert document["prediction"]["remark"] == "no prediction: there is no SYNC"
+    assert not any(axis["silent"] for axis in document["axes"])  # nobody has asked them
+
+
+def test_the_rate_of_another_master_is_measured_once_its_sync_is_steady(bus: QuietBus, tmp_path: Path) -> None:
+    """Its drives' current has no known scale: what is predicted has no measured current beside it."""
+    bus.clock.now_ns += 300_000_000
+    _moving(bus, 4.0, 1.0)
+    bus.clock.now_ns -= 300_000_000  # it begins within the first reading
+    assert CELL.sync is not None
+    timed = replace(CELL, sync=replace(CELL.sync, pacing=PacingMode.TIMED))
+    watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), cell=timed)
+    watch.listen(0.5)
+    assert watch._facts is None
+    documents = [watch.read(0.5) for _ in range(6)]
+    assert watch._facts is not None
+    assert watch._facts.rate_hz == pytest.approx(PREDICTED_HZ, rel=0.01)
+    predictions = [axis["prediction"] for axis in documents[-1]["axes"]]
+    assert all(found["measured"] is None and found["residual_rms"] is None for found in predictions)
+
+
+def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_remedy(
+    bus: QuietBus, tmp_path: Path
+) -> None:
+    values = {0x6041: 0x1208, 0x603F: 0x7305}
+
+    def answer(msg: can.Message, timeout: float | None = None) -> None:
+        index = int.from_bytes(msg.data[1:3], "little")
+        value = values.get(index, 0) if msg.arbitration_id == 0x603 else 0
+        reply = bytes((0x43, *msg.data[1:4])) + value.to_bytes(4, "little")
+        bus.coming.append((bus.clock.now_ns, _frame(msg.arbitration_id - 0x80, reply)))
+
+    bus.send = answer  # type: ignore[method-assign]
+    feed = Feed(tmp_path / "cell.yaml", stop=None)
+    watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), feed)
+    watch.listen(QUIET_S)
+    document = watch.read(0.5)
+    assert document["source"] == "asked"
+    assert "10 positions a second are too few" in document["prediction"]["remark"]
+    assert [axis["prediction"] for axis in document["axes"]] == [None] * 6
+    assert [axis["fault"] is not None for axis in document["axes"]] == [False, False, True, False, False, False]
+    assert document["axes"][2]["fault"] == asdict(explain(0x7305))
+    out = io.StringIO()
+    Console(file=out, width=200).print(monitor_view(document))
+    assert "J3 is in fault: 7305h incremental sensor 1 fault; check the plugs and cables of encoder" in out.getvalue()
+    # A console gets it too, however late it comes.
+    assert [(event["axis"], event["code"]) for event in feed._events] == [(2, 0x7305)]
+    bus.coming.append((bus.clock.now_ns, _frame(0x82, struct.pack("<HB5x", 0x3210, 1))))
+    for node in range(1, 7):  # other events do not displace it
+        bus.coming.append((bus.clock.now_ns, _frame(0x700 + node, b"\x05")))
+    (notice,) = (one for one in watch.read(0.5)["notices"] if one["alarm"])
+    assert notice == event_document(EventKind.EMCY, 0x3210, "J2", notice["text"])
+    assert notice["text"].startswith("EMCY 3210h") and notice["remedy"] == remedy_of(0x3210)

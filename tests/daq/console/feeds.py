@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 import socket
 import threading
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from http.client import HTTPConnection, HTTPResponse
 from pathlib import Path
+from typing import Any
 
 from daq.config.cell import Cell
 from daq.console.live import Live
@@ -26,12 +28,12 @@ TOKEN = "the-token-of-the-test"
 RATE_HZ = 500.0
 
 
-def facts(cell: Cell, log: Path) -> RunFacts:
+def facts(cell: Cell, log: Path | None) -> RunFacts:
     """A run of a cell of uncoupled motors, in which a count is a milliradian and a raw unit a milliampere."""
     count = len(cell.axes)
     identity = [[float(row == column) for column in range(count)] for row in range(count)]
     scales = [1e-3] * count, [1e-3] * count, identity, [0.0] * count
-    return RunFacts("id", str(log), cell.axis_names, RATE_HZ, 3, *scales, None, {"can0": 0.4})
+    return RunFacts("id", None if log is None else str(log), cell.axis_names, RATE_HZ, 3, *scales, None, {"can0": 0.4})
 
 
 def predicting_calibration() -> Calibration:
@@ -47,9 +49,9 @@ def predicting_calibration() -> Calibration:
 
 
 class Recording:
-    """Publishes samples, as the recorder does."""
+    """Publishes samples, as the recorder does; as a monitor does without a log."""
 
-    def __init__(self, feed: Feed, cell: Cell, log: Path) -> None:
+    def __init__(self, feed: Feed, cell: Cell, log: Path | None) -> None:
         self.feed, self.axes, self.samples = feed, len(cell.axes), 0
         feed.begin(facts(cell, log), self.statistics)
 
@@ -67,11 +69,60 @@ class Recording:
             self.feed.sample(Sample(cycle, cycle * 2_000_000, position, current, (0x237,) * self.axes))
 
 
+class Arrivals(deque[socket.socket]):
+    """Consoles that a feed has accepted; a test waits for them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.came = threading.Event()
+
+    def append(self, one: socket.socket, /) -> None:
+        """Take one."""
+        super().append(one)
+        self.came.set()
+
+
+def arrivals(feed: Feed) -> threading.Event:
+    """Event that is set once a console was accepted after this call."""
+    feed._new = Arrivals()
+    return feed._new.came
+
+
+class WatchedLive(Live):
+    """A console's state for whose changes another thread can wait."""
+
+    def __init__(self, cell_file: Path, cell: Cell) -> None:
+        self.changed = threading.Condition()
+        super().__init__(cell_file, cell)
+
+    def take(self, packet: bytes) -> None:
+        """Take a packet."""
+        super().take(packet)
+        self._notify()
+
+    def _clear(self, phase: str, run: RunFacts | None) -> None:
+        super()._clear(phase, run)
+        self._notify()
+
+    def _finish(self, end: dict[str, Any]) -> None:
+        super()._finish(end)
+        self._notify()
+
+    def _notify(self) -> None:
+        with self.changed:
+            self.changed.notify_all()
+
+    def wait(self, until: Callable[[], bool]) -> None:
+        """Wait for a condition."""
+        with self.changed:
+            assert self.changed.wait_for(until, timeout=30), "it did not happen in 30 s"
+
+
 class Served:
     """A console on a free port, in a thread."""
 
     def __init__(self, cell_file: Path, cell: Cell, report: Path | None = None) -> None:
-        self.live = Live(cell_file, cell)
+        self.live = WatchedLive(cell_file, cell)
         self.listener = listen(0)
         self.port = self.listener.getsockname()[1]
         page = Page(cell, self.live, Results(cell_file, cell, report=report))

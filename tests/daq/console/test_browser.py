@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -42,12 +41,16 @@ HEARD_S = 60.0  #: Time for the page to show what is awaited; longer than a busy
 
 
 def until(page: Page, condition: str) -> None:
-    """Wait for a condition in the page's script; the browser's own waiting would need `unsafe-eval`."""
-    for _ in range(round(20 * HEARD_S)):
-        if page.evaluate(condition):
-            return
-        time.sleep(0.05)
-    raise AssertionError(f"not within {HEARD_S:g} s: {condition}\n{page.inner_text('body')}")
+    """Wait in the page for a condition of its script; the browser's own waiting would need `unsafe-eval`."""
+    found = page.evaluate(f"""() => new Promise((resolve) => {{
+        const end = performance.now() + {1e3 * HEARD_S};
+        const look = () => {{
+            const met = Boolean({condition});
+            if (met || performance.now() > end) resolve(met); else setTimeout(look, 20);
+        }};
+        look();
+    }})""")
+    assert found, f"not within {HEARD_S:g} s: {condition}\n{page.inner_text('body')}"
 
 
 class Rig:

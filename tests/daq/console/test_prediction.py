@@ -20,6 +20,7 @@ from ident.prediction import predict_current
 from tests.daq.console.feeds import predicting_calibration
 
 RATE_HZ, SAMPLES = 500.0, 3000
+CYCLES = np.arange(SAMPLES)
 
 
 def _motion(cell: Cell) -> tuple[np.ndarray, np.ndarray]:
@@ -36,8 +37,8 @@ def test_rows_are_those_of_the_whole_run(cell: Cell, block: int) -> None:
     calibration, model = predicting_calibration(), model_of(cell)
     position, current = _motion(cell)
     predictor = Predictor(calibration, cell, None, RATE_HZ)
-    parts = [predictor.take(at, position[at : at + block], current[at : at + block]) for at in range(0, SAMPLES, block)]
-    found = [part for part in parts if part is not None]
+    blocks = [slice(at, at + block) for at in range(0, SAMPLES, block)]
+    found = [part for one in blocks for part in predictor.take(CYCLES[one], position[one], current[one])]
     cycle, predicted, residual = (
         np.concatenate([getattr(part, name) for part in found]) for name in ("cycle", "predicted", "residual")
     )
@@ -67,11 +68,15 @@ def test_rows_are_those_of_the_whole_run(cell: Cell, block: int) -> None:
 def test_nothing_is_predicted_at_standstill_and_a_gap_begins_anew(cell: Cell) -> None:
     predictor = Predictor(predicting_calibration(), cell, None, RATE_HZ)
     position, current = _motion(cell)
-    still = predictor.take(0, position[2100:2600], current[2100:2600])
-    assert still is not None
+    (still,) = predictor.take(CYCLES[:500], position[2100:2600], current[2100:2600])
     assert np.isnan(still.predicted).all() and np.isnan(still.residual).all()
-    after = predictor.take(10_000, position[:500], current[:500])
-    assert after is not None
+    # The gap is within the block.
+    cycle = np.concatenate((CYCLES[500:600], CYCLES[:500] + 10_000))
+    (after,) = predictor.take(
+        cycle,
+        np.concatenate((position[2600:2700], position[:500])),
+        np.concatenate((current[2600:2700], current[:500])),
+    )
     assert after.cycle[0] > 10_000
     assert np.isfinite(after.predicted).any()
     assert (after.band > 0.0).all()
@@ -81,6 +86,6 @@ def test_what_the_calibration_does_not_know_is_not_predicted(cell: Cell) -> None
     unknown = Predictor(predicting_calibration(), cell, Payload("body", "flange", {"m": 1.0}), RATE_HZ)
     assert "nothing is known of mounting" in unknown.problem
     position, current = _motion(cell)
-    assert unknown.take(0, position, current) is None
+    assert unknown.take(CYCLES, position, current) == []
     with pytest.raises(LogsDiffer):
         Predictor(replace(predicting_calibration(), cell="other"), replace(cell, folder=Path()), None, RATE_HZ)

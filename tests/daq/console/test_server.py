@@ -5,15 +5,16 @@ from __future__ import annotations
 import json
 import re
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from daq.config.cell import Cell
 from daq.workflow.feed import Feed
-from tests.daq.console.feeds import TOKEN, Recording, Served, served
+from drivers.canopen.emcy import remedy_of
+from drivers.stream.sample import CellEvent, EventKind
+from tests.daq.console.feeds import TOKEN, Recording, Served, arrivals, served
 
 
 @pytest.fixture(scope="module")
@@ -24,14 +25,6 @@ def console(cell: Cell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Se
     (folder / "secret.txt").write_text("secret")
     with served(folder / "cell.yaml", cell, folder) as one:
         yield one
-
-
-def _wait(until: Callable[[], bool]) -> None:
-    for _ in range(2000):
-        if until():
-            return
-        time.sleep(0.005)
-    raise AssertionError("it did not happen in 10 s")
 
 
 def test_the_page_loads_nothing_from_elsewhere_and_runs_no_inline_script(console: Served) -> None:
@@ -92,9 +85,11 @@ def test_the_report_runs_no_script(console: Served) -> None:
 
 def test_a_reader_that_stalls_delays_neither_another_nor_a_stop(cell: Cell, cell_file: Path) -> None:
     stopped = threading.Event()
-    with served(cell_file, cell) as console, Feed(cell_file, stopped.set) as feed:
+    feed = Feed(cell_file, stopped.set)
+    accepted = arrivals(feed)
+    with served(cell_file, cell) as console, feed:
         recording = Recording(feed, cell, cell_file)
-        _wait(lambda: bool(feed._new or feed._consoles))  # the console has found the feed, and was accepted
+        assert accepted.wait(30)  # the console has found the feed
         with console.reader(), console.reader() as reading:
             lines = reading.makefile("rb")
             shown: list[list[float]] = []
@@ -103,7 +98,7 @@ def test_a_reader_that_stalls_delays_neither_another_nor_a_stop(cell: Cell, cell
                 while b"data: " not in (line := lines.readline()):
                     pass
                 shown += json.loads(line[6:])["new"].get("points", [])
-                _wait(lambda: console.live.samples == recording.samples)
+                console.live.wait(lambda: console.live.samples == recording.samples)
             own = f"http://127.0.0.1:{console.port}"
             answer, content = console.ask(f"/{TOKEN}/stop", "POST", origin=own)
             assert answer.status == 200
@@ -118,3 +113,41 @@ def test_a_reader_that_stalls_delays_neither_another_nor_a_stop(cell: Cell, cell
         cycle = round(point[1] * degree * 1e3)
         assert point[2] * degree * 1e3 == pytest.approx(cycle + 1)
         assert point[1 + len(cell.axes)] == pytest.approx(-1e-3 * cycle)
+
+
+def test_a_monitor_is_shown_until_a_recorder_begins_and_again_after_it(cell: Cell, cell_file: Path) -> None:
+    watching = Feed(cell_file, stop=None)
+    accepted = arrivals(watching)
+    with served(cell_file, cell) as console, watching:
+        live = console.live
+        monitor = Recording(watching, cell, None)
+        assert accepted.wait(30)
+        monitor.run(100)
+        live.wait(lambda: live.samples == 100)
+        assert (live.phase, live.run is not None and live.run.log) == ("watching", None)
+        shown = live.status()
+        assert shown["axes"][0]["state"] == "OPERATION ENABLED"
+        assert shown["free_bytes"] is None
+        assert len(live.points.since(0)) == 10
+        own = f"http://127.0.0.1:{console.port}"
+        _, content = console.ask(f"/{TOKEN}/stop", "POST", origin=own)
+        assert not json.loads(content)["accepted"]  # nothing of a monitor's can be stopped
+        came = arrivals(watching)
+        feed = Feed(cell_file, lambda: None)
+        accepted = arrivals(feed)
+        with feed:
+            assert accepted.wait(30)
+            recording = Recording(feed, cell, cell_file)
+            recording.run(50)
+            live.wait(lambda: live.phase == "running" and live.samples == 50)
+            feed.finish()
+        assert came.wait(30)
+        monitor.run(100)
+        live.wait(lambda: live.phase == "watching" and live.samples == 200)
+        # How the recording ended stays on the page; the monitor's end does not replace it.
+        assert (live.end or {})["ok"] and (live.result or {})["valid"]
+        watching.event(CellEvent(0, 2, EventKind.EMCY, 0x7305, "J3 (node 3): EMCY 7305h"))
+        live.wait(lambda: live.events.end == 1)
+        (event,) = live.events.since(0)
+        assert (event["axis"], event["text"], event["remedy"]) == ("J3", "EMCY 7305h", remedy_of(0x7305))
+    assert watching.remark == feed.remark == ""

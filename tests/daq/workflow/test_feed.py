@@ -7,7 +7,7 @@ import os
 import socket
 import struct
 import threading
-import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +16,20 @@ import pytest
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.workflow import feed as feeds
-from daq.workflow.feed import ACCEPTED, HEAD, LARGEST_PACKET, SAMPLES, STOP, Feed, end_of, sample_dtype, socket_names
+from daq.workflow.feed import (
+    ACCEPTED,
+    HEAD,
+    LARGEST_PACKET,
+    SAMPLES,
+    STOP,
+    Feed,
+    end_of,
+    facts_of_recorder,
+    sample_dtype,
+    socket_names,
+)
 from drivers.stream.sample import CellEvent, EventKind
-from tests.daq.console.feeds import Recording
+from tests.daq.console.feeds import Recording, arrivals, facts
 
 
 @pytest.fixture(scope="module")
@@ -34,11 +45,11 @@ def cell_file(tmp_path: Path) -> Path:
 
 
 def _console(cell_file: Path, feed: Feed) -> socket.socket:
+    accepted = arrivals(feed)
     console = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     console.settimeout(10)
-    console.connect(socket_names(cell_file)[0])
-    while not feed._new:  # the feed's thread has accepted it
-        time.sleep(0.001)
+    console.connect(socket_names(cell_file).feed)
+    assert accepted.wait(10)
     return console
 
 
@@ -89,6 +100,20 @@ def test_a_console_that_does_not_read_loses_packets_and_delays_nothing(cell_file
     assert after[2] == 60_010
 
 
+def test_a_monitor_asks_a_recorder_for_the_facts_of_its_run(cell_file: Path, cell: Cell) -> None:
+    assert facts_of_recorder(cell_file, 10.0) is None
+    feed = Feed(cell_file)
+    accepted = arrivals(feed)
+    with feed, ThreadPoolExecutor(1) as pool:
+        recording = Recording(feed, cell, cell_file)
+        asked = pool.submit(facts_of_recorder, cell_file, 10.0)
+        assert accepted.wait(10)
+        recording.run(10)
+        assert asked.result() == facts(cell, cell_file)
+        recording.run(20)  # it has gone
+        assert not feed._consoles
+
+
 def test_a_stop_is_acknowledged_and_its_end_reported_while_the_curves_stall(cell_file: Path, cell: Cell) -> None:
     stopped = threading.Event()
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
@@ -97,7 +122,7 @@ def test_a_stop_is_acknowledged_and_its_end_reported_while_the_curves_stall(cell
         recording = Recording(feed, cell, cell_file)
         with _console(cell_file, feed):
             recording.run(60_000)
-            asking.connect(socket_names(cell_file)[1])
+            asking.connect(socket_names(cell_file).stop)
             asking.sendall(STOP)
             assert asking.recv(len(ACCEPTED)) == ACCEPTED
             assert stopped.wait(10)
@@ -108,7 +133,7 @@ def test_a_stop_is_acknowledged_and_its_end_reported_while_the_curves_stall(cell
 def test_another_word_stops_nothing(cell_file: Path) -> None:
     with Feed(cell_file, stop=lambda: pytest.fail("stopped")), socket.socket(socket.AF_UNIX) as asking:
         asking.settimeout(10)
-        asking.connect(socket_names(cell_file)[1])
+        asking.connect(socket_names(cell_file).stop)
         asking.sendall(b"GET /")
         assert asking.recv(10) == b""
 

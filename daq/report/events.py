@@ -1,0 +1,41 @@
+"""Events of a cell in words, with what to do: the console's page and `drivegain monitor` show the same."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from drivers.canopen.emcy import remedy_of
+from drivers.stream.sample import EventKind
+
+REMEDIES = {
+    EventKind.HEARTBEAT_LOST: "check the drive's power and its cable; `drivegain scan` shows which nodes answer",
+    EventKind.FOLLOWING_ERROR: "check brake, load and collision; use slower moves (`record --speed 0.5`)",
+    EventKind.LIMIT: "check limit switches and current limits, or use slower moves",
+    EventKind.SAMPLE_LOST: "check the load of bus and computer; the run is marked invalid, record it again",
+    EventKind.BUS_BUSY: "end the other program on this bus",
+    EventKind.BUS_LOST: "check the CAN interface and its cable",
+    EventKind.BUS_PASSIVE: "check the bus's cable and its two terminating resistors",
+    EventKind.FRAMES_DROPPED: "reduce the load of this computer; the run is marked invalid, record it again",
+    EventKind.SYNC_LOST: "check the device that produces SYNC",
+    EventKind.PDO_LENGTH: "did another program change the mapping, or does another device use this identifier?",
+    EventKind.FROZEN: "check the encoder and the motor cable; restart the drive",
+    EventKind.STOP_UNCONFIRMED: "look at this axis; use the emergency stop if it moves",
+}
+ALARMING = frozenset(REMEDIES) | {EventKind.EMCY}
+
+
+def event_document(kind: EventKind, code: int, axis: str | None, text: str) -> dict[str, Any]:
+    """JSON document of an event: the axis by name, and the remedy.
+
+    Args:
+        kind, code, text: as in `CellEvent`.
+        axis: its name, None for the whole cell.
+    """
+    remedy = remedy_of(code) if kind is EventKind.EMCY else REMEDIES.get(kind, "")
+    # The axis is shown beside the text.
+    shown = text if axis is None else re.sub(rf"^{re.escape(axis)}( \(node \d+\))?: ", "", text)
+    return {
+        **{"axis": axis, "kind": kind.value, "code": code},
+        **{"text": shown, "remedy": remedy, "alarm": kind in ALARMING},
+    }
