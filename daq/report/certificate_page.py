@@ -212,7 +212,7 @@ def _write(certificate: Certificate) -> str:
     rows = [(one.axis, one.key, str(one.line), f"{one.old:.9g}", one.spelling or "-") for one in edit.changes]
     return section(
         f"What would be written into {edit.file.name}",
-        table("", ("axis", "key", "line", "number now", "number then"), rows),
+        table("", ("axis", "key", "line", "now", "new"), rows),
         paragraph("This page writes nothing."),
     )
 

@@ -18,7 +18,7 @@ _UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")
 """Unicode categories: control, format, surrogates, private, unassigned, separators of lines and paragraphs."""
 LIGHT = {
     **{"paper": "#fff", "ink": "#1a1a1a", "soft": "#595959", "line": "#d4d4d4", "shade": "#f0f0f0"},
-    **{"data": "#0072B2", "act": "#B34700", "pale": "#8CC4E8"},
+    **{"data": "#0072B2", "act": "#B34700", "pale": "#6AAFE0"},
 }
 _DARK = {
     **{"paper": "#16181a", "ink": "#ececec", "soft": "#b0b0b0", "line": "#44484c", "shade": "#26292d"},
@@ -77,6 +77,7 @@ caption { text-align: left; font-weight: bold; padding: 0.2rem 0; }
 th, td { padding: 0.2rem 0.7rem; border-bottom: 1px solid var(--line); text-align: right; vertical-align: baseline; }
 th { font-weight: 600; } td { white-space: nowrap; } thead th { color: var(--soft); font-weight: normal; }
 th:first-child, .text { text-align: left; } th:first-child { padding-left: 0; }
+.names tbody th { white-space: nowrap; position: sticky; left: 0; background: var(--paper); }
 .words { width: 100%; } .words .text { white-space: normal; }
 .pair { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 21rem), 1fr)); gap: 0 1.5rem; }
 figure { margin: 0.6rem 0; max-width: 26rem; } figcaption { color: var(--soft); font-size: 0.9rem; }
@@ -85,8 +86,9 @@ details { border-bottom: 1px solid var(--line); } details > :not(summary) { marg
 summary { cursor: pointer; padding: 0.5rem 0; font-weight: 600; }
 summary:focus-visible { outline: 3px solid var(--data); }
 @media (max-width: 40rem) {
+  th, td { padding: 0.2rem 0.4rem; }
   .words, .words tbody { display: block; } .words thead { display: none; }
-  .words tr { display: grid; grid-template-columns: 1fr 1.4fr; gap: 0 1rem; padding: 0.4rem 0;
+  .words tr { display: grid; grid-template-columns: 7.2rem 1fr; gap: 0 1rem; padding: 0.4rem 0;
     border-bottom: 1px solid var(--line); }
   .words th, .words td { border: 0; padding: 0; text-align: left; white-space: normal; }
   .words td:last-child { grid-area: 1 / 2; }
@@ -164,7 +166,7 @@ def table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[str]], 
     """Build a table of plain texts; the first cell of each row is its heading, and its kind is a CSS class.
 
     A column with any cell that is no number is aligned to the left. Kind "words" is for rows that end in a sentence:
-    a phone shows each row as a card.
+    a phone shows each row as a card. Kind "names" keeps the names of the rows in sight where the table scrolls.
     """
     lines = list(rows)
     texts = [not all(_NUMBER.fullmatch(line[column]) for line in lines) for column in range(len(headings))]

@@ -30,7 +30,7 @@ STEP_S, LARGEST_ROWS = 0.04, 1500  #: Time between two rows of a preview, and th
 MARK = '<meta name="drivegain-plan" content="'  #: Text at the beginning of a page, before the digest of its plan
 _GRID_M = 0.25  #: Side of a square of the drawn plane z = 0
 HEAD_BYTES = 1024  #: Beginning of a page, in which the digest of its plan is
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B58900", "#56B4E9", "#7F7F7F", "#882255")
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B58900", "#3B9BD6", "#7F7F7F", "#882255")
 _DARK = ("#4BA3E3", "#F08A4B", "#2FC298", "#E39BC4", "#E0B73C", "#9AD5FF", "#B5B5B5", "#D77AA8")
 _STYLE = """
 :root { color-scheme: light dark; --ink: #1a1a1a; --soft: #595959; --grid: #d4d4d4; --paper: #fff; --act: #B34700;

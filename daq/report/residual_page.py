@@ -65,7 +65,7 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration, compa
         folded("What was found, in sentences", listed(summary(fitted, account))),
         folded(
             "Errors without and with the effects",
-            table("Relative error ‖e‖/‖v‖ [%]", ("", *axes, "total"), errors),
+            table("Relative error ‖e‖/‖v‖ [%]", ("", *axes, "total"), errors, "names"),
             paragraph(
                 "Error: the share of each motor's current that the model leaves, ‖e‖/‖v‖, over the rows in motion; "
                 "in total with each current weighted by its gain. Compare errors only under the same filters (end "
@@ -133,10 +133,9 @@ def _gains(fitted: Fit, account: Account) -> str:
         (
             axis.name,
             with_deviation(change.before, change.before_std),
-            with_deviation(change.after, change.after_std),
+            f"{with_deviation(change.after, change.after_std)} {axis.gain_unit}",
             f"{change.change_percent:+.2f} ± {change.change_std_percent:.2f}",
-            "yes" if change.significant else "no",
-            axis.gain_unit,
+            "more than noise" if change.significant else "within noise",
         )
         for axis, change in zip(fitted.cell.axes, changes, strict=True)
     ]
@@ -149,7 +148,7 @@ def _gains(fitted: Fit, account: Account) -> str:
     ]
     return folded(
         "Gains without and with the effects",
-        table("", ("axis", *WHEN, "change ± σ [%]", "more than noise", "unit"), rows),
+        table("", ("axis", *WHEN, "change ± σ [%]", "verdict"), rows, "words"),
         figure(
             intervals(shifts, "Change of each gain by the effects", "change by the effects [%]"),
             "0 is the gain without the effects. Bar: ± 2 σ of the change, whose noise both estimates share in part.",

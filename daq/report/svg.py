@@ -267,7 +267,7 @@ class _Scale:
 
 def _ticks(low: float, high: float) -> Iterator[float]:
     """Round numbers between two ends, three to six of them."""
-    raw = (high - low) / 4.0
+    raw = (high - low) / 5.0
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if power * factor >= raw)
     for number in range(math.ceil(low / step), math.floor(high / step) + 1):
