@@ -1,8 +1,7 @@
 """Refresh the pictures of the documentation from real commands: `make screenshots`.
 
-The console's page is that of `make test-console`.
-Terminal pictures are the output of commands on the simulated cell, as SVG without a remote font. Plots are those of
-`make demo`. The page of `report.html` is printed by WeasyPrint, in an environment of its own (out/screenshots-venv).
+Pages are drawn by Chromium (`make browser`); the console's is that of `make test-console`. Terminal pictures are the
+output of commands on the simulated cell, as SVG without a remote font. Plots and certificate are those of `make demo`.
 A history needs months, so that of the plot is drawn: twenty weekly calibrations, J4 falling from the eleventh on.
 """
 
@@ -12,16 +11,17 @@ import argparse
 import io
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
-import venv
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import drawings
 from PIL import Image
+from playwright.sync_api import sync_playwright
 from rich._export_format import CONSOLE_SVG_FORMAT
 from rich.console import Console
 from rich.terminal_theme import MONOKAI
@@ -34,14 +34,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PICTURES = ROOT / "docs" / "pictures"
 DRIVEGAIN = Path(sys.executable).with_name("drivegain")
 COLUMNS = 100
-REPORT_VENV = ROOT / "out" / "screenshots-venv"
-PRINT_FIRST_PAGES = """
-import io, sys, pypdfium2, weasyprint
-page, folder, many = sys.argv[1:]
-document = pypdfium2.PdfDocument(io.BytesIO(weasyprint.HTML(page).write_pdf()))
-for number in range(int(many)):
-    document[number].render(scale=1.3).to_pil().save(f"{folder}/{number}.png")
-"""
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
 def main() -> int:
@@ -53,12 +46,11 @@ def main() -> int:
     (PICTURES / "house.svg").write_text(drawings.house(), encoding="utf-8")
     (PICTURES / "one-sample.svg").write_text(drawings.one_sample(), encoding="utf-8")
     _webp(demo / "gains.png", "gains", width=1000)
-    _webp(next(demo.glob("residual-*.png")), "residual", width=1100)
     _webp(ROOT / "out" / "console" / "desktop.png", "console", width=1000)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         _terminals(folder, demo)
-        _report(folder, demo)
+        _pages(folder, demo)
         _history(folder)
     for picture in sorted(PICTURES.iterdir()):
         sys.stdout.write(f"{picture.stat().st_size / 1000:7.1f} kB  {picture.relative_to(ROOT)}\n")
@@ -72,6 +64,7 @@ def _terminals(folder: Path, demo: Path) -> None:
     with _simulated_cell(folder):
         _terminal("scan", f"scan {cell}", folder)
     _terminal("plan", f"plan {cell} --out plan.yaml --duration 14", folder)
+    _run(f"plan {cell} --out same.yaml --duration 14 --preview preview.html", folder)
     (folder / "calibration.yaml").symlink_to(demo / "calibration.yaml")
     (folder / "configs").symlink_to(ROOT / "configs")
     _terminal("apply", "apply configs/cells/demo.yaml calibration.yaml", folder, _short_diff)
@@ -83,22 +76,23 @@ def _short_diff(lines: list[str]) -> list[str]:
     return [*lines[: begin + 5], "  …", *lines[-2:]]
 
 
-def _report(folder: Path, demo: Path) -> None:
-    """The first two pages of report.html, side by side."""
-    logs = [str(demo / f"{name}.mcap") for name in ("bare-1", "loaded-1", "bare-2", "loaded-2")]
-    holdout = str(demo / "held-out.mcap")
-    _run(["residual", *logs, "--holdout", holdout, "--out", "found.yaml", "--report", "report"], folder)
-    python = REPORT_VENV / "bin" / "python"
-    if not python.exists():
-        venv.create(REPORT_VENV, with_pip=True)
-        subprocess.run([python, "-m", "pip", "install", "-qq", "weasyprint", "pypdfium2", "pillow"], check=True)
-    page = folder / "report" / "report.html"
-    subprocess.run([python, "-c", PRINT_FIRST_PAGES, str(page), str(folder), "2"], check=True)
-    pages = [Image.open(folder / f"{number}.png").convert("RGB") for number in range(2)]
-    both = Image.new("RGB", (sum(one.width for one in pages), pages[0].height), "white")
-    for number, one in enumerate(pages):
-        both.paste(one, (number * pages[0].width, 0))
-    both.save(PICTURES / "report.webp", quality=60, method=6)
+def _pages(folder: Path, demo: Path) -> None:
+    """The first sheet of report.html, the residual of its effect, and the preview of a plan half-way."""
+    shots = (
+        ("report", demo / "report" / "report.html", "main", ""),
+        ("residual", next(demo.glob("residual-*.svg")), "svg", ""),
+        ("preview", folder / "preview.html", "body", "at = last / 2; draw()"),
+    )
+    with sync_playwright() as playwright:
+        # A container's root may not make the namespaces of the browser's sandbox; it opens our own pages alone.
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 920, "height": 1000}, device_scale_factor=1.5)
+        for name, source, part, script in shots:
+            page.goto(source.as_uri())
+            page.evaluate(script)
+            page.locator(part).first.screenshot(path=folder / f"{name}.png")
+            _webp(folder / f"{name}.png", name, width=820)
+        browser.close()
 
 
 def _history(folder: Path) -> None:

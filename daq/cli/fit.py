@@ -33,7 +33,7 @@ HoldoutOption = Annotated[
     list[Path] | None, typer.Option("--holdout", help="Held-out log, for the final error; repeatable.")
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="Calibration file to write (calibration.yaml).")]
-PicturesOption = Annotated[Path | None, typer.Option("--pictures", help="Folder for pictures (PNG); it is created.")]
+PicturesOption = Annotated[Path | None, typer.Option("--pictures", help="Folder for pictures; it is created.")]
 AcceptLossesOption = Annotated[
     bool,
     typer.Option("--accept-losses", help="Use logs with lost frames, less those samples; `apply` refuses the result."),

@@ -14,6 +14,25 @@ function element(name, text, className) {
   return made;
 }
 
+// Text with `commands` between back quotes.
+function prose(name, text, className) {
+  const made = element(name, undefined, className);
+  text.split("`").forEach((part, k) => made.append(k % 2 ? element("code", part) : part));
+  return made;
+}
+
+// CiA 402 states in words.
+const STATES = {
+  "NOT READY TO SWITCH ON": "starting",
+  "SWITCH ON DISABLED": "power off",
+  "READY TO SWITCH ON": "power off, ready",
+  "SWITCHED ON": "power on, not enabled",
+  "OPERATION ENABLED": "enabled",
+  "QUICK STOP ACTIVE": "stopping",
+  "FAULT REACTION ACTIVE": "fault, stopping",
+  "FAULT": "fault, power off",
+};
+
 function number(value, digits) {
   return value === null || value === undefined ? "–" : value.toFixed(digits);
 }
@@ -39,22 +58,29 @@ function buildAxis(axis, index) {
   const values = element("p", "–", "values");
   const current = element("canvas");
   current.setAttribute("role", "img");
-  current.setAttribute("aria-label", `Current reference of ${axis.name}`);
+  current.setAttribute("aria-label", `Current of ${axis.name} over time`);
   const residual = element("canvas", undefined, "residual");
   residual.setAttribute("role", "img");
-  residual.setAttribute("aria-label", `Residual current of ${axis.name}`);
+  residual.setAttribute("aria-label", `Measured less predicted current of ${axis.name} over time`);
   residual.hidden = true;
-  card.append(head, range, values, current, residual);
+  const times = element("p", undefined, "times");
+  const begin = element("span");
+  times.append(begin, element("span", "now"));
+  card.append(head, range, values, current, residual, times);
   byId("axes").append(card);
-  axes.push({ ...axis, index, state, bar, marker, values, current, residual });
+  axes.push({ ...axis, index, card, state, bar, marker, values, current, residual, begin });
 }
 
 function showAxis(axis, status) {
   const now = status.axes[axis.index];
   if (!now) return;
-  axis.state.textContent = now.silent ? `${now.state}, DOES NOT ANSWER` : now.state;
+  const words = STATES[now.state] || now.state;
+  axis.card.classList.add("live");
+  axis.state.textContent = now.silent ? `${words}, DOES NOT ANSWER` : words;
+  axis.state.title = now.state;
   axis.state.className = `state${now.fault || now.silent ? " fault" : now.power ? " power" : ""}`;
-  axis.values.textContent = `${number(now.position, 2)} ${axis.unit}, ${number(now.current, 3)} ${axis.current_unit}`;
+  axis.values.textContent =
+    `position ${number(now.position, 2)} ${axis.unit}, current ${number(now.current, 3)} ${axis.current_unit}`;
   const share = (now.position - axis.lower) / (axis.upper - axis.lower);
   axis.marker.style.left = `calc(${100 * Math.min(1, Math.max(0, share))}% - 0.17rem)`;
   axis.bar.classList.toggle("near", share < 0.03 || share > 0.97);
@@ -71,9 +97,9 @@ function since(list, time) {
   return list.slice(low);
 }
 
-function niceStep(range) {
-  const power = 10 ** Math.floor(Math.log10(range / 3));
-  return [1, 2, 5, 10].map((one) => one * power).find((one) => range / one <= 4);
+function niceStep(range, most) {
+  const power = 10 ** Math.floor(Math.log10(range / most));
+  return [1, 2, 5, 10].map((one) => one * power).find((one) => range / one <= most);
 }
 
 // A chart: lines and bands over time, one scale for all of them. A line is {points, color}, of [time, value] pairs.
@@ -105,7 +131,7 @@ function draw(canvas, colors, begin, end, lines, bands, unit) {
   const left = 46, bottom = 4;
   const x = (time) => left + (width - left - 4) * (time - begin) / (end - begin);
   const y = (value) => bottom + (height - 2 * bottom) * (high - value) / (high - low);
-  const step = niceStep(high - low);
+  const step = niceStep(high - low, height > 80 ? 6 : 3);
   pen.font = "12px system-ui, sans-serif";
   pen.textAlign = "right";
   pen.textBaseline = "middle";
@@ -128,15 +154,17 @@ function draw(canvas, colors, begin, end, lines, bands, unit) {
       pen.fill();
     }
   }
-  for (const { points, color, thickness } of lines) {
+  for (const { points, color, dash } of lines) {
     pen.strokeStyle = color;
-    pen.lineWidth = thickness || 1.5;
+    pen.lineWidth = dash ? 2.5 : 1.5;
+    pen.setLineDash(dash || []);
     for (const part of stretches(points)) {
       pen.beginPath();
       part.forEach(([time, value]) => pen.lineTo(x(time), y(value)));
       pen.stroke();
     }
   }
+  pen.setLineDash([]);
 }
 
 function stretches(points) {
@@ -159,12 +187,13 @@ function drawAll() {
   const begin = end - Number(byId("span").value);
   const points = since(shown.points, begin), rows = since(shown.rows, begin);
   for (const axis of axes) {
+    axis.begin.textContent = `${number(begin - end, 0)} s`;
     const half = shown.status.band[axis.index] || 0;
     const measured = points.map((point) => [point[0], point[1 + axes.length + axis.index]]);
     const predicted = rows.map((row) => [row[0], row[1 + axis.index]]);
     const residual = rows.map((row) => [row[0], row[1 + axes.length + axis.index]]);
     draw(axis.current, colors, begin, end,
-      [{ points: predicted, color: colors.predicted, thickness: 4 }, { points: measured, color: colors.current }],
+      [{ points: measured, color: colors.current }, { points: predicted, color: colors.predicted, dash: [7, 4] }],
       [{ points: predicted, half, color: colors.band }], axis.current_unit);
     axis.residual.hidden = !shown.rows.length;
     if (shown.rows.length) {
@@ -178,16 +207,20 @@ function drawAll() {
 // ---- Words and figures
 
 const PHASES = {
-  waiting: "No recording runs. Start one in a terminal: drivegain record or drivegain recalibrate.",
+  waiting: "No recording runs. Start one in a terminal: `drivegain record` or `drivegain recalibrate`.",
   running: "The drives are prepared…",
   watching: "drivegain monitor watches; nothing is recorded.",
   ended: "The last run has ended.",
 };
 
+function grouped(count) {
+  return String(count).replace(/\B(?=(\d{3})+$)/g, "\u202f");
+}
+
 function showStatus(status) {
   const run = shown.run;
   const running = status.phase === "running";
-  byId("phase").textContent = running && run ? "Recording" : PHASES[status.phase];
+  byId("phase").replaceChildren(...prose("p", running && run ? "Recording" : PHASES[status.phase]).childNodes);
   byId("stop").disabled = !running;
   const watching = status.phase === "watching";
   byId("log").textContent = run && run.log ? run.log.split("/").at(-1) : watching ? "no recording" : "no run yet";
@@ -196,14 +229,15 @@ function showStatus(status) {
   byId("done").textContent = status.moves ? `${status.done} of ${status.moves} moves` : "";
   const loads = Object.entries(status.bus_load).map(([bus, load]) => `${bus} ${number(100 * load, 0)} %`).join(", ");
   const figures = [
-    ["Samples", String(status.samples)],
-    ["SYNC cycles lost", String(status.lost), status.lost > 0],
-    ["Missing answers", String(status.missing), status.missing > 0],
+    ["Samples", grouped(status.samples)],
+    ["SYNC cycles lost", grouped(status.lost), status.lost > 0],
+    ["Missing answers", grouped(status.missing), status.missing > 0],
     ["Sample rate", running || watching ? `${number(status.rate_hz, 0)} Hz` : "–"],
     ["Bus load, computed", (running || watching) && loads ? loads : "–"],
     ["Disk free", status.free_bytes === null ? "–" : `${number(status.free_bytes / 1e9, 1)} GB`],
-    ["Packets this page missed", String(status.dropped)],
   ];
+  // The recorder never waits for this page; the log has what the page missed.
+  if (status.dropped > 0) figures.push(["Missed here, in the log", grouped(status.dropped)]);
   const list = byId("figures");
   if (list.children.length !== figures.length) {
     list.replaceChildren(...figures.map(([name]) => {
@@ -235,7 +269,7 @@ function showEnd(status) {
   if (end && !end.ok) words.push(`It ended early: ${end.text}.`);
   if (end && !end.axes_stopped) words.push("NOT ALL AXES ARE CONFIRMED STOPPED: look at the robot.");
   else if (end && !end.ok) words.push("The axes are stopped.");
-  notice.textContent = words.join(" ") || "The program has ended.";
+  notice.replaceChildren(...prose("p", words.join(" ") || "The program has ended.").childNodes);
   notice.classList.toggle("good", Boolean(!end || end.ok) && Boolean(!result || result.valid));
 }
 
@@ -252,11 +286,13 @@ function addEvents(events) {
     const line = element("li");
     line.append(element("span", `${number(event.time_s, 3)} s `, "quiet"));
     line.append(element("strong", event.axis ? `${event.axis} ` : "", event.alarm ? "alarm" : ""));
-    line.append(element("span", (event.alarm ? "⚠ " : "") + event.text, event.alarm ? "alarm" : ""));
-    if (event.remedy) line.append(element("span", `→ ${event.remedy}`, "remedy"));
+    line.append(prose("span", (event.alarm ? "⚠ " : "") + event.text, event.alarm ? "alarm" : ""));
+    if (event.remedy) line.append(prose("span", `→ ${event.remedy}`, "remedy"));
     byId(event.alarm ? "alarms" : "events").prepend(line);
   }
   for (const list of [byId("alarms"), byId("events")]) while (list.children.length > 200) list.lastChild.remove();
+  byId("faults").hidden = !byId("alarms").children.length;
+  byId("quiet").hidden = byId("events").children.length > 0;
 }
 
 // ---- Results
@@ -280,14 +316,19 @@ function signed(value, digits, unit) {
   return value === null ? "–" : `${value > 0 ? "+" : ""}${number(value, digits)} ${unit}`;
 }
 
+function utc(iso) {
+  const time = new Date(iso);
+  return Number.isNaN(time.getTime()) ? iso : `${time.toISOString().slice(0, 16).replace("T", " ")} UTC`;
+}
+
 function showResults(found) {
-  const parts = found.problems.map((text) => element("p", text, "alarm"));
+  const parts = found.problems.map((text) => prose("p", text, "alarm"));
   if (found.gains) {
-    parts.push(element("h3", `Gains of ${found.gains.file}, fitted ${found.gains.created.slice(0, 16).replace("T", " ")}`));
-    parts.push(table(["axis", "gain ± σ", "unit", "from the nameplate", `error on ${found.gains.error}`],
-      found.gains.axes.map((one) => [one.axis, withDeviation(one.value, one.std), one.unit,
+    parts.push(element("h3", `Gains of ${found.gains.file}, fitted ${utc(found.gains.created)}`));
+    parts.push(table(["axis", "gain ± σ", "since nameplate", `error, ${found.gains.error}`],
+      found.gains.axes.map((one) => [one.axis, `${withDeviation(one.value, one.std)} ${one.unit}`,
         signed(one.change_percent, 2, "%"), `${number(one.error_percent, 2)} %`])));
-  } else parts.push(element("p", "No calibration yet. After the recordings: drivegain fit LOG … --out calibration.yaml"));
+  } else parts.push(prose("p", "No calibration yet. After the recordings: `drivegain fit LOG … --out calibration.yaml`"));
   if (found.report) {
     const link = element("a", "Open the report");
     link.href = "report";
@@ -343,6 +384,7 @@ function take(message) {
     Object.assign(shown, { run: fresh.run, points: [], rows: [], events: [], received: 0 });
     byId("alarms").replaceChildren();
     byId("events").replaceChildren();
+    addEvents([]);
   }
   for (const name of ["points", "rows", "events"]) {
     if (!fresh[name]) continue;

@@ -145,11 +145,12 @@ class Certificate:
         differing = [row for row in self.rows if row.significant]
         most = max(differing, key=lambda row: abs(row.change.change_percent), default=None)
         furthest = "" if most is None else f"{most.change.axis} by {most.change.change_percent:+.1f} %"
-        count = f"{len(differing)} of {len(self.rows)} gains"
+        every = len(differing) == len(self.rows)
+        count = f"all {len(self.rows)} gains" if every else f"{len(differing)} of {len(self.rows)} gains"
         match self.verdict:
             case Verdict.REFUSED:
                 failed = [refusal for refusal in refusals if refusal.gate not in _OPERATORS]
-                more = "" if len(failed) == 1 else f", and {len(failed) - 1} more failed"
+                more = "" if len(failed) == 1 else f" (and {len(failed) - 1} more, below)"
                 one = failed[0]
                 return f"Must not be written: {one.subject}: {one.found}, expected {one.expected}{more}."
             case Verdict.UNCHANGED:
@@ -218,7 +219,8 @@ def identity(calibration: Calibration) -> tuple[tuple[str, str], ...]:
     operators = sorted({one.operator for one in recordings if one.operator})
     times = sorted(one.recorded_s for one in recordings if one.recorded_s is not None)
     days = list(dict.fromkeys(datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M") for time_s in times))
-    between = days[0] if len(days) == 1 else f"{days[0]} to {days[-1]}" if days else ""
+    same_day = bool(days) and days[0][:10] == days[-1][:10]
+    between = days[0] if len(days) == 1 else f"{days[0]} to {days[-1][11 if same_day else 0 :]}" if days else ""
     return (
         ("Serial numbers", _serials(calibration)),
         ("Operator", ", ".join(operators) or "not known: the recordings name none"),

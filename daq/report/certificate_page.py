@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 from daq.report.certificate import AxisRow, Certificate, Verdict, identity
-from daq.report.effect_names import accepted_text, curve_of, size_text
+from daq.report.effect_names import WORDS, accepted_text, curve_of, size_text
 from daq.report.gains import diagnosis_texts, partial_note, with_deviation
-from daq.report.html import element, figure, folded, listed, page, paragraph, section, table, terms
-from daq.report.svg import Interval, before_after, curve, intervals
+from daq.report.html import element, figure, folded, listed, page, pair, paragraph, section, table, terms
+from daq.report.picture import QUANTITY
+from daq.report.svg import Interval, Line, before_after, chart, intervals
 from daq.report.text import percent_text
 from ident.calibration import AcceptedEffect, Calibration
+from ident.estimators.estimate import RelativeError
 
 _LOOK = {Verdict.REFUSED: "act", Verdict.WAITING: "act", Verdict.UNCHANGED: "quiet", Verdict.NOT_COMPARED: "quiet"}
 """CSS class of the verdict; blue without one. Orange asks the reader to act."""
@@ -19,10 +22,22 @@ _SIGN = {
     Verdict.READY: "✓",
     Verdict.UNCHANGED: "=",
     Verdict.WAITING: "…",
-    Verdict.NOT_COMPARED: "?",
+    Verdict.NOT_COMPARED: "•",
     Verdict.REFUSED: "✕",
 }
 _SIGMAS = 2.0
+_FILTERS = {
+    "position_cutoff_hz": "cut-off of the positions [Hz]",
+    "position_order": "order of that filter",
+    "decimation_cutoff_hz": "cut-off before decimation [Hz]",
+    "standstill_rad_s": "standstill below, of each axis [rad/s]",
+    "standstill_share": "share of standstill in the filter's window, at most",
+}
+_METHODS = {
+    **{"ls": "least squares", "wls": "weighted least squares", "tls": "total least squares"},
+    **{"ml": "maximum likelihood", "iv": "instrumental variables"},
+}
+_ROLES = {"holdout": "held out"}
 
 
 def certificate_page(certificate: Certificate, consequence: str = "", details: Sequence[str] = ()) -> str:
@@ -33,41 +48,49 @@ def certificate_page(certificate: Certificate, consequence: str = "", details: S
         consequence: what the effects change in the gains, a sentence; empty where it is not known.
         details: further folded sections, before those of the calibration itself.
     """
-    calibration = certificate.calibration
+    calibration, look = certificate.calibration, _LOOK.get(certificate.verdict, "")
     return page(
         f"Calibration of cell {calibration.cell}",
         (
             '<main class="sheet">',
             paragraph("Calibration certificate", "kind"),
             element("h1", f"Cell {calibration.cell}"),
-            paragraph(f"{_SIGN[certificate.verdict]} {certificate.sentence}", _verdict_class(certificate.verdict)),
+            paragraph(f"{_SIGN[certificate.verdict]} {certificate.sentence}", f"verdict {look}"),
+            *_next(certificate, look),
             *_warnings(certificate),
             terms(identity(calibration)),
             _gains(certificate),
-            _pictures(certificate),
-            _errors(calibration),
             _effects(calibration, consequence),
             _write(certificate),
             "</main>",
             *_since(certificate),
+            '<section class="details">',
+            element("h2", "Details"),
             *details,
             *_evidence(calibration),
+            "</section>",
         ),
     )
 
 
-def _verdict_class(verdict: Verdict) -> str:
-    return f"verdict {_LOOK[verdict]}" if verdict in _LOOK else "verdict"
+def _next(certificate: Certificate, look: str) -> Iterator[str]:
+    """What to do now, below the verdict."""
+    comparison = certificate.comparison
+    if comparison.unread:
+        yield paragraph(comparison.unread, f"next {look}")
+    elif comparison.command and certificate.verdict in {Verdict.READY, Verdict.WAITING}:
+        yield paragraph(f"To review the change: `{comparison.command}`. With `--yes` it is written.", f"next {look}")
 
 
 def _warnings(certificate: Certificate) -> Iterator[str]:
+    """What to check and what to do about it; checks that failed alike are one entry."""
     note = partial_note(certificate.calibration)
     texts = (*(() if note is None else (note,)), *diagnosis_texts(certificate.calibration.diagnoses))
-    of_axes = {row.change.axis for row in certificate.rows}
-    # The failed checks of an axis are in its row of the table.
-    failed = [str(one) for one in certificate.comparison.refusals if one.subject not in of_axes]
+    failed: dict[str, list[str]] = {}
+    for one in certificate.comparison.refusals:
+        failed.setdefault(f"found {one.found}; expected {one.expected}; {one.remedy}", []).append(one.subject)
     if texts or failed:
-        yield listed((*texts, *failed))
+        yield listed((*texts, *(f"{', '.join(subjects)}: {text}." for text, subjects in failed.items())))
 
 
 def _gains(certificate: Certificate) -> str:
@@ -76,19 +99,17 @@ def _gains(certificate: Certificate) -> str:
         (
             row.change.axis,
             f"{row.change.old:.5g}",
-            with_deviation(gain.value, gain.std),
-            gain.unit,
+            f"{with_deviation(gain.value, gain.std)} {gain.unit}",
             _percent(row.change.change_percent),
             _limit(row.allowed_percent),
             row.words(certificate.place),
         )
         for gain, row in zip(certificate.calibration.gains, certificate.rows, strict=True)
     ]
-    unread = certificate.comparison.unread
     return section(
         "Drive gains",
-        *(paragraph(unread) for _ in range(bool(unread))),
-        table("", ("axis", place, "identified ± σ", "unit", "change [%]", "limit [%]", "verdict"), rows, "words"),
+        table("", ("axis", place, "identified ± σ", "change [%]", "limit [%]", "verdict"), rows, "words"),
+        pair((_changes(certificate), *_errors(certificate.calibration))),
     )
 
 
@@ -107,35 +128,42 @@ def _interval(row: AxisRow, earlier: float = math.nan) -> Interval:
     )
 
 
-def _pictures(certificate: Certificate) -> str:
-    """Gains beside their limits and, with a held-out run, the errors before and after."""
-    calibration = certificate.calibration
-    gains = figure(
-        intervals(
-            [_interval(row) for row in certificate.rows],
-            "Change of each gain with its interval and its limits",
-            f"change from the {certificate.place} [%]",
-        ),
-        f"Line: the {certificate.place}. Dot with bar: identified gain ± 2 σ; a bar shorter than the dot is not seen. "
-        "Orange lines: limits.",
-    )
+def _changes(certificate: Certificate) -> str:
+    """Gains beside their limits."""
+    place = certificate.place
+    drawn = intervals([_interval(row) for row in certificate.rows], "Change of each gain", f"from the {place} [%]")
+    caption = f"0 is the gain of the {place}. Bar: ± 2 σ, often shorter than the dot. Shaded: within the limits."
+    return figure(drawn, caption, f"Change from the {place}")
+
+
+def _errors(calibration: Calibration) -> Iterator[str]:
+    """Error of each axis and of all, before and after; NaN where it is not known."""
     held, nameplate = calibration.holdout_error_percent, calibration.nameplate_holdout_error_percent
     if held is None:
-        return gains
-    axes = [gain.axis for gain in calibration.gains]
-    before = (math.nan,) * len(axes) if nameplate is None else nameplate.axes
-    errors = figure(
-        before_after(list(zip(axes, before, held.axes, strict=True)), "Error of each axis", "held-out error [%]"),
-        "Full: error with the identified gains." + ("" if nameplate is None else " Hollow: with the nameplate gains."),
+        drawn = _beside(calibration, None, calibration.relative_error_percent, "error [%]")
+        caption = "No run was held out: the error on data that the fit has not used is not known."
+        yield figure(drawn, f"Share of the torque that the model leaves. {caption}", "Error on the data of the fit")
+        return
+    hollow = "" if nameplate is None else " Hollow: the same model with the nameplate gains."
+    yield figure(
+        _beside(calibration, nameplate, held, "error [%]"),
+        f"Share of the torque that the model leaves. Full: with the identified gains.{hollow}",
+        "Error on held-out runs",
     )
-    return f'<div class="pair">{gains}{errors}</div>'
+
+
+def _beside(calibration: Calibration, before: RelativeError | None, after: RelativeError, unit: str) -> str:
+    names = (*(gain.axis for gain in calibration.gains), "all")
+    first = (math.nan,) * len(names) if before is None else (*before.axes, before.total)
+    return before_after(list(zip(names, first, (*after.axes, after.total), strict=True)), "Error of each axis", unit)
 
 
 def _percent(percent: float) -> str:
     """Signed with one decimal, with two where it is small."""
     if not math.isfinite(percent):
         return "-"
-    return f"{percent:+.1f}" if abs(percent) >= 10.0 else f"{percent:+.2f}"
+    # Adding 0 turns -0.0 into 0.0.
+    return f"{percent:+.1f}" if abs(percent) >= 10.0 else f"{round(percent, 2) + 0.0:+.2f}"
 
 
 def _limit(allowed: tuple[float, float]) -> str:
@@ -143,30 +171,6 @@ def _limit(allowed: tuple[float, float]) -> str:
     if not math.isfinite(low) or not math.isfinite(high):
         return "-"
     return f"±{high:.3g}" if math.isclose(-low, high) else f"{low:+.3g} to {high:+.3g}"
-
-
-def _errors(calibration: Calibration) -> str:
-    axes = tuple(gain.axis for gain in calibration.gains)
-    held, nameplate = calibration.holdout_error_percent, calibration.nameplate_holdout_error_percent
-    if held is None:
-        fit = calibration.relative_error_percent
-        return section(
-            "Error",
-            paragraph(
-                "No run was held out, so that the error on data that the fit has not seen is not known. On the data of "
-                f"the fit the model leaves {percent_text(fit.total)} % of the torque."
-            ),
-            table("", ("[%]", *axes, "total"), [("data of the fit", *map(percent_text, (*fit.axes, fit.total)))]),
-        )
-    rows = [("identified gains", held)] if nameplate is None else [("nameplate gains", nameplate), ("identified", held)]
-    return section(
-        "Error on held-out runs",
-        table(
-            "",
-            ("share of the torque left [%]", *axes, "total"),
-            [(name, *map(percent_text, (*error.axes, error.total))) for name, error in rows],
-        ),
-    )
 
 
 def _effects(calibration: Calibration, consequence: str) -> str:
@@ -183,18 +187,19 @@ def _effect(effect: AcceptedEffect, calibration: Calibration) -> str:
     words, size = accepted_text(effect, calibration), size_text(effect, calibration)
     before, after = percent_text(effect.error_before_percent), percent_text(effect.error_after_percent)
     text = paragraph(
-        f"{effect.axis} has {words}: {size}. Without it the model leaves {before} % on data that the fit has not used, "
-        f"with it {after} %."
+        f"{effect.axis} has {words}: {size}. On data that the fit has not used, the model without it leaves {before} % "
+        f"of the torque of {effect.axis}, with it {after} %."
     )
     shown = curve_of(effect, calibration)
     if shown is None:
         return text
-    torque = "torque against the motion [Nm]" if shown.turns else "torque [Nm]"
-    band = "; its covariance is not known" if shown.half_nm is None else " ± 2 σ"
-    return text + figure(
-        curve(shown.x, shown.torque_nm, shown.half_nm, f"Torque of {effect.axis}", (shown.variable, torque)),
-        f"{effect.axis}: torque that the model lacks, over the {shown.variable.partition(' [')[0]}{band}.",
-    )
+    band = "The uncertainty is not known." if shown.half_nm is None else "Band: ± 2 σ."
+    against = ", against the motion" if shown.turns else ""
+    line = Line(shown.x, shown.torque_nm)
+    torque = f"{QUANTITY[shown.force]} [{shown.force}]{against}"
+    title = f"{effect.axis}: {QUANTITY[shown.force]} that the declared model lacks"
+    drawn = chart((line,), title, (shown.variable, torque), half=shown.half_nm)
+    return text + figure(drawn, band, title)
 
 
 def _write(certificate: Certificate) -> str:
@@ -204,14 +209,11 @@ def _write(certificate: Certificate) -> str:
         return ""
     if not edit.has_effect:
         return section("What would be written", paragraph(f"Nothing: {edit.file.name} has these gains already."))
-    rows = [(one.axis, one.key, f"line {one.line}", f"{one.old:.9g}", one.spelling or "-") for one in edit.changes]
+    rows = [(one.axis, one.key, str(one.line), f"{one.old:.9g}", one.spelling or "-") for one in edit.changes]
     return section(
-        "What would be written",
-        table(f"Into {edit.file.name}", ("axis", "key", "place", "gain now", "number written"), rows),
-        paragraph(
-            "This page writes nothing."
-            + (f" To review the change, and to write it with --yes: {comparison.command}" if comparison.command else "")
-        ),
+        f"What would be written into {edit.file.name}",
+        table("", ("axis", "key", "line", "now", "new"), rows),
+        paragraph("This page writes nothing."),
     )
 
 
@@ -220,7 +222,6 @@ def _since(certificate: Certificate) -> Iterator[str]:
     earlier, calibration = certificate.earlier, certificate.calibration
     if earlier is None:
         return
-    axes = tuple(gain.axis for gain in calibration.gains)
     old = {gain.axis: gain for gain in earlier.gains}
     rows = [
         (
@@ -232,11 +233,6 @@ def _since(certificate: Certificate) -> Iterator[str]:
             "changed" if row.significant else "same within noise",
         )
         for gain, row in zip(calibration.gains, certificate.since, strict=True)
-    ]
-    errors = [
-        (name, *map(percent_text, (*one.holdout_error_percent.axes, one.holdout_error_percent.total)))
-        for name, one in (("earlier", earlier), ("this one", calibration))
-        if one.holdout_error_percent is not None and len(one.holdout_error_percent.axes) == len(axes)
     ]
     lists = {
         name: {(e.axis, accepted_text(e, one)) for e in one.effects}
@@ -251,28 +247,41 @@ def _since(certificate: Certificate) -> Iterator[str]:
         for (name, then), (_, now) in zip(identity(earlier), identity(calibration), strict=True)
         if then != now
     ]
+    change = figure(
+        # The limits are those of a change from the controller, not of one from here.
+        intervals(
+            [replace(_interval(row), lower=-math.inf, upper=math.inf) for row in certificate.since],
+            "Change of each gain",
+            "from the earlier calibration [%]",
+        ),
+        "0 is the earlier calibration. Bar: ± 2 σ of this one.",
+        "Change from the earlier calibration",
+    )
+    before, after = earlier.holdout_error_percent, calibration.holdout_error_percent
+    errors = ""
+    if before is not None and after is not None and len(before.axes) == len(after.axes):
+        caption = "Hollow: earlier. Full: this one. The runs differ, so that only large differences count."
+        errors = figure(_beside(calibration, before, after, "error [%]"), caption, "Error on held-out runs")
     yield section(
         "Beside the earlier calibration",
         table("", ("axis", "earlier ± σ", "this one ± σ", "change [%]", "in σ of both", "verdict"), rows, "words"),
-        figure(
-            intervals(
-                [_interval(row) for row in certificate.since], "Change since the earlier calibration", "change [%]"
-            ),
-            "Line: the earlier calibration. Dot with bar: this one ± 2 σ of its own.",
-        ),
-        table(
-            "Error on held-out runs [%]; other runs, so that only large differences count", ("", *axes, "total"), errors
-        )
-        if errors
-        else "",
+        pair((change, errors)),
         listed((*effects, *facts)),
     )
+
+
+def _rival_text(rival: str) -> str:
+    """Describe `load-friction on J2` in words."""
+    name, _, where = rival.partition(" ")
+    return f"{WORDS.get(name, name)} {where}"
 
 
 def _evidence(calibration: Calibration) -> Iterator[str]:
     """What the calibration rests on: ambiguity, parameters, filters and logs."""
     rivals = [
-        (e.axis, accepted_text(e, calibration), ", ".join(e.ambiguity)) for e in calibration.effects if e.ambiguity
+        (effect.axis, accepted_text(effect, calibration), "; ".join(map(_rival_text, effect.ambiguity)))
+        for effect in calibration.effects
+        if effect.ambiguity
     ]
     if rivals:
         yield folded(
@@ -282,6 +291,12 @@ def _evidence(calibration: Calibration) -> Iterator[str]:
     of_effects = {one.name for effect in calibration.effects for one in effect.coefficients}
     yield folded(
         "Dynamic parameters",
+        paragraph(
+            "The number is that of the axis. I: moment of inertia of the link (Ia: of the motor), m: its mass, mx, my, "
+            "mz: mass × centre of mass, fv: viscous friction, fs: dry friction, off: constant torque, m in the middle "
+            "of a name (Iam, fvm, fsm): coupled motors. A sum is what motion shows of several links together; a name "
+            "after a colon is a payload."
+        ),
         table(
             "",
             ("parameter", "value ± σ", "unit"),
@@ -293,17 +308,22 @@ def _evidence(calibration: Calibration) -> Iterator[str]:
         ),
     )
     filters = [
-        (name.replace("_", " "), ", ".join(f"{v:g}" for v in value) if isinstance(value, list) else f"{value:g}")
+        (
+            _FILTERS.get(name, name.replace("_", " ")),
+            ", ".join(f"{v:g}" for v in value) if isinstance(value, list) else f"{value:g}",
+        )
         for name, value in calibration.filter.items()
     ]
+    logs = [(one.name, _ROLES.get(one.role, one.role), one.sha256) for one in calibration.sources]
     fit = calibration.relative_error_percent
     yield folded(
         "Filters, logs and digests",
         table("Filters", ("setting", "value"), filters),
-        table("Logs", ("log", "role", "sha256"), [(one.name, one.role, one.sha256) for one in calibration.sources]),
+        table("Logs", ("log", "used for", "sha256"), logs),
         paragraph(
-            f"Method {calibration.method}, {calibration.rows} rows, condition {calibration.condition:.0f}; on the data "
-            f"of the fit the model leaves {percent_text(fit.total)} %. Configuration "
-            f"{calibration.configuration_sha256 or 'not known'}, made {calibration.created} by {calibration.software}."
+            f"Estimator {_METHODS.get(calibration.method, calibration.method)}, {calibration.rows} rows, condition "
+            f"{calibration.condition:.0f}; on the data of the fit the model leaves {percent_text(fit.total)} %. "
+            f"Configuration {calibration.configuration_sha256 or 'not known'}, made {calibration.created} by "
+            f"{calibration.software}."
         ),
     )

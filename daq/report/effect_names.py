@@ -65,13 +65,14 @@ class Curve:
     torque_nm: FloatArray  #: torque that the term adds in the positive direction, shape (k,)
     half_nm: FloatArray | None  #: two σ of it, shape (k,); None where the calibration has no covariance
     variable: str  #: name of the variable with its unit
+    force: str  #: unit of the torque: Nm, or N along a prismatic joint
     turns: bool  #: whether the torque turns with the direction of motion, as friction does
 
     @property
     def text(self) -> str:
         """Its range in words."""
         turns = ", against the motion in either direction" if self.turns else ""
-        return f"between {self.torque_nm.min():+.2g} and {self.torque_nm.max():+.2g} Nm{turns}"
+        return f"between {self.torque_nm.min():+.2g} and {self.torque_nm.max():+.2g} {self.force}{turns}"
 
 
 def effect_text(effect: Effect, axes: tuple[str, ...]) -> str:
@@ -89,6 +90,15 @@ def variable_text(effect: Effect, axes: tuple[str, ...]) -> str:
     if effect.abscissa is Abscissa.OTHER_VELOCITY and other is not None:
         return f"the velocity of {axes[other]}"
     return "the " + effect.abscissa.value.partition(" [")[0]
+
+
+def variable_label(effect: Effect, axes: tuple[str, ...], force: str) -> str:
+    """Name the variable with its unit, in N and metres where the joint's force is in N: `joint position [rad]`."""
+    abscissa = effect.abscissa
+    label = f"{variable_text(effect, axes).removeprefix('the ')} [{abscissa.value.partition(' [')[2]}"
+    if force != "N" or abscissa in {Abscissa.MOTOR_ANGLE, Abscissa.CURRENT, Abscissa.OTHER_VELOCITY}:
+        return label
+    return label.replace("rad", "m").replace("Nm", "N").replace("torque", "force")
 
 
 def accepted_text(accepted: AcceptedEffect, calibration: Calibration) -> str:
@@ -146,10 +156,11 @@ def curve_of(accepted: AcceptedEffect, calibration: Calibration) -> Curve | None
         half_nm = _SIGMAS * np.sqrt(np.einsum("pk,pq,qk->k", shapes, covariance[np.ix_(rows, rows)], shapes))
     folded = isinstance(effect, Smooth) and effect.variable in FOLDED
     axes = tuple(gain.axis for gain in calibration.gains)
-    _, _, unit = effect.abscissa.value.partition(" [")
-    name = variable_text(effect, axes).removeprefix("the ") + (", magnitude" if folded else "")
+    force = calibration.gains[placed.axis].unit.partition("/")[0]
+    name, _, unit = variable_label(effect, axes, force).partition(" [")
+    name += ", magnitude" if folded else ""
     values = np.array([one.value for one in _in_order(accepted, placed)])
-    return Curve(x, values @ shapes, half_nm, f"{name} [{unit}", bool(effect.signed))
+    return Curve(x, values @ shapes, half_nm, f"{name} [{unit}", force, bool(effect.signed))
 
 
 def _placed(accepted: AcceptedEffect, calibration: Calibration) -> PlacedEffect | None:

@@ -1,26 +1,22 @@
-"""The gains with their σ: a table, a picture beside the nameplate, and a picture before and after effects."""
+"""The gains with their σ: a table, and a picture beside the nameplate."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from rich.table import Table
 
-from daq.report.picture import BLUE, GREEN, GREY, ORANGE, grid, legend_below, render, unformatted
+from daq.report.picture import BLUE, GREEN, GREY, legend_below, render, single
 from daq.report.text import plain_table, terminal_text
 from ident.calibration import Calibration, Gain
 from ident.data.torque_channel import TorqueSlope
 from ident.errors import Diagnosis
 
-if TYPE_CHECKING:  # `history` needs no effects
-    from ident.discovery.before_after import GainShift
-
 _SIGMAS = 2.0
 CERTAIN_SIGMAS = 3.0  #: Of the ratio of a drive's own torque to the gain, before a difference is said
-_BESIDE = 0.12  #: Offset of the points before and after, in units of the distance between axes
 
 
 def plot_gains(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str) -> bytes:
@@ -29,7 +25,7 @@ def plot_gains(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
     Gains of different axes differ by an order of magnitude and may be negative, so all are shown in percent.
     Return a PNG. `truth` is by axis, for a simulated cell only.
     """
-    figure, ((place,),) = grid(1, (1.0,), title, height_in=3.2)
+    figure, place = single(title, 3.2)
     positions = np.arange(len(gains))
     change = np.array([gain.change_percent for gain in gains])
     width = np.array([_SIGMAS * 100.0 * gain.std / abs(gain.nameplate) for gain in gains])
@@ -142,32 +138,3 @@ def with_deviation(value: float, std: float) -> str:
         return f"{value:.4g} ± {std:g}"
     decimals = max(1 - math.floor(math.log10(std)), 0)
     return f"{value:.{decimals}f} ± {std:.{decimals}f}"
-
-
-def plot_gain_changes(changes: tuple[GainShift, ...], axes: tuple[str, ...], *, title: str) -> bytes:
-    """Draw each gain before and after, in per cent of the one before, with the interval of either.
-
-    Both estimates share their noise, so the σ of the change decides whether a change is more than noise, not the
-    overlap of the intervals; axes where it is are starred. Return a PNG.
-    """
-    figure, ((place,),) = grid(1, (1.0,), unformatted(title), height_in=2.8)
-    places = np.arange(len(changes))
-    scale = np.array([100.0 / abs(change.before) for change in changes])
-    after = np.array([change.change_percent for change in changes])
-    place.axhline(0.0, color=GREY, linewidth=0.8)
-    kinds = (
-        ("before", ORANGE, "s", -_BESIDE, np.zeros(len(changes)), np.array([c.before_std for c in changes])),
-        ("after", BLUE, "o", _BESIDE, after, np.array([c.after_std for c in changes])),
-    )
-    for label, colour, marker, beside, values, std in kinds:
-        width, name = _SIGMAS * std * scale, f"{label} ± {_SIGMAS:g} σ"
-        place.errorbar(
-            places + beside, values, yerr=width, fmt=marker, color=colour, capsize=5, markersize=5, label=name
-        )
-    names = [f"{name} *" if change.significant else name for name, change in zip(axes, changes, strict=True)]
-    place.set_xticks(places, [unformatted(name) for name in names])
-    place.set_xlim(-0.6, len(changes) - 0.4)
-    place.margins(y=0.15)
-    place.set_ylabel("change of the gain [%]", fontsize=8)
-    legend_below(figure, place)
-    return render(figure)

@@ -1,13 +1,13 @@
 """Pieces of a page that needs no other file: no script, no address, pictures inside, every text escaped.
 
-The page reads on a phone (16 px, wide tables scroll in a box of their own), on paper (the first sheet is one A4 page)
-and in dark mode. Colour-blind readers can distinguish the colours, those of `daq.report.picture`, and no meaning rests
-on colour alone.
+The page reads on a phone (16 px; wide tables scroll in a box of their own, those with a verdict stack their cells), on
+paper (the first sheet is one A4 page, closed sections are left out) and in dark mode. Colour-blind readers can
+distinguish the colours, those of `daq.report.picture`, and no meaning rests on colour alone.
 """
 
 from __future__ import annotations
 
-import base64
+import re
 from collections.abc import Iterable, Sequence
 from html import escape
 from unicodedata import category
@@ -16,11 +16,46 @@ MARK = '<meta name="generator" content="drivegain">'
 """Text at the beginning of every page, by which an earlier one is recognised."""
 _UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")
 """Unicode categories: control, format, surrogates, private, unassigned, separators of lines and paragraphs."""
-_STYLE = """
-:root { color-scheme: light dark; --paper: #fff; --ink: #1a1a1a; --soft: #595959; --line: #d4d4d4; --shade: #f2f2f2;
-  --data: #0072B2; --act: #B34700; }
-@media (prefers-color-scheme: dark) { :root { --paper: #16181a; --ink: #ececec; --soft: #b0b0b0; --line: #44484c;
-  --shade: #232629; --data: #56B4E9; --act: #F0A060; } }
+LIGHT = {
+    **{"paper": "#fff", "ink": "#1a1a1a", "soft": "#595959", "line": "#d4d4d4", "shade": "#f0f0f0"},
+    **{"data": "#0072B2", "act": "#B34700", "pale": "#6AAFE0"},
+}
+_DARK = {
+    **{"paper": "#16181a", "ink": "#ececec", "soft": "#b0b0b0", "line": "#44484c", "shade": "#26292d"},
+    **{"data": "#56B4E9", "act": "#F0A060", "pale": "#2F6F99"},
+}
+_CODE = re.compile("`([^`\n]+)`")
+_NUMBER = re.compile(r"[+\-±]?([\d.]+(e[+-]?\d+)?|nan|inf)( .*)?|-")
+DRAWING = """
+svg text { fill: var(--ink); font: 14px system-ui, sans-serif; font-variant-numeric: tabular-nums; }
+svg .soft { fill: var(--soft); font-size: 13px; } svg .end { text-anchor: end; } svg .mid { text-anchor: middle; }
+svg .grid { stroke: var(--line); } svg .zero { stroke: var(--ink); } svg .limit { stroke: var(--act); stroke-width: 2; }
+svg .range { fill: var(--shade); } svg .band { fill: var(--data); opacity: 0.25; }
+svg .bar { stroke: var(--data); stroke-width: 3; } svg .dot { fill: var(--data); }
+svg .hollow { fill: var(--paper); stroke: var(--soft); stroke-width: 2; }
+svg .full { fill: var(--data); } svg .empty { fill: var(--paper); stroke: var(--soft); }
+svg .alike { fill: var(--pale); stroke: var(--data); }
+svg path { fill: none; stroke: var(--data); } svg .line { stroke-width: 2; } svg .thin { stroke-width: 1; }
+svg .wide { stroke: var(--pale); stroke-width: 4; }
+svg .dashed { stroke: var(--ink); stroke-width: 1.5; stroke-dasharray: 4 2; }
+svg .other { stroke: var(--act); stroke-width: 2; stroke-dasharray: 5 3; }
+svg .cloud { stroke-width: 2.2; stroke-linecap: round; opacity: 0.4; }
+svg .rest { stroke: var(--act); stroke-width: 2.2; stroke-linecap: round; opacity: 0.4; }
+"""
+"""Style of the drawings of `daq.report.svg`."""
+
+
+def _colours(colours: dict[str, str]) -> str:
+    return " ".join(f"--{name}: {colour};" for name, colour in colours.items())
+
+
+_STYLE = (
+    f"""
+:root {{ color-scheme: light dark; {_colours(LIGHT)} }}
+@media (prefers-color-scheme: dark) {{ :root {{ {_colours(_DARK)} }} }}
+@media print {{ :root {{ {_colours(LIGHT)} }} }}
+{DRAWING}"""
+    + """
 * { box-sizing: border-box; }
 body { font: 16px/1.45 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 56rem;
   margin: 1.5rem auto; padding: 0 1rem; overflow-wrap: anywhere; }
@@ -30,39 +65,47 @@ h3 { font-size: 1rem; margin: 0.8rem 0 0.2rem; }
 p, ul { margin: 0.4rem 0; }
 .kind { color: var(--soft); margin: 0; }
 .verdict { border-left: 0.4rem solid var(--data); background: var(--shade); padding: 0.6rem 0.8rem; font-size: 1.1rem;
-  margin: 0.8rem 0; }
+  margin: 0.8rem 0 0; }
+.next { border-left: 0.4rem solid var(--data); background: var(--shade); margin: 0; padding: 0 0.8rem 0.6rem; }
 .act { border-color: var(--act); } .quiet { border-color: var(--soft); }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: 0.1rem 1rem; margin: 0.6rem 0; }
+code { font: 0.95em ui-monospace, monospace; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: 0.1rem 1rem; margin: 0.8rem 0; }
 dt { color: var(--soft); } dd { margin: 0; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; margin: 0.5rem 0; font-variant-numeric: tabular-nums; overflow-wrap: normal; }
 caption { text-align: left; font-weight: bold; padding: 0.2rem 0; }
-th, td { padding: 0.2rem 0.6rem; border-bottom: 1px solid var(--line); text-align: right; vertical-align: baseline; }
+th, td { padding: 0.2rem 0.7rem; border-bottom: 1px solid var(--line); text-align: right; vertical-align: baseline; }
 th { font-weight: 600; } td { white-space: nowrap; } thead th { color: var(--soft); font-weight: normal; }
-th:first-child, td:first-child { text-align: left; padding-left: 0; }
-.words td:last-child, .words th:last-child { text-align: left; white-space: normal; min-width: 13.5rem; }
-.pair { display: flex; flex-wrap: wrap; gap: 0 1.5rem; } .pair figure { flex: 1 1 21rem; max-width: 30rem; }
-figure { margin: 0.6rem 0; } figure svg { max-width: 30rem; } figcaption { color: var(--soft); font-size: 0.9rem; }
-svg { width: 100%; height: auto; display: block; } img { max-width: 100%; background: #fff; }
-svg text { fill: var(--ink); font: 12px system-ui, sans-serif; font-variant-numeric: tabular-nums; }
-svg .soft { fill: var(--soft); } svg .end { text-anchor: end; } svg .mid { text-anchor: middle; }
-svg .grid { stroke: var(--line); } svg .zero { stroke: var(--ink); } svg .limit { stroke: var(--act); stroke-width: 2; }
-svg .range { fill: var(--shade); } svg .band { fill: var(--data); opacity: 0.25; }
-svg .bar { stroke: var(--data); stroke-width: 3; } svg .line { stroke: var(--data); stroke-width: 2; fill: none; }
-svg .dot { fill: var(--data); } svg .hollow { fill: var(--paper); stroke: var(--soft); stroke-width: 2; }
+th:first-child, .text { text-align: left; } th:first-child { padding-left: 0; }
+.names tbody th { white-space: nowrap; position: sticky; left: 0; background: var(--paper); }
+.words { width: 100%; } .words .text { white-space: normal; }
+.pair { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 21rem), 1fr)); gap: 0 1.5rem; }
+figure { margin: 0.6rem 0; max-width: 26rem; } figcaption { color: var(--soft); font-size: 0.9rem; }
+svg { width: 100%; height: auto; display: block; }
 details { border-bottom: 1px solid var(--line); } details > :not(summary) { margin-left: 0.2rem; }
 summary { cursor: pointer; padding: 0.5rem 0; font-weight: 600; }
-pre { overflow-x: auto; background: var(--shade); padding: 0.5rem; font-size: 0.9rem; }
+summary:focus-visible { outline: 3px solid var(--data); }
+@media (max-width: 40rem) {
+  th, td { padding: 0.2rem 0.4rem; }
+  .words, .words tbody { display: block; } .words thead { display: none; }
+  .words tr { display: grid; grid-template-columns: 7.2rem 1fr; gap: 0 1rem; padding: 0.4rem 0;
+    border-bottom: 1px solid var(--line); }
+  .words th, .words td { border: 0; padding: 0; text-align: left; white-space: normal; }
+  .words td:last-child { grid-area: 1 / 2; }
+  .words td:not(:last-child)::before { content: attr(data-name); display: block; color: var(--soft);
+    font-size: 0.9rem; }
+}
 @page { size: A4; margin: 13mm; }
 @media print {
-  :root { --paper: #fff; --ink: #000; --soft: #444; --line: #bbb; --shade: #f2f2f2; --data: #0072B2; --act: #B34700; }
   html { font-size: 8.5pt; } body { margin: 0; padding: 0; max-width: none; font-size: 9pt; }
-  h1 { font-size: 15pt; } h2 { font-size: 11pt; margin: 3mm 0 1mm; } .verdict { font-size: 11pt; margin: 2mm 0; }
-  .pair { flex-wrap: nowrap; } .pair figure { flex: 1 1 0; min-width: 0; } .scroll { overflow: visible; }
-  th, td { padding: 0.4mm 1.5mm; } td { white-space: normal; }
+  h1 { font-size: 15pt; } h2 { font-size: 11pt; margin: 3mm 0 1mm; } .verdict { font-size: 11pt; margin: 2mm 0 0; }
+  .pair { grid-template-columns: 1fr 1fr; } .scroll { overflow: visible; } figure { max-width: 85mm; }
+  th, td { padding: 0.4mm 1.5mm; border-width: 0.5pt; } td { white-space: normal; }
   .sheet { break-after: page; } figure, table, dl, .verdict { break-inside: avoid; } h2, h3 { break-after: avoid; }
+  .next { break-before: avoid; } details:not([open]), .details:not(:has(details[open])) { display: none; }
 }
 """
+)
 
 
 def page(title: str, body: Iterable[str]) -> str:
@@ -88,9 +131,10 @@ def page(title: str, body: Iterable[str]) -> str:
 
 
 def element(tag: str, text: str, kind: str = "") -> str:
-    """Build an element of plain text; its kind is a CSS class."""
+    """Build an element of plain text, `code` between back quotes; its kind is a CSS class."""
     named = f' class="{kind}"' if kind else ""
-    return f"<{tag}{named}>{spelled(text)}</{tag}>"
+    words = _CODE.sub(r"<code>\1</code>", spelled(text))
+    return f"<{tag}{named}>{words}</{tag}>"
 
 
 def paragraph(text: str, kind: str = "") -> str:
@@ -119,24 +163,36 @@ def terms(pairs: Iterable[tuple[str, str]]) -> str:
 
 
 def table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
-    """Build a table of plain texts; the first cell of each row is its heading, and its kind is a CSS class."""
-    head = "".join(f'<th scope="col">{spelled(heading)}</th>' for heading in headings)
-    lines = [f'<table class="{kind}">' if kind else "<table>", element("caption", caption) if caption else ""]
-    lines += [f"<thead><tr>{head}</tr></thead>", "<tbody>"]
-    for first, *others in rows:
-        lines.append(f'<tr><th scope="row">{spelled(first)}</th>{"".join(element("td", one) for one in others)}</tr>')
-    return "\n".join(('<div class="scroll">', *lines, "</tbody></table>", "</div>"))
+    """Build a table of plain texts; the first cell of each row is its heading, and its kind is a CSS class.
+
+    A column with any cell that is no number is aligned to the left. Kind "words" is for rows that end in a sentence:
+    a phone shows each row as a card. Kind "names" keeps the names of the rows in sight where the table scrolls.
+    """
+    lines = list(rows)
+    texts = [not all(_NUMBER.fullmatch(line[column]) for line in lines) for column in range(len(headings))]
+    kinds = [' class="text"' if text else "" for text in texts]
+    names = [spelled(heading) for heading in headings]
+    head = "".join(f'<th scope="col"{style}>{name}</th>' for name, style in zip(names, kinds, strict=True))
+    made = [f'<table class="{kind}">' if kind else "<table>", element("caption", caption) if caption else ""]
+    made += [f"<thead><tr>{head}</tr></thead>", "<tbody>"]
+    for first, *others in lines:
+        cells = "".join(
+            f'<td{style} data-name="{name}">{spelled(one)}</td>'
+            for one, name, style in zip(others, names[1:], kinds[1:], strict=True)
+        )
+        made.append(f'<tr><th scope="row">{spelled(first)}</th>{cells}</tr>')
+    return "\n".join(('<div class="scroll">', *made, "</tbody></table>", "</div>"))
 
 
-def figure(svg: str, caption: str) -> str:
-    """Show a drawing of `daq.report.svg` with its caption."""
-    return f"<figure>{svg}{element('figcaption', caption)}</figure>"
+def figure(svg: str, caption: str = "", title: str = "") -> str:
+    """Show a drawing of `daq.report.svg` under its title, with its caption."""
+    head, foot = (element(tag, text) if text else "" for tag, text in (("h3", title), ("figcaption", caption)))
+    return f"<figure>{head}{svg}{foot}</figure>"
 
 
-def picture(png: bytes, caption: str) -> str:
-    """Embed a picture with its caption."""
-    data, words = base64.b64encode(png).decode("ascii"), spelled(caption)
-    return f'<figure><img alt="{words}" src="data:image/png;base64,{data}"><figcaption>{words}</figcaption></figure>'
+def pair(figures: Iterable[str]) -> str:
+    """Show figures side by side where there is room."""
+    return f'<div class="pair">{"".join(figures)}</div>'
 
 
 def spelled(text: str) -> str:

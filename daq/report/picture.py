@@ -1,4 +1,4 @@
-"""Shared by all pictures: size, colours and rendering. No pyplot, which keeps figures in a global list."""
+"""Shared by the pictures of matplotlib: size, colours, rendering. No pyplot, which keeps figures in a global list."""
 
 from __future__ import annotations
 
@@ -41,18 +41,12 @@ def panels(count: int, columns: int, title: str) -> tuple[Figure, list[Axes]]:
     return figure, places[:count]
 
 
-def grid(rows: int, widths: tuple[float, ...], title: str, height_in: float) -> tuple[Figure, list[list[Axes]]]:
-    """Make a figure whose rows share their vertical axis and whose columns share their horizontal one.
-
-    `widths` are relative, one a column; `height_in` is that of one row [inch].
-    """
-    figure = _figure(title, 2 * _PANEL_IN[0], height_in * rows + _TITLE_AND_LEGEND_IN)
-    places = figure.subplots(
-        rows, len(widths), sharex="col", sharey=True, squeeze=False, gridspec_kw={"width_ratios": widths}
-    )
-    for place in places.flat:
-        _plain(place)
-    return figure, [list(row) for row in places]
+def single(title: str, height_in: float) -> tuple[Figure, Axes]:
+    """Make a figure of one wide panel, of a height in inches."""
+    figure = _figure(title, 2 * _PANEL_IN[0], height_in + _TITLE_AND_LEGEND_IN)
+    place = figure.subplots()
+    _plain(place)
+    return figure, place
 
 
 def _figure(title: str, width_in: float, height_in: float) -> Figure:

@@ -1,6 +1,7 @@
 """A plan as a page of its own: the arm moves through it, with swept volume, clearance and speeds.
 
-Lines are the joint chain of the URDF; thick lines are the capsules that the clearance is computed with.
+Lines are the joint chain of the URDF; the bodies are the capsules that the clearance is computed with. The swept volume
+is drawn from the same capsules at every row.
 """
 
 from __future__ import annotations
@@ -8,11 +9,13 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from html import escape
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,24 +24,33 @@ from daq.files import open_regular, sha256
 from daq.workflow.experiment import PlannedMove, path_of
 from ident.arrays import FloatArray
 from ident.model.robot import poses
-from ident.planning.clearance import Checker
+from ident.planning.clearance import BASE, Checker
 
 STEP_S, LARGEST_ROWS = 0.04, 1500  #: Time between two rows of a preview, and their largest number
 MARK = '<meta name="drivegain-plan" content="'  #: Text at the beginning of a page, before the digest of its plan
+_GRID_M = 0.25  #: Side of a square of the drawn plane z = 0
 HEAD_BYTES = 1024  #: Beginning of a page, in which the digest of its plan is
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B58900", "#3B9BD6", "#7F7F7F", "#882255")
+_DARK = ("#4BA3E3", "#F08A4B", "#2FC298", "#E39BC4", "#E0B73C", "#9AD5FF", "#B5B5B5", "#D77AA8")
 _STYLE = """
-:root { color-scheme: light dark; --ink: #222; --grid: #ddd; --paper: #fff; }
-@media (prefers-color-scheme: dark) { :root { --ink: #ddd; --grid: #444; --paper: #181818; } }
-body { font: 16px/1.45 sans-serif; color: var(--ink); background: var(--paper); max-width: 75em; margin: 1em auto;
-  padding: 0 1em; }
-h1 { font-size: 1.4em; } h2 { font-size: 1em; margin: 0.8em 0 0.2em; }
-canvas { width: 100%; display: block; } #arm { height: min(60vh, 34em); touch-action: none; cursor: grab; }
-#clearance, #speed { height: 10em; }
-.controls { display: flex; flex-wrap: wrap; gap: 0.4em 1em; align-items: center; }
-.controls input[type=range] { flex: 1 1 12em; } button { font: inherit; padding: 0.3em 1em; }
-.axis { white-space: nowrap; margin-right: 1em; } .axis::before { content: "\\25AC "; color: var(--axis); }
-"""
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B58900", "#56B4E9", "#7F7F7F", "#882255")
+:root { color-scheme: light dark; --ink: #1a1a1a; --soft: #595959; --grid: #d4d4d4; --paper: #fff; --act: #B34700;
+  --base: #8a8a8a; --swept: #b9cbe0; --swept-edge: #33567f; --footprint: #a3a3a3; AXES }
+@media (prefers-color-scheme: dark) { :root { --ink: #ececec; --soft: #b0b0b0; --grid: #44484c; --paper: #16181a;
+  --act: #F0A060; --base: #8f8f8f; --swept: #4d6e93; --swept-edge: #bcd6f2; --footprint: #6d6d6d; DARK } }
+body { font: 16px/1.45 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 64rem;
+  margin: 1rem auto; padding: 0 1rem; overflow-wrap: anywhere; }
+h1 { font-size: 1.4rem; margin: 0.5rem 0; } h2 { font-size: 1.05rem; margin: 1rem 0 0.2rem; }
+ul { margin: 0.5rem 0; padding-left: 1.2rem; } p { margin: 0.3rem 0; color: var(--soft); } .act { color: var(--act); }
+canvas { width: 100%; display: block; } #clearance { height: 9rem; }
+#arm { height: min(60vh, 34rem); touch-action: none; cursor: grab; border: 1px solid var(--grid); }
+.controls { display: flex; flex-wrap: wrap; gap: 0.4rem 0.6rem; align-items: center; margin: 0.5rem 0; }
+.controls input[type=range] { flex: 1 1 12rem; } button { font: inherit; padding: 0.35rem 0.9rem; }
+#now { font-variant-numeric: tabular-nums; min-width: 22rem; } #now.act { font-weight: bold; }
+@media (max-width: 40rem) { #arm { height: 50vh; } #now { min-width: 0; flex-basis: 100%; } }
+@media print { .controls { display: none; } }
+""".replace("AXES", " ".join(f"--axis-{k}: {colour};" for k, colour in enumerate(_COLOURS))).replace(
+    "DARK", " ".join(f"--axis-{k}: {colour};" for k, colour in enumerate(_DARK))
+)
 
 
 def preview_page(cell: Cell, moves: Sequence[PlannedMove], checker: Checker, plan: bytes) -> str:
@@ -52,13 +64,10 @@ def preview_page(cell: Cell, moves: Sequence[PlannedMove], checker: Checker, pla
     """
     script = (Path(__file__).parent / "plan_preview.js").read_text(encoding="utf-8")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    data = json.dumps(preview_data(cell, moves, checker), separators=(",", ":"), allow_nan=False)
+    drawn = preview_data(cell, moves, checker)
+    data = json.dumps(drawn, separators=(",", ":"), allow_nan=False)
     data = data.replace("<", "\\u003c")  # no name in it ends the script
-    legend = " ".join(
-        f'<span class="axis" style="--axis: {_COLOURS[index % len(_COLOURS)]}">{escape(name)}</span>'
-        for index, name in enumerate(cell.axis_names)
-    )
-    shape = "as declared in the cell file" if cell.clearance and cell.clearance.capsules else "guessed from the URDF"
+    facts = "".join(f"<li>{escape(text)}</li>" for text in _facts(cell, checker, drawn))
     return f"""\
 <!DOCTYPE html>
 <html lang="en">
@@ -72,17 +81,21 @@ style-src 'unsafe-inline'">
 <style>{_STYLE}</style>
 </head>
 <body>
-<h1>Plan for cell {escape(cell.name)}: {len(moves)} moves</h1>
+<h1>Plan for cell {escape(cell.name)}: {len(moves)} moves in {drawn["time_s"][-1]:.0f} s</h1>
 <canvas id="arm"></canvas>
 <div class="controls"><button id="play">Play</button><input id="time" type="range" min="0" value="0" aria-label="time">
-<label><input id="swept" type="checkbox" checked> swept volume</label><span id="now"></span></div>
-<p>Drag to turn, scroll to zoom. The arm's shape is {shape}. Green: workspace; orange: obstacles. The page starts at the
-first target: where the robot stands before is not known here.</p>
-<h2>Clearance [mm]; orange: the smallest distance allowed</h2>
+<span id="now" role="status"></span></div>
+<div class="controls"><button data-view="home">3-D</button><button data-view="z">From above</button>
+<button data-view="y">Along y</button><button data-view="x">Along x</button>
+<button data-zoom="1.25" aria-label="zoom in">+</button><button data-zoom="0.8" aria-label="zoom out">−</button>
+<label><input id="swept" type="checkbox" checked> swept volume</label></div>
+<p>Drag to turn. Each link has the colour of the axis that moves it. Pale, with an outline: everywhere that a moving
+part comes; grey on the grid: its footprint. A square of the grid is {1000 * _GRID_M:.0f} mm.</p>
+<ul>{facts}</ul>
+<h2>Clearance [mm]</h2>
 <canvas id="clearance"></canvas>
-<h2>Speed of each axis [% of its limit]</h2>
+<h2>Speed of each axis; full height is 100 % of its limit</h2>
 <canvas id="speed"></canvas>
-<p>{legend}</p>
 <script id="data" type="application/json">{data}</script>
 <script>{script}</script>
 </body>
@@ -90,7 +103,7 @@ first target: where the robot stands before is not known here.</p>
 """
 
 
-def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> dict[str, object]:
+def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> dict[str, Any]:
     """Compute what the page draws, in rows of equal time steps; lengths in m and mm."""
     time_s, position, speed, move = _rows(cell, moves)
     at, capsules = poses(checker.robot, position), checker.scene.capsules
@@ -98,20 +111,36 @@ def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> 
     ends = np.array([(capsule.start_m, capsule.end_m) for capsule in capsules]).reshape(-1, 1, 2, 3)
     placed = np.einsum("ckij,cxej->kcei", at.rotation[frame], ends) + at.origin_m[frame].swapaxes(0, 1)[:, :, None]
     origins = at.origin_m.swapaxes(0, 1)
-    seen = np.concatenate((origins.reshape(-1, 3), placed.reshape(-1, 3)))
-    lower, upper = seen.min(axis=0), seen.max(axis=0)
+    reach = _reach(placed, checker)
     clearance_mm = 1000.0 * (checker.margins(position) + checker.scene.minimum_m)
     boxes = [*checker.scene.boxes, *([] if checker.scene.workspace is None else [checker.scene.workspace])]
+    seen = np.concatenate((origins.reshape(-1, 3), [reach.lower_m, reach.upper_m]))
+    # A box that reaches far beyond the arm, such as a floor, must not make the arm small.
+    span = float(np.linalg.norm(np.ptp(seen, axis=0)))
+    corners = [np.clip(end, seen.min(axis=0) - span / 4, seen.max(axis=0) + span / 4) for one in boxes
+               for end in (one.lower_m, one.upper_m)]  # fmt: skip
+    seen = np.concatenate((seen, np.array(corners).reshape(-1, 3)))
+    lower, upper = seen.min(axis=0), seen.max(axis=0)
     limits = np.array([axis.limits.velocity for axis in cell.axes])
     return {
         "time_s": _rounded(time_s, 3),
         "move": move.tolist(),
         "moves": len(moves),
-        "colours": _COLOURS,
         "origins_m": _rounded(origins, 3),
         "ends_m": _rounded(placed, 3),
         "capsules": [{"name": one.name, "link": one.link, "radius_m": one.radius_m} for one in capsules],
-        "boxes": [{"name": one.name, "lower_m": one.lower_m, "upper_m": one.upper_m} for one in boxes],
+        "boxes": [
+            {
+                **{"name": one.name, "lower_m": one.lower_m, "upper_m": one.upper_m},
+                "obstacle": one is not checker.scene.workspace,
+            }
+            for one in boxes
+        ],
+        "reach": {
+            **{"lower_m": _rounded(np.array(reach.lower_m), 3), "upper_m": _rounded(np.array(reach.upper_m), 3)},
+            "radius_m": round(reach.radius_m, 3),
+        },
+        "grid_m": _GRID_M,
         "centre_m": _rounded(0.5 * (lower + upper), 3),
         "radius_m": round(0.5 * float(np.linalg.norm(upper - lower)) + 0.05, 3),
         "clearance_mm": [round(value, 1) if np.isfinite(value) else None for value in clearance_mm.tolist()],
@@ -121,6 +150,51 @@ def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> 
             for name, column in zip(cell.axis_names, 100.0 * np.abs(speed / limits).T, strict=True)
         ],
     }
+
+
+@dataclass(frozen=True, slots=True)
+class _Reach:
+    """Extent of the moving parts over the plan, in the base frame [m]."""
+
+    lower_m: tuple[float, ...]
+    upper_m: tuple[float, ...]
+    radius_m: float  #: from the z axis of the base
+
+
+def _reach(ends_m: FloatArray, checker: Checker) -> _Reach:
+    """Reach of the capsules that move; `ends_m`, shape (rows, capsules, 2, 3), are the ends of all capsules."""
+    moving = [index for index, capsule in enumerate(checker.scene.capsules) if capsule.link != BASE]
+    if not moving:
+        return _Reach((0.0,) * 3, (0.0,) * 3, 0.0)
+    ends = ends_m[:, moving]
+    radius_m = np.array([checker.scene.capsules[index].radius_m for index in moving])[None, :, None]
+    lower, upper = (ends - radius_m[..., None]).min(axis=(0, 1, 2)), (ends + radius_m[..., None]).max(axis=(0, 1, 2))
+    across = float((np.hypot(ends[..., 0], ends[..., 1]) + radius_m).max())
+    return _Reach(tuple(lower.tolist()), tuple(upper.tolist()), across)
+
+
+def _facts(cell: Cell, checker: Checker, drawn: Mapping[str, Any]) -> Iterator[str]:
+    """What a person must know before approving the plan, a sentence each."""
+    known = [pair for pair in zip(drawn["clearance_mm"], drawn["time_s"], strict=True) if pair[0] is not None]
+    if known:
+        least_mm, at_s = min(known)
+        yield f"Smallest clearance: {least_mm:.0f} mm, at {at_s:.1f} s; {drawn['minimum_mm']:.0f} mm must be kept."
+    reach = drawn["reach"]
+    extents = zip("xyz", reach["lower_m"], reach["upper_m"], strict=True)
+    yield (
+        f"The moving parts stay within {', '.join(f'{name} {low:+.2f} to {high:+.2f}' for name, low, high in extents)} "
+        f"m, and within {reach['radius_m']:.2f} m of the z axis of the base."
+    )
+    if (lowest_m := reach["lower_m"][2]) < 0.0:
+        yield f"They come {-lowest_m:.2f} m below z = 0, the plane of the grid: is there a floor or a table?"
+    declared = cell.clearance is not None and bool(cell.clearance.capsules)
+    shape = "that of the cell file" if declared else "a guess from the URDF; the real arm may be thicker"
+    yield f"The shape of the arm is {shape}."
+    bodies = {"obstacle": checker.scene.boxes, "workspace": checker.scene.workspace}
+    if missing := [word for word, found in bodies.items() if not found]:
+        yield f"The cell file declares no {' and no '.join(missing)}: tables, cables and people are not on this page."
+    checked = "drivegain record checks the way there" if cell.clearance is not None else "nothing checks the way there"
+    yield f"The page starts at the first target. Where the robot stands before is not known here; {checked}."
 
 
 def _rows(cell: Cell, moves: Sequence[PlannedMove]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

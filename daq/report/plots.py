@@ -1,44 +1,30 @@
-"""The pictures of a fit and of a residual, each a PNG: torques, effects, and the ranking of candidates."""
+"""The pictures of a fit and of a residual as drawings: torques, effects, and the ranking of candidates.
+
+Each function returns the drawings of a page, one a panel; `daq.report.svg.sheet` makes a file of them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.config.cell import MILLIMETRE, Cell, JointUnit
+from daq.config.cell import Cell
 from daq.files import replace_file
-from daq.report.effect_names import effect_text, other_axis, variable_text
+from daq.report.effect_names import effect_text, other_axis, variable_label
 from daq.report.fit import start_of
 from daq.report.gains import plot_gains
-from daq.report.picture import (
-    BLACK,
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PURPLE,
-    QUANTITY,
-    SKY,
-    grid,
-    legend_below,
-    panels,
-    render,
-    unformatted,
-)
+from daq.report.picture import QUANTITY
+from daq.report.svg import Line, chart, ranking, sheet
 from daq.workflow.fit import Fit
 from ident.arrays import FloatArray
 from ident.calibration import Calibration
 from ident.discovery.evidence import Evidence
 from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect
-from ident.effects.signals import Abscissa, fitted_signals, session_began_s
+from ident.effects.signals import fitted_signals, session_began_s
 from ident.equations.rows import decimate_rows
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 def draw_fit(fitted: Fit, calibration: Calibration, truth: dict[str, float] | None, out: Path) -> None:
@@ -51,16 +37,19 @@ def draw_fit(fitted: Fit, calibration: Calibration, truth: dict[str, float] | No
     """
     before = start_of(fitted)
     final = fitted.steps[-1].after if fitted.steps else before
-    replace_file(out / "torques.png", draw_torques(final, fitted.cell))
+    title = f"Joint torques, {'first run of the fit' if final.holdout is None else 'a held-out run'}"
+    replace_file(out / "torques.svg", sheet(draw_torques(final, fitted.cell), title))
     replace_file(out / "gains.png", plot_gains(calibration.gains, truth, title="Joint drive gains"))
     for step in fitted.steps:
         for placed in (placed for placed in step.after.effects if placed not in before.effects):
-            name = f"residual-{fitted.cell.axis_names[placed.axis]}-{placed.effect.name}.png"
-            replace_file(out / name, draw_effect(before, step.after, placed, fitted.cell))
+            axis = fitted.cell.axis_names[placed.axis]
+            title = f"{axis}: {effect_text(placed.effect, fitted.cell.axis_names)}"
+            drawn = sheet(draw_effect(before, step.after, placed, fitted.cell), title)
+            replace_file(out / f"residual-{axis}-{placed.effect.name}.svg", drawn)
         before = step.after
 
 
-def draw_torques(final: Evidence, cell: Cell) -> bytes:
+def draw_torques(final: Evidence, cell: Cell) -> tuple[str, ...]:
     """Draw measured and predicted torque of the first held-out run, or of the fit."""
     rows = final.training if final.holdout is None else final.holdout
     rows = rows.only(rows.run == rows.run[0])
@@ -69,7 +58,6 @@ def draw_torques(final: Evidence, cell: Cell) -> bytes:
         np.where(rows.use, rows.torque(final.estimate.gains), np.nan).T,
         np.where(rows.use, final.estimate.predicted_torque(rows), np.nan).T,
         cell.axis_names,
-        title=f"Joint torques of {'the first run of the fit' if final.holdout is None else 'a held-out run'}",
         forces=tuple(axis.unit.force for axis in cell.axes),
     )
 
@@ -80,11 +68,10 @@ def plot_torques(
     predicted_nm: FloatArray,
     axes: tuple[str, ...],
     *,
-    title: str,
     forces: tuple[str, ...] = (),
     shown_s: float = 10.0,
-) -> bytes:
-    """Draw τ = V g with the identified gains (full) and the model's τ (dotted), one panel an axis (paper Fig. 2).
+) -> tuple[str, ...]:
+    """Draw τ = V g with the identified gains (wide) and the model's τ (dashed), one panel an axis (paper Fig. 2).
 
     The relative error over each panel is that of the whole run, not only of the stretch that is drawn.
 
@@ -93,34 +80,27 @@ def plot_torques(
         measured_nm: torque from current and identified gain, shape (k, n) [forces]; NaN where a row was left out.
         predicted_nm: torque from the model, same shape [forces].
         axes: names of the n axes.
-        title: names the run.
         forces: "Nm" or, along a prismatic joint, "N", for each axis; all are "Nm" when left out.
         shown_s: length of the stretch that is drawn, from the beginning [s]; in a longer one the lines merge.
     """
     shown = time_s <= time_s[0] + shown_s
-    whole_s = float(time_s[-1] - time_s[0])
-    extent = f", first {shown_s:g} s of {whole_s:.0f} s" if whole_s > shown_s else ""
-    figure, places = panels(
-        len(axes), 2, f"{unformatted(title)}{extent}\ngaps: samples left out, most of them at standstill"
-    )
-    units = forces or ("Nm",) * len(axes)
-    for index, (name, unit, place) in enumerate(zip(axes, units, places, strict=True)):
+    drawn = []
+    for index, (name, unit) in enumerate(zip(axes, forces or ("Nm",) * len(axes), strict=True)):
         measured, predicted = measured_nm[:, index], predicted_nm[:, index]
-        place.plot(time_s[shown], measured[shown], color=SKY, linewidth=2.4, label="current × identified gain")
-        place.plot(time_s[shown], predicted[shown], color=BLACK, linewidth=1.5, linestyle=":", label="model")
         both = np.isfinite(measured) & np.isfinite(predicted)
         norm = float(np.linalg.norm(measured[both]))
         # ‖ρ‖/‖Y‖ (paper, Table 6); unknown without samples.
         error = 100.0 * float(np.linalg.norm((measured - predicted)[both])) / norm if norm else float("nan")
-        place.set_title(f"{unformatted(name)}   relative error {error:.1f} %", fontsize=9, loc="left")
-        place.set_ylabel(f"{QUANTITY[unit]} [{unit}]", fontsize=8)
-        if index >= len(axes) - 2:
-            place.set_xlabel("time [s]", fontsize=8)
-    legend_below(figure, places[0])
-    return render(figure)
+        lines = (
+            Line(time_s[shown], measured[shown], "wide", "current × gain"),
+            Line(time_s[shown], predicted[shown], "dashed", "model"),
+        )
+        label = f"{name}: {QUANTITY[unit]} [{unit}], error {error:.1f} %"
+        drawn.append(chart(lines, f"Measured and predicted {QUANTITY[unit]} of {name}", ("time [s]", label)))
+    return tuple(drawn)
 
 
-def draw_effect(before: Evidence, after: Evidence, placed: PlacedEffect, cell: Cell) -> bytes:
+def draw_effect(before: Evidence, after: Evidence, placed: PlacedEffect, cell: Cell) -> tuple[str, ...]:
     """Draw the residual of an axis before and after an effect was added, on the first held-out run, or of the fit."""
     index = len(after.trained) if after.held_out else 0
     rows_before = before.holdout if before.holdout is not None else before.training
@@ -142,24 +122,12 @@ def draw_effect(before: Evidence, after: Evidence, placed: PlacedEffect, cell: C
         rows_after.time_s[chosen],
         *residuals,
         variable=variable,
-        variable_label=_label(placed, cell.axis_names, axis.unit),
+        variable_label=variable_label(placed.effect, cell.axis_names, axis.unit.force),
         velocity_rad_s=velocity,
-        title=f"{axis.name}: {effect_text(placed.effect, cell.axis_names)}, run {data.name}",
         force=axis.unit.force,
     )
 
 
-def _label(placed: PlacedEffect, axes: tuple[str, ...], unit: JointUnit) -> str:
-    """Label the variable with its unit at this joint: force and metres along a prismatic one."""
-    abscissa = placed.effect.abscissa
-    words, _, measure = abscissa.value.partition(" [")
-    label = f"{variable_text(placed.effect, axes) if other_axis(placed.effect) is not None else words} [{measure}"
-    if unit is not MILLIMETRE or abscissa in {Abscissa.MOTOR_ANGLE, Abscissa.CURRENT, Abscissa.OTHER_VELOCITY}:
-        return label
-    return label.replace("rad", "m").replace("Nm", "N").replace("torque", "force")
-
-
-_POINTS = 2000
 _BINS = 40
 
 
@@ -171,12 +139,11 @@ def plot_residual(
     variable: FloatArray,
     variable_label: str,
     velocity_rad_s: FloatArray,
-    title: str,
     force: str = "Nm",
-) -> bytes:
-    """Draw the residual of one axis before and after an effect joined the model.
+) -> tuple[str, ...]:
+    """Draw the residual of one axis before and after an effect joined the model, in four panels of one scale.
 
-    Left over time, right against the variable that the effect depends on, with the mean of each stretch of it for
+    First over time, then against the variable that the effect depends on, with the mean of each stretch of it for
     either direction of motion (missing friction cancels over both): a mean away from zero is torque that the model
     still lacks.
 
@@ -187,70 +154,49 @@ def plot_residual(
         variable: variable that the effect depends on, shape (k,).
         variable_label: its name and unit.
         velocity_rad_s: of the axis, shape (k,) [rad/s or m/s].
-        title: names axis, effect and run.
         force: "Nm", or "N" along a prismatic joint.
     """
-    title = f"{unformatted(title)}\ngaps: samples left out, most of them at standstill"
-    figure, places = grid(2, (1.7, 1.0), title, height_in=2.5)
-    rows = (("without the effect", before_nm, ORANGE), ("with the effect", after_nm, BLUE))
-    for (over_time, scatter), (name, residual_nm, colour) in zip(places, rows, strict=True):
-        over_time.plot(time_s, residual_nm, color=colour, linewidth=0.8)
-        shown = np.isfinite(residual_nm)
-        rms_nm = float(np.sqrt(np.mean(residual_nm[shown] ** 2))) if shown.any() else float("nan")
-        over_time.set_title(f"{name}: RMS {rms_nm:.3g} {force}", fontsize=9, loc="left")
-        over_time.set_ylabel(f"residual {QUANTITY[force]} [{force}]", fontsize=8)
-        _draw_scatter(scatter, variable, residual_nm, velocity_rad_s)
-    places[1][0].set_xlabel("time [s]", fontsize=8)
-    places[1][1].set_xlabel(variable_label, fontsize=8)
-    places[0][1].set_title("the same against the variable of the effect", fontsize=9, loc="left")
-    legend_below(figure, places[0][1])
-    return render(figure)
+    drawn = []
+    reach = float(np.nanmax(np.abs(np.concatenate([before_nm, after_nm, [0.0]]))))
+    for words, residual_nm in (("without", before_nm), ("with", after_nm)):
+        shown = residual_nm[np.isfinite(residual_nm)]
+        rms_nm = float(np.sqrt(np.mean(shown**2))) if len(shown) else float("nan")
+        label = f"residual {words} the effect [{force}], RMS {rms_nm:.3g}"
+        title = f"Residual {QUANTITY[force]} {words} the effect"
+        over_time = chart((Line(time_s, residual_nm, "thin"),), title, ("time [s]", label), reach=reach)
+        lines = _against(variable, residual_nm, velocity_rad_s)
+        drawn += [over_time, chart(lines, title, (variable_label, f"{words} the effect [{force}]"), reach=reach)]
+    return tuple(drawn)
 
 
-def _draw_scatter(place: Axes, variable: FloatArray, residual_nm: FloatArray, velocity_rad_s: FloatArray) -> None:
-    place.axhline(0.0, color=GREY, linewidth=0.8)
+def _against(variable: FloatArray, residual_nm: FloatArray, velocity_rad_s: FloatArray) -> tuple[Line, ...]:
+    """Samples and means over the variable, for either direction of motion."""
     known = np.isfinite(variable) & np.isfinite(residual_nm)
-    directions = (("forwards", velocity_rad_s > 0, GREEN, "-"), ("backwards", velocity_rad_s < 0, PURPLE, "--"))
-    for name, moving, colour, line in directions:
+    clouds, means = [], []
+    directions = (("forwards", velocity_rad_s > 0, "cloud", "line"), ("backwards", velocity_rad_s < 0, "rest", "other"))
+    for name, moving, cloud, line in directions:
         x, y = variable[known & moving], residual_nm[known & moving]
-        step = max(len(x) // _POINTS, 1)
-        place.plot(x[::step], y[::step], ".", color=colour, markersize=2, alpha=0.35, label=f"sample, {name}")
         # Stretches of the variable with equally many samples, so that no mean is of a handful of them.
         order = np.argsort(x, kind="stable") if len(x) >= _BINS else np.array([], dtype=np.intp)
         bins = np.array_split(order, _BINS) if len(order) else []
-        centres, means = [x[part].mean() for part in bins], [y[part].mean() for part in bins]
-        # A white rim keeps the mean visible in a cloud of its own colour.
-        place.plot(centres, means, color="white", linewidth=3.6)
-        place.plot(centres, means, color=colour, linewidth=1.8, linestyle=line, label=f"mean, {name}")
+        clouds.append(Line(x, y, cloud))
+        centres, middle = (np.array([column[part].mean() for part in bins]) for column in (x, y))
+        means.append(Line(centres, middle, line, f"mean {name}"))
+    return (*clouds, *means)
 
 
-_BAR_IN = 0.32
-_LOOK = {"passes every gate": (BLUE, ""), "indistinguishable from the best": (ORANGE, "//"), "fails a gate": (GREY, "")}
-"""Colour and hatch of a bar by its label; the hatch distinguishes them in grey print."""
-
-
-def plot_ranking(
-    findings: Sequence[Finding], rivals: Sequence[PlacedEffect], axes: tuple[str, ...], *, title: str
-) -> bytes:
+def plot_ranking(findings: Sequence[Finding], rivals: Sequence[PlacedEffect], axes: tuple[str, ...]) -> str:
     """Draw candidates by the fall of the squared error on left-out moves, the best first.
 
-    Rivals are those not distinguishable from the added one or, where none was added, from the best; they are hatched.
+    Rivals are those not distinguishable from the added one; they are pale. Those that fail a gate are hollow.
     """
-    figure, ((place,),) = grid(1, (1.0,), unformatted(title), height_in=_BAR_IN * len(findings))
-    hatched = {(rival.effect.name, rival.axis) for rival in rivals}
-    passed, rival, failed = _LOOK
-    labels = [
-        rival if (finding.effect.name, finding.axis) in hatched else passed if finding.passed else failed
-        for finding in findings
+    alike = {(rival.effect.name, rival.axis) for rival in rivals}
+    rows = [
+        (
+            f"{axes[one.axis]}: {effect_text(one.effect, axes)}",
+            one.held_out_fall,
+            "alike" if (one.effect.name, one.axis) in alike else "full" if one.passed else "empty",
+        )
+        for one in findings
     ]
-    for label, (colour, hatch) in _LOOK.items():
-        rows = [row for row, one in enumerate(labels) if one == label]
-        falls = [findings[row].held_out_fall for row in rows]
-        if rows:
-            place.barh(rows, falls, color=colour, hatch=hatch, edgecolor="white", label=label)
-    names = [PlacedEffect(finding.effect, finding.axis).name_among(axes) for finding in findings]
-    place.set_yticks(range(len(names)), [unformatted(name) for name in names])
-    place.invert_yaxis()
-    place.set_xlabel("fall of the squared error on moves left out [noise variances]", fontsize=8)
-    legend_below(figure, place)
-    return render(figure)
+    return ranking(rows, "Candidates", "fall of the squared error [noise variances]")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from datetime import datetime
 from pathlib import Path
 
@@ -11,10 +12,11 @@ from daq.report.certificate import Comparison, certify, without_controller
 from daq.report.certificate_page import certificate_page
 from daq.report.effect_names import effect_text, variable_text
 from daq.report.fit import coefficients, identifiability_notes, start_of
-from daq.report.gains import plot_gain_changes, with_deviation
-from daq.report.html import MARK, folded, listed, paragraph, picture, table
+from daq.report.gains import with_deviation
+from daq.report.html import MARK, figure, folded, listed, pair, paragraph, table
 from daq.report.plots import draw_effect, draw_torques, plot_ranking
 from daq.report.residual import WHEN, error_rows, gains_sentence, residual_document, summary
+from daq.report.svg import Interval, intervals
 from daq.report.text import json_text, percent_text
 from daq.workflow.fit import Fit
 from ident.calibration import Calibration
@@ -63,10 +65,10 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration, compa
             sections += [_effect(fitted, before, step, turn, placed) for placed in turn.added]
         before = step.after
     details = (
-        folded("Findings", listed(summary(fitted, account))),
+        folded("What was found, in sentences", listed(summary(fitted, account))),
         folded(
-            "Before and after",
-            table("Relative error ‖e‖/‖v‖ [%]", ("", *axes, "total"), errors),
+            "Errors without and with the effects",
+            table("Relative error ‖e‖/‖v‖ [%]", ("", *axes, "total"), errors, "names"),
             paragraph(
                 "Error: the share of each motor's current that the model leaves, ‖e‖/‖v‖, over the rows in motion; "
                 "in total with each current weighted by its gain. Compare errors only under the same filters (end "
@@ -75,7 +77,11 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration, compa
             ),
         ),
         *sections,
-        folded("Torques", picture(draw_torques(before, fitted.cell), "Measured and predicted joint torques")),
+        folded(
+            "Measured and predicted torques",
+            paragraph("Gaps: samples left out, most of them at standstill."),
+            pair(map(figure, draw_torques(before, fitted.cell))),
+        ),
         _gains(fitted, account),
         *(_turn(fitted, number, step) for number, step in enumerate(fitted.steps, start=1)),
         _limits(fitted),
@@ -88,13 +94,13 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
     axis, final = axes[placed.axis], fitted.steps[-1].after
     kept = placed in final.effects
     rivals = () if step.accepted is None else step.accepted.ambiguity
-    ambiguous = ", ".join(rival.name_among(axes) for rival in rivals)
+    ambiguous = "; ".join(f"{axes[one.axis]}: {effect_text(one.effect, axes)}" for one in rivals)
     sentences = (
-        f"Effect {placed.name_among(axes)}.",
+        f"Name in files and commands: `{placed.name_among(axes)}`.",
         f"These data cannot distinguish it from: {ambiguous}."
         if ambiguous
         else "Every other candidate is clearly worse.",
-        *(() if kept else ("A later turn removed it again, because it no longer reduced the error.",)),
+        *(() if kept else ("A later round removed it again, because it no longer reduced the error.",)),
     )
     pairs = (
         ("fit", turn.before.in_sample, turn.after.in_sample),
@@ -114,10 +120,10 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
         paragraph(" ".join(sentences)),
         table("Identified coefficients", ("coefficient", "value ± σ", "unit"), sizes) if sizes else "",
         table(f"Relative error of {axis} [%]", ("", *WHEN), errors),
-        picture(
-            draw_effect(before, step.after, placed, fitted.cell),
+        pair(map(figure, draw_effect(before, step.after, placed, fitted.cell))),
+        paragraph(
             f"Residual of {axis} over time and against {variable_text(placed.effect, axes)}, without and with the "
-            "effect. A mean away from zero is torque that the model still lacks.",
+            "effect. A mean away from zero is torque that the model still lacks. Gaps: samples left out."
         ),
     )
 
@@ -125,25 +131,30 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
 def _gains(fitted: Fit, account: Account) -> str:
     axes, changes = fitted.cell.axis_names, account.total.gains
     if fitted.estimate.gains_fixed:
-        return folded("Drive gains", paragraph("The gains were held at their nameplate values."))
+        return folded("Gains without and with the effects", paragraph("The gains were held at their nameplate values."))
     rows = [
         (
             axis.name,
             with_deviation(change.before, change.before_std),
-            with_deviation(change.after, change.after_std),
+            f"{with_deviation(change.after, change.after_std)} {axis.gain_unit}",
             f"{change.change_percent:+.2f} ± {change.change_std_percent:.2f}",
-            "yes" if change.significant else "no",
-            axis.gain_unit,
+            "more than noise" if change.significant else "within noise",
         )
         for axis, change in zip(fitted.cell.axes, changes, strict=True)
     ]
+    shifts = [
+        Interval(
+            *(name, one.change_percent, 2.0 * one.change_std_percent, -math.inf, math.inf),
+            f"{one.change_percent:+.2f} %",
+        )
+        for name, one in zip(axes, changes, strict=True)
+    ]
     return folded(
-        "Drive gains",
-        table("Before and after", ("axis", *WHEN, "change ± σ [%]", "more than noise", "unit"), rows),
-        picture(
-            plot_gain_changes(changes, axes, title=f"Drive gains of {fitted.cell.name}"),
-            "Gains with their intervals, before and after, in per cent of the gain before; * changed by more than "
-            "noise. Both estimates share their noise, so overlapping intervals do not exclude a change.",
+        "Gains without and with the effects",
+        table("", ("axis", *WHEN, "change ± σ [%]", "verdict"), rows, "words"),
+        figure(
+            intervals(shifts, "Change of each gain by the effects", "change by the effects [%]"),
+            "0 is the gain without the effects. Bar: ± 2 σ of the change, whose noise both estimates share in part.",
         ),
     )
 
@@ -151,23 +162,22 @@ def _gains(fitted: Fit, account: Account) -> str:
 def _turn(fitted: Fit, number: int, step: Step) -> str:
     axes, added = fitted.cell.axis_names, step.accepted
     shown = (*step.findings[:_SHOWN], *(finding for finding in step.structures[:_SHOWN] if finding.passed))
-    best = added or next(iter(step.findings), None)
-    outcome = "Nothing passed every gate and nothing was added."
+    outcome = "Nothing passed every check and nothing was added."
     if added is not None:
-        outcome = f"Added: {PlacedEffect(added.effect, added.axis).name_among(axes)}."
+        outcome = f"Added to {axes[added.axis]}: {effect_text(added.effect, axes)}."
     ranking = paragraph("No candidate could be tried.")
     if shown:
         ranked = sorted(shown, key=lambda finding: -finding.held_out_fall)
-        rivals = () if best is None else best.ambiguity
-        ranking = picture(
-            plot_ranking(ranked, rivals, axes, title=f"Turn {number}: the best candidates"),
-            "Candidates by how much they reduce the error of left-out moves.",
+        ranking = figure(
+            plot_ranking(ranked, () if added is None else added.ambiguity, axes),
+            "Candidates by how much they reduce the error of left-out moves. Full: passed every check. Pale: these "
+            "data cannot distinguish it from the added one. Hollow: failed a check.",
         )
     refused = [
-        f"Not added: {PlacedEffect(aside.finding.effect, aside.finding.axis).name_among(axes)}: {aside.reason(axes)}."
+        f"Not added to {axes[aside.finding.axis]}: {effect_text(aside.finding.effect, axes)}: {aside.reason(axes)}."
         for aside in step.set_aside
     ]
-    return folded(f"Turn {number}: what was tried", paragraph(" ".join((outcome, *refused))), ranking)
+    return folded(f"Search, round {number}: what was tried", paragraph(" ".join((outcome, *refused))), ranking)
 
 
 def _limits(fitted: Fit) -> str:

@@ -1,22 +1,24 @@
-"""Drawings of a certificate as SVG in the page: intervals beside limits, errors before and after, a curve.
+"""Drawings as SVG: intervals beside limits, values before and after, curves, a ranking; and a file of several.
 
-They take their colours from the page's style (`daq.report.html`), so that they follow dark mode and paper. A drawing is
-`_WIDTH` wide, about that of a phone, so that its text keeps its size there.
+In a page they take their colours from its style (`daq.report.html`), so that they follow dark mode and paper. A drawing
+is `_WIDTH` wide, about that of a phone, so that its text keeps its size there. A curve has no more points than a screen
+can show.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from daq.report.html import spelled
+from daq.report.html import DRAWING, LIGHT, spelled
 from ident.arrays import FloatArray
 
 _WIDTH, _ROW, _TOP, _FOOT = 360.0, 25.0, 6.0, 36.0
-_LEFT, _RIGHT = 46.0, 84.0  #: Room for the names and for the numbers
+_LEFT, _RIGHT = 46.0, 96.0  #: Room for the names and for the numbers
 _ROOM = 1.12  #: Length of a scale over the largest value on it
 
 
@@ -41,6 +43,7 @@ def intervals(rows: Sequence[Interval], title: str, unit: str) -> str:
     """
     reach = _largest([abs(r.value) + r.half for r in rows] + [abs(r.earlier) for r in rows])
     bounds = _largest([abs(bound) for r in rows for bound in (r.lower, r.upper)])
+    limited = bounds > 0.0
     to_scale = bounds == 0.0 or reach >= 0.1 * bounds
     # Below 0.1 a scale would only magnify noise.
     extent = _ROOM * max(reach, bounds if to_scale else 0.0, 0.1)
@@ -49,7 +52,8 @@ def intervals(rows: Sequence[Interval], title: str, unit: str) -> str:
     for number, row in enumerate(rows):
         y = scale.y(number)
         low, high = (scale.x(min(max(bound, -extent), extent)) for bound in (row.lower, row.upper))
-        parts.insert(0, f'<rect class="range" x="{low:.1f}" y="{y - 9:.1f}" width="{high - low:.1f}" height="18"/>')
+        if limited:
+            parts.insert(0, f'<rect class="range" x="{low:.1f}" y="{y - 9:.1f}" width="{high - low:.1f}" height="18"/>')
         parts += [
             _line(scale.x(bound), y - 9, scale.x(bound), y + 9, "limit")
             for bound in (row.lower, row.upper)
@@ -63,10 +67,10 @@ def intervals(rows: Sequence[Interval], title: str, unit: str) -> str:
         parts += [_text(0, y + 4, row.name), _text(_WIDTH, y + 4, row.label, "end")]
     if not to_scale:
         parts += [
-            _text(_LEFT, scale.bottom + 30, "◂ limit", "soft"),
-            _text(scale.right, scale.bottom + 30, "limit ▸", "soft end"),
+            _text(_LEFT, scale.bottom + 47, "◂ limit", "soft"),
+            _text(scale.right, scale.bottom + 47, "limit ▸", "soft end"),
         ]
-    return _drawing(parts, title, scale.bottom + _FOOT)
+    return _drawing(parts, title, scale.bottom + _FOOT + (0.0 if to_scale else 17.0))
 
 
 def before_after(rows: Sequence[tuple[str, float, float]], title: str, unit: str) -> str:
@@ -82,39 +86,150 @@ def before_after(rows: Sequence[tuple[str, float, float]], title: str, unit: str
             parts.append(_dot(scale.x(before), y, "hollow"))
         if math.isfinite(after):
             parts.append(_dot(scale.x(after), y, "dot"))
-        label = " → ".join(f"{value:.1f}" for value in known) or "-"
+        label = " → ".join(f"{value:.2f}" for value in known) or "-"
         parts += [_text(0, y + 4, name), _text(_WIDTH, y + 4, label, "end")]
     return _drawing(parts, title, scale.bottom + _FOOT)
 
 
-def curve(x: FloatArray, y: FloatArray, half: FloatArray | None, title: str, labels: tuple[str, str]) -> str:
-    """Draw y over x with its band y ± half, all of shape (k,); no band where half is None. `labels`: of x and of y."""
-    edges = np.concatenate([y] if half is None else [y - half, y + half])
-    low, high = min(float(edges.min()), 0.0), max(float(edges.max()), 0.0)
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One curve of a chart, or a cloud of points."""
+
+    x: FloatArray  #: shape (k,); ascending, unless the kind is a cloud
+    y: FloatArray  #: shape (k,); NaN leaves a gap
+    kind: str = "line"  #: CSS class: line, thin, wide, dashed, other; cloud and rest are points
+    name: str = ""  #: in the legend, empty for none
+
+
+def chart(
+    lines: Sequence[Line],
+    title: str,
+    labels: tuple[str, str],
+    *,
+    half: FloatArray | None = None,
+    reach: float = 0.0,
+) -> str:
+    """Draw curves over one variable.
+
+    Args:
+        lines: at least one, the first below the others.
+        title: for readers who do not see the drawing.
+        labels: of x and of y.
+        half: half of the band around the first line, shape (k,); None for no band.
+        reach: the scale of y reaches from -reach to reach at least, so that charts can share it.
+    """
+    first = lines[0]
+    values = [line.y for line in lines] + ([] if half is None else [first.y - half, first.y + half])
+    known = np.concatenate([column[np.isfinite(column)] for column in values] + [np.array([0.0, reach, -reach])])
+    low, high = float(known.min()), float(known.max())
     high = high if high > low else low + 1.0
-    across, left, height = _WIDTH - 8.0, 46.0, 140.0
+    along = np.concatenate([line.x[np.isfinite(line.x)] for line in lines])
+    begin, end = (float(along.min()), float(along.max())) if len(along) else (0.0, 1.0)
+    end = end if end > begin else begin + 1.0
+    across, left, top, height = _WIDTH - 8.0, 50.0, 22.0, 150.0
 
-    def right(value: float) -> float:
-        return left + (value - float(x[0])) / float(x[-1] - x[0]) * (across - left)
+    def right(x: FloatArray) -> FloatArray:
+        return left + (x - begin) / (end - begin) * (across - left)
 
-    def down(value: float) -> float:
-        return 20.0 + (high - value) / (high - low) * (height - 20.0)
+    def down(y: FloatArray) -> FloatArray:
+        return top + (high - y) / (high - low) * (height - top)
 
-    def place(xs: FloatArray, ys: FloatArray) -> str:
-        return " ".join(f"{right(a):.1f},{down(b):.1f}" for a, b in zip(xs.tolist(), ys.tolist(), strict=True))
-
-    parts = [
-        _line(left, down(tick), across, down(tick), "zero" if tick == 0.0 else "grid") for tick in _ticks(low, high)
-    ]
-    parts += [_text(left - 5, down(tick) + 4, f"{tick:g}", "soft end") for tick in _ticks(low, high)]
-    for tick in _ticks(float(x[0]), float(x[-1])):
-        parts.append(_text(right(tick), height + 16, f"{tick:g}", "soft mid"))
+    ticks = np.array(list(_ticks(low, high)))
+    parts = []
+    for tick, y in zip(ticks.tolist(), down(ticks).tolist(), strict=True):
+        parts += [_line(left, y, across, y, "zero" if tick == 0.0 else "grid")]
+        parts += [_text(left - 5, y + 4, f"{tick:g}", "soft end")]
+    ticks = np.array(list(_ticks(begin, end)))
+    for tick, x in zip(ticks.tolist(), right(ticks).tolist(), strict=True):
+        parts.append(_text(x, height + 17, f"{tick:g}", "soft mid"))
     if half is not None:
-        both = place(np.concatenate([x, x[::-1]]), np.concatenate([y + half, (y - half)[::-1]]))
-        parts.append(f'<polygon class="band" points="{both}"/>')
-    parts.append(f'<polyline class="line" points="{place(x, y)}"/>')
-    parts += [_text(0, 12, labels[1], "soft"), _text(across, height + 32, labels[0], "soft end")]
-    return _drawing(parts, title, height + 38)
+        xs, ys = np.concatenate([first.x, first.x[::-1]]), np.concatenate([first.y + half, (first.y - half)[::-1]])
+        places = zip(right(xs).tolist(), down(ys).tolist(), strict=True)
+        parts.append(f'<polygon class="band" points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in places)}"/>')
+    for line in lines:
+        draw = _points if line.kind in {"cloud", "rest"} else _curve
+        parts.append(f'<path class="{line.kind}" d="{draw(right(line.x), down(line.y))}"/>')
+    parts += [_text(0, 13, labels[1], "soft"), _text(across, height + 36, labels[0], "soft end")]
+    bottom = height + 42
+    named, at = [line for line in lines if line.name], left
+    if named:
+        bottom += 18
+    for line in named:
+        sample = f"M{at:.0f} {bottom - 10:.0f}h{0 if line.kind in {'cloud', 'rest'} else 22}"
+        parts += [f'<path class="{line.kind}" d="{sample}"/>', _text(at + 28, bottom - 6, line.name, "soft")]
+        at += 40 + 7.5 * len(line.name)
+    return _drawing(parts, title, bottom)
+
+
+def visible(x: FloatArray, y: FloatArray, stretches: int = 2 * round(_WIDTH)) -> tuple[FloatArray, FloatArray]:
+    """Keep lowest and highest value of each stretch of a curve, and its gaps, so that no peak is lost.
+
+    Args:
+        x, y: shape (k,), NaN in y leaves a gap.
+        stretches: two a unit of the drawing's width, the dots of a fine screen.
+    """
+    if len(x) <= 2 * stretches:
+        return x, y
+    kept = []
+    for part in np.array_split(np.arange(len(x)), stretches):
+        values = y[part]
+        gap = np.flatnonzero(~np.isfinite(values))
+        if len(gap) < len(part):
+            kept += sorted({int(part[np.nanargmin(values)]), int(part[np.nanargmax(values)]), *part[gap[:1]].tolist()})
+        else:
+            kept.append(int(part[0]))
+    return x[kept], y[kept]
+
+
+def _curve(x: FloatArray, y: FloatArray) -> str:
+    steps, pen = [], "M"
+    for a, b in zip(*(column.tolist() for column in visible(x, y)), strict=True):
+        if math.isfinite(b):
+            steps.append(f"{pen}{a:.1f} {b:.1f}")
+            pen = "L"
+        else:
+            pen = "M"
+    return "".join(steps)
+
+
+def _points(x: FloatArray, y: FloatArray) -> str:
+    """Points as strokes of no length; those that fall on one place are drawn once."""
+    places = np.unique(np.round(np.stack([x, y], axis=1)[np.isfinite(x) & np.isfinite(y)]), axis=0)
+    return "".join(f"M{a:.0f} {b:.0f}h0" for a, b in places.tolist())
+
+
+def ranking(rows: Sequence[tuple[str, float, str]], title: str, unit: str) -> str:
+    """Draw bars under their names. A row: name, length, and CSS class: full, alike, empty."""
+    scale = _Scale(0.0, _ROOM * max(_largest(length for _, length, _ in rows), 1e-9), 2 * len(rows), 8.0, 60.0)
+    parts = list(scale.frame(unit))
+    for number, (name, length, kind) in enumerate(rows):
+        y = scale.y(2 * number)
+        width = max(scale.x(max(length, 0.0)) - scale.x(0.0), 1.0)
+        bar = f'<rect class="{kind}" x="{scale.x(0.0):.1f}" y="{y + 9:.1f}" width="{width:.1f}" height="14"/>'
+        parts += [_text(0, y + 3, name), bar, _text(scale.x(0.0) + width + 5, y + 21, f"{length:.3g}", "soft")]
+    return _drawing(parts, title, scale.bottom + _FOOT)
+
+
+def sheet(drawings: Sequence[str], title: str, columns: int = 2) -> bytes:
+    """Return a file of its own with several drawings under a title, in the colours of paper."""
+    heights = [float(found[1]) for one in drawings if (found := re.search(r'viewBox="0 0 \S+ ([\d.]+)"', one))]
+    row, across, gap = max(heights), min(columns, len(drawings)), 24.0
+    width, height = across * (_WIDTH + gap) + gap, -(-len(drawings) // across) * (row + gap) + 48.0
+    style = re.sub(r"var\(--(\w+)\)", lambda found: LIGHT[found[1]], DRAWING)
+    placed = (
+        one.replace(
+            "<svg ",
+            f'<svg x="{gap + number % across * (_WIDTH + gap):g}" y="{48 + number // across * (row + gap):g}" '
+            f'width="{_WIDTH:g}" height="{height_of:g}" ',
+            1,
+        )
+        for number, (one, height_of) in enumerate(zip(drawings, heights, strict=True))
+    )
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" width="{width:g}" '
+        f'height="{height:g}"><style>{style}</style><rect width="100%" height="100%" fill="{LIGHT["paper"]}"/>'
+        f"{_text(gap, 28, title)}{''.join(placed)}</svg>\n"
+    ).encode()
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,17 +239,19 @@ class _Scale:
     low: float
     high: float
     rows: int
+    left: float = _LEFT
+    room: float = _RIGHT
 
     @property
     def right(self) -> float:
-        return _WIDTH - _RIGHT
+        return _WIDTH - self.room
 
     @property
     def bottom(self) -> float:
         return _TOP + _ROW * self.rows
 
     def x(self, value: float) -> float:
-        return _LEFT + (value - self.low) / (self.high - self.low) * (self.right - _LEFT)
+        return self.left + (value - self.low) / (self.high - self.low) * (self.right - self.left)
 
     def y(self, row: int) -> float:
         return _TOP + _ROW * (row + 0.5)
@@ -145,12 +262,12 @@ class _Scale:
             yield _text(
                 self.x(tick), self.bottom + 14, f"{tick:+g}" if self.low < 0 and tick else f"{tick:g}", "soft mid"
             )
-        yield _text((_LEFT + self.right) / 2, self.bottom + 30, unit, "soft mid")
+        yield _text((self.left + self.right) / 2, self.bottom + 30, unit, "soft mid")
 
 
 def _ticks(low: float, high: float) -> Iterator[float]:
     """Round numbers between two ends, three to six of them."""
-    raw = (high - low) / 4.0
+    raw = (high - low) / 5.0
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if power * factor >= raw)
     for number in range(math.ceil(low / step), math.floor(high / step) + 1):
@@ -164,7 +281,7 @@ def _largest(values: Iterable[float]) -> float:
 def _drawing(parts: Iterable[str], title: str, height: float) -> str:
     words = spelled(title)
     return (
-        f'<svg viewBox="0 0 {_WIDTH:g} {height:g}" role="img" aria-label="{words}"><title>{words}</title>'
+        f'<svg viewBox="0 0 {_WIDTH:g} {height:g}" role="group" aria-label="{words}"><title>{words}</title>'
         f"{''.join(parts)}</svg>"
     )
 

@@ -17,6 +17,7 @@ from daq.report import paper_tables
 from daq.report.fit import error_document
 from daq.report.gains import diagnosis_texts
 from daq.report.plots import plot_torques
+from daq.report.svg import sheet
 from daq.report.text import percent_text, picked, plain_table, printable, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
 from daq.workflow.validate import CrossValidation, DataUse, Validation, WeighedRun, conditioning_of, together
@@ -79,15 +80,15 @@ def draw_validations(calibration: Calibration, validations: tuple[Validation, ..
     for validation in validations:
         # Logs in different folders may have the same name.
         stem = validation.run if logs_of[validation.run] == 1 else f"{validation.run}-{validation.digest[:8]}"
-        path = folder / f"{stem}.png"
+        path = folder / f"{stem}.svg"
         measured_nm, predicted_nm = (
             np.where(validation.use, torque_nm, np.nan).T
             for torque_nm in (validation.measured_nm, validation.predicted_nm)
         )
         title = f"{validation.run}, {validation.data_use.value}: torque of {calibration.cell}"
         folder.mkdir(parents=True, exist_ok=True)
-        drawn = plot_torques(validation.time_s, measured_nm, predicted_nm, axes, title=title, forces=forces)
-        replace_file(path, drawn)
+        drawn = plot_torques(validation.time_s, measured_nm, predicted_nm, axes, forces=forces)
+        replace_file(path, sheet(drawn, title))
         pictures[validation.log] = path
     return pictures
 

@@ -186,7 +186,7 @@ def _make_room(out: Path, logs: tuple[Path, ...]) -> None:
     for log in logs:
         log.unlink(missing_ok=True)
         log.with_name(log.name + ".part").unlink(missing_ok=True)
-    for picture in out.glob("residual-*.png"):
+    for picture in out.glob("residual-*"):
         picture.unlink()
 
 

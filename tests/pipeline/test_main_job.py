@@ -55,8 +55,8 @@ def test_the_copy_of_the_controller_file_has_the_gains_and_every_comment(demonst
 
 
 def test_the_pictures_are_there(demonstration: Path) -> None:
-    pictures = {path.name for path in demonstration.glob("*.png")}
-    assert pictures == {"torques.png", "gains.png", "residual-J3-load-friction.png"}
+    pictures = {path.name for pattern in ("*.png", "*.svg") for path in demonstration.glob(pattern)}
+    assert pictures == {"torques.svg", "gains.png", "residual-J3-load-friction.svg"}
 
 
 def test_a_log_is_enough_to_identify_from(

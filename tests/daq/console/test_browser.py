@@ -223,6 +223,33 @@ def test_a_page_of_another_site_reads_nothing_and_stops_nothing(
         assert any("Content Security Policy" in text for text in made.refused)
 
 
+def test_a_preview_is_a_right_handed_view_from_above(tmp_path: Path, checkout: Path, browser: Browser) -> None:
+    cell = checkout / "configs" / "cells" / "demo.yaml"
+    preview = tmp_path / "plan.html"
+    planned = ["plan", str(cell), "--out", str(tmp_path / "plan.yaml"), "--duration", "8", "--exchanges", "0"]
+    assert main([*planned, "--preview", str(preview)]) == ExitCode.OK
+    page = browser.new_page(viewport={"width": 1000, "height": 1300})
+    faults: list[str] = []
+    page.on("console", lambda message: faults.append(message.text))
+    page.on("pageerror", lambda error: faults.append(str(error)))
+    page.goto(preview.as_uri())
+    for button in ("From above", "Along y", "Along x", "3-D", "+"):
+        page.click(f"button:text-is('{button}')")
+        origin, x, y, z = (
+            np.array(page.evaluate(f"(([see, near]) => [...see({point}), near({point})])(camera(400, 400))"))
+            for point in ("[0, 0, 0]", "[1, 0, 0]", "[0, 1, 0]", "[0, 0, 1]")
+        )
+        scale = page.evaluate("camera(400, 400)[2]")
+        # Right, up, and towards the viewer are a right-handed frame, so the images of x, y, z must be one as well.
+        axes = np.stack([one - origin for one in (x, y, z)]) * np.array([1 / scale, -1 / scale, 1.0])
+        np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(axes) == pytest.approx(1.0)
+        assert axes[2, 2] >= -1e-9  # seen from the side or from above, never from below
+    page.screenshot(path=checkout / "out" / "console" / "preview.png", full_page=True)
+    page.close()
+    assert faults == []
+
+
 def _pictures(made: Rig, browser: Browser, checkout: Path) -> None:
     """Screenshots for people, in out/, and that nothing is wider than a phone."""
     out = checkout / "out" / "console"

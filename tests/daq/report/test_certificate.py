@@ -73,12 +73,15 @@ def test_every_number_of_the_document_is_on_the_page() -> None:
     page = Reader(text)
     assert not set(page.tags) & {"script", "link", "iframe", "object", "a", "img"}
     assert "http" not in text.replace("http-equiv", "")
-    assert f"? {document['sentence']}" in page.texts
+    assert f"• {document['sentence']}" in page.texts
     for gain, axis in zip(calibration.gains, document["axes"], strict=True):
-        assert {f"{axis['old']:.5g}", with_deviation(gain.value, gain.std), axis["verdict"]} <= set(page.texts)
+        identified = f"{with_deviation(gain.value, gain.std)} {gain.unit}"
+        assert {f"{axis['old']:.5g}", identified, axis["verdict"]} <= set(page.texts)
         assert axis["change_percent"] == pytest.approx(gain.change_percent)
-    for error in (document["holdout_error_percent"], document["nameplate_holdout_error_percent"]):
-        assert {f"{value:.2f}" for value in (*error["axes"], error["total"])} <= set(page.texts)
+    before, after = document["nameplate_holdout_error_percent"], document["holdout_error_percent"]
+    assert f"{before['total']:.2f} → {after['total']:.2f}" in page.texts
+    for first, second in zip(before["axes"], after["axes"], strict=True):
+        assert f"{first:.2f} → {second:.2f}" in page.texts
     for value in document["identity"].values():
         assert value in page.texts
 
@@ -91,7 +94,7 @@ def test_the_mass_is_shown_as_it_was_entered_twice_and_what_is_missing_is_said()
     bare = replace(calibration, sources=(), holdout_error_percent=None, effects=())
     texts = Reader(_page(bare)).texts
     assert "not known: the recordings name none" in texts
-    assert any(text.startswith("No run was held out") for text in texts)
+    assert any("No run was held out" in text for text in texts)
     assert "The calibration holds no effect beyond the declared model." in texts
 
 

@@ -22,7 +22,7 @@ from daq.workflow.plan import Plan
 from daq.workflow.plan_file import check_approach
 from drivers.errors import MotionRefused
 from ident.model.robot import poses
-from ident.planning.clearance import Box, Checker
+from ident.planning.clearance import BASE, Box, Checker
 
 TARGETS = ((0.0, 0.0, 1.2, 0.0, 0.0, 0.0), (0.8, 0.4, 0.6, 0.0, 0.5, 0.0), (-0.8, -0.4, 1.2, 1.0, -0.5, 2.0))
 MOVES = tuple(PlannedMove(target, 0.5, 0.5, 0.1) for target in TARGETS)
@@ -76,6 +76,33 @@ def test_a_capsule_is_where_the_arm_is_and_the_clearance_that_of_the_checker(
     found = [drawn["clearance_mm"][row] for row in (0, -1)]
     np.testing.assert_allclose(found, 1000.0 * (margin_m + 0.02), atol=0.06)
     assert [box["name"] for box in drawn["boxes"]] == ["wall"]
+
+
+def test_the_reach_is_that_of_every_moving_capsule_at_every_row(checker: Checker, drawn: dict[str, Any]) -> None:
+    shares = np.linspace(0.0, 1.0, 21)[:, None]
+    points, radii = [], []
+    for row in drawn["ends_m"]:
+        for capsule, (start, end) in zip(checker.scene.capsules, np.array(row), strict=True):
+            if capsule.link != BASE:
+                points.append((1.0 - shares) * start + shares * end)
+                radii.append(np.full(21, capsule.radius_m))
+    along, radius = np.concatenate(points), np.concatenate(radii)
+    np.testing.assert_allclose(drawn["reach"]["lower_m"], (along - radius[:, None]).min(axis=0), atol=0.002)
+    np.testing.assert_allclose(drawn["reach"]["upper_m"], (along + radius[:, None]).max(axis=0), atol=0.002)
+    across = (np.hypot(along[:, 0], along[:, 1]) + radius).max()
+    assert drawn["reach"]["radius_m"] == pytest.approx(across, abs=0.002)
+
+
+def test_the_page_says_what_is_not_known(cell: Cell, checker: Checker) -> None:
+    page = preview_page(cell, MOVES, checker, b"plan")
+    assert "The shape of the arm is a guess from the URDF" in page
+    assert "declares no workspace: tables" in page
+    assert "drivegain record checks the way there" in page
+    assert "below z = 0" not in page
+    assert re.search(r"Smallest clearance: -\d+ mm, at [\d.]+ s; 20 mm must be kept", page)
+    bare = replace(cell, clearance=None)
+    page = preview_page(bare, MOVES, scene_of(bare, model_of(bare).robot, 4.59).checker, b"plan")
+    assert "nothing checks the way there" in page
 
 
 def test_the_page_needs_no_other_file_and_runs_only_its_own_script(cell: Cell, checker: Checker) -> None:

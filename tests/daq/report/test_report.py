@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import re
 import subprocess
 import sys
+from xml.etree import ElementTree
 
 import matplotlib.image
 import numpy as np
@@ -13,8 +15,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from daq.report.gains import gain_table, plot_gains, torque_sentences, with_deviation
-from daq.report.picture import ORANGE, grid, render
 from daq.report.plots import plot_residual, plot_torques
+from daq.report.svg import Line, chart, sheet, visible
 from ident.calibration import Gain
 from ident.data.torque_channel import TorqueSlope
 from tests.daq.calibrations import AXES, demo_calibration
@@ -31,65 +33,86 @@ def _torques(samples: int = 3000) -> tuple[FloatArray, FloatArray, FloatArray]:
     return time_s, measured_nm, predicted_nm
 
 
-def _draw(kind: str) -> bytes:
+def _drawings(kind: str) -> tuple[str, ...]:
     time_s, measured_nm, predicted_nm = _torques()
     if kind == "torque":
-        return plot_torques(time_s, measured_nm, predicted_nm, AXES, title="demo, run loaded-1")
-    if kind == "residual":
-        return plot_residual(
-            time_s,
-            measured_nm[:, 2] - 0.5 * predicted_nm[:, 2],
-            measured_nm[:, 2] - predicted_nm[:, 2],
-            variable=predicted_nm[:, 2],
-            variable_label="load torque [Nm]",
-            velocity_rad_s=np.cos(3 * time_s),
-            title="J3: load-friction",
-        )
-    return plot_gains(demo_calibration().gains, dict.fromkeys(AXES, 20.0), title="demo")
+        return plot_torques(time_s, measured_nm, predicted_nm, AXES)
+    return plot_residual(
+        time_s,
+        measured_nm[:, 2] - 0.5 * predicted_nm[:, 2],
+        measured_nm[:, 2] - predicted_nm[:, 2],
+        variable=predicted_nm[:, 2],
+        variable_label="load torque [Nm]",
+        velocity_rad_s=np.cos(3 * time_s),
+    )
 
 
-@pytest.mark.parametrize("kind", ["torque", "residual", "gains"])
-def test_a_picture_is_whole_and_the_same_twice(kind: str) -> None:
-    drawn = _draw(kind)
-    assert drawn == _draw(kind)
-    pixels = matplotlib.image.imread(io.BytesIO(drawn))
-    assert pixels.shape[0] > 400
-    assert pixels.shape[1] > 900
-    # Something is drawn: a blank sheet has one colour.
-    assert len(np.unique(np.round(255 * pixels).astype(np.uint8).view(np.uint32))) > 20
+@pytest.mark.parametrize(("kind", "panels"), [("torque", 6), ("residual", 4)])
+def test_a_file_of_drawings_is_whole_and_the_same_twice(kind: str, panels: int) -> None:
+    drawn = sheet(_drawings(kind), "J3 <&> run")
+    assert drawn == sheet(_drawings(kind), "J3 <&> run")
+    assert len(drawn) < 400_000
+    assert b"var(" not in drawn  # not every viewer of pictures knows variables
+    root = ElementTree.fromstring(drawn)
+    inner = [child for child in root if child.tag.endswith("svg")]
+    assert len(inner) == panels
+    places = {(float(one.attrib["x"]), float(one.attrib["y"])) for one in inner}
+    assert len(places) == panels
+    for one in inner:
+        assert float(one.attrib["x"]) + float(one.attrib["width"]) < float(root.attrib["width"])
+        assert float(one.attrib["y"]) + float(one.attrib["height"]) < float(root.attrib["height"])
+
+
+def test_the_picture_of_the_gains_is_whole_and_the_same_twice() -> None:
+    drawn = plot_gains(demo_calibration().gains, dict.fromkeys(AXES, 20.0), title="demo")
+    assert drawn == plot_gains(demo_calibration().gains, dict.fromkeys(AXES, 20.0), title="demo")
+    assert matplotlib.image.imread(io.BytesIO(drawn)).shape[1] > 900
 
 
 @pytest.mark.parametrize("axes", [1, 2, 5, 7])
 def test_any_number_of_axes_has_its_panels(axes: int) -> None:
     time_s = np.arange(50) / 10.0
     torque_nm = np.ones((50, axes))
-    drawn = plot_torques(time_s, torque_nm, torque_nm, tuple(f"J{i}" for i in range(axes)), title="t")
-    assert matplotlib.image.imread(io.BytesIO(drawn)).size > 0
+    drawn = plot_torques(time_s, torque_nm, torque_nm, tuple(f"J{i}" for i in range(axes)))
+    assert len(drawn) == axes
+    ElementTree.fromstring(sheet(drawn, "t"))
 
 
 def test_a_run_of_which_nothing_could_be_used_is_drawn_all_the_same() -> None:
     nothing = np.full((50, 2), np.nan)
-    drawn = plot_torques(np.arange(50) / 10.0, nothing, nothing, ("J1", "J2"), title="t")
-    assert matplotlib.image.imread(io.BytesIO(drawn)).size > 0
+    for one in plot_torques(np.arange(50) / 10.0, nothing, nothing, ("J1", "J2")):
+        assert "nan" not in one.partition("error nan")[2]
 
 
 @pytest.mark.parametrize("samples", [400, 6001, 300_000])
 @pytest.mark.parametrize("place", [0.0, 0.37, 1.0])
-def test_no_peak_and_no_gap_is_lost_on_the_way_to_the_pixels(samples: int, place: float) -> None:
-    time_s, column = np.linspace(0.0, 1.0, samples), np.zeros(samples)
+def test_no_peak_and_no_gap_is_lost_on_the_way_to_the_drawing(samples: int, place: float) -> None:
+    x, column = np.linspace(0.0, 1.0, samples), np.zeros(samples)
     column[round(place * (samples - 1))] = 1.0
     column[round(0.6 * samples) : round(0.7 * samples)] = np.nan
-    figure, ((axes,),) = grid(1, (1.0,), "peak", height_in=3.0)
-    axes.plot(time_s, column, color=ORANGE, linewidth=0.8)
-    axes.set_ylim(-0.5, 1.5)
-    axes.set_xlim(-0.1, 1.1)
-    pixels = matplotlib.image.imread(io.BytesIO(render(figure)))
-    drawn = (pixels[..., 0] > 0.8) & (pixels[..., 2] < 0.5)
-    rows, columns = np.nonzero(drawn.any(axis=1))[0], np.nonzero(drawn.any(axis=0))[0]
-    assert np.ptp(rows) > 0.4 * np.ptp(axes.get_window_extent().get_points()[:, 1])  # up to the peak, half of the panel
-    gaps = np.diff(columns)
-    assert gaps.max() > 0.07 * np.ptp(columns)  # a tenth is left out
-    assert np.count_nonzero(gaps > 2) == 1
+    kept, values = visible(x, column)
+    assert len(kept) <= 3000
+    assert np.all(np.diff(kept) >= 0.0)
+    assert np.nanmax(values) == 1.0
+    assert kept[np.nanargmax(values)] == x[round(place * (samples - 1))]
+    gap = kept[~np.isfinite(values)]
+    assert gap.min() == pytest.approx(0.6, abs=0.01)
+    assert gap.max() == pytest.approx(0.7, abs=0.01)
+    assert not np.any(np.isfinite(values) & (kept > 0.605) & (kept < 0.695))
+
+
+def test_a_chart_draws_its_values_to_scale_and_breaks_at_gaps() -> None:
+    """The scale of y is found from the grid lines of the drawing itself."""
+    values = np.array([0.0, 10.0, np.nan, -10.0])
+    drawn = ElementTree.fromstring(chart((Line(np.arange(4.0), values),), "t", ("x", "y")))
+    down = {float(t.text): float(t.attrib["y"]) - 4 for t in drawn.iter("text") if t.attrib.get("class") == "soft end"
+            and t.text and t.text.lstrip("-").replace(".", "").isdigit()}  # fmt: skip
+    (path,) = drawn.iter("path")
+    pieces = re.findall(r"([ML])([\d.]+) ([\d.]+)", path.attrib["d"])
+    assert [pen for pen, _, _ in pieces] == ["M", "L", "M"]
+    assert [float(y) for _, _, y in pieces] == pytest.approx([down[0.0], down[10.0], down[-10.0]], abs=0.1)
+    x = [float(one) for _, one, _ in pieces]
+    assert (x[1] - x[0]) / (x[2] - x[0]) == pytest.approx(1 / 3, abs=0.01)
 
 
 def test_the_table_says_error_and_truth_within_80_columns() -> None:

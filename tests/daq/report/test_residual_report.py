@@ -183,9 +183,9 @@ def shown(whole_page: str) -> Reader:
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures without content, for tests of the words: to draw those of a page takes longer than all the rest."""
-    for name in ("draw_effect", "draw_torques", "plot_gain_changes", "plot_ranking"):
-        monkeypatch.setattr(residual_page_module, name, lambda *_, **__: b"")
+    """Pages without drawings, for tests of the words."""
+    for name in ("draw_effect", "draw_torques", "plot_ranking"):
+        monkeypatch.setattr(residual_page_module, name, lambda *_, **__: "")
 
 
 def test_the_page_is_self_contained(shown: Reader) -> None:
@@ -196,12 +196,15 @@ def test_the_page_is_self_contained(shown: Reader) -> None:
         assert not any(name.startswith("on") for name in element.attributes)
         for name in ("src", "href", "srcset", "action", "data", "poster"):
             value = element.attributes.get(name)
-            assert value is None or value.startswith("data:image/png;base64,")
+            assert value is None
     style = page.texts[[text.startswith("\n:root") for text in page.texts].index(True)]
     assert "url(" not in style
     assert "@import" not in style
-    assert all(element.attributes.get("alt") for element in page.elements if element.tag == "img")
-    assert sum(element.tag == "img" for element in page.elements) == 5  # effect, torques, gains, two turns
+    assert "img" not in tags
+    drawings = [element for element in page.elements if element.tag == "svg"]
+    assert all(drawing.attributes["aria-label"] for drawing in drawings)
+    # Changes and errors, four of the effect, torques of six axes, gains, two rounds.
+    assert len(drawings) == 2 + 4 + 6 + 1 + 2
 
 
 def test_the_page_says_the_outcome_first(closed: Closed, shown: Reader) -> None:
@@ -214,8 +217,8 @@ def test_the_page_says_the_outcome_first(closed: Closed, shown: Reader) -> None:
     assert first.startswith(
         f"J3 has a spring: the error of J3 on held-out runs falls from {before:.1f} to {after:.1f} % ("
     )
-    assert page.texts.index(first) < page.texts.index("Before and after")
-    assert "These data cannot distinguish it from: load-friction on J2." in page.text
+    assert page.texts.index(first) < page.texts.index("Errors without and with the effects")
+    assert "These data cannot distinguish it from: J2: friction that grows with the load." in page.text
     assert "1.2 Nm on J2" in page.text
     for error in (reported.before.in_sample, reported.after.cross_validated, reported.after.holdout):
         assert f"{error.total:.2f}" in page.texts
@@ -386,7 +389,10 @@ def test_what_did_not_join_is_reported_with_the_reason(closed: Closed) -> None:
     assert any("J2 may have friction that grows with the load: it would" in one for one in sentences)
     assert any("added: spring on J3 explains more." in one for one in sentences)
     assert made.document()["turns"][1]["set_aside"][0]["reason"].endswith("the gain of J4 by 2.9 σ")
-    assert "Not added: smooth-load on J2: it has no name" in Reader(made.page()).text
+    assert (
+        "Not added to J2: a torque that depends on the load torque and that no named effect explains: it has no name"
+        in Reader(made.page()).text
+    )
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -469,7 +475,7 @@ def test_a_folder_that_takes_no_file_is_refused_before_any_work(
 
 @pytest.mark.parametrize("unseen", ["\x1b", "\u202e", "\u2066", "\u200b", "\x00", "\x85", "\u2028", "\ud800"])
 def test_what_is_not_seen_is_spelt_out(unseen: str) -> None:
-    text = page(f"a{unseen}b", [paragraph(f"{unseen}"), table(unseen, [unseen], [[unseen, unseen]])])
+    text = page(f"a{unseen}b", [paragraph(f"{unseen}"), table(unseen, [unseen] * 2, [[unseen, unseen]])])
     assert unseen not in text
     assert f"<title>a\\u{ord(unseen):04x}b</title>" in text
     text.encode()
@@ -505,7 +511,7 @@ def test_a_disk_that_fails_leaves_the_old_report(
 def test_a_disk_that_fails_leaves_the_old_pictures(
     closed: Closed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    old = tmp_path / "torques.png"
+    old = tmp_path / "torques.svg"
     old.write_bytes(b"the old one")
 
     def fail(*arguments: object) -> None:
@@ -519,7 +525,7 @@ def test_a_disk_that_fails_leaves_the_old_pictures(
     assert old.read_bytes() == b"the old one"
     assert list(tmp_path.iterdir()) == [old]
     draw_fit(closed.fitted, calibration, None, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"torques.png", "gains.png", "residual-J3-spring.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {"torques.svg", "gains.png", "residual-J3-spring.svg"}
 
 
 def test_the_verb_writes_the_report_and_says_the_same(

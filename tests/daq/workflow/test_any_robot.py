@@ -192,7 +192,7 @@ def test_a_picture_says_newton_where_the_joint_slides() -> None:
     time_s = np.linspace(0.0, 1.0, 50)
     force = np.stack([np.sin(9 * time_s), np.cos(9 * time_s)], axis=1)
     default, torque, sliding = (
-        plot_torques(time_s, force, 0.9 * force, ("Z", "A"), title="gantry", forces=forces)
+        plot_torques(time_s, force, 0.9 * force, ("Z", "A"), forces=forces)
         for forces in ((), ("Nm", "Nm"), ("N", "Nm"))
     )
     assert default == torque != sliding

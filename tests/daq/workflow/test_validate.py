@@ -45,8 +45,8 @@ def test_text_and_picture(real: tuple[Path, Path], tmp_path: Path, capsys: pytes
     assert next_step(said) == "apply"
     assert f"{load_calibration(file).relative_error_percent.total:.2f}" in text
     assert "seen by the fit" in text
-    assert text.splitlines()[-1] == f"Written: {tmp_path / 'new' / 'folder' / 'tx40.png'}"
-    assert (tmp_path / "new" / "folder" / "tx40.png").read_bytes().startswith(b"\x89PNG")
+    assert text.splitlines()[-1] == f"Written: {tmp_path / 'new' / 'folder' / 'tx40.svg'}"
+    assert (tmp_path / "new" / "folder" / "tx40.svg").read_bytes().startswith(b"<svg")
     (tmp_path / "occupied").write_text("", encoding="utf-8")
     assert main(["validate", str(file), str(log), "--pictures", str(tmp_path / "occupied")]) == 1
     error = capsys.readouterr().err
