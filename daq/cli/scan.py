@@ -95,21 +95,10 @@ def _scale_of(network: CanopenNetwork, axis: Axis) -> ScaleReading | None:
 
 def _fault_of(network: CanopenNetwork, axis: Axis) -> str:
     """Describe the error code (603Fh) of an axis in fault, which its reset clears."""
-    from drivers.canopen.emcy import explain
+    from drivers.canopen.emcy import explain, read_error_code
 
-    code = error_code(network, axis)
+    code = read_error_code(network.link.objects(axis.node_id))
     return "the drive names no error code (603Fh)" if code == 0 else f"{explain(code).hex}: {explain(code).text}"
-
-
-def error_code(network: CanopenNetwork, axis: Axis) -> int:
-    """Read the error code (603Fh) of an axis; 0 where it names none."""
-    from drivers.errors import DriverError
-    from drivers.profiles.profile import ObjectEntry
-
-    try:
-        return network.link.objects(axis.node_id).read(ObjectEntry(0x603F, 0, 16, signed=False))
-    except DriverError:
-        return 0
 
 
 SCAN = Verb("scan", scan_verb, "drivegain scan CELL")

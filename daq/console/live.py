@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from daq.config.cell import Cell
-from daq.console.prediction import Predictor, predictor_of
 from daq.report.bus import ENABLED, FAULTY
 from daq.report.events import event_document
 from daq.workflow.feed import (
@@ -31,6 +30,7 @@ from daq.workflow.feed import (
     sample_dtype,
     socket_names,
 )
+from daq.workflow.prediction import Predictor, predictor_of
 from drivers.profiles.cia402 import decode
 from drivers.stream.sample import EventKind
 from ident.arrays import FloatArray

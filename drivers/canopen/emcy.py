@@ -8,6 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drivers.errors import DriverError
+from drivers.profiles.profile import ObjectEntry
+
+if TYPE_CHECKING:
+    from drivers.canopen.sdo import ObjectAccess
 
 _LINES = Path(__file__).with_name("emcy.txt").read_text(encoding="utf-8").splitlines()
 _TEXTS = {digits: text for digits, _, text in (line.partition(" ") for line in _LINES if not line.startswith("#"))}
@@ -60,3 +67,11 @@ def describe(code: int) -> str:
         if code & mask in CODES and code & mask:
             return f"{CODES[code & mask]} (this code is the maker's)"
     return f"{_TEXTS.get(f'{code >> 12:X}', 'reserved')} (this code is the maker's)"
+
+
+def read_error_code(access: ObjectAccess) -> int:
+    """Read the error code of a drive (603Fh); 0 where it names none or does not answer."""
+    try:
+        return access.read(ObjectEntry(0x603F, 0, 16, signed=False))
+    except DriverError:
+        return 0

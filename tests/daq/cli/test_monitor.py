@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from daq.cli.app import main
-from daq.cli.monitor import _Watch
 from daq.config.bus import answer_us, drive_axes
 from daq.config.cell import Cell, PacingMode, model_of
 from daq.config.cell_file import load_cell
@@ -27,6 +26,7 @@ from daq.report.bus import bus_loads_percent, joint_positions, monitor_document,
 from daq.report.events import event_document
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.feed import Feed, RunFacts
+from daq.workflow.monitor import CellWatch
 from daq.workflow.safeguards import bus_lock, bus_taken
 from drivers.canopen.bus import BusAddress, open_bus
 from drivers.canopen.emcy import explain, remedy_of
@@ -116,9 +116,9 @@ def _watch(
     calibration: Calibration | None = None,
     feed: Feed | None = None,
     cell: Cell = CELL,
-) -> _Watch:
+) -> CellWatch:
     network = cast(CanopenNetwork, Network(_link(bus), drive_axes(CELL)))
-    return _Watch(cell_file, cell, network, feed or Feed(cell_file, stop=None), calibration, None)
+    return CellWatch(cell_file, cell, network, feed or Feed(cell_file, stop=None), calibration, None)
 
 
 def _answers(at_ns: int, cycle: int, silent: int | None = None) -> list[tuple[int, can.Message]]:
@@ -371,8 +371,8 @@ def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong
 ) -> None:
     calibration = predicting_calibration()
     run = _moving(bus, 6.0, factor)
-    monkeypatch.setattr("daq.workflow.safeguards.bus_taken", lambda _cell: True)
-    monkeypatch.setattr("daq.workflow.feed.facts_of_recorder", lambda *_: run)
+    monkeypatch.setattr("daq.workflow.monitor.bus_taken", lambda _cell: True)
+    monkeypatch.setattr("daq.workflow.monitor.facts_of_recorder", lambda *_: run)
     watch = _watch(bus, tmp_path / "cell.yaml", calibration)
     watch.listen(2.0)
     document = [watch.read(0.5) for _ in range(7)][-1]

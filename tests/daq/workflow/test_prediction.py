@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from daq.config.cell import Cell, model_of
-from daq.console.prediction import Predictor
+from daq.config.cell_file import load_cell
 from daq.errors import LogsDiffer
+from daq.workflow.prediction import Predictor
 from daq.workflow.validate import conditioning_of
 from ident.data.dataset import differentiate
 from ident.data.run import Run
@@ -21,6 +22,12 @@ from tests.daq.console.feeds import predicting_calibration
 
 RATE_HZ, SAMPLES = 500.0, 3000
 CYCLES = np.arange(SAMPLES)
+
+
+@pytest.fixture(scope="module")
+def cell(checkout: Path) -> Cell:
+    """The demo cell."""
+    return load_cell(checkout / "configs" / "cells" / "demo.yaml")
 
 
 def _motion(cell: Cell) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,267 @@
+"""The work of `drivegain monitor`: it reads the bus, publishes every sample for consoles, and predicts the currents.
+
+While a recorder of drivegain leads the bus, the recorder's feed names the run: its rate, payload and the scale of its
+currents. Beside another master the rate is counted, and the scale is known only if the drives were queried before.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from math import isfinite, nan
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from daq.config.cell import Cell, PacingMode
+from daq.errors import LogIncomplete
+from daq.log.conversion import scaling
+from daq.log.metadata import AxisReadback, Readback, RunStatistics
+from daq.report.bus import FAULTY, bus_loads_percent, monitor_document
+from daq.report.events import ALARMING
+from daq.workflow.feed import Feed, RunFacts, facts_of_recorder
+from daq.workflow.prediction import Predictor, Recent, predictor_of
+from daq.workflow.safeguards import bus_taken
+from drivers.canopen.emcy import ErrorCode, explain, read_error_code
+from drivers.canopen.network import CanopenNetwork
+from drivers.errors import DriverError
+from drivers.profiles.cia402 import decode
+from drivers.profiles.scale import read_scale
+from drivers.stream.monitor import READING_S, AxisReading, CellMonitor, CellReading, ReadingSource
+from drivers.stream.sample import CellEvent, EventKind, Sample
+from ident.calibration import Calibration
+from ident.errors import IdentificationError
+
+FACTS_S = 0.1  #: Time for a recorder to name its run; it sends to a new console within 20 ms
+KEPT_EVENTS = 5  #: Alarming events, and others
+SAME_RATE = 0.01  #: Largest relative difference at which two rates of SYNC are the same
+CHANGED_RATE = 0.1  #: Relative difference at which it is another one, beside lost SYNCs
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """Origin and scale of the samples; when they change, curves and prediction begin anew."""
+
+    reading: ReadingSource
+    recorded: bool  #: the facts are those of a recorder
+    rate_hz: float | None  #: of the samples, None where a recorder names it
+    ampere: tuple[float | None, ...]
+
+
+class CellWatch:
+    """Reads the bus, publishes every sample, and predicts the currents."""
+
+    def __init__(
+        self,
+        cell_file: Path,
+        cell: Cell,
+        network: CanopenNetwork,
+        feed: Feed,
+        calibration: Calibration | None,
+        payload: str | None,
+    ) -> None:
+        self._cell_file, self._cell, self._network, self._feed = cell_file, cell, network, feed
+        self._calibration, self._payload = calibration, payload
+        offset_ns = time.time_ns() - network.link.clock()
+        self._monitor = CellMonitor(network.link, network.axes, self._take, offset_ns, taken=lambda: bus_taken(cell))
+        self._ampere: list[float | None] = [None] * len(network.axes)
+        self._events: deque[CellEvent] = deque(maxlen=KEPT_EVENTS)
+        self._alarms: deque[CellEvent] = deque(maxlen=KEPT_EVENTS)  # which other events do not displace
+        self._unscaled = set(range(len(network.axes)))  # axes whose scale was not asked for yet
+        self._lockstep = cell.sync is not None and cell.sync.pacing is PacingMode.LOCKSTEP
+        self._codes: dict[int, int] = {}  # last error code of each axis that is in fault
+        self._facts: RunFacts | None = None
+        self._source: _Source | None = None
+        self._samples: list[Sample] = []  # since the last reading
+        self._count, self._missing = 0, [0] * len(network.axes)
+        self._cycles = range(0)  # of the run so far
+        self._predictor: Predictor | None = None
+        self._recent: Recent | None = None
+        self._remark = ""
+        self._sync_hz = 0.0  # of the last reading
+
+    def listen(self, seconds: float) -> None:
+        """Listen for another master; its samples count for the first reading."""
+        reading = self._monitor.watch(seconds)
+        # At the start a node's presence is no news; an error is.
+        events = tuple(event for event in reading.events if event.kind is not EventKind.NMT)
+        self._take_events(events, reading)
+        self._follow(reading, bus_taken(self._cell))
+
+    def read(self, interval_s: float) -> dict[str, Any]:
+        """Read the bus for a time; returns the document of what is shown."""
+        reading = self._monitor.watch(interval_s)
+        self._take_events(reading.events, reading)
+        recorder = bus_taken(self._cell)
+        if not recorder:
+            self._query(reading)
+        self._follow(reading, recorder)
+        self._predict()
+        return monitor_document(
+            self._cell,
+            reading,
+            self._ampere,
+            sorted((*self._alarms, *self._events), key=lambda event: event.time_ns),
+            faults=self._faults(),
+            recorder=recorder,
+            prediction=self._prediction(),
+        )
+
+    def _take(self, sample: Sample) -> None:
+        self._samples.append(sample)
+        self._cycles = range(self._cycles.start if self._count else sample.cycle, sample.cycle + 1)
+        self._count += 1
+        for axis in range(len(self._missing)):
+            self._missing[axis] += sample.missing >> axis & 1
+        if self._facts is not None:
+            self._feed.sample(sample)
+
+    def _take_events(self, events: tuple[CellEvent, ...], reading: CellReading) -> None:
+        for event in events:
+            if event.kind is EventKind.BUS_BUSY:
+                continue  # another master is no event here: the head line names it
+            (self._alarms if event.kind in ALARMING else self._events).append(event)
+            if event.axis is not None and event.kind in (EventKind.EMCY, EventKind.EMCY_RESET):
+                self._codes[event.axis] = event.code if event.kind is EventKind.EMCY else 0
+            if self._facts is not None:
+                self._feed.event(event)
+        for number, axis in enumerate(reading.axes):
+            if not _in_fault(axis):
+                self._codes.pop(number, None)
+
+    def _query(self, reading: CellReading) -> None:
+        """On a quiet bus, read the current's scale of each axis once, and the error code of an axis in fault."""
+        asked = reading.source is ReadingSource.ASKED
+        for number, (axis, found) in enumerate(zip(self._network.axes, reading.axes, strict=True)):
+            if not asked or found.rate_hz == 0.0:
+                continue
+            if number in self._unscaled:
+                self._unscaled.remove(number)
+                self._monitor.pause()
+                with suppress(DriverError):  # its current stays a raw number, and is shown as one
+                    access = self._network.link.objects(axis.node_id)
+                    self._ampere[number] = read_scale(access, axis.profile).ampere_per_unit
+            if _in_fault(found) and number not in self._codes:
+                self._monitor.pause()
+                self._codes[number] = read_error_code(self._network.link.objects(axis.node_id))
+                self._publish_fault(number)
+
+    def _publish_fault(self, axis: int) -> None:
+        """Show an error to the console that it cannot know: of before the run, or read from the drive."""
+        code = self._codes[axis]
+        if code and self._facts is not None:
+            text = f"in fault: {explain(code).hex} {explain(code).text}"
+            self._feed.event(CellEvent(time.time_ns(), axis, EventKind.EMCY, code, text))
+
+    def _faults(self) -> dict[str, ErrorCode]:
+        return {self._cell.axis_names[axis]: explain(code) for axis, code in self._codes.items() if code}
+
+    def _follow(self, reading: CellReading, recorder: bool) -> None:
+        """Begin anew where the source of the samples has changed."""
+        if reading.source is ReadingSource.OVERHEARD and reading.sync_hz == 0.0:
+            self._facts, self._source, self._remark = None, None, "no prediction: there is no SYNC"
+            self._samples.clear()
+            return
+        recorder = recorder and reading.source is ReadingSource.OVERHEARD
+        recorded = self._source is not None and self._source.recorded and recorder
+        run = facts_of_recorder(self._cell_file, FACTS_S) if recorder and not recorded else None
+        if run is not None:
+            self._ampere = [value if isfinite(value) else None for value in run.current_per_unit]
+        recorded = recorded or run is not None
+        rate_hz = None if recorded else self._rate_hz(reading)
+        source = _Source(reading.source, recorded, rate_hz, tuple(self._ampere))
+        if source == self._source or (rate_hz is None and not recorded):
+            return
+        if self._source is not None:
+            self._samples.clear()  # they are of another rate
+        self._source = source
+        try:
+            self._begin(self._own_facts(reading, rate_hz or 0.0) if run is None else replace(run, log=None, moves=0))
+        except LogIncomplete as error:
+            self._facts, self._remark = None, str(error)
+
+    def _rate_hz(self, reading: CellReading) -> float | None:
+        """Rate of the samples; None where SYNC began or changed within a reading, whose count is then not its rate."""
+        if reading.source is ReadingSource.ASKED:
+            return 1.0 / READING_S
+        sync = self._cell.sync
+        declared_hz = 0.0 if sync is None else 1e6 / sync.period_us
+        if self._lockstep:
+            return declared_hz
+        before_hz, self._sync_hz = self._sync_hz, reading.sync_hz
+        counting_hz = 2.0 / reading.seconds  # error of a count of SYNCs
+        known = self._source
+        known_hz = None if known is None or known.reading is not reading.source else known.rate_hz
+        if known_hz is not None and abs(reading.sync_hz - known_hz) < CHANGED_RATE * known_hz + counting_hz:
+            return known_hz
+        if before_hz == 0.0 or abs(reading.sync_hz - before_hz) > SAME_RATE * before_hz + counting_hz:
+            return None
+        same = abs(reading.sync_hz - declared_hz) < SAME_RATE * declared_hz + counting_hz
+        return declared_hz if same else reading.sync_hz
+
+    def _own_facts(self, reading: CellReading, rate_hz: float) -> RunFacts:
+        """Facts of a run that no recorder names."""
+        units = (nan if ampere is None else ampere for ampere in self._ampere)
+        answers = zip(self._cell.axis_names, units, strict=True)
+        scale = scaling(self._cell, Readback(tuple(AxisReadback(name, unit) for name, unit in answers)))
+        loads = zip(self._cell.buses, bus_loads_percent(self._cell, reading), strict=True)
+        return RunFacts(
+            run_id="monitor",
+            log=None,
+            axes=self._cell.axis_names,
+            rate_hz=rate_hz,
+            moves=0,
+            rad_per_count=scale.rad_per_count.tolist(),
+            current_per_unit=scale.current_per_unit.tolist(),
+            to_joint=scale.to_joint.tolist(),
+            offset_rad=scale.offset_rad.tolist(),
+            payload=self._payload,
+            bus_load={bus.name: load / 100.0 for bus, load in loads},
+        )
+
+    def _begin(self, facts: RunFacts) -> None:
+        """Publish a run and begin its prediction."""
+        self._monitor.period_ns = None if self._lockstep else round(1e9 / facts.rate_hz)
+        self._facts, self._count, self._missing = facts, 0, [0] * len(facts.axes)
+        self._feed.begin(facts, self._statistics)
+        for axis in self._codes:
+            self._publish_fault(axis)
+        self._predictor = self._recent = None
+        if self._calibration is not None:
+            self._predictor, self._remark = predictor_of(self._calibration, self._cell, facts)
+            self._recent = None if self._predictor is None else Recent(self._predictor.rows_hz)
+
+    def _statistics(self) -> RunStatistics:
+        return RunStatistics(self._count, len(self._cycles) - self._count, tuple(self._missing), valid=True)
+
+    def _predict(self) -> None:
+        """Take the samples of a reading."""
+        whole = [sample for sample in self._samples if sample.missing == 0]
+        self._samples.clear()
+        if self._predictor is None or self._recent is None or self._facts is None or not whole:
+            return
+        scale = self._facts.scaling
+        position = scale.joint_position(np.array([sample.position_counts for sample in whole], dtype=np.int64))
+        current = np.array([sample.current_raw for sample in whole]) * scale.current_per_unit
+        try:
+            for rows in self._predictor.take(np.array([sample.cycle for sample in whole]), position, current):
+                self._recent.add(rows)
+        except IdentificationError as error:
+            self._predictor, self._remark = None, f"no prediction: {error}"
+
+    def _prediction(self) -> dict[str, Any] | None:
+        if self._calibration is None:
+            return None
+        axes = [] if self._recent is None or self._facts is None else [asdict(one) for one in self._recent.axes()]
+        return {
+            "payload": self._payload if self._facts is None else self._facts.payload,
+            "remark": self._remark,
+            "axes": axes,
+        }
+
+
+def _in_fault(axis: AxisReading) -> bool:
+    return axis.statusword is not None and decode(axis.statusword) in FAULTY
