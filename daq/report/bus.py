@@ -258,10 +258,10 @@ def monitor_view(document: dict[str, Any]) -> Group:
     head = Text(printable(f"{document['cell']}: {_SOURCE_TEXT[source]}"))
     loads = ", ".join(f"{printable(bus['bus'])} {bus['load_percent']:.1f} % at worst" for bus in document["buses"])
     load = Text(f"{loads}, {document['frames_per_s']:.0f} frames/s, SYNC {document['sync_hz']:.1f} Hz")
-    return Group(head, table, load, *_prediction_view(document), *faults, *map(_notice, document["notices"]))
+    return Group(head, table, load, *prediction_view(document), *faults, *map(_notice, document["notices"]))
 
 
-def _prediction_view(document: dict[str, Any]) -> Iterator[RenderableType]:
+def prediction_view(document: dict[str, Any]) -> Iterator[RenderableType]:
     """Measured beside predicted current, or why there is none; nothing without a calibration."""
     if document["prediction"] is None:
         return

@@ -14,6 +14,7 @@ from pydantic import Field
 
 from daq.config.yaml_file import StrictModel
 from daq.jobs.session import SessionState
+from daq.report.bus_schemas import ErrorCodeReport, MonitorReport
 from daq.report.controller_schemas import (
     CertificateReport,
     DriveChange,
@@ -444,6 +445,8 @@ class DemoReport(StrictModel):
 REPORTS: dict[str, Any] = {
     "demo": DemoReport,
     "scan": ScanReport,
+    "monitor": MonitorReport,
+    "explain-emcy": ErrorCodeReport,
     "plan": PlanReport,
     "record": RecordReport,
     "fit": FitReport | CasesReport,

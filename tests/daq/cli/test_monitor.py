@@ -23,6 +23,7 @@ from daq.config.cell import Cell, PacingMode, model_of
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
 from daq.report.bus import bus_loads_percent, joint_positions, monitor_document, monitor_view
+from daq.report.bus_schemas import MonitorReport
 from daq.report.events import event_document
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.feed import Feed, RunFacts
@@ -378,6 +379,7 @@ def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong
     document = [watch.read(0.5) for _ in range(7)][-1]
     assert document["recorder"]
     assert document["prediction"] == {"payload": None, "remark": ""}
+    MonitorReport.model_validate(document)
     predictions = [axis["prediction"] for axis in document["axes"]]
     assert [found["conspicuous"] for found in predictions] == [False, False, False, factor > 1.0, False, False]
     for number, found in enumerate(predictions):
@@ -428,6 +430,7 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
     watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), feed)
     watch.listen(QUIET_S)
     document = watch.read(0.5)
+    MonitorReport.model_validate(document)
     assert document["source"] == "asked"
     assert "10 positions a second are too few" in document["prediction"]["remark"]
     assert [axis["prediction"] for axis in document["axes"]] == [None] * 6

@@ -6,7 +6,7 @@ import ast
 import io
 import re
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,6 +28,7 @@ from daq.ledger.watch import Series, watch
 from daq.report import bus, fit, fleet, gains, history, paper_tables, proposal, residual, urdf, validation, weighing
 from daq.report.log import log_lines
 from daq.report.text import WholeTable
+from daq.workflow.prediction import RecentCurrent
 from daq.workflow.validate import DataUse
 from daq.writeback.request import GainChange
 from ident.calibration import Gain
@@ -82,13 +83,17 @@ def _monitor(cell: Cell, _: Any) -> Iterator[RenderableType]:
         "current_a": -12.345,
         "state": "FAULT REACTION ACTIVE",
         "enabled": True,
+        "in_fault": True,
+        "fault": None,
         "silent": False,
         "rate_hz": 1000.1,
         "lost": 12345678,
+        "prediction": asdict(RecentCurrent(-12.345, -11.234, 0.123, 1.234, 0.99, True)),
     }
     axes = [{"axis": name, "position": -179.123 - n, **axis} for n, name in enumerate(AXES)]
-    document = {"cell": "demo", "source": "asked", "recorder": False, "axes": axes, "events": [], "buses": []}
-    yield bus.monitor_view({**document, "frames_per_s": 12345.0, "sync_hz": 1000.0})
+    document = {"cell": "demo", "source": "asked", "recorder": False, "axes": axes, "notices": [], "buses": []}
+    known = {"prediction": {"payload": "disc", "remark": ""}, "frames_per_s": 12345.0, "sync_hz": 1000.0}
+    yield bus.monitor_view({**document, **known})
 
 
 def _comparison(cell: Cell, _: Any) -> Iterable[RenderableType]:
@@ -207,6 +212,7 @@ def _paper(cell: Cell, _: Any) -> Iterator[RenderableType]:
 
 EXAMPLES: dict[str, Callable[[Cell, Any], Iterable[RenderableType]]] = {
     "bus.monitor_view": _monitor,
+    "bus.prediction_view": _monitor,
     "bus.scan_table": _scan,
     "fit.comparison_tables": _comparison,
     "fit.error_table": lambda _cell, _: [fit.error_table("Error", AXES, {"held out, before": ERROR})],

@@ -1,0 +1,97 @@
+"""JSON Schema of what `monitor` and `explain-emcy` print under `--json`."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from daq.config.yaml_file import StrictModel
+
+
+class ErrorCodeEntry(StrictModel):
+    """An error code of EMCY or 603Fh in words."""
+
+    code: int
+    hex: str
+    text: str
+    remedy: str
+
+
+class ErrorCodeReport(ErrorCodeEntry):
+    """`explain-emcy`."""
+
+    standard: bool = Field(description="whether CiA 301 or CiA 402 names it; else its class is described")
+
+
+class PredictedCurrent(StrictModel):
+    """Current of one axis by a calibration [A], half a second ago, filtered as in the fit."""
+
+    measured: float | None = Field(description="null at standstill, or where the scale of the current is unknown")
+    predicted: float | None = Field(description="null at standstill")
+    band: float = Field(description="twice the calibration's error")
+    residual_rms: float | None = Field(description="over the last 10 s of motion")
+    outside_share: float = Field(description="share of that time in which the residual is outside the band")
+    conspicuous: bool = Field(description="it is outside for more than half of at least 2 s of motion")
+
+
+class MonitoredAxis(StrictModel):
+    """One axis."""
+
+    axis: str
+    node_id: int
+    position: float | None
+    unit: str = Field(description="of the position")
+    position_counts: int | None
+    current_a: float | None
+    current_raw: int | None
+    state: str | None = Field(description="state of CiA 402")
+    enabled: bool | None = Field(description="whether the motor has torque")
+    in_fault: bool
+    statusword: int | None
+    nmt: str | None = Field(description="NMT state of CiA 301")
+    rate_hz: float = Field(description="of complete answers")
+    lost: int = Field(description="SYNCs or requests without an answer")
+    silent: bool
+    fault: ErrorCodeEntry | None = Field(description="of an axis in fault, where its code is known")
+    prediction: PredictedCurrent | None
+
+
+class MonitoredBus(StrictModel):
+    """Load of one bus."""
+
+    bus: str
+    load_percent: float = Field(description="with every frame as long as bit stuffing can make it")
+
+
+class PredictionState(StrictModel):
+    """Premise of the predicted currents."""
+
+    payload: str | None
+    remark: str = Field(description="why there are none; empty if there are")
+
+
+class Notice(StrictModel):
+    """A recent event."""
+
+    axis: str | None
+    kind: str
+    code: int
+    text: str
+    remedy: str
+    alarm: bool
+
+
+class MonitorReport(StrictModel):
+    """`monitor`."""
+
+    cell: str
+    source: str = Field(description="asked, or overheard while another master leads the bus")
+    recorder: bool = Field(description="whether a recording or job of drivegain has the bus")
+    seconds: float
+    sync_hz: float
+    frames_per_s: float
+    bus_load_percent: float = Field(description="of the most loaded bus")
+    buses: list[MonitoredBus]
+    axes: list[MonitoredAxis]
+    prediction: PredictionState | None = Field(description="null without --calibration")
+    events: list[str] = Field(description="texts of recent events")
+    notices: list[Notice] = Field(description="the same events with what to do")
