@@ -132,7 +132,7 @@ def _say_next(cell: Path, declared: Cell, plan: Path, out: Path, carried: Payloa
 
 
 def _before_motion(cell: Cell, plan: Path, not_weighed: bool, allowed_by: str | None) -> Iterator[str]:
-    """What a person should know before the axes move; ``allowed_by`` is what in the cell file allows it."""
+    """Remarks for a person before the axes move; ``allowed_by`` is what in the cell file allows the motion."""
     from daq.report.bus import load_lines
     from daq.report.plan_preview import find_preview
 

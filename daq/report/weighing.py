@@ -1,4 +1,4 @@
-"""What was weighed on the flange, and contacts: tables, documents and the picture of external torques."""
+"""A body weighed on the flange, and contacts: tables, documents and the picture of external torques."""
 
 from __future__ import annotations
 

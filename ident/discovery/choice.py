@@ -1,4 +1,4 @@
-"""What the choice of effects adds to σ: rivals of those that joined, and those that stayed out.
+"""Share of the choice of effects in σ: rivals of those that joined, and those that stayed out.
 
 The covariance of a joint fit takes its effects as given. But the search has chosen them, on the same data. Another
 model r could be the true one. It would put the gains and parameters θ at θ_r, and averaged over the models (Buckland,

@@ -264,7 +264,7 @@ def _proposals(
 
 
 def _first_of_axis(aside: Sequence[SetAside], new: SetAside) -> tuple[SetAside, ...]:
-    """What runs left out refuse, unless a better finding of its kind on this axis was set aside before."""
+    """Finding that runs left out refuse, unless a better finding of its kind on this axis was set aside before."""
     kind = new.finding.axis, is_unnamed(new.finding.effect)
     return () if kind in {(one.finding.axis, is_unnamed(one.finding.effect)) for one in aside} else (new,)
 

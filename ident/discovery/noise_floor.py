@@ -65,7 +65,7 @@ _MEDIAN_EFFICIENCY = 2.0 / np.pi  #: Efficiency of a median of many against thei
 
 
 class FloorSource(Enum):
-    """What a noise floor is measured on."""
+    """Rows that a noise floor is measured on."""
 
     STANDSTILL = "standstill"
     REPEATED_MOVES = "repeated moves"

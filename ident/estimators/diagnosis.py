@@ -1,4 +1,4 @@
-"""What is wrong with a recording, by run, channel or axis, before any of its numbers is believed.
+"""Faults of a recording, by run, channel or axis, before any of its numbers is believed.
 
 A fit may end with small deviations and be wrong: a payload turned between two runs, two currents exchanged, mA read as
 A. Each mistake leaves a trace of its own. `diagnose` looks for them in the equations of a fit; `exchanged_channels`

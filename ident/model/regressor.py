@@ -227,7 +227,7 @@ def _move(
 
 
 def _borne(link: _Link, wrench: FloatArray, position: FloatArray) -> FloatArray:
-    """What a link's wrench is at its parent, shape (6, k): the transpose of `_move`."""
+    """A link's wrench at its parent, shape (6, k): the transpose of `_move`."""
     n, f = (wrench if link.back is None else link.back.T @ wrench).reshape(2, 3, -1)
     if link.revolute:
         c, s = cos_sin(position)

@@ -39,7 +39,7 @@ CASES = tuple(EffectCase(f"{count}-effects", SEED, EFFECTS[:count]) for count in
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """What one whole command took."""
+    """Time and memory of one whole command."""
 
     seconds: float  #: of processor time
     peak_mb: float  #: largest resident memory

@@ -38,7 +38,7 @@ def late(small_runs: tuple[ident.Run, ...]) -> tuple[ident.Run, ...]:
 
 @pytest.fixture(scope="module")
 def searched(small_truth: Truth, late: tuple[ident.Run, ...]) -> tuple[ident.Identification, tuple[ident.Step, ...]]:
-    """What was identified first, and the turns of the search."""
+    """First estimate, and the turns of the search."""
     found = ident.identify(small_truth.model, late[:3], Conditioning(), holdout=late[3:])
     families = ((TimeSkew(),), (Coupling(2, 1), Coupling(3, 1)))
     evidence = ident.gather(found, late[:3], late[3:])

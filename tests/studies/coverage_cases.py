@@ -57,7 +57,7 @@ EFFECTS = tuple(chain.from_iterable(SINGLE_EFFECTS))
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What differs from case to case.
+    """World, motion and search of a case.
 
     Attributes:
         world: of WORLDS.

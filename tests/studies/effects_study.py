@@ -390,7 +390,7 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
 
 
 def _structures_of(row: Row) -> tuple[str, ...]:
-    """What the removed effect may be called."""
+    """Names that the removed effect may be given."""
     family, axis = row.true[0].split(" on ")
     return tuple(f"{variable} on {axis}" for variable in VARIABLES[family])
 

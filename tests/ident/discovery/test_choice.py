@@ -1,4 +1,4 @@
-"""What the choice of effects adds to σ: against refits with a rival, and with an effect that stayed out."""
+"""Share of the choice of effects in σ: against refits with a rival, and with an effect that stayed out."""
 
 from __future__ import annotations
 
