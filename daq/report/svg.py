@@ -19,6 +19,7 @@ from ident.arrays import FloatArray
 
 _WIDTH, _ROW, _TOP, _FOOT = 360.0, 25.0, 6.0, 36.0
 _LEFT, _RIGHT = 46.0, 96.0  #: Room for the names and for the numbers
+_LETTER, _LONGEST = 8.5, 170.0  #: Width of a letter of a name, and of a name at most
 _ROOM = 1.12  #: Length of a scale over the largest value on it
 
 
@@ -47,7 +48,7 @@ def intervals(rows: Sequence[Interval], title: str, unit: str) -> str:
     to_scale = bounds == 0.0 or reach >= 0.1 * bounds
     # Below 0.1 a scale would only magnify noise.
     extent = _ROOM * max(reach, bounds if to_scale else 0.0, 0.1)
-    scale = _Scale(-extent, extent, len(rows))
+    scale = _Scale(-extent, extent, len(rows), _room(row.name for row in rows))
     parts = [*scale.frame(unit), _line(scale.x(0.0), _TOP, scale.x(0.0), scale.bottom, "zero")]
     for number, row in enumerate(rows):
         y = scale.y(number)
@@ -64,10 +65,10 @@ def intervals(rows: Sequence[Interval], title: str, unit: str) -> str:
         if math.isfinite(row.value):
             parts.append(_line(scale.x(row.value - row.half), y, scale.x(row.value + row.half), y, "bar"))
             parts.append(_dot(scale.x(row.value), y, "dot"))
-        parts += [_text(0, y + 4, row.name), _text(_WIDTH, y + 4, row.label, "end")]
+        parts += [_name(y + 4, row.name), _text(_WIDTH, y + 4, row.label, "end")]
     if not to_scale:
         parts += [
-            _text(_LEFT, scale.bottom + 47, "◂ limit", "soft"),
+            _text(scale.left, scale.bottom + 47, "◂ limit", "soft"),
             _text(scale.right, scale.bottom + 47, "limit ▸", "soft end"),
         ]
     return _drawing(parts, title, scale.bottom + _FOOT + (0.0 if to_scale else 17.0))
@@ -75,7 +76,8 @@ def intervals(rows: Sequence[Interval], title: str, unit: str) -> str:
 
 def before_after(rows: Sequence[tuple[str, float, float]], title: str, unit: str) -> str:
     """Draw each value before (hollow) and after (full), from zero; NaN for one that is not known."""
-    scale = _Scale(0.0, _ROOM * max(_largest([v for _, *both in rows for v in both]), 1e-9), len(rows))
+    most = _ROOM * max(_largest([v for _, *both in rows for v in both]), 1e-9)
+    scale = _Scale(0.0, most, len(rows), _room(name for name, *_ in rows))
     parts = list(scale.frame(unit))
     for number, (name, before, after) in enumerate(rows):
         y = scale.y(number)
@@ -87,7 +89,7 @@ def before_after(rows: Sequence[tuple[str, float, float]], title: str, unit: str
         if math.isfinite(after):
             parts.append(_dot(scale.x(after), y, "dot"))
         label = " → ".join(f"{value:.2f}" for value in known) or "-"
-        parts += [_text(0, y + 4, name), _text(_WIDTH, y + 4, label, "end")]
+        parts += [_name(y + 4, name), _text(_WIDTH, y + 4, label, "end")]
     return _drawing(parts, title, scale.bottom + _FOOT)
 
 
@@ -272,6 +274,18 @@ def _ticks(low: float, high: float) -> Iterator[float]:
     step = next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if power * factor >= raw)
     for number in range(math.ceil(low / step), math.floor(high / step) + 1):
         yield round(number * step, 12)
+
+
+def _room(names: Iterable[str]) -> float:
+    """Room to the left of a scale for the names of its rows."""
+    return max(_LEFT, min(_LETTER * max(map(len, names), default=0), _LONGEST) + 10.0)
+
+
+def _name(y: float, name: str) -> str:
+    """Name of a row; one that is too long for its room is drawn narrower, not cut."""
+    drawn = _text(0, y, name)
+    narrow = f'<text textLength="{_LONGEST:g}" lengthAdjust="spacingAndGlyphs"'
+    return drawn.replace("<text", narrow, 1) if _LETTER * len(name) > _LONGEST else drawn
 
 
 def _largest(values: Iterable[float]) -> float:
