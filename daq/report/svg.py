@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from textwrap import wrap
 
 import numpy as np
 
@@ -202,13 +203,22 @@ def _points(x: FloatArray, y: FloatArray) -> str:
 
 def ranking(rows: Sequence[tuple[str, float, str]], title: str, unit: str) -> str:
     """Draw bars under their names. A row: name, length, and CSS class: full, alike, empty."""
-    scale = _Scale(0.0, _ROOM * max(_largest(length for _, length, _ in rows), 1e-9), 2 * len(rows), 8.0, 60.0)
-    parts = list(scale.frame(unit))
-    for number, (name, length, kind) in enumerate(rows):
-        y = scale.y(2 * number)
+    names = [wrap(name, round((_WIDTH - 8.0) / _LETTER)) for name, _, _ in rows]
+    lines = sum(map(len, names))
+    longest = _ROOM * max(_largest(length for _, length, _ in rows), 1e-9)
+    scale = _Scale(0.0, longest, (17.0 * lines + 25.0 * len(rows)) / _ROW, 8.0, 60.0)
+    parts, y = list(scale.frame(unit)), _TOP
+    for words, (_, length, kind) in zip(names, rows, strict=True):
+        for line in words:
+            y += 17.0
+            parts.append(_text(0, y - 3, line))
         width = max(scale.x(max(length, 0.0)) - scale.x(0.0), 1.0)
-        bar = f'<rect class="{kind}" x="{scale.x(0.0):.1f}" y="{y + 9:.1f}" width="{width:.1f}" height="14"/>'
-        parts += [_text(0, y + 3, name), bar, _text(scale.x(0.0) + width + 5, y + 21, f"{length:.3g}", "soft")]
+        number = f"{length:.0f}" if abs(length) >= 100.0 else f"{length:.3g}"
+        parts.append(
+            f'<rect class="{kind}" x="{scale.x(0.0):.1f}" y="{y + 2:.1f}" width="{width:.1f}" height="14"/>'
+            + _text(scale.x(0.0) + width + 5, y + 14, number, "soft")
+        )
+        y += 25.0
     return _drawing(parts, title, scale.bottom + _FOOT)
 
 
@@ -240,7 +250,7 @@ class _Scale:
 
     low: float
     high: float
-    rows: int
+    rows: float
     left: float = _LEFT
     room: float = _RIGHT
 
@@ -255,7 +265,7 @@ class _Scale:
     def x(self, value: float) -> float:
         return self.left + (value - self.low) / (self.high - self.low) * (self.right - self.left)
 
-    def y(self, row: int) -> float:
+    def y(self, row: float) -> float:
         return _TOP + _ROW * (row + 0.5)
 
     def frame(self, unit: str) -> Iterator[str]:

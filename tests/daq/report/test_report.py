@@ -16,7 +16,7 @@ from rich.console import Console
 
 from daq.report.gains import gain_table, plot_gains, torque_sentences, with_deviation
 from daq.report.plots import plot_residual, plot_torques
-from daq.report.svg import Line, before_after, chart, sheet, visible
+from daq.report.svg import Line, before_after, chart, ranking, sheet, visible
 from ident.calibration import Gain
 from ident.data.torque_channel import TorqueSlope
 from tests.daq.calibrations import AXES, demo_calibration
@@ -121,6 +121,16 @@ def test_a_name_of_any_length_leaves_the_scale_free() -> None:
         left = min(float(one.attrib["x1"]) for one in drawn.iter("line"))
         (shown,) = (one for one in drawn.iter("text") if one.text == name)
         assert float(shown.attrib.get("textLength", 8.5 * len(name))) < left
+
+
+def test_no_word_of_a_ranking_is_cut_off() -> None:
+    name = "J3: a torque that depends on the predicted current and that no named effect explains"
+    drawn = ElementTree.fromstring(ranking([(name, 5846.2, "full"), ("J2: a spring", 3.2, "empty")], "t", "%"))
+    width, height = map(float, drawn.attrib["viewBox"].split()[2:])
+    texts = [(one.text or "", float(one.attrib["x"]), float(one.attrib["y"])) for one in drawn.iter("text")]
+    assert " ".join(text for text, _, _ in texts if text in name) == name
+    assert all(8.5 * len(text) + x <= width and y <= height for text, x, y in texts if text in name)
+    assert {"5846", "3.2"} <= {text for text, _, _ in texts}
 
 
 def test_the_table_says_error_and_truth_within_80_columns() -> None:
