@@ -300,11 +300,13 @@ function addEvents(events) {
 function table(headings, rows) {
   const made = element("table");
   const head = element("tr");
-  headings.forEach((text) => head.append(element("th", text)));
+  // A column of words is aligned to the left, one of numbers to the right.
+  const kinds = headings.map((_, k) => (rows.every((row) => /^[-+–\d]/.test(row[k])) ? "" : "text"));
+  headings.forEach((text, k) => head.append(element("th", text, kinds[k])));
   made.append(head);
   for (const row of rows) {
     const line = element("tr");
-    row.forEach((text) => line.append(element("td", text)));
+    row.forEach((text, k) => line.append(element("td", text, k ? kinds[k] : "")));
     made.append(line);
   }
   const box = element("div", undefined, "table");
@@ -324,8 +326,8 @@ function utc(iso) {
 function showResults(found) {
   const parts = found.problems.map((text) => prose("p", text, "alarm"));
   if (found.gains) {
-    parts.push(element("h3", `Gains of ${found.gains.file}, fitted ${utc(found.gains.created)}`));
-    parts.push(table(["axis", "gain ± σ", "since nameplate", `error, ${found.gains.error}`],
+    parts.push(element("h3", `Gains of ${found.gains.file}, fitted ${utc(found.gains.created)}; error on ${found.gains.error}`));
+    parts.push(table(["axis", "gain ± σ", "since nameplate", "error"],
       found.gains.axes.map((one) => [one.axis, `${withDeviation(one.value, one.std)} ${one.unit}`,
         signed(one.change_percent, 2, "%"), `${number(one.error_percent, 2)} %`])));
   } else parts.push(prose("p", "No calibration yet. After the recordings: `drivegain fit LOG … --out calibration.yaml`"));
@@ -339,14 +341,19 @@ function showResults(found) {
   if (found.session) {
     const { session } = found;
     parts.push(element("h3", `Scheduled recalibration ${session.session}: ${session.outcome}`));
-    if (session.waits) parts.push(element("p", "A proposal waits for approval. Type in a terminal:", "alarm"));
-    else if (session.problem) parts.push(element("p", session.problem));
     session.sentences.forEach((text) => parts.push(element("p", text)));
-    if (session.to_do.length) parts.push(element("pre", session.to_do.join("\n")));
+    if (session.waits) parts.push(element("p", "A proposal waits for approval. Type in a terminal:", "alarm"));
+    else if (session.problem) parts.push(prose("p", session.problem));
+    for (const text of session.to_do) {
+      // A line is words, a command, or words before a command; one between back quotes is part of the words.
+      const [, words, command] = /^(.*?)((?<!`)drivegain [^`]*)?$/.exec(text);
+      if (words) parts.push(prose("p", words));
+      if (command) parts.push(element("pre", command));
+    }
   }
   if (found.history) {
     parts.push(element("h3", `History: ${found.history.calibrations} calibrations`));
-    parts.push(table(["axis", "since the baseline", "σ", "drift"], found.history.axes.map((one) => [one.axis,
+    parts.push(table(["axis", "since baseline", "in σ", "drift"], found.history.axes.map((one) => [one.axis,
       signed(one.change_percent, 2, "%"), one.change_sigmas === null ? "–" : number(Math.abs(one.change_sigmas), 1),
       one.alarm || "none"])));
     parts.push(element("pre", found.history.command));

@@ -211,7 +211,7 @@ def _write(certificate: Certificate) -> str:
         return section("What would be written", paragraph(f"Nothing: {edit.file.name} has these gains already."))
     rows = [(one.axis, one.key, str(one.line), f"{one.old:.9g}", one.spelling or "-") for one in edit.changes]
     return section(
-        f"What would be written into {edit.file.name}",
+        f"What would be written into {'/'.join(edit.file.parts[-2:])}",
         table("", ("axis", "key", "line", "now", "new"), rows),
         paragraph("This page writes nothing."),
     )

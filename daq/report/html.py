@@ -90,7 +90,7 @@ summary:focus-visible { outline: 3px solid var(--data); }
   .words, .words tbody { display: block; } .words thead { display: none; }
   .words tr { display: grid; grid-template-columns: 7.2rem 1fr; gap: 0 1rem; padding: 0.4rem 0;
     border-bottom: 1px solid var(--line); }
-  .words th, .words td { border: 0; padding: 0; text-align: left; white-space: normal; }
+  .words th, .words td { border: 0; padding: 0; text-align: left; white-space: normal; overflow-wrap: anywhere; }
   .words td:last-child { grid-area: 1 / 2; }
   .words td:not(:last-child)::before { content: attr(data-name); display: block; color: var(--soft);
     font-size: 0.9rem; }

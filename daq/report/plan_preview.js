@@ -6,6 +6,7 @@ const byId = id => document.getElementById(id);
 const arm = byId("arm"), slider = byId("time"), last = data.time_s.length - 1;
 const dark = matchMedia("(prefers-color-scheme: dark)");
 const VIEWS = {home: [-0.7, 0.45], x: [Math.PI / 2, 0], y: [0, 0], z: [0, Math.PI / 2]};
+const FONT = "14px system-ui, sans-serif";
 let [yaw, pitch] = VIEWS.home, zoom = 1, running = false, at = 0, before = 0, sweptKey = "";
 const sweptImage = document.createElement("canvas");
 slider.max = last;
@@ -27,10 +28,20 @@ function plain(canvas, ratio) {
   return pen;
 }
 
+// Scale at which the whole scene is in sight from each of the views [pixels/m].
+function fit(width, height) {
+  const half = [0, 1, 2].map(k => (data.frame_m[1][k] - data.frame_m[0][k]) / 2 + 0.03);
+  return Math.min(...Object.values(VIEWS).map(([turned, raised]) => {
+    const [cy, sy, cp, sp] = [Math.cos(turned), Math.sin(turned), Math.cos(raised), Math.sin(raised)].map(Math.abs);
+    const [across, up] = [cy * half[0] + sy * half[1], cp * half[2] + sp * (cy * half[1] + sy * half[0])];
+    return Math.min(width / across, height / up) * 0.48;
+  }));
+}
+
 // The place of a point on the screen, how near it is to the viewer [m], and the scale of a metre. Seen from above, a
 // point that is farther away is higher on the screen.
 function camera(width, height) {
-  const scale = zoom * 0.68 * Math.min(width, height) / data.radius_m;
+  const scale = zoom * fit(width, height);
   const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
   const seen = point => {
     const [x, y, z] = point.map((value, k) => value - data.centre_m[k]);
@@ -72,7 +83,7 @@ function box(pen, see, one) {
 }
 
 function label(pen, text, x, y, colour, align = "left") {
-  pen.font = "14px system-ui, sans-serif";
+  pen.font = FONT;
   pen.textAlign = align;
   pen.fillStyle = colour;
   pen.fillText(text, x, y);
@@ -160,7 +171,9 @@ function ticks(low, high, most) {
 
 // A place for curves: the pen, x of a time, and the lower edge; it has drawn the times and the cursor.
 function timeline(canvas) {
-  const [pen, width, height] = sized(canvas), left = 60, bottom = height - 22, end = data.time_s[last] || 1;
+  const [pen, width, height] = sized(canvas), bottom = height - 22, end = data.time_s[last] || 1;
+  pen.font = FONT;
+  const left = 30 + Math.min(180, Math.max(30, ...data.speeds.map(one => pen.measureText(one.name).width)));
   const x = t => left + (width - left - 12) * t / end;
   for (const t of ticks(0, end, Math.min(10, width / 70))) label(pen, `${t} s`, x(t), height - 5, ink("--soft"), "center");
   const now = x(data.time_s[Math.round(at)]);
@@ -204,7 +217,7 @@ function drawSpeeds() {
   data.speeds.forEach((one, k) => {
     const floor = 34 * (k + 1), y = v => floor - 29 * v / 100;
     line(pen, [[left, floor], [right, floor]], ink("--grid"), 0.8);
-    label(pen, one.name, 0, floor - 9, ink("--ink"));
+    label(pen, one.name, 18, floor - 9, ink("--ink"));
     pen.strokeStyle = pen.fillStyle = colourOf(k);
     pen.lineWidth = 1.5;
     trace(pen, x, y, one.values);
@@ -213,7 +226,7 @@ function drawSpeeds() {
     pen.globalAlpha = 0.35;
     pen.fill();
     pen.globalAlpha = 1;
-    pen.fillRect(28, floor - 20, 12, 12);
+    pen.fillRect(0, floor - 20, 12, 12);
   });
   cursor();
 }

@@ -47,7 +47,9 @@ canvas { width: 100%; display: block; } #clearance { height: 9rem; }
 .controls input[type=range] { flex: 1 1 12rem; } button { font: inherit; padding: 0.35rem 0.9rem; }
 #now { font-variant-numeric: tabular-nums; min-width: 22rem; } #now.act { font-weight: bold; }
 @media (max-width: 40rem) { #arm { height: 50vh; } #now { min-width: 0; flex-basis: 100%; } }
-@media print { .controls { display: none; } }
+@media print { .controls { display: none; } body { font-size: 10pt; max-width: none; margin: 0; }
+  canvas { object-fit: contain; object-position: left; break-inside: avoid; } h2 { break-after: avoid; }
+  #arm { height: 9cm; object-position: center; } #clearance { height: 3cm; } #speed { max-height: 6cm; } }
 """.replace("AXES", " ".join(f"--axis-{k}: {colour};" for k, colour in enumerate(_COLOURS))).replace(
     "DARK", " ".join(f"--axis-{k}: {colour};" for k, colour in enumerate(_DARK))
 )
@@ -117,7 +119,7 @@ def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> 
     seen = np.concatenate((origins.reshape(-1, 3), [reach.lower_m, reach.upper_m]))
     # A box that reaches far beyond the arm, such as a floor, must not make the arm small.
     span = float(np.linalg.norm(np.ptp(seen, axis=0)))
-    corners = [np.clip(end, seen.min(axis=0) - span / 4, seen.max(axis=0) + span / 4) for one in boxes
+    corners = [np.clip(end, seen.min(axis=0) - span / 2, seen.max(axis=0) + span / 2) for one in boxes
                for end in (one.lower_m, one.upper_m)]  # fmt: skip
     seen = np.concatenate((seen, np.array(corners).reshape(-1, 3)))
     lower, upper = seen.min(axis=0), seen.max(axis=0)
@@ -141,6 +143,7 @@ def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> 
             "radius_m": round(reach.radius_m, 3),
         },
         "grid_m": _GRID_M,
+        "frame_m": [_rounded(lower, 3), _rounded(upper, 3)],
         "centre_m": _rounded(0.5 * (lower + upper), 3),
         "radius_m": round(0.5 * float(np.linalg.norm(upper - lower)) + 0.05, 3),
         "clearance_mm": [round(value, 1) if np.isfinite(value) else None for value in clearance_mm.tolist()],

@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from textwrap import wrap
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from ident.arrays import FloatArray
 
 _WIDTH, _ROW, _TOP, _FOOT = 360.0, 25.0, 6.0, 36.0
 _LEFT, _RIGHT = 46.0, 96.0  #: Room for the names and for the numbers
+_LETTER, _LONGEST = 8.5, 170.0  #: Width of a letter of a name, and of a name at most
 _ROOM = 1.12  #: Length of a scale over the largest value on it
 
 
@@ -47,7 +49,7 @@ def intervals(rows: Sequence[Interval], title: str, unit: str) -> str:
     to_scale = bounds == 0.0 or reach >= 0.1 * bounds
     # Below 0.1 a scale would only magnify noise.
     extent = _ROOM * max(reach, bounds if to_scale else 0.0, 0.1)
-    scale = _Scale(-extent, extent, len(rows))
+    scale = _Scale(-extent, extent, len(rows), _room(row.name for row in rows))
     parts = [*scale.frame(unit), _line(scale.x(0.0), _TOP, scale.x(0.0), scale.bottom, "zero")]
     for number, row in enumerate(rows):
         y = scale.y(number)
@@ -64,10 +66,10 @@ def intervals(rows: Sequence[Interval], title: str, unit: str) -> str:
         if math.isfinite(row.value):
             parts.append(_line(scale.x(row.value - row.half), y, scale.x(row.value + row.half), y, "bar"))
             parts.append(_dot(scale.x(row.value), y, "dot"))
-        parts += [_text(0, y + 4, row.name), _text(_WIDTH, y + 4, row.label, "end")]
+        parts += [_name(y + 4, row.name), _text(_WIDTH, y + 4, row.label, "end")]
     if not to_scale:
         parts += [
-            _text(_LEFT, scale.bottom + 47, "◂ limit", "soft"),
+            _text(scale.left, scale.bottom + 47, "◂ limit", "soft"),
             _text(scale.right, scale.bottom + 47, "limit ▸", "soft end"),
         ]
     return _drawing(parts, title, scale.bottom + _FOOT + (0.0 if to_scale else 17.0))
@@ -75,7 +77,8 @@ def intervals(rows: Sequence[Interval], title: str, unit: str) -> str:
 
 def before_after(rows: Sequence[tuple[str, float, float]], title: str, unit: str) -> str:
     """Draw each value before (hollow) and after (full), from zero; NaN for one that is not known."""
-    scale = _Scale(0.0, _ROOM * max(_largest([v for _, *both in rows for v in both]), 1e-9), len(rows))
+    most = _ROOM * max(_largest([v for _, *both in rows for v in both]), 1e-9)
+    scale = _Scale(0.0, most, len(rows), _room(name for name, *_ in rows))
     parts = list(scale.frame(unit))
     for number, (name, before, after) in enumerate(rows):
         y = scale.y(number)
@@ -87,7 +90,7 @@ def before_after(rows: Sequence[tuple[str, float, float]], title: str, unit: str
         if math.isfinite(after):
             parts.append(_dot(scale.x(after), y, "dot"))
         label = " → ".join(f"{value:.2f}" for value in known) or "-"
-        parts += [_text(0, y + 4, name), _text(_WIDTH, y + 4, label, "end")]
+        parts += [_name(y + 4, name), _text(_WIDTH, y + 4, label, "end")]
     return _drawing(parts, title, scale.bottom + _FOOT)
 
 
@@ -200,13 +203,22 @@ def _points(x: FloatArray, y: FloatArray) -> str:
 
 def ranking(rows: Sequence[tuple[str, float, str]], title: str, unit: str) -> str:
     """Draw bars under their names. A row: name, length, and CSS class: full, alike, empty."""
-    scale = _Scale(0.0, _ROOM * max(_largest(length for _, length, _ in rows), 1e-9), 2 * len(rows), 8.0, 60.0)
-    parts = list(scale.frame(unit))
-    for number, (name, length, kind) in enumerate(rows):
-        y = scale.y(2 * number)
+    names = [wrap(name, round((_WIDTH - 8.0) / _LETTER)) for name, _, _ in rows]
+    lines = sum(map(len, names))
+    longest = _ROOM * max(_largest(length for _, length, _ in rows), 1e-9)
+    scale = _Scale(0.0, longest, (17.0 * lines + 25.0 * len(rows)) / _ROW, 8.0, 60.0)
+    parts, y = list(scale.frame(unit)), _TOP
+    for words, (_, length, kind) in zip(names, rows, strict=True):
+        for line in words:
+            y += 17.0
+            parts.append(_text(0, y - 3, line))
         width = max(scale.x(max(length, 0.0)) - scale.x(0.0), 1.0)
-        bar = f'<rect class="{kind}" x="{scale.x(0.0):.1f}" y="{y + 9:.1f}" width="{width:.1f}" height="14"/>'
-        parts += [_text(0, y + 3, name), bar, _text(scale.x(0.0) + width + 5, y + 21, f"{length:.3g}", "soft")]
+        number = f"{length:.0f}" if abs(length) >= 100.0 else f"{length:.3g}"
+        parts.append(
+            f'<rect class="{kind}" x="{scale.x(0.0):.1f}" y="{y + 2:.1f}" width="{width:.1f}" height="14"/>'
+            + _text(scale.x(0.0) + width + 5, y + 14, number, "soft")
+        )
+        y += 25.0
     return _drawing(parts, title, scale.bottom + _FOOT)
 
 
@@ -238,7 +250,7 @@ class _Scale:
 
     low: float
     high: float
-    rows: int
+    rows: float
     left: float = _LEFT
     room: float = _RIGHT
 
@@ -253,7 +265,7 @@ class _Scale:
     def x(self, value: float) -> float:
         return self.left + (value - self.low) / (self.high - self.low) * (self.right - self.left)
 
-    def y(self, row: int) -> float:
+    def y(self, row: float) -> float:
         return _TOP + _ROW * (row + 0.5)
 
     def frame(self, unit: str) -> Iterator[str]:
@@ -272,6 +284,18 @@ def _ticks(low: float, high: float) -> Iterator[float]:
     step = next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if power * factor >= raw)
     for number in range(math.ceil(low / step), math.floor(high / step) + 1):
         yield round(number * step, 12)
+
+
+def _room(names: Iterable[str]) -> float:
+    """Room to the left of a scale for the names of its rows."""
+    return max(_LEFT, min(_LETTER * max(map(len, names), default=0), _LONGEST) + 10.0)
+
+
+def _name(y: float, name: str) -> str:
+    """Name of a row; one that is too long for its room is drawn narrower, not cut."""
+    drawn = _text(0, y, name)
+    narrow = f'<text textLength="{_LONGEST:g}" lengthAdjust="spacingAndGlyphs"'
+    return drawn.replace("<text", narrow, 1) if _LETTER * len(name) > _LONGEST else drawn
 
 
 def _largest(values: Iterable[float]) -> float:

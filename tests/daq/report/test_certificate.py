@@ -123,6 +123,23 @@ def test_a_term_without_a_name_is_its_curve() -> None:
     assert size_text(calibration.effects[0], calibration) in " ".join(Reader(text).texts)
 
 
+def test_the_curve_of_a_sliding_axis_is_a_force_over_metres() -> None:
+    made = _with_smooth()
+    sliding = replace(made, gains=tuple(replace(one, unit="N/A") if one.axis == "J2" else one for one in made.gains))
+    texts = Reader(_page(sliding)).texts
+    assert {"force [N]", "joint position [m]"} <= set(texts)
+    assert any(" N. On data" in text for text in texts)
+    assert "torque [Nm]" in Reader(_page(made)).texts
+
+
+def test_checks_that_failed_alike_are_one_entry_with_its_remedy() -> None:
+    calibration = demo_calibration()
+    vague = replace(calibration, gains=tuple(replace(one, std=0.2 * abs(one.value)) for one in calibration.gains))
+    texts = Reader(_page(vague)).texts
+    (entry,) = (text for text in texts if text.startswith("J1, J2, J3, J4, J5, J6: found σ 20.00 %"))
+    assert entry.endswith("record longer or more exciting moves, or a heavier payload.")
+
+
 def test_the_verdict_is_that_of_the_gates() -> None:
     calibration = demo_calibration()
     assert certify(calibration, without_controller(calibration, "", NOW)).verdict is Verdict.NOT_COMPARED

@@ -16,7 +16,7 @@ from rich.console import Console
 
 from daq.report.gains import gain_table, plot_gains, torque_sentences, with_deviation
 from daq.report.plots import plot_residual, plot_torques
-from daq.report.svg import Line, chart, sheet, visible
+from daq.report.svg import Line, before_after, chart, ranking, sheet, visible
 from ident.calibration import Gain
 from ident.data.torque_channel import TorqueSlope
 from tests.daq.calibrations import AXES, demo_calibration
@@ -113,6 +113,24 @@ def test_a_chart_draws_its_values_to_scale_and_breaks_at_gaps() -> None:
     assert [float(y) for _, _, y in pieces] == pytest.approx([down[0.0], down[10.0], down[-10.0]], abs=0.1)
     x = [float(one) for _, one, _ in pieces]
     assert (x[1] - x[0]) / (x[2] - x[0]) == pytest.approx(1 / 3, abs=0.01)
+
+
+def test_a_name_of_any_length_leaves_the_scale_free() -> None:
+    for name in ("J1", "shoulder_lift_joint", "a name that is longer than all the room there is"):
+        drawn = ElementTree.fromstring(before_after([(name, 3.0, 2.0)], "t", "%"))
+        left = min(float(one.attrib["x1"]) for one in drawn.iter("line"))
+        (shown,) = (one for one in drawn.iter("text") if one.text == name)
+        assert float(shown.attrib.get("textLength", 8.5 * len(name))) < left
+
+
+def test_no_word_of_a_ranking_is_cut_off() -> None:
+    name = "J3: a torque that depends on the predicted current and that no named effect explains"
+    drawn = ElementTree.fromstring(ranking([(name, 5846.2, "full"), ("J2: a spring", 3.2, "empty")], "t", "%"))
+    width, height = map(float, drawn.attrib["viewBox"].split()[2:])
+    texts = [(one.text or "", float(one.attrib["x"]), float(one.attrib["y"])) for one in drawn.iter("text")]
+    assert " ".join(text for text, _, _ in texts if text in name) == name
+    assert all(8.5 * len(text) + x <= width and y <= height for text, x, y in texts if text in name)
+    assert {"5846", "3.2"} <= {text for text, _, _ in texts}
 
 
 def test_the_table_says_error_and_truth_within_80_columns() -> None:
