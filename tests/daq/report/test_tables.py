@@ -82,13 +82,19 @@ def _monitor(cell: Cell, _: Any) -> Iterator[RenderableType]:
         "current_a": -12.345,
         "state": "FAULT REACTION ACTIVE",
         "enabled": True,
+        "in_fault": False,
         "silent": False,
         "rate_hz": 1000.1,
         "lost": 12345678,
+        "prediction": {
+            **{"measured": -12.345, "predicted": 123.456, "band": 12.345},
+            **{"residual_rms": 123.456, "outside_share": 0.98, "conspicuous": True},
+        },
     }
     axes = [{"axis": name, "position": -179.123 - n, **axis} for n, name in enumerate(AXES)]
-    document = {"cell": "demo", "source": "asked", "recorder": False, "axes": axes, "events": [], "buses": []}
-    yield bus.monitor_view({**document, "frames_per_s": 12345.0, "sync_hz": 1000.0})
+    document = {"cell": "demo", "source": "asked", "recorder": False, "axes": axes, "notices": [], "buses": []}
+    prediction = {"payload": None, "remark": ""}
+    yield bus.monitor_view({**document, "frames_per_s": 12345.0, "sync_hz": 1000.0, "prediction": prediction})
 
 
 def _comparison(cell: Cell, _: Any) -> Iterable[RenderableType]:
@@ -206,6 +212,7 @@ def _paper(cell: Cell, _: Any) -> Iterator[RenderableType]:
 
 
 EXAMPLES: dict[str, Callable[[Cell, Any], Iterable[RenderableType]]] = {
+    "bus._prediction_view": _monitor,
     "bus.monitor_view": _monitor,
     "bus.scan_table": _scan,
     "fit.comparison_tables": _comparison,
