@@ -225,7 +225,8 @@ def residual_verb(
     else:
         print_view(residual_view(closed, changed, calibration), out, report, pictures)
         if out is not None:
-            say_next("drivegain", "validate", out, *(holdout or logs))
+            same = [] if cell is None else ["--cell", cell]
+            say_next("drivegain", "validate", out, *(holdout or logs), *same)
 
 
 def check_report(folder: Path | None) -> None:

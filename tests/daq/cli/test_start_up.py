@@ -19,7 +19,7 @@ NUMERICS = ("scipy.signal", "scipy.stats", "pinocchio", "numba", "matplotlib")
 """Libraries that only identification, simulation and pictures use."""
 
 UNUSED = {
-    "scan": ("scipy", "cryptography", "mcap", "ruamel", "rich.progress", "ident.estimators", "ident.discovery"),
+    "scan": ("scipy", "cryptography", "mcap", "rich.progress", "ident.estimators", "ident.discovery"),
     "info": (
         "scipy",
         "can",
