@@ -33,7 +33,7 @@ REFUSALS: dict[FaultKind, tuple[type[DriverError], str]] = {
         BusBusy,
         r"a SYNC \(080h\) that we did not send; .* no other master, .* SYNC producer",
     ),
-    FaultKind.SDO_MASTER: (BusBusy, r"an SDO request to node 2 \(602h\) that we did not send"),
+    FaultKind.SDO_MASTER: (BusBusy, r"an SDO request to J2 \(node 2\) \(602h\) that we did not send"),
 }
 
 

@@ -191,5 +191,5 @@ def test_someone_who_only_asks_a_drive_is_reported_and_does_not_stop_the_run() -
     outcome = run("asks", at(FaultKind.SDO_MASTER, cycles=5))
     assert outcome.error is None
     assert [event.text for event in outcome.events if event.kind is EventKind.BUS_BUSY] == [
-        "an SDO request to node 3 (603h) that we did not send"
+        "an SDO request to J3 (node 3) (603h) that we did not send"
     ]
