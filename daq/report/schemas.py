@@ -33,7 +33,6 @@ from daq.report.fit_schemas import (
     ValidateReport,
     WeighReport,
 )
-from daq.report.monitor_schema import MonitorReport
 from daq.workflow.calibration_file import EffectEntry
 
 
@@ -78,16 +77,6 @@ class ScanReport(StrictModel):
     faults: dict[str, str] = Field(description="the fault of each of them")
     current: dict[str, str] = Field(description="recorded current of each axis")
     mistyped: list[str] = Field(description="nameplate gains that plan or record would refuse")
-
-
-class ExplainReport(StrictModel):
-    """`explain-emcy`."""
-
-    code: int
-    hex: str
-    text: str
-    remedy: str
-    standard: bool = Field(description="whether CiA 301 or CiA 402 defines the code; else only its class is known")
 
 
 class PlannedGain(StrictModel):
@@ -466,10 +455,8 @@ REPORTS: dict[str, Any] = {
     "report": CertificateReport,
     "apply": FileChange | DriveChange,
     "rollback": FileRollback | DriveRollback,
-    "monitor": MonitorReport,
     "info": InfoReport,
     "history": HistoryReport,
-    "explain-emcy": ExplainReport,
     "recalibrate": DryRunReport | JobReport | RefusedJob,
     "sign": KeyReport | SignatureReport | SignersReport,
     "fleet": FleetReport,
