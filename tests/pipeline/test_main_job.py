@@ -14,6 +14,7 @@ from daq.cli.app import main
 from daq.config.cell import model_of
 from daq.errors import ExitCode
 from daq.log.conversion import load_run
+from daq.report.schemas import DemoReport
 from daq.workflow.fit import check_signs
 from ident.errors import RolesExchanged
 from ident.estimators.identify import identify
@@ -29,6 +30,7 @@ def demonstration(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_summary_reports_the_whole_story(demonstration: Path) -> None:
     summary = json.loads((demonstration / "summary.json").read_text())
+    DemoReport.model_validate_json(json.dumps(summary))
     assert [gain["axis"] for gain in summary["gains"]] == [f"J{number}" for number in range(1, 7)]
     # Runs of 10 s instead of 40 s: the bound of the full demonstration, 1.5 %, widened by less than the root of that.
     for gain in summary["gains"]:
