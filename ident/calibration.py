@@ -91,7 +91,7 @@ class Calibration:
     """Gains, parameters and effects of a cell, with their errors and sources."""
 
     cell: str  #: name of the cell
-    method: str  #: ls, wls, tls or ml
+    method: str  #: ls, wls, tls, ml or iv
     gains: tuple[Gain, ...]  #: one an axis
     #: Base parameters of the robot, then the unknown parameters of each payload mounting.
     parameters: tuple[Parameter, ...]

@@ -15,7 +15,7 @@ from ident.equations.system import System
 from ident.errors import IdentificationError
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import Scaling, ls, tls, wls
-from ident.estimators.maximum_likelihood import ml
+from ident.estimators.maximum_likelihood import iv, ml
 from ident.model.model import Model
 
 CUTOFF_FACTORS = (0.5, 1.0, 2.0)
@@ -33,6 +33,7 @@ ESTIMATORS: dict[str, Callable[[System], Estimate]] = {
     "tls, columns": lambda system: tls(system, Scaling.COLUMNS),
     "tls, both": lambda system: tls(system, Scaling.BOTH),
     "ml": ml,
+    "iv": iv,
 }
 
 
@@ -95,7 +96,7 @@ def compare(
         )
         progress(f"estimators under {filters.position_cutoff_hz:g} Hz / {filters.decimation_cutoff_hz:g} Hz")
         try:
-            reduction = reduce_runs(model, runs(), filters)
+            reduction = reduce_runs(model, runs(), filters, instruments=True)
             system = reduction.system(reduction.base(), reduction.payload_columns())
         except IdentificationError as error:
             if factor == 1.0:

@@ -207,6 +207,6 @@ def estimate_with(method: Method, system: System, fixed_gains: FloatArray | None
     """
     if method is Method.TLS:
         if fixed_gains is not None:
-            raise DataUnfit(", ".join(system.runs), "tls needs free gains; with fixed gains choose ls, wls or ml")
+            raise DataUnfit(", ".join(system.runs), "tls needs free gains; with fixed gains choose ls, wls, ml or iv")
         return tls(system)
     return {Method.LS: ls, Method.WLS: wls, Method.ML: ml, Method.IV: iv}[method](system, fixed_gains)
