@@ -200,7 +200,7 @@ def calibration_of(
         configuration_sha256="",
         created="",
         software="",
-        session_began_s=None if last is None else session_began_s(last.trained),
+        session_began_s=None if last is None else session_began_s(last.fit_runs),
         covariance_factor=factor_of(estimate.covariance),
     )
 

@@ -57,7 +57,9 @@ def fit_verb(
     logs: LogsArgument,
     method: Annotated[
         Method | None,
-        typer.Option(help="ls, wls, tls of the paper; ml (default; wls with fixed gains); iv: instruments of the demand."),
+        typer.Option(
+            help="ls, wls, tls of the paper; ml (default; wls with fixed gains); iv: instruments of the demand."
+        ),
     ] = None,
     gains: GainsOption = Gains.FREE,
     known: KnownOption = Known.MASS,

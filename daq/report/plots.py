@@ -102,11 +102,11 @@ def plot_torques(
 
 def draw_effect(before: Evidence, after: Evidence, placed: PlacedEffect, cell: Cell) -> tuple[str, ...]:
     """Draw the residual of an axis before and after an effect was added, on the first held-out run, or of the fit."""
-    index = len(after.trained) if after.held_out else 0
+    index = len(after.fit_runs) if after.held_out else 0
     rows_before = before.holdout if before.holdout is not None else before.training
     rows_after = after.holdout if after.holdout is not None else after.training
     chosen, data = rows_after.run == index, after.datasets[index]
-    seen = fitted_signals(after.model, data, after.training, after.estimate, session_began_s(after.trained))
+    seen = fitted_signals(after.model, data, after.training, after.estimate, session_began_s(after.fit_runs))
     along = seen.variable(placed.effect.abscissa, placed.axis, other_axis(placed.effect))
     variable, velocity = (
         decimate_rows(data, rows_after.conditioning, column[None])[0]

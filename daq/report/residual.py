@@ -318,7 +318,7 @@ def _silence(fitted: Fit) -> str:
         for axis, limit in zip(fitted.cell.axes, last.limits_nm, strict=True)
     )
     ended = f"The search ended early: {last.ended}. " if last.ended else ""
-    trained = last.after.trained
+    trained = last.after.fit_runs
     clockless = len(trained) > 1 and session_began_s(trained) is None
     unseen = " The runs have no common clock: a warm-up over the session cannot be seen." if clockless else ""
     return (

@@ -349,8 +349,8 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
         IdentificationError: a refit failed.
     """
     evidence = start.evidence()
-    cold = [data.name for data in evidence.trained if data.temperature_c is None]
-    if 0 < len(cold) < len(evidence.trained):
+    cold = [data.name for data in evidence.fit_runs if data.temperature_c is None]
+    if 0 < len(cold) < len(evidence.fit_runs):
         _LOG.warning("%s without temperatures: %s is not looked for", ", ".join(cold), TemperatureFriction.name)
     before = start.identification
     if before.estimate.method is not Method.ML:
@@ -382,7 +382,7 @@ def check_holdout(fitted: Fit) -> None:
         for one in (before, after)
         if (rows := one.holdout) is not None
     )
-    unseen = after.datasets[len(after.trained) :]
+    unseen = after.datasets[len(after.fit_runs) :]
     cold = [one.name for one in unseen if one.temperature_c is None]
     needed = cold and any(placed.effect.name == TemperatureFriction.name for placed in after.effects)
     raise EffectsRefuted(

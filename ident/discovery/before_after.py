@@ -107,7 +107,7 @@ def _residual(observation: Observation, estimate: Estimate) -> FloatArray:
 
 def error_left_out(folds: Folds) -> CurrentError:
     """Error on each fold's rows, predicted by a fit that has not seen their moves."""
-    problem = folds.problem
+    problem = folds.linearisation
     size, left = np.zeros(len(problem.noise)), np.zeros(len(problem.noise))
     np.add.at(size, problem.motor, (problem.current * problem.noise[problem.motor]) ** 2)
     np.add.at(left, problem.motor, (folds.residual * problem.noise[problem.motor]) ** 2)
@@ -138,7 +138,7 @@ def left_out_runs(evidence: Evidence, weights_nm_a: FloatArray) -> LeftOutRuns:
     """
     runs: list[LeftOutRun] = []
     errors: list[CurrentError] = []
-    for index, data in enumerate(evidence.trained):
+    for index, data in enumerate(evidence.fit_runs):
         try:
             errors.append(_error_without(evidence, index))
         except IdentificationError as error:
@@ -150,7 +150,7 @@ def left_out_runs(evidence: Evidence, weights_nm_a: FloatArray) -> LeftOutRuns:
 
 def _error_without(evidence: Evidence, left_out: int) -> CurrentError:
     """Error on one run of the fit, with the model refitted without it."""
-    order = [index for index in range(len(evidence.trained)) if index != left_out] + [left_out]
+    order = [index for index in range(len(evidence.fit_runs)) if index != left_out] + [left_out]
     observation = _in_order(evidence.rows_without_effects, order)
     last = observation.run == len(order) - 1
     training, held = observation.only(~last), observation.only(last)
@@ -304,7 +304,7 @@ def account(
             continue
         before, last = last, assessed(step.after)
         turns.append(before_after(before, last))
-    end, floors = steps[-1], noise_floors(start.trained, start.conditioning)
+    end, floors = steps[-1], noise_floors(start.fit_runs, start.conditioning)
     if end.choice_std is not None:
         last = replace(last, gains_std=end.after.estimate.gains_std, choice_std=end.choice_std)
     left_a = left_on(end.after.training, end.after.estimate)
@@ -344,7 +344,7 @@ def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns |
             gains_fixed=estimate.gains_fixed,
         )
     )
-    held, problem, moves = evidence.holdout, folds.problem, None
+    held, problem, moves = evidence.holdout, folds.linearisation, None
     if not estimate.gains_fixed:
         runs = problem.of_clusters(evidence.training.run)
         moves = Moves(folds.cluster_hessian, folds.cluster_score, problem.scale, runs)

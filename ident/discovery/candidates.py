@@ -79,7 +79,7 @@ class SearchProblem:
 
     def trials(self, torques: Iterable[FloatArray]) -> tuple[Trial | None, ...]:
         """Test candidates given by their joint torques (n, p, r); None where the model contains them already."""
-        problem, to_motor = self.folds.problem, self.model.drive_train.to_motor
+        problem, to_motor = self.folds.linearisation, self.model.drive_train.to_motor
         return _scored(self.folds, ((torque.shape[1], problem.felt(torque, to_motor)) for torque in torques))
 
     def torque(self, effect: Effect, axis: int) -> FloatArray:
@@ -234,9 +234,9 @@ def _scored_together(folds: Folds, width: int, candidates: Sequence[Felt]) -> tu
     of its own.
     """
     made = [_products(own, candidates) for own in folds.motors if any(own.motor in felt for felt in candidates)]
-    shape, unknowns = (len(candidates), width), folds.problem.jacobian.width
+    shape, unknowns = (len(candidates), width), folds.linearisation.jacobian.width
     # ΦᵀJ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor.
-    parts = (folds.count, len(folds.problem.gamma), *shape)
+    parts = (folds.count, len(folds.linearisation.gamma), *shape)
     part_jacobian, part_gram = np.zeros((*parts, unknowns)), np.zeros((*parts, width))
     part_score, part_held = np.zeros(parts), np.zeros(parts)
     for one in made:

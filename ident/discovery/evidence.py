@@ -41,7 +41,7 @@ class Evidence:
     _identification: list[Identification] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
-    def trained(self) -> tuple[Dataset, ...]:
+    def fit_runs(self) -> tuple[Dataset, ...]:
         """Runs of the fit."""
         return self.datasets[: len(self.datasets) - self.held_out]
 
@@ -87,7 +87,7 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequ
         effects: of the model.
         runs: signals of the runs of the fit around the estimate before, where they are at hand.
     """
-    around, current, began_s = before, before, session_began_s(before.trained)  # held-out runs must not affect the fit
+    around, current, began_s = before, before, session_began_s(before.fit_runs)  # held-out runs must not affect the fit
     fixed = before.estimate.gains if before.estimate.gains_fixed else None
     joints = before.model.robot.joints
     columns = tuple(column.at(joints[placed.axis].kind) for placed in effects for column in placed.columns)
@@ -95,12 +95,12 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequ
     for signals in (runs,) if all(placed.effect.abscissa.is_kinematic for placed in effects) else (runs, ()):
         around, training = current, bare
         if effects:
-            training = bare.extended(columns, _torques(effects, around, before.trained, began_s, signals))
+            training = bare.extended(columns, _torques(effects, around, before.fit_runs, began_s, signals))
         estimate = estimate_with(before.estimate.method, training.system(), fixed)
         current = replace(before, training=training, holdout=unseen, effects=effects, estimate=estimate)
     if unseen is None or not effects:
         return current
-    held_out = before.datasets[len(before.trained) :]
+    held_out = before.datasets[len(before.fit_runs) :]
     return replace(current, holdout=unseen.extended(columns, _torques(effects, around, held_out, began_s)))
 
 
@@ -117,12 +117,12 @@ def by_instruments(evidence: Evidence) -> Estimate | None:
 
 def _with_instruments(evidence: Evidence) -> System | None:
     model, conditioning = evidence.model, evidence.conditioning
-    asked = tuple(with_demand(data, model.drive_train, conditioning) for data in evidence.trained)
+    asked = tuple(with_demand(data, model.drive_train, conditioning) for data in evidence.fit_runs)
     if all(data.demanded is None for data in asked):
         return None
     demanded = on_demanded_motion(model, asked, evidence.training)
     if evidence.effects:
-        datasets, began_s = tuple(map(as_demanded, asked)), session_began_s(evidence.trained)
+        datasets, began_s = tuple(map(as_demanded, asked)), session_began_s(evidence.fit_runs)
         demanded = replace(demanded, effects=_torques(evidence.effects, evidence, datasets, began_s))
         del datasets
     del asked  # one more copy of all runs, while the equations are built

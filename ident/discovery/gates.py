@@ -106,7 +106,7 @@ class RunsLeftOut:
     def of(cls, search_problem: SearchProblem) -> RunsLeftOut:
         """Cut a search problem into its runs."""
         folds, observation = search_problem.folds, search_problem.observation
-        left_out, run_of = runs_to_leave_out(observation), folds.problem.of_clusters(observation.run)
+        left_out, run_of = runs_to_leave_out(observation), folds.linearisation.of_clusters(observation.run)
         if not left_out:
             return cls(search_problem, run_of, ())
         hessian, score = folds.cluster_hessian, folds.cluster_score
@@ -122,7 +122,7 @@ class RunsLeftOut:
     def change(self, columns: FloatArray) -> PairedChange:
         """Change of the error on runs left out when whitened columns, shape (rows, p), join the model."""
         folds = self.search_problem.folds
-        problem, observation, phi = folds.problem, self.search_problem.observation, columns.T
+        problem, observation, phi = folds.linearisation, self.search_problem.observation, columns.T
         count, width, unknowns = len(self.others), len(phi), problem.jacobian.width
         # ΦᵀΦ, Φᵀe and ΦᵀJ of each run.
         grams, scores = np.zeros((count, width, width)), np.zeros((count, width))
@@ -165,7 +165,7 @@ class RunsLeftOut:
 def whitened_columns(search_problem: SearchProblem, effect: Effect, axis: int) -> FloatArray:
     """Columns of an effect beside the Jacobian of a search problem, shape (rows, p)."""
     torque = search_problem.torque(effect, axis)
-    return search_problem.folds.problem.whitened(torque, search_problem.model.drive_train.to_motor)
+    return search_problem.folds.linearisation.whitened(torque, search_problem.model.drive_train.to_motor)
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +197,7 @@ def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effect
         effects: in the fit.
     """
     own = own_unknowns(estimate, effects)
-    problem = search_problem.folds.problem
+    problem = search_problem.folds.linearisation
     taken = np.isin(problem.free, len(estimate.gains) + own)
     columns = problem.jacobian.columns(np.flatnonzero(taken)) / problem.scale[taken]
     torque = columns @ estimate.parameters[own]
@@ -224,8 +224,8 @@ def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effect
 
 def gain_shifts(folds: Folds, torque: FloatArray) -> FloatArray:
     """Shift of each gain when a whitened torque, shape (rows,), joins the model [Nm at the joint per A], shape (n,)."""
-    count = len(folds.problem.gamma)
-    return shifts_by(folds, torque, max(count, int(folds.problem.free[-1]) + 1))[:count]
+    count = len(folds.linearisation.gamma)
+    return shifts_by(folds, torque, max(count, int(folds.linearisation.free[-1]) + 1))[:count]
 
 
 def shifts_by(folds: Folds, torque: FloatArray, size: int) -> FloatArray:
@@ -233,7 +233,7 @@ def shifts_by(folds: Folds, torque: FloatArray, size: int) -> FloatArray:
 
     It is zero for what is fixed and for what the problem does not hold.
     """
-    problem, shifts = folds.problem, np.zeros(size)
+    problem, shifts = folds.linearisation, np.zeros(size)
     shifts[problem.free] = -linalg.cho_solve(folds.full_factor, problem.jacobian.on_columns(torque)) * problem.scale
     return shifts
 

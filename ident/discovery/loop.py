@@ -151,7 +151,7 @@ def find_effects(
     return (*steps[:-1], _with_choice(steps, model, gates))
 
 
-def _with_choice(steps: Sequence[Step], model: _Model, gates: Gates) -> Step:
+def _with_choice(steps: Sequence[Step], model: _JointFit, gates: Gates) -> Step:
     """Return the last step, what the choice of its effects adds to the covariance of its estimate included."""
     estimate, accepted = model.evidence.estimate, dict[PlacedEffect, tuple[Finding, tuple[Finding, ...]]]()
     for step in steps:  # an effect that left and joined again counts by its last turn
@@ -171,16 +171,16 @@ def _with_choice(steps: Sequence[Step], model: _Model, gates: Gates) -> Step:
 
 
 @dataclass(frozen=True, slots=True)
-class _Model:
+class _JointFit:
     """A joint fit, and the problem linearised around it."""
 
     evidence: Evidence
     search_problem: SearchProblem
 
 
-def _linearised(evidence: Evidence, cache: ColumnCache) -> _Model:
-    problem = prepare_search(evidence.model, evidence.trained, evidence.training, evidence.estimate, cache)
-    return _Model(evidence, problem)
+def _linearised(evidence: Evidence, cache: ColumnCache) -> _JointFit:
+    problem = prepare_search(evidence.model, evidence.fit_runs, evidence.training, evidence.estimate, cache)
+    return _JointFit(evidence, problem)
 
 
 def _keys(evidence: Evidence) -> frozenset[EffectKey]:
@@ -188,18 +188,18 @@ def _keys(evidence: Evidence) -> frozenset[EffectKey]:
 
 
 def _turn(
-    model: _Model,
+    model: _JointFit,
     rng: np.random.Generator,
     gates: Gates,
     families: tuple[tuple[Effect, ...], ...],
     seen: set[frozenset[EffectKey]],
     progress: Callable[[str], None],
     names: Sequence[str],
-) -> tuple[Step, _Model | None]:
+) -> tuple[Step, _JointFit | None]:
     """Take one turn: the step, and the model with what was accepted; None where nothing was."""
     evidence, problem = model.evidence, model.search_problem
     known, moves = len(evidence.effects), problem.folds.moves
-    most = problem.folds.problem.cluster_count // PIECES_PER_EFFECT
+    most = problem.folds.linearisation.cluster_count // PIECES_PER_EFFECT
     progress("searching for a missing effect" + (f" beside the {known} found" if known else ""))
     proposed = _proposals(problem, evidence.effects, rng, gates, families)
     present = {placed.effect.name for placed in evidence.effects if not is_unnamed(placed.effect)}
@@ -231,7 +231,7 @@ def _turn(
         accepted = replace(accepted, effect=effect)
         progress(f"adding {effect.name} on {names[accepted.axis]}")
         joined = _join(model, accepted, rng, gates, seen)
-        if isinstance(joined, _Model):
+        if isinstance(joined, _JointFit):
             if named is not None and is_unnamed(effect):
                 rival = PlacedEffect(effect, accepted.axis)
                 aside.append(SetAside(named, "{rival} explains clearly more of the same residual", rival))
@@ -242,7 +242,7 @@ def _turn(
         others = structures if is_unnamed(effect) else ()
         taken |= {effect_key(one.effect, one.axis) for one in (accepted, *others) if one.axis == accepted.axis}
     if accepted is not None:
-        pieces = problem.folds.problem.cluster_count
+        pieces = problem.folds.linearisation.cluster_count
         ended = f"{pieces} pieces of {moves} moves allow no more than {most} effects"
     elif moves < MIN_MOVES_FOR_STRUCTURE:
         ended = f"structure without a name needs {MIN_MOVES_FOR_STRUCTURE} moves, found {moves}"
@@ -275,8 +275,8 @@ def _refused(findings: Sequence[Finding], refused: Finding, why: str) -> tuple[F
 
 
 def _join(
-    model: _Model, accepted: Finding, rng: np.random.Generator, gates: Gates, seen: set[frozenset[EffectKey]]
-) -> _Model | SetAside:
+    model: _JointFit, accepted: Finding, rng: np.random.Generator, gates: Gates, seen: set[frozenset[EffectKey]]
+) -> _JointFit | SetAside:
     """Refit with a finding in the model and drop what no longer passes; or say why it may not join."""
     joined = _refit(model, accepted)
     pruned = joined if isinstance(joined, SetAside) else _pruned(joined, accepted, rng, gates)
@@ -289,7 +289,7 @@ def _join(
     return SetAside(accepted, why) if why else pruned
 
 
-def _refit(model: _Model, accepted: Finding) -> _Model | SetAside:
+def _refit(model: _JointFit, accepted: Finding) -> _JointFit | SetAside:
     """Refit with a finding in the model; or say why it may not join, whatever else is in the model."""
     evidence, problem = model.evidence, model.search_problem
     last, gains_std = PlacedEffect(accepted.effect, accepted.axis), evidence.estimate.gains_std
@@ -340,7 +340,7 @@ def _refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
     return f"with instruments from the demanded motion, {why}"
 
 
-def _pruned(model: _Model, accepted: Finding, rng: np.random.Generator, gates: Gates) -> _Model | SetAside:
+def _pruned(model: _JointFit, accepted: Finding, rng: np.random.Generator, gates: Gates) -> _JointFit | SetAside:
     """Drop effects that no longer pass beside the last one; or say why the last one may not stay."""
     last = model.evidence.effects[-1]
     needed: set[PlacedEffect] = set()
@@ -364,7 +364,7 @@ def _pruned(model: _Model, accepted: Finding, rng: np.random.Generator, gates: G
             needed.add(worst)  # the data cannot be fitted without it
 
 
-def _beside_others(model: _Model, placed: PlacedEffect, rng: np.random.Generator, gates: Gates) -> tuple[float, str]:
+def _beside_others(model: _JointFit, placed: PlacedEffect, rng: np.random.Generator, gates: Gates) -> tuple[float, str]:
     """Judge an effect of a joint fit beside all others: fall of ‖e‖² on held-out moves, and why it does not pass."""
     estimate = model.evidence.estimate
     reduced = without_effects_of(model.search_problem, estimate, (placed,))

@@ -97,7 +97,7 @@ def _gathered_at_turns(search_problem: SearchProblem, axis: int) -> float:
     for run in search_problem.rows:
         turned = np.diff(np.sign(run.geared_torque_nm[axis]), prepend=0.0) != 0.0
         near.append(np.convolve(turned, np.ones(round(SETTLED_S * run.rate_hz)))[: len(turned)] > 0.0)
-    is_near, problem = np.concatenate(near), search_problem.folds.problem
+    is_near, problem = np.concatenate(near), search_problem.folds.linearisation
     shares = [0.0]
     for motor in np.flatnonzero(search_problem.model.drive_train.to_motor[:, axis]):
         rows = problem.motor == motor
@@ -126,6 +126,6 @@ def _tried(search_problem: SearchProblem, axis: int, bent: Callable[[Signals], F
 
 def _shares(search_problem: SearchProblem, trials: Sequence[Trial | None]) -> list[float]:
     """Share of a motor's squared residual that each trial explains, of the motor that it affects most."""
-    problem = search_problem.folds.problem
+    problem = search_problem.folds.linearisation
     left = np.bincount(problem.motor, problem.residual**2)
     return [0.0 if trial is None else float(np.max(trial.fallen / left)) for trial in trials]

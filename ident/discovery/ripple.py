@@ -86,7 +86,7 @@ def propose_orders(
         for of_joint in _angles(search_problem, axis)
     )
     made = [one for one in tried if one is not None]
-    clusters = search_problem.folds.problem.cluster_count
+    clusters = search_problem.folds.linearisation.cluster_count
     observed = [one.statistic(np.ones((1, clusters)))[0] for one in made]
     if not made or _independent_probability(observed, clusters) > HOPELESS:
         return {}
@@ -115,7 +115,7 @@ def periodogram(search_problem: SearchProblem, axis: int, of_joint: int) -> Peri
     bins = _fast_length(STEPS_A_LINE * range_rev / width_rev)
     first, last = int(np.ceil(STEPS_A_LINE * FEWEST_PERIODS)), bins // BINS_A_PERIOD
     places = [((angle - lowest) / (2.0 * np.pi * width_rev)).astype(np.int64) for angle in angles]
-    problem, observation = search_problem.folds.problem, search_problem.observation
+    problem, observation = search_problem.folds.linearisation, search_problem.observation
     torque = search_problem.model.drive_train.to_motor[:, axis] if of_joint else np.eye(search_problem.axes)[axis]
     weights = torque * problem.gamma / problem.noise
     filters = [row_filter(data, observation.conditioning) for data in search_problem.datasets]

@@ -223,7 +223,7 @@ def _judge(
     probabilities: Iterator[float],
     gates: Gates,
 ) -> Finding:
-    problem = search_problem.folds.problem
+    problem = search_problem.folds.linearisation
     probability = [next(probabilities) for _ in family.members]
     # A setting that needs impossible coefficients is chosen only where every setting of the family does.
     ruled_out = [impossible(effect.coefficients, trial.coefficients, _sigma(trial)) for effect, trial in family.members]
@@ -408,7 +408,7 @@ def detection_limits_nm(search_problem: SearchProblem, gates: Gates) -> FloatArr
     absorbed by those. The limit holds for effects whose shape the dictionary or a spline can follow; on a short
     recording noise raises it.
     """
-    problem = search_problem.folds.problem
+    problem = search_problem.folds.linearisation
     square = np.bincount(problem.motor, problem.residual**2) / np.bincount(problem.motor)
     noise_a = problem.noise * np.sqrt(square)
     return np.asarray(noise_a / np.abs(problem.gamma) * np.sqrt(gates.smallest_share))

@@ -336,7 +336,7 @@ class Folds:
     A block holds the rows of one motor in one cluster; folds, clusters and motors are sums over blocks.
     """
 
-    problem: Linearisation  #: the linearisation, its rows sorted by motor, fold and cluster
+    linearisation: Linearisation  #: its rows sorted by motor, fold and cluster
     moves: int  #: number of whole moves distributed over the folds; a cluster may be only a piece of one
     blocks: tuple[tuple[slice, int, int, int], ...]  #: rows, fold, cluster and motor of each block
     motors: tuple[MotorRows, ...]  #: the same by motor, those without rows left out
@@ -358,7 +358,7 @@ class Folds:
     def square_sum(self, residual: FloatArray) -> FloatArray:
         """‖e‖² of each fold and motor, shape (folds, n)."""
         rows, fold, _, motor = zip(*self.blocks, strict=True)
-        total = np.zeros((self.count, len(self.problem.gamma)))
+        total = np.zeros((self.count, len(self.linearisation.gamma)))
         np.add.at(total, (fold, motor), np.add.reduceat(residual**2, [part.start for part in rows]))
         return total
 
@@ -428,7 +428,9 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
         parts = own.by_fold(own.sums(own.equations[:-2], left[None])[..., 0], count)
         part_score[:, own.motor][:, own.seen] = parts
     return Folds(
-        problem=replace(problem, jacobian=replace(jacobian, parts=tuple(sorted_parts))),  # held once, by MotorRows
+        linearisation=replace(
+            problem, jacobian=replace(jacobian, parts=tuple(sorted_parts))
+        ),  # held once, by MotorRows
         moves=moves,
         blocks=blocks,
         motors=tuple(by_motor),

@@ -170,7 +170,7 @@ def acting_on(axis: int, count: int, torque_nm: FloatArray) -> FloatArray:
 
 def search_problem_of(evidence: Evidence, cache: ColumnCache | None = None) -> SearchProblem:
     """The residual of the runs of the fit."""
-    return prepare_search(evidence.model, evidence.trained, evidence.training, evidence.estimate, cache)
+    return prepare_search(evidence.model, evidence.fit_runs, evidence.training, evidence.estimate, cache)
 
 
 def whole(jacobian: Jacobian) -> FloatArray:
@@ -202,7 +202,7 @@ def calibrated(evidence: Evidence) -> Calibration:
     return replace(
         whole,
         effects=tuple(effects),
-        session_began_s=session_began_s(evidence.trained),
+        session_began_s=session_began_s(evidence.fit_runs),
         covariance_factor=factor_of(estimate.covariance),
     )
 

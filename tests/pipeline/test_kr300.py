@@ -49,10 +49,10 @@ def test_the_current_at_standstill_is_no_noise_floor(shared_data: Path) -> None:
     found = identify(model_of(cell), runs, cell.conditioning, method=Method.ML, fixed_gains=gains)
     start = gather(found, runs)
     left_a = left_on(start.training, start.estimate)
-    *others, floor = noise_floors(start.trained, cell.conditioning)
+    *others, floor = noise_floors(start.fit_runs, cell.conditioning)
     assert others == [None] * 5
     assert floor is not None
     assert floor.noise_a > 3.0 * left_a[5]
     assert floor.is_refuted(left_a[5])
     # No run repeats a move of another or its own.
-    assert noise_floors(start.trained, cell.conditioning, (FloorSource.REPEATED_MOVES,)) == (None,) * 6
+    assert noise_floors(start.fit_runs, cell.conditioning, (FloorSource.REPEATED_MOVES,)) == (None,) * 6

@@ -42,7 +42,7 @@ def lines(name: str, cell: Cell, runs: Sequence[Run], *, fixed: bool) -> Iterato
     start = gather(found, runs)
     left_a = left_on(start.training, start.estimate)
     for source in FloorSource:
-        floors = noise_floors(start.trained, start.conditioning, (source,))
+        floors = noise_floors(start.fit_runs, start.conditioning, (source,))
         ratios = [
             "-"
             if floor is None

@@ -109,7 +109,7 @@ def test_left_out_moves_are_predicted_worse_than_seen_ones(start: Evidence) -> N
     estimate = start.estimate
     problem = linearise(start.training, estimate.gains, estimate.parameters, estimate.axis_noise, gains_fixed=False)
     folds = cut_into_folds(problem)
-    seen = replace(folds, residual=folds.problem.residual)
+    seen = replace(folds, residual=folds.linearisation.residual)
     assert error_left_out(seen).left == pytest.approx(error_on(start.training, estimate).left)
     assert np.all(error_left_out(folds).left > error_left_out(seen).left)
 

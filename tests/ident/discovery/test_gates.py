@@ -184,7 +184,7 @@ def test_runs_are_left_out_where_their_payload_is_in_another(small: Evidence) ->
 
 
 def test_an_error_on_runs_left_out_is_that_of_a_fit_of_the_others(search_problem: SearchProblem) -> None:
-    problem, rng = search_problem.folds.problem, np.random.default_rng(1)
+    problem, rng = search_problem.folds.linearisation, np.random.default_rng(1)
     columns = rng.normal(size=(len(problem.motor), 2)) + 0.3 * problem.residual[:, None]
     run = search_problem.observation.run[problem.source]
     declared = whole(problem.jacobian)
@@ -211,7 +211,7 @@ def _levels(small: Evidence, truth: Truth, levels: tuple[float, ...]) -> SearchP
 
 def _powers_of_the_run(problem: SearchProblem, powers: int) -> FloatArray:
     """Friction of joint 2 as a polynomial of the run's number, whitened, shape (rows, powers)."""
-    linear = problem.folds.problem
+    linear = problem.folds.linearisation
     run = problem.observation.run[linear.source].astype(np.float64)
     rubbing = whitened_columns(problem, Stribeck(100.0), 1)  # sign(q̇), as good as
     return np.asarray(rubbing * run[:, None] ** np.arange(1, powers + 1))
@@ -236,7 +236,7 @@ def test_without_an_effect_the_joint_fit_is_the_declared_one_to_first_order(stic
     assert placed.columns[0] in joined.estimate.unknowns  # with its possible values
     reduced = without_effects_of(search_problem_of(joined), joined.estimate, (placed,))
     noise = (joined.estimate.axis_noise, sticking.estimate.axis_noise)
-    ends = (reduced.search_problem.folds.problem, search_problem_of(sticking).folds.problem)
+    ends = (reduced.search_problem.folds.linearisation, search_problem_of(sticking).folds.linearisation)
     squares = [np.sum((end.residual * own[end.motor]) ** 2) for end, own in zip(ends, noise, strict=True)]
     assert squares[0] == pytest.approx(squares[1], rel=0.01)
     shifts = joined.estimate.gains - sticking.estimate.gains
@@ -245,7 +245,7 @@ def test_without_an_effect_the_joint_fit_is_the_declared_one_to_first_order(stic
 
 def test_gains_that_move_by_more_than_sigma_are_named(search_problem: SearchProblem, small: Evidence) -> None:
     """A torque that is a part of motor 1's own torque is a change of its gain; fixed gains cannot move."""
-    problem, std = search_problem.folds.problem, small.estimate.gains_std
+    problem, std = search_problem.folds.linearisation, small.estimate.gains_std
     share = 3.0 * std[0] / small.estimate.gains[0]
     shifts = gain_shifts(search_problem.folds, -share * whole(problem.jacobian)[:, 0])
     assert shifts[0] == pytest.approx(3.0 * std[0], rel=1e-6)
@@ -259,7 +259,7 @@ def test_coefficients_in_their_noise_are_no_effect() -> None:
     assert not in_noise(np.array([3.0, 0.0]), covariance)
 
 
-def _term_after(sticking: Evidence, order: tuple[Effect, ...]) -> loop._Model | SetAside:
+def _term_after(sticking: Evidence, order: tuple[Effect, ...]) -> loop._JointFit | SetAside:
     """Joint fit of a named effect and a term that can replace it, judged as if the last one had just joined."""
     joined = with_effects(sticking, tuple(PlacedEffect(effect, 1) for effect in order))
     finding = Finding(order[-1], 1, np.ones(1), np.ones(1), 0.0, 1.0, 0.1, 5.0, 4.0, 0.2, 9.0, True, np.ones(8))
@@ -273,7 +273,7 @@ def test_a_term_without_a_name_makes_no_named_effect_leave(sticking: Evidence) -
     assert refused.rival == PlacedEffect(STICKING[0], 1)
     assert refused.reason(("J1", "J2", "J3")) == "stribeck on J2 would no longer pass beside it"
     kept = _term_after(sticking, (term, STICKING[0]))
-    assert isinstance(kept, loop._Model)
+    assert isinstance(kept, loop._JointFit)
     assert kept.evidence.effects == (PlacedEffect(STICKING[0], 1),)
 
 

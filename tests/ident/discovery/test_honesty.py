@@ -36,7 +36,7 @@ def problem(small: Evidence) -> Linearisation:
 
 
 def _fold_of_rows(folds: Folds) -> NDArray[np.int64]:
-    fold = np.empty(len(folds.problem.motor), dtype=np.int64)
+    fold = np.empty(len(folds.linearisation.motor), dtype=np.int64)
     for rows, number, _, _ in folds.blocks:
         fold[rows] = number
     return fold
@@ -49,14 +49,14 @@ def _shows_its_own(folds: Folds, other: Folds) -> float:
 
 
 def _changed(problem: Linearisation, folds: Folds) -> Linearisation:
-    first = np.unique(folds.problem.cluster[_fold_of_rows(folds) == 0])
+    first = np.unique(folds.linearisation.cluster[_fold_of_rows(folds) == 0])
     return replace(problem, residual=problem.residual + 3.0 * np.isin(problem.cluster, first))
 
 
 def test_a_held_out_fold_does_not_influence_its_own_prediction(problem: Linearisation) -> None:
     folds = cut_into_folds(problem)
     fold = _fold_of_rows(folds)
-    parts = [set(folds.problem.cluster[fold == number]) for number in range(folds.count)]
+    parts = [set(folds.linearisation.cluster[fold == number]) for number in range(folds.count)]
     assert sum(map(len, parts)) == problem.cluster_count
     assert not any(one & other for one, other in combinations(parts, 2))
     changed = cut_into_folds(_changed(problem, folds))
@@ -72,8 +72,8 @@ def test_a_planted_leak_is_seen(problem: Linearisation, monkeypatch: pytest.Monk
     assert _shows_its_own(folds, changed) == pytest.approx(3.0)
 
     def of_all_rows(fold: Folds) -> FloatArray:
-        step = linalg.cho_solve(fold.full_factor, fold.problem.jacobian.on_columns(fold.problem.residual))
-        return np.asarray(fold.problem.residual - fold.problem.jacobian @ step)
+        step = linalg.cho_solve(fold.full_factor, fold.linearisation.jacobian.on_columns(fold.linearisation.residual))
+        return np.asarray(fold.linearisation.residual - fold.linearisation.jacobian @ step)
 
     leaking = [replace(one, residual=of_all_rows(one)) for one in (folds, changed)]
     assert _shows_its_own(*leaking) < 2.9
@@ -87,7 +87,7 @@ def test_a_planted_leak_is_seen(problem: Linearisation, monkeypatch: pytest.Monk
 
 
 def _folds_a_move(folds: Folds) -> list[int]:
-    move, fold = folds.problem.cluster // 4, _fold_of_rows(folds)
+    move, fold = folds.linearisation.cluster // 4, _fold_of_rows(folds)
     return [len(np.unique(fold[move == number])) for number in np.unique(move)]
 
 
@@ -96,9 +96,9 @@ def test_pieces_of_a_short_recording_stay_in_the_fold_of_their_move(small: Evide
     short = replace(small, training=small.training.only(rows), datasets=small.datasets[:2])
     search_problem = search_problem_of(short)
     folds = search_problem.folds
-    assert folds.moves < folds.problem.cluster_count  # cut into pieces, as there are few
+    assert folds.moves < folds.linearisation.cluster_count  # cut into pieces, as there are few
     fold = _fold_of_rows(folds)
-    move = short.training.move[folds.problem.source]
+    move = short.training.move[folds.linearisation.source]
     assert all(len(np.unique(fold[move == number])) == 1 for number in np.unique(move))
 
 
@@ -130,7 +130,9 @@ def test_the_choice_of_a_setting_does_not_see_its_fold(problem: Linearisation) -
     folds = cut_into_folds(problem)
     own = _fold_of_rows(folds) == 0
     columns = rng.normal(size=(len(own), 3))
-    changed = cut_into_folds(replace(folds.problem, residual=folds.problem.residual + 5.0 * own * columns[:, 0]))
+    changed = cut_into_folds(
+        replace(folds.linearisation, residual=folds.linearisation.residual + 5.0 * own * columns[:, 0])
+    )
     before, after = (score_candidates(one, columns, [slice(i, i + 1) for i in range(3)]) for one in (folds, changed))
     for one, other in zip(before, after, strict=True):
         assert one is not None

@@ -55,9 +55,9 @@ def test_noise_proposes_no_order(small: Evidence) -> None:
     rng, problem = np.random.default_rng(8), search_problem_of(small)
     folds, alarms = problem.folds, 0
     for _ in range(15):
-        size = rng.uniform(0.2, 2.0, folds.problem.cluster_count)[folds.problem.cluster]
+        size = rng.uniform(0.2, 2.0, folds.linearisation.cluster_count)[folds.linearisation.cluster]
         noise = size * np.convolve(rng.normal(size=len(size)), (0.6, 1.0, 0.6), "same")
-        drawn = replace(problem, folds=replace(folds, problem=replace(folds.problem, residual=noise)))
+        drawn = replace(problem, folds=replace(folds, linearisation=replace(folds.linearisation, residual=noise)))
         alarms += bool(propose_orders(drawn, (), rng, GATES))
     assert alarms <= 1
 
@@ -77,8 +77,11 @@ def test_the_transform_is_the_sum_over_the_rows_of_each_move(small: Evidence) ->
     chosen = len(made.orders) // 10
     columns = problem.torque(Ripple(float(made.orders[chosen])), 1)
     folds = problem.folds
-    slow = folds.problem.whitened(columns, problem.model.drive_train.to_motor) * folds.problem.residual[:, None]
-    by_move = np.stack([np.bincount(folds.problem.cluster, part) for part in slow.T])
+    slow = (
+        folds.linearisation.whitened(columns, problem.model.drive_train.to_motor)
+        * folds.linearisation.residual[:, None]
+    )
+    by_move = np.stack([np.bincount(folds.linearisation.cluster, part) for part in slow.T])
     # The transform counts its angle from another origin.
     assert np.hypot(*made.scores[:, :, chosen]) == pytest.approx(np.hypot(*by_move), rel=0.02, abs=0.01 * by_move.max())
 

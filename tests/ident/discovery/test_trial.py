@@ -96,7 +96,7 @@ def test_blocks_say_what_whole_rows_say(seed: int, widths: list[int]) -> None:
     """Candidates of one and of several columns side by side, on all motors or on one alone."""
     rng = np.random.default_rng(seed)
     folds = cut_into_folds(_problem(rng))
-    problem = folds.problem
+    problem = folds.linearisation
     columns = rng.normal(size=(len(problem.motor), sum(widths)))
     columns[:, 0] *= problem.motor == 1
     columns += 0.4 * whole(problem.jacobian)[:, :1] + 0.2 * problem.residual[:, None]
@@ -109,7 +109,7 @@ def test_blocks_say_what_whole_rows_say(seed: int, widths: list[int]) -> None:
 def test_what_the_model_says_already_is_no_candidate() -> None:
     rng = np.random.default_rng(1)
     folds = cut_into_folds(_problem(rng))
-    j = whole(folds.problem.jacobian)
+    j = whole(folds.linearisation.jacobian)
     own = rng.normal(size=len(j))
     said = j @ rng.normal(size=WIDTH)
     columns = np.stack((said, own, said + own, own, 2.0 * own, said + 1e-2 * own), axis=1)
@@ -118,14 +118,14 @@ def test_what_the_model_says_already_is_no_candidate() -> None:
     assert absorbed is None
     assert twin is None
     assert double is None
-    _agree(good, _written_out(folds.problem, columns[:, 1:2]))
+    _agree(good, _written_out(folds.linearisation, columns[:, 1:2]))
     assert nearly is not None
 
 
 def test_a_column_that_one_fold_alone_sees_predicts_nothing_there() -> None:
     rng = np.random.default_rng(2)
     folds = cut_into_folds(_problem(rng))
-    problem = folds.problem
+    problem = folds.linearisation
     seen = rng.normal(size=(len(problem.motor), 1)) * (problem.cluster % 8 == 3)[:, None]
     (trial,) = score_candidates(folds, seen, [slice(0, 1)])
     assert trial is not None
@@ -138,7 +138,7 @@ def test_a_column_that_one_fold_alone_sees_predicts_nothing_there() -> None:
 def test_pairs_of_which_one_fold_alone_sees_a_part_predict_with_the_other() -> None:
     rng = np.random.default_rng(3)
     folds = cut_into_folds(_problem(rng))
-    problem = folds.problem
+    problem = folds.linearisation
     whole = rng.normal(size=len(problem.motor)) + 0.5 * problem.residual
     seen = rng.normal(size=len(problem.motor)) * (problem.cluster % 8 == 3)
     pair = np.stack((whole, seen), axis=1)
@@ -150,7 +150,7 @@ def test_pairs_of_which_one_fold_alone_sees_a_part_predict_with_the_other() -> N
 def test_the_unit_of_a_candidate_does_not_matter() -> None:
     rng = np.random.default_rng(4)
     folds = cut_into_folds(_problem(rng))
-    columns = rng.normal(size=(len(folds.problem.motor), 2))
+    columns = rng.normal(size=(len(folds.linearisation.motor), 2))
     (one,) = score_candidates(folds, columns, [slice(0, 2)])
     (other,) = score_candidates(folds, columns * np.array([1e5, 1e-4]), [slice(0, 2)])
     assert one is not None
@@ -163,7 +163,7 @@ def test_the_unit_of_a_candidate_does_not_matter() -> None:
 def test_a_draws_statistic_is_that_of_its_moves_one_by_one(width: int) -> None:
     rng = np.random.default_rng(5)
     folds = cut_into_folds(_problem(rng))
-    (trial,) = score_candidates(folds, rng.normal(size=(len(folds.problem.motor), width)), [slice(0, width)])
+    (trial,) = score_candidates(folds, rng.normal(size=(len(folds.linearisation.motor), width)), [slice(0, width)])
     assert trial is not None
     signs = rng.choice((-1.0, 1.0), size=(5, MOVES))
     expected = []
