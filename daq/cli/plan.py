@@ -76,7 +76,7 @@ def plan_verb(
     if json:
         print_json(plan_document(out, declared, experiment, made, judged))
     else:
-        typer.echo(plan_text(out, declared, experiment, made, judged))
+        typer.echo(plan_text(out, preview, declared, experiment, made, judged))
         say_next("drivegain", "record", cell, out, "--out", "unloaded.mcap", "--enable-motion")
 
 

@@ -122,13 +122,27 @@ def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:
 
 
 def _say_next(cell: Path, declared: Cell, plan: Path, out: Path, carried: Payload | None) -> None:
-    """Name the run with the payload after one without, and the fit of both after that."""
-    if carried is not None:
-        others = [path for path in sorted(out.parent.glob("*.mcap")) if path.name != out.name]
-        say_next("drivegain", "fit", *others, out, "--out", "calibration.yaml")
-    elif declared.payloads:
-        weighed = ("--payload", declared.payloads[0].payload.name, "--mass", "KG")
-        say_next("drivegain", "record", cell, plan, "--out", "loaded.mcap", *weighed, "--enable-motion")
+    """Name the run with the payload after one without, and the fit of both where it is plain which these are."""
+    if carried is None:
+        if declared.payloads:
+            weighed = ("--payload", declared.payloads[0].payload.name, "--mass", "KG")
+            say_next("drivegain", "record", cell, plan, "--out", "loaded.mcap", *weighed, "--enable-motion")
+        return
+    others, calibration = [path for path in out.parent.glob("*.mcap") if path != out], out.with_name("calibration.yaml")
+    if len(others) == 1 and not calibration.exists() and _is_unloaded(others[0], declared):
+        say_next("drivegain", "fit", *others, out, "--out", calibration)
+
+
+def _is_unloaded(log: Path, declared: Cell) -> bool:
+    """Whether a log is a valid run of this cell without load."""
+    from daq.errors import DaqError
+    from daq.report.log import describe_log
+
+    try:
+        found = describe_log(log)
+    except DaqError:
+        return False
+    return (found["cell"], found["payload"], found["valid"]) == (declared.name, None, True)
 
 
 def _before_motion(cell: Cell, plan: Path, not_weighed: bool, allowed_by: str | None) -> Iterator[str]:

@@ -137,8 +137,10 @@ def say_written(console: Console, *paths: Path | None) -> None:
     """Print the files and folders that were written, a line each; None for those that were not asked for."""
     for path in paths:
         if path is not None:
+            page = path / "report.html"
             name = f"{path}/" if path.is_dir() else str(path)
-            console.print(terminal_text(f"Written: {name}"))
+            seen = f" (certificate: {page})" if page.exists() else ""
+            console.print(terminal_text(f"Written: {name}{seen}"))
 
 
 class Stepper:

@@ -165,6 +165,13 @@ def parse_yaml(text: bytes, name: str) -> Document:
             expected=f"a configuration of at most {MAX_BYTES} bytes",
             remedy="is this the right file?",
         )
+    if text.startswith(b"\x89MCAP"):
+        raise YamlInvalid(
+            name,
+            found="a log (MCAP)",
+            expected="a file in YAML",
+            remedy="give the files in the order of the command's help",
+        )
     lines: dict[Location, int] = {}
     try:
         loader = _QuickLoader(text) if _is_plain(text) else _Loader(text, name)

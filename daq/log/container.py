@@ -175,11 +175,12 @@ class RecordFile:
     def _check_start(self, stream: BinaryIO, size: int) -> None:
         start = stream.read(len(MAGIC))
         if start != MAGIC[: len(start)] or (size < len(MAGIC) and size > 0):
+            is_text = all(byte in b"\t\n\r" or 0x20 <= byte < 0x7F for byte in start)
             raise LogForeign(
                 str(self.path),
-                found=f"first bytes {start!r}",
-                expected="an MCAP file",
-                remedy="is this the right file?",
+                found=f"a text file that begins with {start.decode()!r}" if is_text else f"first bytes {start!r}",
+                expected="a log (MCAP)",
+                remedy="is this the right file? give the files in the order of the command's help",
             )
 
     def _check_end(self, stream: BinaryIO, size: int) -> None:

@@ -41,8 +41,11 @@ def plan_document(
     }
 
 
-def plan_text(out: Path, cell: Cell, experiment: Experiment, made: Plan, judged: tuple[GainVerdict, ...]) -> str:
-    """Describe a plan in lines for the operator."""
+def plan_text(
+    out: Path, preview: Path | None, cell: Cell, experiment: Experiment, made: Plan, judged: tuple[GainVerdict, ...]
+) -> str:
+    """Describe a plan in lines for the operator, who looks at its preview, if there is one."""
+    look = ", or look at it (--preview PAGE)" if preview is None else f": {preview} shows the moves"
     width = max(len(name) for name in (*cell.axis_names, "axis"))
     lines = [
         f"{out}: {len(made.moves)} moves in {made.duration_s:.0f} s, condition {made.condition:.0f}",
@@ -53,7 +56,7 @@ def plan_text(out: Path, cell: Cell, experiment: Experiment, made: Plan, judged:
         ),
         *(f"  {gain.words(axis.name)}" for axis, gain in zip(cell.axes, judged, strict=True)),
         "Assumed: " + "; ".join(experiment.remarks) + ".",
-        "Read the plan before the robot executes it, or look at it (--preview PAGE). "
+        f"Read the plan before the robot executes it{look}. "
         + (
             "`record` checks the way to its first target from where the robot stands."
             if cell.clearance is not None
