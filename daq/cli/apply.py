@@ -21,16 +21,15 @@ import typer
 from daq.cli.terminal import WRITTEN, at_most_one, delay_signals, interruptible, output_console, write_output
 from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
 from daq.environment import login
-from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, DaqError, ExitCode, UsageError
+from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, ExitCode, UsageError
 from daq.report.text import terminal_text
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
     from daq.config.policy import ApplyPolicy
-    from daq.ledger.judgement import Spread
     from daq.ledger.ledger import Ledger
     from daq.writeback.drive_target import DriveTarget
-    from daq.writeback.request import GainChange, Request
+    from daq.writeback.request import Request
     from daq.writeback.target import E, Proposal, Target, Written
     from drivers.canopen.parameters import Saving
     from ident.calibration import Calibration
@@ -124,6 +123,7 @@ def apply_to(
     The write, its audit and its entry in the history are done within `whole`.
     """
     from daq.files import sha256
+    from daq.ledger.judgement import query_history
     from daq.report.proposal import describe, show
     from daq.writeback.target import apply, propose
 
@@ -384,22 +384,6 @@ def require_separate_audit(audit: Path, others: Iterable[Path | None]) -> None:
                 expected="a file of the audit's own",
                 remedy="correct `history.audit` of the cell file, or --audit; nothing was written",
             )
-
-
-def query_history(cell: Cell, target: str, request: Request, changes: Sequence[GainChange]) -> Spread:
-    """Return the figures of the cell's history that a change is judged by; none where it cannot be read."""
-    from daq.files import sha256
-    from daq.ledger.judgement import NOTHING, known_of
-    from daq.ledger.store import HistoryStore
-
-    if cell.history is None:
-        return NOTHING
-    try:
-        with HistoryStore(cell.history.store) as store:
-            return known_of(store, target, sha256(request.signed), changes)
-    except DaqError as error:
-        _LOG.warning("the history cannot be read: the numbers in the controller are taken as exact: %s", error)
-        return NOTHING
 
 
 def record_in_history(cell: Cell, actor: Applier, record: Callable[[Ledger], object]) -> None:

@@ -65,7 +65,6 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
     from datetime import UTC, datetime
     from functools import partial
 
-    from daq.cli.report import compare
     from daq.cli.terminal import interruptible
     from daq.config.cell_file import load_cell
     from daq.environment import login
@@ -73,6 +72,7 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
     from daq.jobs.job import preview, recalibrate
     from daq.jobs.reporting import document, text
     from daq.jobs.session import CALIBRATION
+    from daq.report.certificate import compare
     from daq.report.residual_page import save_report
     from daq.report.text import printable
     from daq.workflow.feed import Feed

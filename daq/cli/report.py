@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
-
-if TYPE_CHECKING:
-    from daq.config.cell import Cell
-    from daq.report.certificate import Comparison
-    from daq.writeback.request import Request
 
 
 def report_verb(
@@ -37,7 +32,7 @@ def report_verb(
     from daq.cli.terminal import check_folder, check_replaceable, print_view, write_output
     from daq.config.cell_file import load_cell
     from daq.files import replace_file
-    from daq.report.certificate import certificate_document, certify, without_controller
+    from daq.report.certificate import certificate_document, certify, compare, without_controller
     from daq.report.certificate_page import certificate_page
     from daq.report.html import MARK
     from daq.workflow.calibration_file import decode, load_calibration, read
@@ -63,32 +58,6 @@ def report_verb(
         print_json(certificate_document(certificate))
     else:
         print_view((certificate.sentence,), page)
-
-
-def compare(cell: Cell, request: Request, command: str = "") -> Comparison:
-    """Compare a calibration with the controller's file of a cell, as `apply` would; reads only.
-
-    Without a file that can be read the gains are compared with the nameplate, and the reason is kept.
-    """
-    from dataclasses import replace
-
-    from daq.cli.apply import query_history
-    from daq.errors import DaqError
-    from daq.report.certificate import Comparison, without_controller
-    from daq.writeback.file_target import FileTarget
-    from daq.writeback.target import propose
-
-    if cell.controller is not None and not cell.controller.gains:
-        places = zip(cell.axis_names, cell.controller.objects, strict=True)
-        listed = ", ".join(f"{axis} {entry.parameter}" for axis, entry in places)
-        unread = f"The drives hold the gains ({listed}), and this page does not open the bus: `{command} --drives`."
-        return without_controller(request.calibration, unread, request.now, cell)
-    try:
-        proposal = propose(FileTarget.of(cell), request)
-    except DaqError as error:
-        return without_controller(request.calibration, f"The controller was not read: {error}.", request.now, cell)
-    known = query_history(cell, proposal.edit.subject, request, proposal.edit.changes)
-    return replace(Comparison.of(proposal, cell.apply, known), command=command)
 
 
 REPORT = Verb("report", report_verb, "drivegain report calibration.yaml --cell CELL")

@@ -24,7 +24,6 @@ from daq.writeback.gates.gate import Gate
 from daq.writeback.request import Request
 from daq.writeback.target import Proposal, Written
 from ident.calibration import Calibration
-from ident.drift.change import FALSE_ALARM
 
 CHANGED_SINCE_START = "The controller's file was written or rolled back since the session began: an operator decides."
 PROPOSAL, DIFF = "proposal.json", "proposal.diff"
@@ -116,23 +115,20 @@ def _note_applied(context: JobContext, ledger: Ledger, digest: str, after_sha256
 
 def decision_of(proposal: Proposal[FileEdit], known: Spread) -> Decision:
     """Judge which gains differ significantly from the controller's (`daq.ledger.judgement`), each among all axes."""
-    found = judge(proposal.edit.changes, known)
-    changes = {change.axis: change for change in proposal.edit.changes}
+    judged, words = judge(proposal.edit.changes, known)
     gains = tuple(
         JudgedGain(
-            axis=axis,
-            unit=changes[axis].unit,
-            old=changes[axis].old,
-            old_std=known.stds[axis],
-            new=changes[axis].new,
-            new_std=changes[axis].std,
-            change_percent=_finite(drift.percent),
-            drift_sigma=_finite(drift.sigmas),
-            differs=probability <= FALSE_ALARM,
+            **picked(change, "axis", "unit", "old", "new"),
+            old_std=known.stds[change.axis],
+            new_std=change.std,
+            change_percent=_finite(judged[change.axis].percent),
+            drift_sigma=_finite(judged[change.axis].sigmas),
+            differs=judged[change.axis].significant,
         )
-        for axis, drift, probability in zip(found.axes, found.changes, found.adjusted, strict=True)
+        for change in proposal.edit.changes
+        if change.axis in judged
     )
-    return Decision(gains=gains, remark=found.words)
+    return Decision(gains=gains, remark=words)
 
 
 def _written_since(context: JobContext, session: Session) -> bool:

@@ -1,15 +1,21 @@
-"""Whether gains differ from those in a controller by more than noise: one answer for dry run, drives and job."""
+"""Whether gains differ from those in a controller by more than noise: one answer for dry run, drives, page and job."""
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from daq.config.cell import Cell
+from daq.errors import DaqError
+from daq.files import sha256
 from daq.ledger.store import HistoryStore
 from daq.ledger.watch import dispersions_of
-from daq.writeback.request import GainChange
-from ident.drift.change import DISPERSION, ChangeDecision, decide
+from daq.writeback.request import GainChange, Request
+from ident.drift.change import DISPERSION, FALSE_ALARM, decide
+
+_LOG = logging.getLogger("drivegain")
 
 SAME_SIGMAS = 0.5
 """A number in the controller's file that is as near to a gain of the history is that gain, rounded for the file."""
@@ -27,6 +33,31 @@ class Spread:
 
 
 NOTHING = Spread()
+
+
+@dataclass(frozen=True, slots=True)
+class JudgedChange:
+    """The change of one gain, judged among all axes."""
+
+    percent: float = math.nan  #: as of `ident.drift.change.Change`
+    sigmas: float = math.nan  #: the change in σ of both as calibrations scatter, negative where the gain has decreased
+    significant: bool = False  #: whether it is more than noise, at FALSE_ALARM over all axes
+
+
+NOT_JUDGED = JudgedChange()
+"""Of a gain whose numbers are not finite."""
+
+
+def query_history(cell: Cell, target: str, request: Request, changes: Sequence[GainChange]) -> Spread:
+    """Return the figures of a cell's history; none, with a warning, where it cannot be read."""
+    if cell.history is None:
+        return NOTHING
+    try:
+        with HistoryStore(cell.history.store) as store:
+            return known_of(store, target, sha256(request.signed), changes)
+    except DaqError as error:
+        _LOG.warning("the history cannot be read: the numbers in the controller are taken as exact: %s", error)
+        return NOTHING
 
 
 def known_of(store: HistoryStore, target: str, digest: str, changes: Sequence[GainChange]) -> Spread:
@@ -54,14 +85,17 @@ def known_of(store: HistoryStore, target: str, digest: str, changes: Sequence[Ga
     return Spread(stds, dispersions_of(others, tuple(gains)))
 
 
-def judge(changes: Sequence[GainChange], known: Spread) -> ChangeDecision:
-    """Decide whether any change is more than noise; numbers that are not finite have a gate of their own."""
+def judge(changes: Sequence[GainChange], known: Spread) -> tuple[dict[str, JudgedChange], str]:
+    """Judge changes by axis, and say the result in one sentence.
+
+    Left out are gains whose numbers are not finite: these have a gate of their own.
+    """
     comparable = [
         change
         for change in changes
         if all(map(math.isfinite, (change.old, change.new, change.std))) and change.std >= 0.0
     ]
-    return decide(
+    found = decide(
         tuple(change.axis for change in comparable),
         [change.old for change in comparable],
         [known.stds.get(change.axis, 0.0) for change in comparable],
@@ -69,3 +103,13 @@ def judge(changes: Sequence[GainChange], known: Spread) -> ChangeDecision:
         [change.std for change in comparable],
         dispersion=[known.dispersions.get(change.axis, DISPERSION) for change in comparable],
     )
+    judged = (JudgedChange(one.percent, one.sigmas, s) for one, s in zip(found.changes, found.significant, strict=True))
+    return dict(zip(found.axes, judged, strict=True)), found.words
+
+
+def noise_note(changes: Sequence[GainChange], known: Spread, old: str) -> str:
+    """Say what "more than noise" means for these changes; `old` names what they are from, such as "the nameplate"."""
+    exact = [change.axis for change in changes if not known.stds.get(change.axis)]
+    whose = "all axes" if len(exact) == len(changes) else ", ".join(exact)
+    taken = f"{old} taken as exact ({whose})" if exact else "σ of both"
+    return f"more than noise: probability below {100 * FALSE_ALARM:g} % among all axes, {taken}"

@@ -7,27 +7,28 @@ controller was not read, the nameplate takes its place, and the limit of a chang
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from enum import Enum
 from typing import Any
 
 from daq.config.cell import Cell
 from daq.config.policy import ApplyPolicy
-from daq.errors import CalibrationRefused
-from daq.ledger.judgement import NOTHING, Spread, judge
+from daq.errors import CalibrationRefused, DaqError
+from daq.ledger.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, judge, noise_note, query_history
 from daq.report.effect_names import accepted_text, size_text
 from daq.report.fit import error_document
+from daq.report.proposal import refusal_document
 from daq.report.text import picked
-from daq.writeback.file_target import FileEdit
+from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.gates.gate import Gate, GateContext, Refusal
 from daq.writeback.gates.table import check_gates
 from daq.writeback.request import Edit, GainChange, Request
-from daq.writeback.target import Proposal
+from daq.writeback.target import Proposal, propose
 from ident.calibration import Calibration
-from ident.drift.change import FALSE_ALARM
 
 FORMAT, VERSION = "drivegain-certificate", 1
+EARLIER = "earlier calibration"  #: What `since` compares with
 _OPERATORS = frozenset({Gate.SIGNATURE, Gate.BASE})
 """Gates that an operator opens by reviewing or signing; the calibration itself is not at fault."""
 
@@ -93,14 +94,36 @@ def without_controller(calibration: Calibration, unread: str, now: datetime, cel
     )
 
 
+def compare(cell: Cell, request: Request, command: str = "") -> Comparison:
+    """Compare a calibration with the controller's file of a cell, as `apply` would; reads only.
+
+    Without a file that can be read the gains are compared with the nameplate, and the reason is kept.
+
+    Args:
+        cell: from its file.
+        request: calibration to judge.
+        command: that shows the change; see `Comparison`.
+    """
+    if cell.controller is not None and not cell.controller.gains:
+        places = zip(cell.axis_names, cell.controller.objects, strict=True)
+        listed = ", ".join(f"{axis} {entry.parameter}" for axis, entry in places)
+        unread = f"The drives hold the gains ({listed}), and this page does not open the bus: `{command} --drives`."
+        return without_controller(request.calibration, unread, request.now, cell)
+    try:
+        proposal = propose(FileTarget.of(cell), request)
+    except DaqError as error:
+        return without_controller(request.calibration, f"The controller was not read: {error}.", request.now, cell)
+    known = query_history(cell, proposal.edit.subject, request, proposal.edit.changes)
+    return replace(Comparison.of(proposal, cell.apply, known), command=command)
+
+
 @dataclass(frozen=True, slots=True)
 class AxisRow:
     """One gain of the certificate."""
 
     change: GainChange  #: gain in the controller, or nameplate, and identified one with its σ
     allowed_percent: tuple[float, float]  #: limits of the change
-    sigmas: float  #: the change in σ of both, as calibrations scatter; NaN where it cannot be judged
-    significant: bool  #: whether it is more than noise
+    judged: JudgedChange  #: NaN where it cannot be judged
     refusals: tuple[Refusal, ...]  #: failed checks of this axis
 
     def words(self, place: str) -> str:
@@ -108,6 +131,11 @@ class AxisRow:
         if self.refusals:
             return "; ".join(f"refused: {refusal.found}" for refusal in self.refusals)
         return f"differs from the {place}" if self.significant else "same within noise"
+
+    @property
+    def significant(self) -> bool:
+        """Whether the change is more than noise."""
+        return self.judged.significant
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +153,12 @@ class Certificate:
     def place(self) -> str:
         """What the gains are compared with."""
         return "nameplate" if self.comparison.edit is None else "controller"
+
+    @property
+    def note(self) -> str:
+        """What a difference beyond noise is, as `apply` says it."""
+        old = "the nameplate" if self.comparison.edit is None else "the number in the controller"
+        return noise_note(self.comparison.changes, self.comparison.known, old)
 
     @property
     def verdict(self) -> Verdict:
@@ -186,16 +220,12 @@ def certify(calibration: Calibration, comparison: Comparison, earlier: Calibrati
 
 
 def _rows(comparison: Comparison) -> tuple[AxisRow, ...]:
-    judged = judge(comparison.changes, comparison.known)
-    found = {
-        axis: (abs(change.sigmas), probability <= FALSE_ALARM)
-        for axis, change, probability in zip(judged.axes, judged.changes, judged.adjusted, strict=True)
-    }
+    judged, _ = judge(comparison.changes, comparison.known)
     return tuple(
         AxisRow(
             change,
             comparison.allowed_percent(change),
-            *found.get(change.axis, (math.nan, False)),
+            judged.get(change.axis, NOT_JUDGED),
             tuple(refusal for refusal in comparison.refusals if refusal.subject == change.axis),
         )
         for change in comparison.changes
@@ -283,7 +313,7 @@ def certificate_document(certificate: Certificate) -> dict[str, Any]:
         "controller": None if edit is None else str(edit.file),
         "controller_unread": comparison.unread or None,
         "axes": [_axis_document(row, certificate.place) for row in certificate.rows],
-        "refusals": [asdict(refusal) | {"gate": refusal.gate.value} for refusal in comparison.refusals],
+        "refusals": [refusal_document(refusal) for refusal in comparison.refusals],
         "holdout_error_percent": error_document(calibration.holdout_error_percent),
         "nameplate_holdout_error_percent": error_document(calibration.nameplate_holdout_error_percent),
         "relative_error_percent": error_document(calibration.relative_error_percent),
@@ -301,7 +331,7 @@ def certificate_document(certificate: Certificate) -> dict[str, Any]:
         if certificate.earlier is None
         else {
             "created": certificate.earlier.created,
-            "axes": [_axis_document(row, "earlier calibration") for row in certificate.since],
+            "axes": [_axis_document(row, EARLIER) for row in certificate.since],
             "holdout_error_percent": error_document(certificate.earlier.holdout_error_percent),
         },
     }
@@ -309,11 +339,14 @@ def certificate_document(certificate: Certificate) -> dict[str, Any]:
 
 def _axis_document(row: AxisRow, place: str) -> dict[str, Any]:
     return {
-        **picked(row.change, "axis", "key", "line", "old", "new", "std", "std_percent", "unit", "nameplate"),
+        "axis": row.change.axis,
+        "key": row.change.key or None,
+        "line": row.change.line or None,
+        **picked(row.change, "old", "new", "std", "std_percent", "unit", "nameplate"),
         **picked(row.change, "change_percent"),
         "written": row.change.spelling or None,
         "allowed_percent": list(row.allowed_percent),
-        "sigmas": row.sigmas,
+        "change_sigmas": row.judged.sigmas,
         "significant": row.significant,
         "verdict": row.words(place),
     }

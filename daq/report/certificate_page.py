@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from daq.report.certificate import AxisRow, Certificate, Verdict, identity
+from daq.report.certificate import EARLIER, AxisRow, Certificate, Verdict, identity
 from daq.report.effect_names import WORDS, accepted_text, curve_of, size_text
 from daq.report.gains import diagnosis_texts, partial_note, with_deviation
 from daq.report.html import element, figure, folded, listed, page, pair, paragraph, section, table, terms
@@ -109,6 +109,7 @@ def _gains(certificate: Certificate) -> str:
     return section(
         "Drive gains",
         table("", ("axis", place, "identified ± σ", "change [%]", "limit [%]", "verdict"), rows, "words"),
+        paragraph(f"{certificate.note[0].upper()}{certificate.note[1:]}."),
         pair((_changes(certificate), *_errors(certificate.calibration))),
     )
 
@@ -229,8 +230,8 @@ def _since(certificate: Certificate) -> Iterator[str]:
             with_deviation(old[gain.axis].value, old[gain.axis].std),
             with_deviation(gain.value, gain.std),
             _percent(row.change.change_percent),
-            f"{row.sigmas:.1f}",
-            "changed" if row.significant else "same within noise",
+            f"{abs(row.judged.sigmas):.1f}",
+            row.words(EARLIER),
         )
         for gain, row in zip(calibration.gains, certificate.since, strict=True)
     ]

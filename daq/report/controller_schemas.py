@@ -29,7 +29,7 @@ class FileGain(StrictModel):
     old: float
     new: float
     change_percent: Figure
-    change_sigmas: Figure
+    change_sigmas: Figure = Field(description="signed as change_percent")
     significant: bool
     std_percent: Figure
     nameplate: float
@@ -110,8 +110,8 @@ class CertifiedGain(StrictModel):
     """A gain beside the one in the controller, or beside the nameplate."""
 
     axis: str
-    key: str
-    line: int
+    key: str | None = Field(description="in the controller's file; null where it was not read")
+    line: int | None
     old: Figure
     new: float
     std: float
@@ -121,7 +121,7 @@ class CertifiedGain(StrictModel):
     change_percent: Figure
     written: str | None
     allowed_percent: list[Figure] = Field(description="limits of the change; null: none")
-    sigmas: Figure
+    change_sigmas: Figure = Field(description="signed as change_percent")
     significant: bool
     verdict: str
 

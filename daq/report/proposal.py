@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
-from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -12,25 +10,22 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from daq.ledger.judgement import NOTHING, Spread, judge
+from daq.ledger.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, judge, noise_note
 from daq.report.gains import with_deviation
 from daq.report.text import picked, plain_table, terminal_lines, terminal_text
 from daq.writeback.drive_target import DriveEdit
 from daq.writeback.file_target import FileEdit
+from daq.writeback.gates.gate import Refusal
 from daq.writeback.request import Edit, GainChange
 from daq.writeback.target import E, Proposal, Written
-from ident.drift.change import FALSE_ALARM
 
 
 def show(proposal: Proposal[E], console: Console, known: Spread = NOTHING) -> None:
     """Print the change as a table and as a diff, judged by the history."""
     edit = proposal.edit
     console.print(change_table(edit.changes, known, _place(edit)))
-    exact = [change.axis for change in edit.changes if not known.stds.get(change.axis)]
-    whose = "all axes" if len(exact) == len(edit.changes) else ", ".join(exact)
-    taken = f"the number {_place(edit)} taken as exact ({whose})" if exact else "σ of both"
-    note = f"* more than noise: probability below {100 * FALSE_ALARM:g} % among all axes, {taken}"
-    console.print(terminal_text(note), style="dim")
+    note = noise_note(edit.changes, known, f"the number {_place(edit)}")
+    console.print(terminal_text(f"* {note}"), style="dim")
     console.print()
     if isinstance(edit, DriveEdit):
         for change, value in zip(edit.changes, edit.values, strict=True):
@@ -43,16 +38,16 @@ def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING, place
     """Make the table of old and new gains, with the figures to judge a change by."""
     headings = ("axis", place, "identified ± σ", "σ %", "Δ %", "Δ in σ", "nameplate", "off %", "unit")
     table = plain_table(headings, left=(0, len(headings) - 1))
-    judged = _by_axis(changes, known)
+    judged, _ = judge(changes, known)
     for change in changes:
-        sigmas, beyond_noise = judged.get(change.axis, (math.nan, False))
+        found = judged.get(change.axis, NOT_JUDGED)
         table.add_row(
             terminal_text(change.axis),
             f"{change.old:.5g}",
             with_deviation(change.new, change.std),
             f"{change.std_percent:.2f}",
             f"{change.change_percent:+.1f}",
-            f"{sigmas:.1f} {'*' if beyond_noise else ' '}",
+            f"{abs(found.sigmas):.1f} {'*' if found.significant else ' '}",
             f"{change.nameplate:.5g}",
             f"{change.nameplate_percent:+.1f}",
             terminal_text(change.unit),
@@ -63,30 +58,34 @@ def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING, place
 def describe(proposal: Proposal[E], written: Written | None, known: Spread = NOTHING) -> dict[str, Any]:
     """Make the document of a proposal and its outcome for `--json`."""
     edit = proposal.edit
-    refusals = [asdict(refusal) | {"gate": refusal.gate.value} for refusal in proposal.refusals]
+    refusals = [refusal_document(refusal) for refusal in proposal.refusals]
     base = {"base_sha256": edit.base_sha256, "base": edit.base, "applied": written is not None}
     if isinstance(edit, DriveEdit):
         names = ("old", "new", "std", "nameplate", "unit")
         changes = [{"axis": one.axis, "object": one.key, **picked(one, *names)} for one in edit.changes]
         cell = None if proposal.target.cell is None else proposal.target.cell.name
         return {"cell": cell, **base, **_outcome(written), "changes": changes, "refusals": refusals}
-    judged = _by_axis(edit.changes, known)
+    judged, _ = judge(edit.changes, known)
     return {
         "file": str(edit.place),
         **base,
         "backup": None if written is None else str(written.backup),
-        "changes": [_file_change(change, judged.get(change.axis)) for change in edit.changes],
+        "changes": [_file_change(change, judged.get(change.axis, NOT_JUDGED)) for change in edit.changes],
         "refusals": refusals,
         "diff": edit.diff if isinstance(edit, FileEdit) else "",
     }
 
 
-def _file_change(change: GainChange, judged: tuple[float, bool] | None) -> dict[str, Any]:
-    sigmas, significant = (None, False) if judged is None else judged
+def refusal_document(refusal: Refusal) -> dict[str, Any]:
+    """Make the document of a failed check for `--json`."""
+    return asdict(refusal) | {"gate": refusal.gate.value}
+
+
+def _file_change(change: GainChange, judged: JudgedChange) -> dict[str, Any]:
     return {
         **picked(change, "axis", "key", "line", "old", "new", "change_percent"),
-        "change_sigmas": sigmas,
-        "significant": significant,
+        "change_sigmas": judged.sigmas,
+        "significant": judged.significant,
         **picked(change, "std_percent", "nameplate", "nameplate_percent", "unit"),
     }
 
@@ -169,12 +168,3 @@ _DIFF_STYLES = {"+": "green", "-": "red", "@": "cyan"}
 
 def _place(edit: Edit) -> str:
     return "in the drive" if isinstance(edit, DriveEdit) else "in the file"
-
-
-def _by_axis(changes: Sequence[GainChange], known: Spread) -> dict[str, tuple[float, bool]]:
-    """Change in σ of both as calibrations scatter, and whether it is more than noise; of comparable axes."""
-    found = judge(changes, known)
-    return {
-        axis: (abs(change.sigmas), probability <= FALSE_ALARM)
-        for axis, change, probability in zip(found.axes, found.changes, found.adjusted, strict=True)
-    }

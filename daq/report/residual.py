@@ -26,6 +26,7 @@ from ident.discovery.gear_loss import CERTAIN, GearLoss, gear_losses, is_gear_lo
 from ident.discovery.loop import MAX_EFFECTS, Step
 from ident.discovery.noise_floor import FloorSource
 from ident.discovery.search import Finding
+from ident.drift.change import FALSE_ALARM
 from ident.effects.effect import PlacedEffect, Side
 from ident.effects.electrical import TimeSkew
 from ident.effects.signals import session_began_s
@@ -147,7 +148,10 @@ def gains_sentence(fitted: Fit, account: Account) -> str:
     ]
     if not changed:
         return "With and without the effects, the gains are the same within noise."
-    return f"The effects change gains by more than noise: {', '.join(changed)} of the gain without them."
+    return (
+        f"The effects change gains by more than noise (probability below {100 * FALSE_ALARM:g} % among all axes): "
+        f"{', '.join(changed)} of the gain without them."
+    )
 
 
 def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:

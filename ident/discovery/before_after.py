@@ -42,6 +42,7 @@ from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import PairedChange, compare_by_move
 from ident.discovery.loop import Step
 from ident.discovery.noise_floor import NoiseFloor, noise_floors
+from ident.drift.change import FALSE_ALARM
 from ident.effects.effect import PlacedEffect
 from ident.equations.linearisation import (
     Folds,
@@ -179,9 +180,6 @@ def _in_order(bare: Observation, order: Sequence[int]) -> Observation:
     return replace(bare.only(rows), run=number[bare.run[rows]], runs=tuple(bare.runs[run] for run in order))
 
 
-FALSE_ALARM = 0.05  #: Probability that noise alone makes any gain's change significant, over all axes (Bonferroni)
-
-
 @dataclass(frozen=True, slots=True)
 class Errors:
     """Errors of one model [%]; None where not requested, or without held-out runs."""
@@ -233,7 +231,7 @@ class GainShift:
     after_std: float  #: its σ
     choice_std: float  #: the part of it that comes from the choice of the effects (`choice_covariance`)
     change_std: float  #: σ of the change, 0 for a fixed gain
-    significant: bool  #: whether the change is more than noise, at FALSE_ALARM over all axes
+    significant: bool  #: whether the change is more than noise, at FALSE_ALARM over all axes (Bonferroni)
 
     @property
     def change_percent(self) -> float:

@@ -32,6 +32,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
+from itertools import compress
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,7 +40,8 @@ from numpy.typing import ArrayLike
 from ident.arrays import FloatArray
 
 DISPERSION = 1.05  #: Default without a history: repeated fits of simulated cells scatter 5 % more than their σ
-FALSE_ALARM = 0.01  #: Share of recalibrations without any change in which `decide` finds one
+FALSE_ALARM = 0.01
+"""Share of comparisons without any change in which a gain is said to change by more than noise, over all axes."""
 
 _POOLED_WEIGHT, _AXIS_WEIGHT = 10.0, 30.0
 """Weights of the prior and of the pooled estimate beside an axis' own, in numbers of successive differences."""
@@ -77,6 +79,7 @@ class ChangeDecision:
     changes: tuple[Change, ...]  #: one an axis
     #: Probability of each axis' change among all of them (Holm 1979, valid however their errors depend).
     adjusted: tuple[float, ...]
+    significant: tuple[bool, ...]  #: whether each axis' change is more than noise
     words: str  #: the same in one sentence
 
 
@@ -146,7 +149,8 @@ def decide(
     order = np.argsort(probabilities)
     adjusted = np.empty(n)
     adjusted[order] = np.maximum.accumulate(np.minimum(1.0, probabilities[order] * np.arange(n, 0, -1)))
-    differs = bool(adjusted.min(initial=1.0) <= false_alarm)
+    significant = tuple(bool(probability <= false_alarm) for probability in adjusted)
+    differs = any(significant)
     words = "no gain to compare"
     if axes:
         parts = [
@@ -156,9 +160,8 @@ def decide(
         largest = parts[int(np.argmax([abs(change.sigmas) for change in changes]))]
         words = f"no gain has changed by more than noise: the largest change is {largest}"
         if differs:
-            changed = [text for text, p in zip(parts, adjusted, strict=True) if p <= false_alarm]
-            words = f"changed by more than noise: {', '.join(changed)}"
-    return ChangeDecision(differs, axes, changes, tuple(map(float, adjusted)), words)
+            words = f"changed by more than noise: {', '.join(compress(parts, significant))}"
+    return ChangeDecision(differs, axes, changes, tuple(map(float, adjusted)), significant, words)
 
 
 def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:

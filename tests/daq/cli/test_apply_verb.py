@@ -399,7 +399,7 @@ def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
         found: dict[str, object] = json.loads(capsys.readouterr().out)["changes"][3]
         return found
 
-    assert fourth()["change_sigmas"] == pytest.approx(2.31 / (DISPERSION * 0.03684))  # entered by hand: exact
+    assert fourth()["change_sigmas"] == pytest.approx(-2.31 / (DISPERSION * 0.03684))  # entered by hand: exact
     assert bench.apply("--yes") == ExitCode.OK
     known = decode(bench.calibration.read_bytes(), "")
     gain = known.gains[3]

@@ -155,7 +155,7 @@ def test_a_page_beside_an_earlier_one_shows_what_changed() -> None:
     first = calibration.gains[0]
     earlier = replace(calibration, gains=(replace(first, value=0.9 * first.value), *calibration.gains[1:]), effects=())
     texts = Reader(_page(calibration, earlier)).texts
-    assert texts.count("changed") == 1
+    assert texts.count("differs from the earlier calibration") == 1
     assert "+11.1" in texts
     assert any(text.startswith("New: J3 has friction that grows with the load") for text in texts)
     with pytest.raises(CalibrationRefused, match="of the same cell"):
@@ -173,8 +173,16 @@ def test_the_verb_writes_one_page_and_never_over_another_file(
     # The configuration of the demo cell is not the one that the calibration names.
     assert document["verdict"] == "refused"
     assert [axis["key"] for axis in document["axes"]] == [f"drives.J{number}.gain" for number in range(1, 7)]
+    # J4 went from -11.52 to -9.21: its size decreased. The number in the controller is no calibration's.
+    assert document["axes"][3]["change_sigmas"] < 0.0 < document["axes"][0]["change_sigmas"]
     texts = Reader(page.read_text(encoding="utf-8")).texts
+    taken = "the number in the controller taken as exact (all axes)."
+    assert f"More than noise: probability below 1 % among all axes, {taken}" in texts
     assert {axis["written"] for axis in document["axes"]} <= set(texts)
+    assert main(["report", str(file), "--json"]) == ExitCode.OK
+    unread = json.loads(capsys.readouterr().out)["axes"]
+    assert all(axis["key"] is axis["line"] is None for axis in unread)
+    assert "the nameplate taken as exact (all axes)." in page.read_text(encoding="utf-8")
     page.write_text("the user's own", encoding="utf-8")
     assert main(["report", str(file)]) == ExitCode.USAGE
     assert page.read_text(encoding="utf-8") == "the user's own"

@@ -350,8 +350,8 @@ def test_the_summary_says_what_the_effects_change(closed: Closed) -> None:
         (False, "With and without the effects, the gains are the same within noise."),
         (
             True,
-            f"The effects change gains by more than noise: J1 by {gains[0].change_percent:+.1f} % of the gain "
-            "without them.",
+            "The effects change gains by more than noise (probability below 1 % among all axes): "
+            f"J1 by {gains[0].change_percent:+.1f} % of the gain without them.",
         ),
     ):
         marked = (replace(gains[0], significant=significant), *(replace(gain, significant=False) for gain in gains[1:]))
