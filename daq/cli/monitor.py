@@ -33,7 +33,7 @@ def monitor_verb(
     from daq.cli.terminal import interruptible
     from daq.config.bus import cell_address, drive_axes
     from daq.config.cell_file import load_cell
-    from daq.report.bus import monitor_view
+    from daq.report.bus import monitor_document, monitor_view
     from daq.workflow.calibration_file import load_calibration
     from daq.workflow.feed import Feed
     from daq.workflow.monitor import CellWatch
@@ -59,7 +59,7 @@ def monitor_verb(
         watch = CellWatch(cell, declared, network, feed, known, None if carried is None else carried.name)
         watch.listen(QUIET_S)
         if once or json or not console.is_terminal:
-            document = watch.read(interval)
+            document = monitor_document(declared, watch.read(interval))
             if json:
                 print_json(document)
             else:
@@ -73,7 +73,7 @@ def monitor_verb(
             console.print(feed.remark)
         with Live(console=console, auto_refresh=False, screen=False) as live:
             while True:
-                live.update(monitor_view(watch.read(interval)), refresh=True)
+                live.update(monitor_view(monitor_document(declared, watch.read(interval))), refresh=True)
 
 
 MONITOR = Verb("monitor", monitor_verb, "drivegain monitor CELL --calibration calibration.yaml")

@@ -37,7 +37,7 @@ def scan_verb(
     from daq.config.cell_file import load_cell
     from daq.errors import ConfigurationInconsistent
     from daq.report.bus import current_signals, scan_rows, scan_view
-    from daq.workflow.nameplates import check_nameplates
+    from daq.workflow.nameplates import check_nameplates, nameplate_warnings
     from drivers.canopen.network import CanopenNetwork
     from drivers.errors import NodeMissing
     from drivers.profiles.cia402 import State
@@ -61,19 +61,20 @@ def scan_verb(
             with CanopenNetwork(part.address, axes) as network:
                 found[part.name] = network.scan(wait_s=wait)
             reset += [axis.name for axis in faulty]
-    mistyped: list[str] = []
+    readings = [scales.get(name) for name in declared.axis_names]
+    mistyped, warnings = list[str](), nameplate_warnings(declared, readings)
     try:
-        check_nameplates(cell, declared, [scales.get(name) for name in declared.axis_names])
+        check_nameplates(cell, declared, readings)
     except ConfigurationInconsistent as error:
         mistyped.append(str(error))
     rows = [row for name, nodes in found.items() for row in scan_rows(declared, nodes, name)]
     if json:
         address = str(cell_address(declared))
         signals = current_signals(declared)
-        cause = {"reset": reset, "faults": causes}
-        print_json({"bus": address, "nodes": rows, **cause, "current": signals, "mistyped": mistyped})
+        cause, doubts = {"reset": reset, "faults": causes}, {"mistyped": mistyped, "warnings": warnings}
+        print_json({"bus": address, "nodes": rows, **cause, "current": signals, **doubts})
     else:
-        print_view(scan_view(declared, rows, causes, mistyped))
+        print_view(scan_view(rows, causes, mistyped, warnings))
     absent = {row["node_id"] for row in rows if row["verdict"] == "missing"}
     missing = [axis for axis in drive_axes(declared) if axis.node_id in absent]
     if missing:

@@ -14,6 +14,7 @@ from drivers.canopen.pdo import HEARTBEAT_MS, SETPOINT_PDOS, STATUSWORD, pack
 from drivers.profiles.profile import Axis, DriveProfile, ObjectEntry
 
 if TYPE_CHECKING:
+    from drivers.stream.monitor import CellReading
     from drivers.stream.split_bus import CellAddress
 
 # Addresses are made through the lazy front door: reading a cell file checks the load of its buses, and that needs no
@@ -250,4 +251,14 @@ def _no_bus(cell: Cell, found: str) -> ConfigurationInconsistent:
         found=found,
         expected="a cell with bus, sync, and node_id and drive of each axis",
         remedy="this cell only imports recordings; add what is missing, as in configs/cells/demo.yaml",
+    )
+
+
+def bus_loads_percent(cell: Cell, reading: CellReading) -> tuple[float, ...]:
+    """Load of each bus, with every frame as long as bit stuffing can make it [%]."""
+    return tuple(
+        100.0
+        * sum(count * frame_bits(length) for length, count in enumerate(frames))
+        / (bus.bitrate_bit_s * reading.seconds)
+        for bus, frames in zip(cell.buses, reading.frames, strict=True)
     )

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 
 from daq.config.cell import Cell
-from daq.report.bus import ENABLED, FAULTY
-from daq.report.events import event_document
+from daq.workflow.events import event_document
 from daq.workflow.feed import (
     ACCEPTED,
     HEAD,
@@ -31,7 +30,7 @@ from daq.workflow.feed import (
     socket_names,
 )
 from daq.workflow.prediction import Predictor, predictor_of
-from drivers.profiles.cia402 import decode
+from drivers.profiles.cia402 import ENABLED, FAULTY, decode
 from drivers.stream.sample import EventKind
 from ident.arrays import FloatArray
 from ident.calibration import Calibration

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,31 +11,26 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from daq.config.bus import bus_loads, frame_bits
+from daq.config.bus import bus_loads, bus_loads_percent
 from daq.config.cell import PacingMode
-from daq.report.events import event_document
 from daq.report.text import picked, plain_table, printable, terminal_text
-from drivers.profiles.cia402 import State, decode
-from drivers.profiles.profile import TapPoint
+from daq.workflow.events import event_document
+from drivers.profiles.cia402 import ENABLED, FAULTY, State, decode
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
-    from drivers.canopen.emcy import ErrorCode
+    from daq.workflow.monitor import WatchedCell
     from drivers.canopen.scan import FoundNode
     from drivers.stream.monitor import CellReading
-    from drivers.stream.sample import CellEvent
-
-ENABLED = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
-"""States in which the drive function is enabled and the motor has torque (CiA 402-2, finite state automaton)."""
-FAULTY = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 
 
 def scan_view(
-    cell: Cell, rows: list[dict[str, Any]], reset: Mapping[str, str], mistyped: Sequence[str] = ()
+    rows: list[dict[str, Any]], reset: Mapping[str, str], mistyped: Sequence[str] = (), warnings: Sequence[str] = ()
 ) -> Iterator[RenderableType]:
     """Table of the nodes on all buses, and what needs attention.
 
-    `reset` has the fault of each axis that was reset, `mistyped` the nameplates that `plan` and `record` would refuse.
+    `reset` has the fault of each axis that was reset, `mistyped` the nameplates that `plan` and `record` would refuse,
+    `warnings` what `record` would warn of.
     """
     yield scan_table(rows)
     for row in rows:
@@ -51,9 +45,7 @@ def scan_view(
             "explain-emcy`) shows the cause. Remove it, then reset the fault with --reset-faults; nothing moves.",
             "yellow",
         )
-    yield from (Text(printable(text), "yellow") for text in mistyped)
-    if (note := actual_current_note(cell)) is not None:
-        yield Text(note, "yellow")
+    yield from (Text(printable(text), "yellow") for text in (*mistyped, *warnings))
 
 
 _IDENTITY = ("vendor_id", "product_code", "serial")
@@ -125,33 +117,16 @@ def scan_table(rows: list[dict[str, Any]]) -> Table:
     return table
 
 
-def monitor_document(
-    cell: Cell,
-    reading: CellReading,
-    ampere: Sequence[float | None],
-    events: Iterable[CellEvent],
-    *,
-    faults: Mapping[str, ErrorCode] = MappingProxyType({}),
-    recorder: bool = False,
-    prediction: dict[str, Any] | None = None,
-) -> dict[str, Any]:
-    """JSON document of one reading of the bus.
-
-    Args:
-        cell, reading: the cell, and what was read from its buses.
-        ampere: amperes per raw unit of each axis' current, None where unknown.
-        events: recent events, oldest first.
-        faults: error code of axes in fault, by name.
-        recorder: whether a recording or job of drivegain on this computer has the bus.
-        prediction: `remark`, `payload` and the currents of the `axes`, if any, by a calibration; None without one.
-    """
+def monitor_document(cell: Cell, watched: WatchedCell) -> dict[str, Any]:
+    """JSON document of one reading of the bus."""
     from drivers.canopen.link import nmt_name  # noqa: PLC0415 - as above
 
+    reading, faults, prediction = watched.reading, watched.faults, watched.prediction
     # While another master prepares, it sends no SYNC, and no axis has to answer.
     addressed = reading.source.value == "asked" or reading.sync_hz > 0.0
     axes: list[dict[str, Any]] = []
     for declared, axis, position, ampere_per_unit in zip(
-        cell.axes, reading.axes, joint_positions(cell, reading), ampere, strict=True
+        cell.axes, reading.axes, joint_positions(cell, reading), watched.ampere, strict=True
     ):
         raw, word = axis.current_raw, axis.statusword
         state = None if word is None else decode(word)
@@ -175,23 +150,23 @@ def monitor_document(
                 "prediction": prediction["axes"][len(axes)] if prediction is not None and prediction["axes"] else None,
             }
         )
-    loads, shown = bus_loads_percent(cell, reading), tuple(events)
+    loads = bus_loads_percent(cell, reading)
     return {
         "cell": cell.name,
         "source": reading.source.value,
-        "recorder": recorder,
+        "recorder": watched.recorder,
         **picked(reading, "seconds", "sync_hz"),
         "frames_per_s": sum(map(sum, reading.frames)) / reading.seconds,
         "bus_load_percent": max(loads),
         "buses": [{"bus": bus.name, "load_percent": load} for bus, load in zip(cell.buses, loads, strict=True)],
         "axes": axes,
         "prediction": None if prediction is None else {key: prediction[key] for key in ("payload", "remark")},
-        "events": [event.text for event in shown],
+        "events": [event.text for event in watched.events],
         "notices": [
             event_document(
                 event.kind, event.code, None if event.axis is None else cell.axis_names[event.axis], event.text
             )
-            for event in shown
+            for event in watched.events
         ],
     }
 
@@ -212,16 +187,6 @@ def joint_positions(cell: Cell, reading: CellReading) -> list[float | None]:
     # A joint's position depends on the motors that move it, and on no others.
     blind = (np.abs(to_joint) > 1e-12 * np.abs(to_joint).max()) @ unknown
     return [None if hidden else float(value) for hidden, value in zip(blind, joint, strict=True)]
-
-
-def bus_loads_percent(cell: Cell, reading: CellReading) -> tuple[float, ...]:
-    """Load of each bus, with every frame as long as bit stuffing can make it [%]."""
-    return tuple(
-        100.0
-        * sum(count * frame_bits(length) for length, count in enumerate(frames))
-        / (bus.bitrate_bit_s * reading.seconds)
-        for bus, frames in zip(cell.buses, reading.frames, strict=True)
-    )
 
 
 _ALARMING = {str(state) for state in (*FAULTY, State.QUICK_STOP_ACTIVE)}
@@ -301,18 +266,6 @@ def current_signals(cell: Cell) -> dict[str, str]:
         for axis in cell.axes
         if axis.profile is not None
     }
-
-
-def actual_current_note(cell: Cell) -> str | None:
-    """Warning where an axis has no current reference: its gain is per actual current, not per reference."""
-    actual = [axis for axis in cell.axes if axis.profile is not None and axis.profile.tap is TapPoint.ACTUAL]
-    if not actual:
-        return None
-    drives = ", ".join(dict.fromkeys(axis.profile.name for axis in actual if axis.profile is not None))
-    return (
-        f"{', '.join(axis.name for axis in actual)}: ACTUAL current, not the reference ({drives} reports none): the "
-        "gains are Nm per A of actual current"
-    )
 
 
 def load_lines(cell: Cell) -> tuple[str, ...]:

@@ -10,12 +10,12 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.report import paper_tables
-from daq.report.bus import actual_current_note
 from daq.report.gains import diagnosis_texts, gain_table, partial_note, torque_document, torque_sentences, torque_table
 from daq.report.text import percent_text, picked, plain_table, printable
 from daq.workflow.calibration_file import as_document
 from daq.workflow.cases import CASES, CaseFit
 from daq.workflow.fit import DOUBTFUL_PERCENT, Fit, needed_verdicts
+from daq.workflow.nameplates import actual_current_note
 from ident.arrays import FloatArray
 from ident.calibration import Calibration, Parameter
 from ident.discovery.evidence import Evidence, without_effects

@@ -77,6 +77,9 @@ class ScanReport(StrictModel):
     faults: dict[str, str] = Field(description="the fault of each of them")
     current: dict[str, str] = Field(description="recorded current of each axis")
     mistyped: list[str] = Field(description="nameplate gains that plan or record would refuse")
+    warnings: list[str] = Field(
+        description="what record would warn of, such as a gain that is near √2 times the drive's"
+    )
 
 
 class PlannedGain(StrictModel):

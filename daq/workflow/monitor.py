@@ -8,27 +8,28 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from math import isfinite, nan
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from daq.config.bus import bus_loads_percent
 from daq.config.cell import Cell, PacingMode
 from daq.errors import LogIncomplete
 from daq.log.conversion import scaling
 from daq.log.metadata import AxisReadback, Readback, RunStatistics
-from daq.report.bus import FAULTY, bus_loads_percent, monitor_document
-from daq.report.events import ALARMING
+from daq.workflow.events import ALARMING
 from daq.workflow.feed import Feed, RunFacts, facts_of_recorder
 from daq.workflow.prediction import Predictor, Recent, predictor_of
 from daq.workflow.safeguards import bus_taken
 from drivers.canopen.emcy import ErrorCode, explain, read_error_code
 from drivers.canopen.network import CanopenNetwork
 from drivers.errors import DriverError
-from drivers.profiles.cia402 import decode
+from drivers.profiles.cia402 import FAULTY, decode
 from drivers.profiles.scale import read_scale
 from drivers.stream.monitor import READING_S, AxisReading, CellMonitor, CellReading, ReadingSource
 from drivers.stream.sample import CellEvent, EventKind, Sample
@@ -49,6 +50,19 @@ class _Source:
     recorded: bool  #: the facts are those of a recorder
     rate_hz: float | None  #: of the samples, None where a recorder names it
     ampere: tuple[float | None, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class WatchedCell:
+    """One reading of the bus with all that is shown beside it."""
+
+    reading: CellReading
+    ampere: Sequence[float | None]  #: amperes per raw unit of each axis' current, None where unknown
+    events: Sequence[CellEvent]  #: recent ones, oldest first
+    faults: Mapping[str, ErrorCode] = field(default_factory=dict)  #: error code of axes in fault, by name
+    recorder: bool = False  #: whether a recording or job of drivegain on this computer has the bus
+    #: `remark`, `payload` and the currents of the `axes`, if any, by a calibration; None without one.
+    prediction: dict[str, Any] | None = None
 
 
 class CellWatch:
@@ -91,8 +105,8 @@ class CellWatch:
         self._take_events(events, reading)
         self._follow(reading, bus_taken(self._cell))
 
-    def read(self, interval_s: float) -> dict[str, Any]:
-        """Read the bus for a time; returns the document of what is shown."""
+    def read(self, interval_s: float) -> WatchedCell:
+        """Read the bus for a time."""
         reading = self._monitor.watch(interval_s)
         self._take_events(reading.events, reading)
         recorder = bus_taken(self._cell)
@@ -100,10 +114,9 @@ class CellWatch:
             self._query(reading)
         self._follow(reading, recorder)
         self._predict()
-        return monitor_document(
-            self._cell,
+        return WatchedCell(
             reading,
-            self._ampere,
+            tuple(self._ampere),
             sorted((*self._alarms, *self._events), key=lambda event: event.time_ns),
             faults=self._faults(),
             recorder=recorder,

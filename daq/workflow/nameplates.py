@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from daq.config.cell import Cell
+from daq.config.cell import Axis, Cell
 from daq.config.yaml_file import Fault, describe, parse_yaml
 from daq.config.yaml_file import read_bytes as read_configuration
 from daq.errors import ConfigurationInconsistent, ControllerUnfit
-from daq.report.bus import actual_current_note
 from daq.writeback.formats.document import decode, read_bytes
+from drivers.profiles.profile import TapPoint
 from drivers.profiles.scale import ScaleReading, check_name_plate
 from ident.model.model import DriveTrain
 from ident.plausible import GAIN_RATIO
@@ -45,7 +45,7 @@ def check_controller(cell_file: Path, cell: Cell) -> None:
     _require_alike(cell_file, cell, list(zip(gains, sources, strict=True)))
 
 
-def check_nameplates(cell_file: Path, cell: Cell, readings: Sequence[ScaleReading | None]) -> tuple[str, ...]:
+def check_nameplates(cell_file: Path, cell: Cell, readings: Sequence[ScaleReading | None]) -> None:
     """Compare each nameplate with the controller's gain, and with N·Kt of the motor's data in the drive (paper eq. 4).
 
     Args:
@@ -53,33 +53,59 @@ def check_nameplates(cell_file: Path, cell: Cell, readings: Sequence[ScaleReadin
         cell: content of it.
         readings: of each drive; None for one that does not answer.
 
-    Returns:
-        Warnings about the recorded currents: no reference, what could not be checked, what differs.
-
     Raises:
         ConfigurationInconsistent: one is more than GAIN_RATIO times the other.
     """
     check_controller(cell_file, cell)
-    axes_by_warning: dict[str, list[str]] = {}
     references = list[Reference | None]()
     for axis, reduction, reading in zip(cell.axes, DriveTrain(cell.ratio).reduction, readings, strict=True):
-        if reading is None:
+        constant = None if reading is None else reading.torque_constant_nm_per_a
+        if reading is None or constant is None or not _comparable(axis):
             references.append(None)
             continue
-        found, constant = reading.warnings, reading.torque_constant_nm_per_a
-        if axis.profile is None or not axis.gain_unit.startswith(("Nm/A", "N/A")):
+        source = f"by N·Kt of the drive's motor ({reading.rated_torque_nm} Nm / {reading.rated_current_a} A)"
+        references.append((constant * abs(float(reduction)), source))
+    _require_alike(cell_file, cell, references)
+
+
+def nameplate_warnings(cell: Cell, readings: Sequence[ScaleReading | None]) -> tuple[str, ...]:
+    """Return warnings about the recorded currents: no reference, what cannot be checked, what differs.
+
+    Args:
+        cell: content of its file.
+        readings: of each drive; None for one that does not answer.
+    """
+    axes_by_warning: dict[str, list[str]] = {}
+    for axis, reduction, reading in zip(cell.axes, DriveTrain(cell.ratio).reduction, readings, strict=True):
+        if reading is None:
+            continue
+        found = reading.warnings
+        if axis.profile is None or not _comparable(axis):
             found += (f"the gain is in {axis.gain_unit}; the torque constant cannot be checked",)
-            constant = None
         else:
             found += check_name_plate(reading, axis.profile.amplitude, axis.nameplate_gain / float(reduction))
-        source = f"by N·Kt of the drive's motor ({reading.rated_torque_nm} Nm / {reading.rated_current_a} A)"
-        references.append(None if constant is None else (constant * abs(float(reduction)), source))
         for warning in found:
             axes_by_warning.setdefault(warning, []).append(axis.name)
-    _require_alike(cell_file, cell, references)
     note = actual_current_note(cell)
     grouped = tuple(f"{', '.join(names)}: {warning}" for warning, names in axes_by_warning.items())
     return grouped if note is None else (note, *grouped)
+
+
+def _comparable(axis: Axis) -> bool:
+    """Whether the gain is per ampere, as the torque constant is."""
+    return axis.profile is not None and axis.gain_unit.startswith(("Nm/A", "N/A"))
+
+
+def actual_current_note(cell: Cell) -> str | None:
+    """Warning where an axis has no current reference: its gain is per actual current, not per reference."""
+    actual = [axis for axis in cell.axes if axis.profile is not None and axis.profile.tap is TapPoint.ACTUAL]
+    if not actual:
+        return None
+    drives = ", ".join(dict.fromkeys(axis.profile.name for axis in actual if axis.profile is not None))
+    return (
+        f"{', '.join(axis.name for axis in actual)}: ACTUAL current, not the reference ({drives} reports none): the "
+        "gains are Nm per A of actual current"
+    )
 
 
 def _require_alike(cell_file: Path, cell: Cell, references: Sequence[Reference | None]) -> None:

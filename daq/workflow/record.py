@@ -22,7 +22,7 @@ from daq.log.metadata import RunInfo, RunStatistics, readback_of_drives
 from daq.log.writer import LogContent, LogWriter
 from daq.workflow.experiment import path_of
 from daq.workflow.feed import Feed, RunFacts
-from daq.workflow.nameplates import check_nameplates
+from daq.workflow.nameplates import check_nameplates, nameplate_warnings
 from daq.workflow.plan import Plan
 from daq.workflow.plan_file import check_approach
 from daq.workflow.safeguards import (
@@ -153,8 +153,10 @@ def record(
     with defer_full_gc(), network_of(cell, block_signals) as network, _sync_producer(cell, network) as producer:
         network.prepare()
         polling = Polling(network, beside_stream=polling_fits(cell))
+        scales = network.scales()
+        check_nameplates(cell_file, cell, scales)
         warnings = (
-            *(*load_warnings(cell), *check_nameplates(cell_file, cell, network.scales()), *network.unguarded()),
+            *(*load_warnings(cell), *nameplate_warnings(cell, scales), *network.unguarded()),
             *(polling_warnings(cell) if polling else ()),
         )
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())

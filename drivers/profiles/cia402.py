@@ -36,6 +36,10 @@ class State(Enum):
 POWERLESS = (State.SWITCH_ON_DISABLED, State.NOT_READY_TO_SWITCH_ON, State.FAULT)
 """States in which a drive gives its motor no power; in FAULT REACTION ACTIVE it still does, in UNKNOWN it may."""
 
+ENABLED = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
+"""States in which the drive function is enabled and the motor has torque."""
+FAULTY = (State.FAULT, State.FAULT_REACTION_ACTIVE)
+
 STATE_BITS = 0x6F  #: Bits of the statusword that encode the state
 
 

@@ -18,16 +18,16 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from daq.cli.app import main
-from daq.config.bus import answer_us, drive_axes
+from daq.config.bus import answer_us, bus_loads_percent, drive_axes
 from daq.config.cell import Cell, PacingMode, model_of
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
-from daq.report.bus import bus_loads_percent, joint_positions, monitor_document, monitor_view
+from daq.report.bus import joint_positions, monitor_document, monitor_view
 from daq.report.bus_schemas import MonitorReport
-from daq.report.events import event_document
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from daq.workflow.events import event_document
 from daq.workflow.feed import Feed, RunFacts
-from daq.workflow.monitor import CellWatch
+from daq.workflow.monitor import CellWatch, WatchedCell
 from daq.workflow.safeguards import bus_lock, bus_taken
 from drivers.canopen.bus import BusAddress, open_bus
 from drivers.canopen.emcy import explain, remedy_of
@@ -263,7 +263,7 @@ def test_what_is_not_known_is_shown_as_that() -> None:
     reading = _reading([0] * 6)
     reading = CellReading(reading.source, 0.5, (*reading.axes[:5], dead), 0.0, ((0,) * 9,), ())
     event = CellEvent(0, None, EventKind.CONTROLLER, 0, "a\x1b[2Jb")
-    document = monitor_document(CELL, reading, [0.002, None, None, None, None, None], [event])
+    document = monitor_document(CELL, WatchedCell(reading, (0.002, None, None, None, None, None), (event,)))
     Console(file=out, width=100).print(monitor_view(document))
     text = out.getvalue()
     assert "+0.010 A" in text
@@ -330,7 +330,7 @@ def test_our_own_recorder_is_no_other_master(tmp_path: Path) -> None:
     said = []
     for recorder in (False, True):
         out = io.StringIO()
-        document = monitor_document(CELL, reading, [None] * 6, [], recorder=recorder)
+        document = monitor_document(CELL, WatchedCell(reading, (None,) * 6, (), recorder=recorder))
         Console(file=out, width=200).print(monitor_view(document))
         said.append(out.getvalue())
     assert "another master" in said[0]
@@ -376,7 +376,7 @@ def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong
     monkeypatch.setattr("daq.workflow.monitor.facts_of_recorder", lambda *_: run)
     watch = _watch(bus, tmp_path / "cell.yaml", calibration)
     watch.listen(2.0)
-    document = [watch.read(0.5) for _ in range(7)][-1]
+    document = [monitor_document(CELL, watch.read(0.5)) for _ in range(7)][-1]
     assert document["recorder"]
     assert document["prediction"] == {"payload": None, "remark": ""}
     MonitorReport.model_validate(document)
@@ -392,7 +392,7 @@ def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong
     coloured = [line for line in out.getvalue().splitlines() if "33m" in line]
     assert [line.split("J")[1][0] for line in coloured] == (["4"] if factor > 1.0 else [])
     bus.coming.clear()
-    document = watch.read(0.5)
+    document = monitor_document(CELL, watch.read(0.5))
     assert document["prediction"]["remark"] == "no prediction: there is no SYNC"
     assert not any(axis["silent"] for axis in document["axes"])  # nobody has asked them
 
@@ -407,7 +407,7 @@ def test_the_rate_of_another_master_is_measured_once_its_sync_is_steady(bus: Qui
     watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), cell=timed)
     watch.listen(0.5)
     assert watch._facts is None
-    documents = [watch.read(0.5) for _ in range(6)]
+    documents = [monitor_document(CELL, watch.read(0.5)) for _ in range(6)]
     assert watch._facts is not None
     assert watch._facts.rate_hz == pytest.approx(PREDICTED_HZ, rel=0.01)
     predictions = [axis["prediction"] for axis in documents[-1]["axes"]]
@@ -429,7 +429,7 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
     feed = Feed(tmp_path / "cell.yaml", stop=None)
     watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), feed)
     watch.listen(QUIET_S)
-    document = watch.read(0.5)
+    document = monitor_document(CELL, watch.read(0.5))
     MonitorReport.model_validate(document)
     assert document["source"] == "asked"
     assert "10 positions a second are too few" in document["prediction"]["remark"]
@@ -444,6 +444,6 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
     bus.coming.append((bus.clock.now_ns, _frame(0x82, struct.pack("<HB5x", 0x3210, 1))))
     for node in range(1, 7):  # other events do not displace it
         bus.coming.append((bus.clock.now_ns, _frame(0x700 + node, b"\x05")))
-    (notice,) = (one for one in watch.read(0.5)["notices"] if one["alarm"])
+    (notice,) = (one for one in monitor_document(CELL, watch.read(0.5))["notices"] if one["alarm"])
     assert notice == event_document(EventKind.EMCY, 0x3210, "J2", notice["text"])
     assert notice["text"].startswith("EMCY 3210h") and notice["remedy"] == remedy_of(0x3210)

@@ -8,6 +8,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.cells import cell_len
 from rich.console import Console
@@ -83,7 +84,7 @@ def test_a_narrow_terminal_gets_every_column_and_whole_words(cell: Cell) -> None
 
 def test_a_message_names_the_axis_first(cell: Cell) -> None:
     rows = scan_rows(cell, (_node(3, 0x237), _node(9, 0x237)), "demo")
-    said = [str(part) for part in scan_view(cell, rows, {})]
+    said = [str(part) for part in scan_view(rows, {})]
     assert said[1].startswith("J3 (node 3) IS ENABLED")
     assert said[2].startswith("node 9 IS ENABLED")
 
@@ -124,24 +125,34 @@ def test_a_fault_is_reset_when_a_person_says_so_and_nothing_gets_power(
 def test_a_mistyped_nameplate_is_reported_with_its_line(
     checkout: Path, cell: Cell, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """25.65 of J3 is written as mNm: the motor's data in the drive and the controller's file contradict it."""
+    """25.65 of J3 is written as mNm: the motor's data in the drive and the controller's file contradict it.
+
+    The data of J1's motor are for amperes of the other amplitude, which is within the limit, and a warning.
+    """
     configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
     file = configs / "cells/demo.yaml"
     file.write_text(file.read_text().replace("25.65", "25650"))
     line = 1 + next(n for n, text in enumerate(file.read_text().splitlines()) if "25650" in text)
     spec = load_simulation(shipped_simulation("clean"))
-    third, reduction = spec.axes[2], float(DriveTrain(cell.ratio).reduction[2])
-    entered = replace(third, entered_torque_nm=25.65 / abs(reduction) * third.rated_current_a)
-    spec = replace(spec, axes=(*spec.axes[:2], entered, *spec.axes[3:]))
+    gains = np.array([np.sqrt(2.0) * cell.axes[0].nameplate_gain, 0.0, 25.65])
+    constants = gains / np.abs(DriveTrain(cell.ratio).reduction[:3])
+    first, third = (
+        replace(spec.axes[i], entered_torque_nm=constants[i] * spec.axes[i].rated_current_a) for i in (0, 2)
+    )
+    spec = replace(spec, axes=(first, spec.axes[1], third, *spec.axes[3:]))
     with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus):
         assert main(["scan", str(file)]) == ExitCode.OK
         shown = capsys.readouterr()
         (configs / "controllers/demo.yaml").unlink()
         assert main(["scan", str(file), "--json"]) == ExitCode.OK
-        (by_drive,) = json.loads(capsys.readouterr().out)["mistyped"]
+        document = json.loads(capsys.readouterr().out)
     assert f"demo.yaml:{line}: axes[2].nameplate_gain_nm_per_a: found 25650 Nm/A, while it is 25.65 by" in shown.out
     assert "Next" not in shown.err
+    (by_drive,) = document["mistyped"]
     assert "by N·Kt of the drive's motor" in by_drive
+    (warning,) = (text for text in document["warnings"] if text.startswith("J1: "))
+    assert "near √2" in warning
+    assert warning.split()[-1] in shown.out
 
 
 @pytest.fixture(scope="module")

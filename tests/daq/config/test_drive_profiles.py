@@ -24,8 +24,9 @@ from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent, ExitCode, SchemaMismatch
 from daq.log.conversion import load_run
 from daq.log.reader import read_log
-from daq.report.bus import actual_current_note, current_signals
+from daq.report.bus import current_signals
 from daq.simulation.simulation_file import load_simulation
+from daq.workflow.nameplates import actual_current_note
 from daq.workflow.plan_file import load_plan
 from daq.workflow.record import record
 from drivers.canopen.bus import open_bus
