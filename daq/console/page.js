@@ -37,8 +37,9 @@ function number(value, digits) {
   return value === null || value === undefined ? "–" : value.toFixed(digits);
 }
 
-// A value with as many digits as the first two of its standard deviation.
+// A value with as many digits as the first two of its standard deviation; one that was held has none.
 function withDeviation(value, std) {
+  if (std === 0) return `${Number(value.toPrecision(4))} (fixed)`;
   const digits = std > 0 ? Math.min(10, Math.max(0, 1 - Math.floor(Math.log10(std)))) : 4;
   return `${number(value, digits)} ± ${number(std, digits)}`;
 }

@@ -131,7 +131,12 @@ def diagnosis_texts(diagnoses: Iterable[Diagnosis]) -> tuple[str, ...]:
 
 
 def with_deviation(value: float, std: float) -> str:
-    """Write `33.90 ± 0.14`, to the second digit of σ (ISO Guide 98-3, 7.2.6); `32.96 (fixed)` where σ is 0."""
+    """Write `33.90 ± 0.14`, to the second digit of σ (ISO Guide 98-3, 7.2.6).
+
+    `32.96 (fixed)` where σ is 0, `-` without a value.
+    """
+    if not math.isfinite(value):
+        return "-"
     if std == 0:
         return f"{value:.4g} (fixed)"
     if not math.isfinite(std) or std < 0:

@@ -13,6 +13,7 @@ from rich.text import Text
 from daq.config.cell import Cell
 from daq.files import replace_file
 from daq.report.fit import error_document
+from daq.report.gains import with_deviation
 from daq.report.picture import BLACK, ORANGE, SKY, legend_below, panels, render, unformatted
 from daq.report.text import picked, plain_table
 from daq.workflow.fit import DOUBTFUL_PERCENT
@@ -30,11 +31,11 @@ def weighed_view(found: Weighed) -> Iterator[RenderableType]:
     body = found.body
     (centre, centre_std), (inertia, inertia_std) = body.centre_m, body.inertia_kg_m2
     table = plain_table(("", "value ± σ", "unit"), title="Body on the flange", left=(0, 2))
-    table.add_row("mass", _with_std(body.mass_kg, body.mass_std_kg), "kg")
+    table.add_row("mass", with_deviation(body.mass_kg, body.mass_std_kg), "kg")
     for name, value, std in zip("xyz", 1000.0 * centre, 1000.0 * centre_std, strict=True):
-        table.add_row(f"centre {name}", _with_std(value, std), "mm")
+        table.add_row(f"centre {name}", with_deviation(value, std), "mm")
     for name, value, std in zip(LINK_PARAMETERS[:6], inertia, inertia_std, strict=True):
-        table.add_row(f"{name} about the centre", _with_std(value, std), "kg m²")
+        table.add_row(f"{name} about the centre", with_deviation(value, std), "kg m²")
     yield table
     yield "In the frame of the last joint."
     if found.declared_kg is not None:
@@ -46,7 +47,7 @@ def weighed_view(found: Weighed) -> Iterator[RenderableType]:
     ten = plain_table(headings, title="The ten about the joint's frame", left=(0, 2, 3))
     rows = zip(LINK_PARAMETERS, LINK_UNITS, body.values, body.std, body.identifiable, strict=True)
     for name, unit, value, std, identifiable in rows:
-        ten.add_row(name, _with_std(value, std), unit, "yes" if identifiable else "no")
+        ten.add_row(name, with_deviation(value, std), unit, "yes" if identifiable else "no")
     yield ""
     yield ten
     # Below the table: beside the rows they would push σ and unit off a terminal of 80 columns.
@@ -67,14 +68,6 @@ def _doubts(found: Weighed) -> Iterator[str]:
         yield "No body shows: the mass is within two σ of nothing."
     elif not np.isnan(body.values).any() and np.linalg.eigvalsh(pseudo_inertia(body.values))[0] < 0.0:
         yield "No solid body has exactly this inertia; use it within its σ."
-
-
-def _with_std(value: float, std: float) -> str:
-    """Value and σ, to two digits of σ."""
-    if not np.isfinite(value + std):
-        return "-"
-    places = 0 if std <= 0.0 else max(0, 1 - int(np.floor(np.log10(std))))
-    return f"{value:.{places}f} ± {std:.{places}f}"
 
 
 def weighed_document(found: Weighed) -> dict[str, Any]:

@@ -155,6 +155,7 @@ def test_the_table_says_error_and_truth_within_80_columns() -> None:
         (1234.5, 56.7, "1234 ± 57"),
         (32.96, 0.0, "32.96 (fixed)"),
         (1.0, float("nan"), "1 ± nan"),
+        (float("nan"), float("nan"), "-"),
     ],
 )
 def test_a_value_is_rounded_by_its_uncertainty(value: float, std: float, text: str) -> None:
