@@ -78,7 +78,7 @@ def test_a_missing_file(tmp_path: Path) -> None:
 def test_a_foreign_file(tmp_path: Path, text: bytes) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(text)
-    with pytest.raises(LogForeign, match="a log .MCAP"):
+    with pytest.raises(LogForeign, match=r"a log .MCAP"):
         read_log(path)
 
 
