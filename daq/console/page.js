@@ -135,7 +135,9 @@ function draw(canvas, colors, begin, end, lines, bands, unit) {
   pen.textAlign = "right";
   pen.textBaseline = "middle";
   pen.lineWidth = 1;
-  for (let tick = Math.ceil(low / step) * step; tick <= high; tick += step) {
+  // Multiples of the step: a sum of steps passes zero at 3e-17.
+  for (let count = Math.ceil(low / step); count * step <= high; count += 1) {
+    const tick = count * step;
     pen.strokeStyle = colors.line;
     pen.beginPath(); pen.moveTo(left, y(tick)); pen.lineTo(width - 4, y(tick)); pen.stroke();
     pen.fillStyle = colors.quiet;
@@ -232,7 +234,7 @@ function showStatus(status) {
     ["SYNC cycles lost", grouped(status.lost), status.lost > 0],
     ["Missing answers", grouped(status.missing), status.missing > 0],
     ["Sample rate", running || watching ? `${number(status.rate_hz, 0)} Hz` : "–"],
-    [`Bus load, ${watching ? "measured, at worst" : "computed"}`, (running || watching) && loads ? loads : "–"],
+    [`Bus load, ${watching ? "measured" : "computed"}`, (running || watching) && loads ? loads : "–"],
     ["Disk free", status.free_bytes === null ? "–" : `${number(status.free_bytes / 1e9, 1)} GB`],
   ];
   // The recorder never waits for this page; the log has what the page missed.
