@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.calibration import AcceptedEffect, Calibration
+from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import EFFECTS, UNNAMED
 from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, Side, at_joints, check_settings
@@ -94,6 +94,36 @@ def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
     return standard
 
 
+def mounted_parameters(calibration: Calibration, mounting: str) -> dict[str, Parameter]:
+    """Parameters that a calibration holds of the payload on a mounting, by their names without the mounting."""
+    split = ((*parameter.name.partition(":"), parameter) for parameter in calibration.parameters)
+    return {name: parameter for name, colon, of, parameter in split if colon and of == mounting}
+
+
+def as_calibrated(calibration: Calibration, payload: Payload | None, run: str) -> Payload | None:
+    """Leave out of a payload what the calibration itself says of its mounting, given or identified.
+
+    Args:
+        calibration: that is to predict.
+        payload: what a run carries; None without load.
+        run: its name, for the error.
+
+    Raises:
+        DataUnfit: the calibration was given another mass on this mounting.
+    """
+    if payload is None:
+        return None
+    own = mounted_parameters(calibration, payload.mounting)
+    mass, weighed = own.get("m"), payload.known.get("m")
+    if mass is not None and mass.std == 0.0 and weighed is not None and weighed != mass.value:
+        raise DataUnfit(
+            run,
+            f"carries {weighed:g} kg on mounting {payload.mounting!r}; the calibration has {mass.value:g} kg: "
+            "give each way of mounting a name of its own",
+        )
+    return replace(payload, known={name: value for name, value in payload.known.items() if name not in own})
+
+
 def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[PlacedEffect, FloatArray]:
     """The effect that a calibration names, on its axis, and its coefficients, shape (p,).
 
@@ -139,14 +169,9 @@ def _payload(calibration: Calibration, data: Dataset) -> FloatArray:
     payload = data.payload
     if payload is None:
         return np.zeros(len(LINK_PARAMETERS))
-    identified: dict[str, float] = {}
-    mountings: set[str] = set()
-    for parameter in calibration.parameters:
-        name, colon, mounting = parameter.name.partition(":")
-        if colon:
-            mountings.add(mounting)
-            if mounting == payload.mounting:
-                identified[name] = parameter.value
+    mountings = {name.partition(":")[2] for name in (one.name for one in calibration.parameters) if ":" in name}
+    own = mounted_parameters(calibration, payload.mounting)
+    identified = {name: parameter.value for name, parameter in own.items()}
     _check_mounting(payload, identified, mountings, data.name)
     masses_kg = {source.mass_kg for source in calibration.sources if source.payload == payload.name}
     mass_kg, fitted_kg = payload.known.get("m"), next(iter(masses_kg - {None}), None)

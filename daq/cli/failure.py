@@ -159,7 +159,7 @@ class Failure:
             *_parts(error),
             int(exit_code(type(error)) or ExitCode.UNEXPECTED),
             labelled,
-            tuple(note for note in notes if note.startswith(("while stopping", "while closing"))),
+            tuple(note for note in notes if note.startswith((f"{driver.WHILE}stopping", f"{driver.WHILE}closing"))),
         )
 
     def document(self) -> dict[str, Any]:

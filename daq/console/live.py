@@ -26,7 +26,7 @@ from daq.workflow.feed import (
     STOP,
     RunFacts,
     connected,
-    sample_dtype,
+    packet_dtype,
     socket_names,
 )
 from daq.workflow.prediction import Predictor, predictor_of
@@ -120,13 +120,14 @@ class Live:
         self._predictor: Predictor | None = None
         self._band = [nan] * len(self.cell.axes)
         self._rate: deque[tuple[float, int]] = deque(maxlen=50)
+        self._measured: dict[str, float] = {}  # load of the buses, by a monitor
         self._free: int | None = None
         self._free_s = -DISK_S
         self._every = 1
         if run is None:
             return
         self._every = max(1, round(run.rate_hz / POINTS_HZ))
-        self._dtype, self._scale = sample_dtype(len(run.axes)), run.scaling
+        self._dtype, self._scale = packet_dtype(len(run.axes)), run.scaling
         self._unit = np.array([axis.unit.si for axis in self.cell.axes])
         if run.axes != self.cell.axis_names:
             self.remark = "the run has other axes than the cell file: restart the console"
@@ -153,6 +154,7 @@ class Live:
             self._clear("watching" if run.log is None else "running", run)
             self._number = before
         self.events.add([self._shown(event) for event in message.get("events", ())])
+        self._measured = message.get("bus_load", self._measured)
         if message.get("result") is not None:
             self.result = message["result"]
         if message.get("end") is not None:
@@ -202,6 +204,7 @@ class Live:
 
     def status(self) -> dict[str, Any]:
         """Return everything that is shown as a number or a word."""
+        computed = {} if self.run is None else self.run.bus_load
         share = 0.0 if self.run is None else self.rate_hz / self.run.rate_hz
         return {
             "phase": self.phase,
@@ -210,7 +213,7 @@ class Live:
             "rate_hz": round(self.rate_hz, 1),
             "moves": 0 if self.run is None else self.run.moves,
             "done": self.done,
-            "bus_load": {} if self.run is None else {bus: share * load for bus, load in self.run.bus_load.items()},
+            "bus_load": self._measured or {bus: share * load for bus, load in computed.items()},
             "free_bytes": self._free_bytes(),
             "band": self._band,
             **{"remark": self.remark, "result": self.result, "end": self.end, "stop": self.stop_state},
@@ -259,7 +262,7 @@ class Live:
             await asyncio.sleep(RETRY_S)
 
     async def _read(self, connection: socket.socket, phase: str) -> None:
-        """Take what has come, READ_S after READ_S: waiting for each packet would cost as much as taking it.
+        """Take what has come every READ_S: waiting for each packet would cost as much as taking it.
 
         A monitor is left when a recorder begins.
         """

@@ -1,7 +1,6 @@
 // The console's page: what the server sends is kept for two minutes, drawn on canvases and written as text, never as
 // markup. `drivegain` on the window holds it, for the tests.
-const KEPT = 6000;
-const shown = { run: null, points: [], rows: [], events: [], status: null, received: 0 };
+const shown = { kept: 0, run: null, points: [], rows: [], events: [], status: null, received: 0 };
 window.drivegain = shown;
 const byId = (id) => document.getElementById(id);
 const axes = [];
@@ -137,7 +136,9 @@ function draw(canvas, colors, begin, end, lines, bands, unit) {
   pen.textAlign = "right";
   pen.textBaseline = "middle";
   pen.lineWidth = 1;
-  for (let tick = Math.ceil(low / step) * step; tick <= high; tick += step) {
+  // Multiples of the step: a sum of steps passes zero at 3e-17.
+  for (let count = Math.ceil(low / step); count * step <= high; count += 1) {
+    const tick = count * step;
     pen.strokeStyle = colors.line;
     pen.beginPath(); pen.moveTo(left, y(tick)); pen.lineTo(width - 4, y(tick)); pen.stroke();
     pen.fillStyle = colors.quiet;
@@ -234,21 +235,22 @@ function showStatus(status) {
     ["SYNC cycles lost", grouped(status.lost), status.lost > 0],
     ["Missing answers", grouped(status.missing), status.missing > 0],
     ["Sample rate", running || watching ? `${number(status.rate_hz, 0)} Hz` : "–"],
-    ["Bus load, computed", (running || watching) && loads ? loads : "–"],
+    [`Bus load, ${watching ? "measured" : "computed"}`, (running || watching) && loads ? loads : "–"],
     ["Disk free", status.free_bytes === null ? "–" : `${number(status.free_bytes / 1e9, 1)} GB`],
   ];
   // The recorder never waits for this page; the log has what the page missed.
   if (status.dropped > 0) figures.push(["Missed here, in the log", grouped(status.dropped)]);
   const list = byId("figures");
   if (list.children.length !== figures.length) {
-    list.replaceChildren(...figures.map(([name]) => {
+    list.replaceChildren(...figures.map(() => {
       const entry = element("div");
-      entry.append(element("dt", name), element("dd"));
+      entry.append(element("dt"), element("dd"));
       return entry;
     }));
   }
-  figures.forEach(([, text, alarm], index) => {
-    const value = list.children[index].lastChild;
+  figures.forEach(([name, text, alarm], index) => {
+    const [label, value] = list.children[index].children;
+    label.textContent = name;
     value.textContent = text;
     value.className = alarm ? "alarm" : "";
   });
@@ -397,7 +399,7 @@ function take(message) {
   for (const name of ["points", "rows", "events"]) {
     if (!fresh[name]) continue;
     shown[name].push(...fresh[name]);
-    shown[name].splice(0, shown[name].length - KEPT);
+    shown[name].splice(0, shown[name].length - shown.kept);
   }
   shown.received += (fresh.points || []).length;
   shown.status = status;
@@ -408,6 +410,7 @@ function take(message) {
 
 async function begin() {
   const cell = await (await fetch("cell")).json();
+  shown.kept = cell.kept_points;
   byId("cell").textContent = cell.cell;
   document.title = `${cell.cell} – drivegain console`;
   cell.axes.forEach(buildAxis);

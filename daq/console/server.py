@@ -17,7 +17,6 @@ from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict
 from importlib.resources import files
-from math import isfinite
 from typing import Any
 
 import uvicorn
@@ -29,9 +28,10 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from daq.config.cell import Cell
-from daq.console.live import Live, Reader
+from daq.console.live import KEPT_POINTS, Live, Reader
 from daq.console.results import Results
 from daq.errors import DaqError
+from daq.report.text import json_safe
 
 TICK_S = 0.04  #: Time between two messages to a page: 25 a second
 RESULTS_S = 2.0  #: Time between two looks at the files
@@ -88,8 +88,8 @@ class Guard:
         elsewhere = headers.get("sec-fetch-site", "none") not in ("none", "same-origin")
         if not set(origins) <= own or elsewhere or (scope["method"] == "POST" and not origins):
             return PlainTextResponse("only the console's own page may ask", 403)
-        token = scope["path"].split("/")[1].encode()
-        return None if hmac.compare_digest(token, self._token) else PlainTextResponse("not found", 404)
+        token = scope["path"].removeprefix("/").partition("/")[0]  # "*" is a path as well (RFC 9112, OPTIONS)
+        return None if hmac.compare_digest(token.encode(), self._token) else PlainTextResponse("not found", 404)
 
 
 class Page:
@@ -156,7 +156,7 @@ class Page:
             }
             for axis in self._cell.axes
         ]
-        return JSONResponse({"cell": self._cell.name, "axes": axes})
+        return JSONResponse({"cell": self._cell.name, "axes": axes, "kept_points": KEPT_POINTS})
 
     async def _shown_results(self, _: Request) -> Response:
         return Response(_json({**self._document, "stop": self._live.stop_state}), media_type="application/json")
@@ -197,19 +197,11 @@ class Page:
 
 
 def _json(document: Any) -> bytes:
-    """Encode a document; numbers that JSON has not become null."""
-
-    def finite(value: Any) -> Any:
-        if isinstance(value, float):
-            return value if isfinite(value) else None
-        if isinstance(value, dict):
-            return {key: finite(one) for key, one in value.items()}
-        return [finite(one) for one in value] if isinstance(value, list | tuple) else value
-
+    """Encode a document; numbers that JSON lacks become null."""
     try:
         return json.dumps(document, allow_nan=False).encode()
     except ValueError:
-        return json.dumps(finite(document)).encode()
+        return json.dumps(json_safe(document)).encode()
 
 
 def listen(port: int) -> socket.socket:

@@ -1,9 +1,11 @@
 """The curves as a stream for Foxglove, which shows them live beside its 3-D view of the arm.
 
-The topics are those of a log, so that one layout serves both: `/joint_states`, `/cell/currents`, `/cell/events` and
-`/robot_description`; with a calibration also `/cell/predicted` and `/cell/residual`. Values come at the rate of the
-page's curves. The stream can only be read. It has no token: the protocol of Foxglove knows none, and its server accepts
-any origin, so that every program and every page on this computer can read it.
+The topics are those of a log: `/joint_states`, `/cell/currents`, `/cell/events` and `/robot_description`; with a
+calibration also `/cell/predicted` and `/cell/residual`, which a log does not have. The layout in `configs/viewers`
+serves both: panels of `/cell/samples`, raw numbers that only a log has, stay empty here. Values come at the rate of the
+page's curves; a velocity is the mean since the value before. The stream can only be read. It has no token: the protocol
+of Foxglove knows none, and its server accepts any origin, so that every program and every page on this computer can
+read it.
 """
 
 from __future__ import annotations
@@ -35,6 +37,7 @@ from daq.log.message import (
     text_bytes,
 )
 from drivers.stream.sample import CellEvent, EventKind
+from ident.arrays import FloatArray
 
 PREDICTED_TOPIC, RESIDUAL_TOPIC = "/cell/predicted", "/cell/residual"
 SCHEMAS = {
@@ -61,6 +64,7 @@ class FoxgloveStream:
         self._live, self._context = live, foxglove.Context()
         self._prefix = joint_state_prefix(joint_names(live.cell))
         self._unit = np.array([axis.unit.si for axis in live.cell.axes])
+        self._before: tuple[float, FloatArray] | None = None  # time and position of the last point
         # Without capabilities a client can neither publish nor set anything.
         self._server = foxglove.start_server(
             name=f"drivegain {live.cell.name}", host="127.0.0.1", port=port, capabilities=[], context=self._context
@@ -85,7 +89,9 @@ class FoxgloveStream:
         reader, described_s = Reader(self._live), -URDF_S
         try:
             while True:
-                _, news = reader.news()
+                begun, news = reader.news()
+                if begun:
+                    self._before = None
                 self._send(**news)
                 if time.monotonic() - described_s > URDF_S:
                     described_s = time.monotonic()
@@ -105,8 +111,13 @@ class FoxgloveStream:
         for time_s, *values in points or ():
             position, current = np.array(values[:axes]) * self._unit, np.array(values[axes:])
             effort = joint_effort(self._live.cell, current, gains).tolist() if len(gains) == axes else []
+            velocity: list[float] = []
+            if self._before is not None:
+                velocity = ((position - self._before[1]) / (time_s - self._before[0])).tolist()
+            self._before = time_s, position
             stamp_ns = self._stamp_ns(time_s)
-            self._log(JOINTS_TOPIC, stamp_ns, joint_state_bytes(self._prefix, stamp_ns, position.tolist(), (), effort))
+            state = joint_state_bytes(self._prefix, stamp_ns, position.tolist(), velocity, effort)
+            self._log(JOINTS_TOPIC, stamp_ns, state)
             self._log(CURRENTS_TOPIC, stamp_ns, currents_bytes(stamp_ns, values[axes:]))
         for time_s, *values in rows or ():
             stamp_ns = self._stamp_ns(time_s)

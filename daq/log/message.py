@@ -56,7 +56,7 @@ float64 value                     # /cell/torque: the drive's own, at the motor 
 """
     + _TIME,
     CURRENTS_SCHEMA: """\
-# Current-loop references of a cell, in the order of its axes.
+# Currents of a cell, in the order of its axes: as recorded (/cell/currents), predicted or residual, by the topic.
 builtin_interfaces/Time stamp     # of the SYNC, since 1970
 float64[] current_a               # [A; where the cell's gain is in another unit, what it is multiplied by]
 """
@@ -66,7 +66,7 @@ float64[] current_a               # [A; where the cell's gain is in another unit
 std_msgs/Header header            # stamp of the SYNC, since 1970
 string[] name                     # joints of the URDF, in the order of the axes
 float64[] position                # [rad; m of a prismatic joint]
-float64[] velocity                # [rad/s or m/s], mean over some 20 ms
+float64[] velocity                # [rad/s or m/s], mean over some 20 ms, or between two samples if that is longer
 float64[] effort                  # [Nm or N], torque of the drives by a calibration's gains; empty without one
 """
     + _SEPARATOR

@@ -235,7 +235,7 @@ def prediction_view(document: dict[str, Any]) -> Iterator[RenderableType]:
         yield Text(printable(remark))
     if not any(axis["prediction"] for axis in document["axes"]):
         return
-    table = plain_table(("axis", "measured A", "predicted A", "± band", "residual rms", "outside"))
+    table = plain_table(("axis", "measured", "predicted", "± band", "residual rms", "outside"))
     for axis in document["axes"]:
         found = axis["prediction"]
         values = [
@@ -247,7 +247,8 @@ def prediction_view(document: dict[str, Any]) -> Iterator[RenderableType]:
         table.add_row(*map(Text, cells), style="bold yellow" if found["conspicuous"] else None)
     carried = "without payload" if payload is None else f"with payload {printable(payload)}"
     yield Text(
-        f"Currents of half a second ago, filtered as in the fit, {carried}; residual of the last 10 s of motion:"
+        "Currents of half a second ago, in the unit of the gains' current, filtered as in the fit, "
+        f"{carried}; residual of the last 10 s in which the axis moved:"
     )
     yield table
 

@@ -23,12 +23,12 @@ class ErrorCodeReport(ErrorCodeEntry):
 
 
 class PredictedCurrent(StrictModel):
-    """Current of one axis by a calibration [A], half a second ago, filtered as in the fit."""
+    """Current of one axis by a calibration, half a second ago, filtered as in the fit [unit of the gain's current]."""
 
     measured: float | None = Field(description="null at standstill, or where the scale of the current is unknown")
     predicted: float | None = Field(description="null at standstill")
     band: float = Field(description="twice the calibration's error")
-    residual_rms: float | None = Field(description="over the last 10 s of motion")
+    residual_rms: float | None = Field(description="over the last 10 s in which the axis moved; null before any")
     outside_share: float = Field(description="share of that time in which the residual is outside the band")
     conspicuous: bool = Field(description="it is outside for more than half of at least 2 s of motion")
 

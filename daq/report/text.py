@@ -148,7 +148,7 @@ def percent_text(percent: float) -> str:
 
 def json_text(document: Any) -> str:
     """JSON document; numbers that JSON lacks become null, bytes of file names that are not UTF-8 are spelled out."""
-    return spelled_bytes(json.dumps(_json_safe(document), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    return spelled_bytes(json.dumps(json_safe(document), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def picked(thing: object, *names: str) -> dict[str, Any]:
@@ -161,13 +161,14 @@ def spelled_bytes(text: str) -> str:
     return text.encode(errors="backslashreplace").decode()
 
 
-def _json_safe(value: Any) -> Any:
+def json_safe(value: Any) -> Any:
+    """Copy a document, with null for numbers that JSON lacks."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, dict):
-        return {str(key): _json_safe(item) for key, item in value.items()}
+        return {str(key): json_safe(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_json_safe(item) for item in value]
+        return [json_safe(item) for item in value]
     return value
 
 

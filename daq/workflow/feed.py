@@ -1,10 +1,10 @@
 """The feed of a recording: every sample and event for consoles that may be slow, and a stop that is acknowledged.
 
-`drivegain monitor` publishes in the same way at an address of its own, and takes no stop. A publisher never waits. A
-packet of a Unix SEQPACKET socket is sent without blocking: where a console does not read, packets are dropped, the
-console sees from their numbers how many, and the recording goes on. A second socket takes the stop, so that it works
-while the curves are stalled. All are in Linux's abstract namespace: they leave no file and end with the process. Only
-processes of the same user, or of root, are served.
+A recorder publishes its samples and events and never waits. Each packet of a Unix SEQPACKET socket is sent without
+blocking: where a console does not read, packets are dropped, the console sees from their numbers how many, and the
+recording goes on. A second socket takes the stop, so that it works while the curves are stalled. `drivegain monitor`
+has a feed of the same kind at another address, without a stop. All are in Linux's abstract namespace: they leave no
+file and end with the process. Only processes of the same user, or of root, are served.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ LARGEST_PACKET = 1 << 18  #: [bytes]
 LARGEST_CONSOLES = 8  #: Served at the same time
 
 SAMPLES, TEXT = 0, 1
-"""Kinds of packets: samples, or a JSON object with some of the keys run, events, result and end."""
+"""Kinds of packets: samples, or a JSON object with some of the keys run, events, bus_load, result and end."""
 HEAD = struct.Struct("<BQQIIH")
 """Kind; number of the packet; of the run so far its samples, lost cycles and missing answers; samples in the packet."""
 
@@ -60,7 +60,7 @@ class RunFacts:
     to_joint: list[list[float]]  #: R⁻¹, shape (n, n)
     offset_rad: list[float]  #: joint positions at zero counts [rad; m of a prismatic joint]
     payload: str | None  #: name in the cell file
-    bus_load: dict[str, float]  #: mean load of each bus at this rate, as a share
+    bus_load: dict[str, float]  #: computed mean load of each bus at this rate, as a share; empty for a monitor
 
     @classmethod
     def of(cls, document: dict[str, Any]) -> RunFacts:
@@ -112,13 +112,13 @@ def facts_of_recorder(cell_file: Path, within_s: float) -> RunFacts | None:
     return None
 
 
-def sample_struct(axes: int) -> struct.Struct:
+def packet_struct(axes: int) -> struct.Struct:
     """Return the layout of a sample in a packet: cycle, time, missing, positions, currents, statuswords."""
     return struct.Struct(f"<QqI{axes}i{axes}i{axes}H")
 
 
-def sample_dtype(axes: int) -> np.dtype[np.void]:
-    """Return the layout of `sample_struct` for numpy."""
+def packet_dtype(axes: int) -> np.dtype[np.void]:
+    """Return the layout of `packet_struct` for numpy."""
     return np.dtype(
         [
             ("cycle", "<u8"),
@@ -170,7 +170,7 @@ class Feed:
         self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS_KEPT)
         self._result: dict[str, Any] | None = None
         self._packed: list[bytes] = []
-        self._layout, self._batch = sample_struct(0), 1
+        self._layout, self._batch = packet_struct(0), 1
         self._waiter: threading.Thread | None = None
 
     def __enter__(self) -> Feed:
@@ -210,7 +210,7 @@ class Feed:
     def begin(self, run: RunFacts, statistics: Callable[[], RunStatistics]) -> None:
         """Begin a run; the statistics are those of its log so far."""
         self._run, self._statistics, self._result = run, statistics, None
-        self._layout, self._batch = sample_struct(len(run.axes)), max(1, round(BATCH_S * run.rate_hz))
+        self._layout, self._batch = packet_struct(len(run.axes)), max(1, round(BATCH_S * run.rate_hz))
         self._events.clear()
         self._send({"run": asdict(run)})
 
@@ -238,6 +238,10 @@ class Feed:
         self._flush()
         self._events.append(shown)
         self._send({"events": [shown]})
+
+    def measured(self, bus_load: dict[str, float]) -> None:
+        """Publish the load that a monitor has measured on each bus, as a share, with the longest bit stuffing."""
+        self._send({"bus_load": bus_load})
 
     def finish(self) -> None:
         """Publish the result of the run, whose log is complete."""

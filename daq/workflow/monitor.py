@@ -48,7 +48,7 @@ class _Source:
 
     reading: ReadingSource
     recorded: bool  #: the facts are those of a recorder
-    rate_hz: float | None  #: of the samples, None where a recorder names it
+    rate_hz: float | None  #: of the samples, counted here; None if recorded: it is then in the recorder's facts
     ampere: tuple[float | None, ...]
 
 
@@ -113,6 +113,8 @@ class CellWatch:
         if not recorder:
             self._query(reading)
         self._follow(reading, recorder)
+        loads = zip(self._cell.buses, bus_loads_percent(self._cell, reading), strict=True)
+        self._feed.measured({bus.name: load / 100.0 for bus, load in loads})
         self._predict()
         return WatchedCell(
             reading,
@@ -192,7 +194,9 @@ class CellWatch:
             self._samples.clear()  # they are of another rate
         self._source = source
         try:
-            self._begin(self._own_facts(reading, rate_hz or 0.0) if run is None else replace(run, log=None, moves=0))
+            self._begin(
+                self._own_facts(rate_hz or 0.0) if run is None else replace(run, log=None, moves=0, bus_load={})
+            )
         except LogIncomplete as error:
             self._facts, self._remark = None, str(error)
 
@@ -215,12 +219,11 @@ class CellWatch:
         same = abs(reading.sync_hz - declared_hz) < SAME_RATE * declared_hz + counting_hz
         return declared_hz if same else reading.sync_hz
 
-    def _own_facts(self, reading: CellReading, rate_hz: float) -> RunFacts:
+    def _own_facts(self, rate_hz: float) -> RunFacts:
         """Facts of a run that no recorder names."""
         units = (nan if ampere is None else ampere for ampere in self._ampere)
         answers = zip(self._cell.axis_names, units, strict=True)
         scale = scaling(self._cell, Readback(tuple(AxisReadback(name, unit) for name, unit in answers)))
-        loads = zip(self._cell.buses, bus_loads_percent(self._cell, reading), strict=True)
         return RunFacts(
             run_id="monitor",
             log=None,
@@ -232,7 +235,7 @@ class CellWatch:
             to_joint=scale.to_joint.tolist(),
             offset_rad=scale.offset_rad.tolist(),
             payload=self._payload,
-            bus_load={bus.name: load / 100.0 for bus, load in loads},
+            bus_load={},
         )
 
     def _begin(self, facts: RunFacts) -> None:

@@ -2,10 +2,11 @@
 
 The filters are those of the fit, applied to the last samples: a low-pass without phase and central differences for the
 positions, one decimator for predicted and measured current. A row is given once all samples of its window are there,
-some 0.4 s later. At standstill there is none: stiction hides any current below it.
+some 0.4 s later. At standstill, by the rule of the fit, there is none: stiction hides any current below it.
 
-The console draws the rows; `drivegain monitor` shows those of the last RECENT_S, and points out an axis with more than
-half of them outside the band. A single row is outside often enough: at each reversal the model's friction errs.
+The console draws the rows; `drivegain monitor` judges an axis by the last RECENT_S in which it moved, and points it out
+if more than half of them are outside the band. A single row is outside often enough: at each reversal the model's
+friction errs.
 
 *Band.* Twice the calibration's relative error of the axis on its held-out runs (of the fit, without any), times the
 root mean square of the current predicted so far in motion. It is the size that residuals had, not a limit for alarms.
@@ -13,7 +14,6 @@ root mean square of the current predicted so far in motion. It is the size that 
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -23,21 +23,23 @@ import numpy as np
 from daq.config.cell import Cell, model_of
 from daq.errors import DaqError
 from daq.workflow.feed import RunFacts
-from daq.workflow.validate import check_cell, conditioning_of, unpredictable
+from daq.workflow.validate import check_cell, conditioning_of, unpredictable, warn_without_temperature
 from ident.arrays import FloatArray, IntArray
 from ident.calibration import Calibration
 from ident.data.conditioning import central_differences, decimator, low_pass
-from ident.data.dataset import planned
+from ident.data.dataset import moving_samples, planned
+from ident.equations.rows import row_masks
 from ident.errors import IdentificationError
 from ident.model.bodies import Payload
 from ident.model.robot import Motion
-from ident.prediction import predict_current
+from ident.prediction import as_calibrated, predict_current
 
 EDGE_S = 0.15  #: Of a window, where the low-pass is not yet what it is over a whole run (to 2·10⁻⁵ at 40 Hz)
 STEP_S = 0.2  #: Samples that are predicted at once: each prediction costs 2 ms, and most of it is not for the samples
-RECENT_S = 10.0  #: Of the rows that are judged together
+RECENT_S = 10.0  #: Of motion whose rows are judged together
 LEAST_S = 2.0  #: Of motion before they are judged
-STANDSTILL_SHARE = 0.01  #: Of the speed limit, where the calibration's filter has no standstill speeds
+STANDSTILL_SHARE_OF_LIMIT = 0.01  #: Of the speed limit, where the calibration's filter has no standstill speeds
+LIVE = "the live motion"  #: Its name in errors and warnings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,28 +65,28 @@ class RecentCurrent:
 
 
 class Recent:
-    """Keeps the rows of the last RECENT_S."""
+    """Keeps the residual of each motor over the last RECENT_S in which it moved."""
 
     def __init__(self, rows_hz: float) -> None:
-        self._rows_hz = rows_hz
-        self._rows: deque[Rows] = deque()
+        self._kept, self._least = round(RECENT_S * rows_hz), LEAST_S * rows_hz
+        self._last: Rows | None = None
+        self._moving: list[FloatArray] = []
 
     def add(self, rows: Rows) -> None:
         """Take the newest rows."""
-        self._rows.append(rows)
-        while sum(len(one.cycle) for one in self._rows) > RECENT_S * self._rows_hz:
-            self._rows.popleft()
+        new = [column[np.isfinite(column)] for column in rows.residual.T]
+        old = self._moving or [np.zeros(0)] * len(new)
+        self._moving = [np.concatenate(pair)[-self._kept :] for pair in zip(old, new, strict=True)]
+        self._last = rows
 
     def axes(self) -> list[RecentCurrent]:
         """Return the current of each motor; empty without rows."""
-        if not self._rows:
+        if self._last is None:
             return []
-        last, residual = self._rows[-1], np.concatenate([one.residual for one in self._rows])
         found = []
-        for predicted, left, band, column in zip(
-            last.predicted[-1], last.residual[-1], last.band, residual.T, strict=True
+        for predicted, left, band, moving in zip(
+            self._last.predicted[-1], self._last.residual[-1], self._last.band, self._moving, strict=True
         ):
-            moving = column[np.isfinite(column)]
             share = float(np.mean(np.abs(moving) > band)) if len(moving) else 0.0
             found.append(
                 RecentCurrent(
@@ -93,7 +95,7 @@ class Recent:
                     band=float(band),
                     residual_rms=float(np.sqrt(np.mean(moving**2))) if len(moving) else None,
                     outside_share=share,
-                    conspicuous=share > 0.5 and len(moving) >= LEAST_S * self._rows_hz,
+                    conspicuous=share > 0.5 and len(moving) >= self._least,
                 )
             )
         return found
@@ -107,16 +109,13 @@ class Predictor:
 
         Raises:
             CalibrationUnreadable, LogsDiffer: see `daq.workflow.validate`.
+            DataUnfit: the calibration was given another mass of this payload.
             ModelError: the model of the cell is not that of the calibration.
         """
         check_cell(calibration, cell.folder or Path(cell.name), cell)
         self.problem = unpredictable(calibration, payload)  #: Why nothing is predicted, empty if it is
-        own = set() if payload is None else _identified(calibration, payload.mounting)
-        self._payload = (
-            None
-            if payload is None
-            else replace(payload, known={name: value for name, value in payload.known.items() if name not in own})
-        )
+        self._payload = as_calibrated(calibration, payload, LIVE)
+        warn_without_temperature(calibration, LIVE, None)
         self._calibration, self._model = calibration, model_of(cell)
         self._conditioning, self._rate_hz = conditioning_of(calibration), rate_hz
         self._filter = decimator(rate_hz, self._conditioning.decimation_cutoff_hz)
@@ -124,7 +123,7 @@ class Predictor:
         self.rows_hz = rate_hz / self._filter.factor
         self._step = max(1, round(STEP_S * rate_hz))
         self._margin = self._filter.half + -(-edge // self._filter.factor) * self._filter.factor
-        limits = [STANDSTILL_SHARE * axis.limits.velocity for axis in cell.axes]
+        limits = [STANDSTILL_SHARE_OF_LIMIT * axis.limits.velocity for axis in cell.axes]
         self._still = np.array(self._conditioning.standstill_rad_s or limits)
         error = calibration.holdout_error_percent or calibration.relative_error_percent
         self._share = 2e-2 * np.array(error.axes)
@@ -174,9 +173,9 @@ class Predictor:
         measured = self._filter(self._current[1:-1].T)
         centres = self._filter.centres(position.shape[1])
         whole = (centres >= self._margin) & (centres < position.shape[1] - self._margin)
-        slow = np.abs(velocity[:, centres[whole]]) < self._still[:, None]
-        # A coupled motor turns with several joints: each of them must move.
-        still = (np.abs(self._model.drive_train.to_motor) > 0).astype(float) @ slow > 0
+        moving, motor_moving = moving_samples(velocity, self._still, self._model.drive_train)
+        data = replace(data, moving=moving.T, motor_moving=motor_moving.T)
+        still = ~row_masks(self._model.drive_train, data, settings)[1][:, whole]
         predicted, measured = predicted[:, whole], measured[:, whole]
         self._squares += np.where(still, 0.0, predicted**2).sum(axis=1)
         self._count += (~still).sum(axis=1)
@@ -200,9 +199,3 @@ def predictor_of(calibration: Calibration, cell: Cell, run: RunFacts) -> tuple[P
     except (DaqError, IdentificationError) as error:
         return None, f"no prediction: {error}"
     return found, found.problem
-
-
-def _identified(calibration: Calibration, mounting: str) -> set[str]:
-    """Names of the payload parameters that a calibration holds for a mounting."""
-    names = (parameter.name.partition(":") for parameter in calibration.parameters)
-    return {name for name, _, of in names if of == mounting}

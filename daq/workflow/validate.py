@@ -19,7 +19,7 @@ from daq.config.cell import Cell, model_of
 from daq.errors import CalibrationUnreadable, LogsDiffer
 from daq.log.conversion import load_run
 from ident.arrays import BoolArray, FloatArray
-from ident.calibration import Calibration, Parameter
+from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
@@ -40,7 +40,13 @@ from ident.estimators.payload_diagnosis import payload_diagnoses
 from ident.model.base import BaseParameters
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
-from ident.prediction import measured_torque, predict_torque, standard_parameters
+from ident.prediction import (
+    as_calibrated,
+    measured_torque,
+    mounted_parameters,
+    predict_torque,
+    standard_parameters,
+)
 from ident.weighing import RowsToWeigh, rows_to_weigh, weigh_rows
 
 _LOG = logging.getLogger("drivegain")
@@ -154,7 +160,7 @@ def unpredictable(calibration: Calibration, payload: Payload | None) -> str:
         return ""
     if "m" not in payload.known:
         return f"payload {payload.name!r} is not predicted: the log leaves its mass open"
-    if not _of_mounting(calibration, payload):
+    if not mounted_parameters(calibration, payload.mounting):
         return f"payload {payload.name!r} is not predicted: nothing is known of mounting {payload.mounting!r}"
     return ""
 
@@ -167,7 +173,8 @@ def predicted(
     Raises:
         IdentificationError: the calibration cannot speak of this run.
     """
-    run = as_calibrated(calibration, run)
+    warn_without_temperature(calibration, run.name, run.temperature_c)
+    run = replace(run, payload=as_calibrated(calibration, run.payload, run.name))
     roles = {source.role for source in calibration.sources if source.sha256 == run.digest}
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
@@ -188,49 +195,17 @@ def predicted(
     )
 
 
-def as_calibrated(calibration: Calibration, run: Run) -> Run:
-    """Leave out of a run's payload what the calibration itself says of it, given or identified.
-
-    Warns as `warn_without_temperature`.
-
-    Raises:
-        DataUnfit: the calibration was given another mass on this mounting.
-    """
-    warn_without_temperature(calibration, run)
-    payload = run.payload
-    if payload is None:
-        return run
-    own = _of_mounting(calibration, payload)
-    mass, weighed = own.get("m"), payload.known.get("m")
-    if mass is not None and mass.std == 0.0 and weighed is not None and weighed != mass.value:
-        raise DataUnfit(
-            run.name,
-            f"carries {weighed:g} kg on mounting {payload.mounting!r}; the calibration has {mass.value:g} kg: "
-            "give each way of mounting a name of its own",
-        )
-    left = {name: value for name, value in payload.known.items() if name not in own}
-    return replace(run, payload=replace(payload, known=left))
-
-
-def warn_without_temperature(calibration: Calibration, run: Run) -> None:
-    """Warn of a run without the temperatures that an effect of the calibration depends on."""
-    for effect in calibration.effects:
-        if effect.name == TemperatureFriction.name and not _has_temperature(calibration, run, effect.axis):
-            _LOG.warning(
-                "%s has no temperature of %s: its friction is predicted at %g °C", run.name, effect.axis, REFERENCE_C
-            )
-
-
-def _has_temperature(calibration: Calibration, run: Run, axis: str) -> bool:
+def warn_without_temperature(calibration: Calibration, name: str, temperature_c: FloatArray | None) -> None:
+    """Warn of a run without the temperatures, shape (k, n), that an effect of the calibration depends on."""
     axes = [gain.axis for gain in calibration.gains]
-    if axis not in axes:
-        return True  # the prediction refuses it
-    return run.temperature_c is not None and not np.isnan(run.temperature_c[:, axes.index(axis)]).any()
-
-
-def _of_mounting(calibration: Calibration, payload: Payload) -> dict[str, Parameter]:
-    split = ((*parameter.name.partition(":"), parameter) for parameter in calibration.parameters)
-    return {name: parameter for name, _, mounting, parameter in split if mounting == payload.mounting}
+    for effect in calibration.effects:
+        # Without such an axis, the prediction refuses the effect.
+        if effect.name != TemperatureFriction.name or effect.axis not in axes:
+            continue
+        if temperature_c is None or np.isnan(temperature_c[:, axes.index(effect.axis)]).any():
+            _LOG.warning(
+                "%s has no temperature of %s: its friction is predicted at %g °C", name, effect.axis, REFERENCE_C
+            )
 
 
 MANUFACTURER = "manufacturer"  #: Label of the nameplate gains
@@ -378,7 +353,8 @@ def _diagnosed(
     idle = idle_joints(model, size, left)
     found = list(scale_diagnoses(measured, predicted, use & ~idle[:, None], axes, name))
     if run.payload is not None and not found:
-        of_payload = {one: parameter.value for one, parameter in _of_mounting(calibration, run.payload).items()}
+        of_mounting = mounted_parameters(calibration, run.payload.mounting)
+        of_payload = {one: parameter.value for one, parameter in of_mounting.items()}
         unknown = tuple(
             index
             for index, parameter in enumerate(LINK_PARAMETERS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from daq.config.cell import Cell, model_of
@@ -12,7 +12,6 @@ from daq.errors import ConfigurationError, LogRepeated, LogsDiffer
 from daq.log.conversion import load_run
 from daq.workflow.experiment import experiment_of, extra_moves
 from daq.workflow.validate import (
-    as_calibrated,
     check_cell,
     conditioning_of,
     unpredictable,
@@ -21,6 +20,7 @@ from daq.workflow.validate import (
 from ident.calibration import Calibration
 from ident.contact import ExternalTorque, external_torque, prediction_band
 from ident.data.run import Run
+from ident.prediction import as_calibrated
 from ident.weighing import Help, WeighedBody, moves_that_help, weigh
 
 
@@ -66,7 +66,7 @@ def weigh_logs(
             )
         without.append(run)
     for run in (*loaded, *without):
-        warn_without_temperature(calibration, run)
+        warn_without_temperature(calibration, run.name, run.temperature_c)
     _require_once((*logs, *bare), (*loaded, *without))
     described: Cell = cells[0]
     body = weigh(calibration, model_of(described), loaded, conditioning_of(calibration), bare=without)
@@ -123,4 +123,5 @@ def _predictable(calibration: Calibration, log: Path, run: Run) -> Run:
             expected="no load, or a payload of the calibration",
             remedy="give another log, or a calibration whose fit had this payload",
         )
-    return as_calibrated(calibration, run)
+    warn_without_temperature(calibration, run.name, run.temperature_c)
+    return replace(run, payload=as_calibrated(calibration, run.payload, run.name))

@@ -2,7 +2,7 @@
 
 While another master is on the bus, nothing is sent: its SYNC and the answers in our mapping are overheard, each cycle a
 `Sample`. On a quiet bus the axes are read by SDO uploads, one open request a node; then a sample has the last values of
-all axes, READING_S after READING_S. Nothing is ever written.
+all axes, every READING_S. Nothing is ever written.
 """
 
 from __future__ import annotations

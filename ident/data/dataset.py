@@ -81,12 +81,8 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     raw = np.ascontiguousarray(position.T)
     smooth = low_pass(raw, rate, conditioning.position_cutoff_hz, conditioning.position_order)
     position, velocity, acceleration = central_differences(smooth, rate)
-    speed_limit = np.asarray(conditioning.standstill_rad_s or standstill_speed(raw, smooth, rate, conditioning))[
-        :, None
-    ]
-    moving = np.abs(velocity) >= speed_limit
-    # Motor speed divided by the reduction, compared at the motor's own joint, which may have another number.
-    motor_moving = np.abs(drive_train.direction @ velocity) >= speed_limit[list(drive_train.joints)]
+    speed = np.asarray(conditioning.standstill_rad_s or standstill_speed(raw, smooth, rate, conditioning))
+    moving, motor_moving = moving_samples(velocity, speed, drive_train)
     valid = np.ones_like(moving).T if usable is None else np.asfortranarray(usable[1:-1], dtype=np.bool_)
     # If the log has no moves, a new one begins after every standstill of all joints.
     any_moving = np.any(moving, axis=0)
@@ -111,6 +107,19 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
         started_s=run.started_s,
         temperature_c=None if temperature_c is None else np.asfortranarray(temperature_c[1:-1]),
     )
+
+
+def moving_samples(velocity: FloatArray, speed: FloatArray, drive_train: DriveTrain) -> tuple[BoolArray, BoolArray]:
+    """Samples of each joint, and of each motor, that are not at standstill, shape (n, k) each.
+
+    Args:
+        velocity: of the joints [rad/s or m/s], shape (n, k).
+        speed: at which each joint begins to move, shape (n,).
+        drive_train: R, for the speed of coupled motors.
+    """
+    moving = np.abs(velocity) >= speed[:, None]
+    # Motor speed divided by the reduction, compared at the motor's own joint, which may have another number.
+    return moving, np.abs(drive_train.direction @ velocity) >= speed[list(drive_train.joints), None]
 
 
 def standstill_speed(raw: FloatArray, smooth: FloatArray, rate_hz: float, conditioning: Conditioning) -> FloatArray:

@@ -44,7 +44,7 @@ def decimate_rows(data: Dataset, conditioning: Conditioning, columns: FloatArray
 
 def row_masks(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning) -> tuple[BoolArray, BoolArray]:
     """Rows of each joint, and of each motor, that count (Observation.use, .motor_use), both of shape (n, r)."""
-    filter_ = row_filter(data, conditioning)
+    filter_ = decimator(data.rate_hz, conditioning.decimation_cutoff_hz)
     # A row's share of standstill is weighted as the filter weights its samples.
     window = Decimator(np.abs(filter_.taps) / np.abs(filter_.taps).sum(), filter_.factor)
     share = conditioning.standstill_share

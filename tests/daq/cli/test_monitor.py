@@ -447,3 +447,16 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
     (notice,) = (one for one in monitor_document(CELL, watch.read(0.5))["notices"] if one["alarm"])
     assert notice == event_document(EventKind.EMCY, 0x3210, "J2", notice["text"])
     assert notice["text"].startswith("EMCY 3210h") and notice["remedy"] == remedy_of(0x3210)
+
+
+def test_each_reading_publishes_the_load_of_the_buses(
+    bus: QuietBus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    feed, loads = Feed(tmp_path / "cell.yaml", stop=None), list[dict[str, float]]()
+    monkeypatch.setattr(feed, "measured", loads.append)
+    watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), feed)
+    watch.listen(QUIET_S)
+    for _ in range(2):
+        watch.read(0.5)
+    assert [list(load) for load in loads] == [[one.name for one in CELL.buses]] * 2
+    assert all(0.0 < load < 0.06 for one in loads for load in one.values())

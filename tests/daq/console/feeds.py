@@ -33,7 +33,8 @@ def facts(cell: Cell, log: Path | None) -> RunFacts:
     count = len(cell.axes)
     identity = [[float(row == column) for column in range(count)] for row in range(count)]
     scales = [1e-3] * count, [1e-3] * count, identity, [0.0] * count
-    return RunFacts("id", None if log is None else str(log), cell.axis_names, RATE_HZ, 3, *scales, None, {"can0": 0.4})
+    loads = {} if log is None else {"can0": 0.4}
+    return RunFacts("id", None if log is None else str(log), cell.axis_names, RATE_HZ, 3, *scales, None, loads)
 
 
 def predicting_calibration() -> Calibration:

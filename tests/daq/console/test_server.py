@@ -48,6 +48,12 @@ def test_without_the_token_there_is_nothing(console: Served, path: str) -> None:
     assert "content-security-policy" in answer.headers
 
 
+def test_a_question_about_the_whole_server_is_refused_like_any_other(console: Served) -> None:
+    answer, content = console.ask("*", "OPTIONS")
+    assert (answer.status, content) == (404, b"not found")
+    assert "content-security-policy" in answer.headers
+
+
 @pytest.mark.parametrize("host", ["evil.example", "127.0.0.1", "127.0.0.1:1", "localhost.evil.example", "[::1]"])
 def test_a_name_that_was_bound_to_this_computer_is_refused(console: Served, host: str) -> None:
     assert console.ask(f"/{TOKEN}/", host=host)[0].status == 421
@@ -129,6 +135,9 @@ def test_a_monitor_is_shown_until_a_recorder_begins_and_again_after_it(cell: Cel
         assert shown["axes"][0]["state"] == "OPERATION ENABLED"
         assert shown["free_bytes"] is None
         assert len(live.points.since(0)) == 10
+        assert shown["bus_load"] == {}  # nothing is computed where another master sends
+        watching.measured({"can0": 0.25})
+        live.wait(lambda: live.status()["bus_load"] == {"can0": 0.25})
         own = f"http://127.0.0.1:{console.port}"
         _, content = console.ask(f"/{TOKEN}/stop", "POST", origin=own)
         assert not json.loads(content)["accepted"]  # nothing of a monitor's can be stopped
@@ -140,6 +149,7 @@ def test_a_monitor_is_shown_until_a_recorder_begins_and_again_after_it(cell: Cel
             recording = Recording(feed, cell, cell_file)
             recording.run(50)
             live.wait(lambda: live.phase == "running" and live.samples == 50)
+            assert live.status()["bus_load"] != {"can0": 0.25}
             feed.finish()
         assert came.wait(30)
         monitor.run(100)

@@ -24,12 +24,12 @@ from daq.config.cell import Cell, joint_names
 from daq.console.live import Live
 from daq.errors import ExitCode
 from daq.log.bag_writer import joint_effort
-from daq.workflow.feed import HEAD, SAMPLES, TEXT, sample_struct
+from daq.workflow.feed import HEAD, SAMPLES, TEXT, packet_struct
 from tests.daq.calibrations import demo_calibration
 from tests.daq.console.feeds import facts
 
 pytest.importorskip("foxglove", reason="needs foxglove-sdk, of the optional extra `foxglove`")
-from daq.console.stream import SCHEMAS, FoxgloveStream
+from daq.console.stream import PREDICTED_TOPIC, RESIDUAL_TOPIC, SCHEMAS, FoxgloveStream
 
 TEXT_FRAME, DATA_FRAME, MESSAGE_DATA = 1, 2, 1
 ORIGIN_NS, PERIOD_NS = 1_700_000_000_000_000_000, 20_000_000
@@ -97,7 +97,7 @@ class Client:
 def _samples(cell: Cell, number: int, count: int) -> bytes:
     """Samples of 50 Hz as the feed packs them: positions and currents are the numbers of the cycle and of the axis."""
     axes = len(cell.axes)
-    layout, packed = sample_struct(axes), b""
+    layout, packed = packet_struct(axes), b""
     for cycle in range(count):
         values = [cycle + axis for axis in range(axes)]
         time_ns = ORIGIN_NS + PERIOD_NS * cycle
@@ -158,6 +158,7 @@ def test_a_client_gets_what_the_feed_holds_and_can_change_nothing(
         assert tuple(state.name) == joint_names(cell)
         assert state.position == pytest.approx(1e-3 * raw)
         assert current.current_a == pytest.approx(-1e-3 * raw)
+        assert state.velocity == pytest.approx([1e-3 / 0.02] * axes if cycle else [])
         assert state.effort == pytest.approx(joint_effort(cell, -1e-3 * raw, gains))
     ((at_ns, predicted),) = found["/cell/predicted"]
     assert at_ns == ORIGIN_NS + 100_000_000
@@ -165,6 +166,15 @@ def test_a_client_gets_what_the_feed_holds_and_can_change_nothing(
     assert list(found["/cell/residual"][0][1].current_a) == list(range(10, 10 + axes))
     ((_, event_seen),) = found["/cell/events"]
     assert (event_seen.axis, event_seen.kind, event_seen.code, event_seen.text) == (2, "emcy", 0x7305, "EMCY 7305h")
+
+
+def test_the_shipped_layout_shows_what_the_stream_sends(checkout: Path) -> None:
+    layout = json.loads((checkout / "configs" / "viewers" / "foxglove.json").read_text(encoding="utf-8"))
+    plotted = {path["value"] for panel in layout["configById"].values() for path in panel.get("paths", ())}
+    topics = {path.partition(".")[0] for path in plotted}
+    assert topics - set(SCHEMAS) == {"/cell/samples"}  # in logs alone
+    for topic in (PREDICTED_TOPIC, RESIDUAL_TOPIC):
+        assert {f"{topic}.current_a[{axis}]" for axis in range(6)} <= plotted
 
 
 def test_a_port_that_is_taken_is_a_wrong_command_line(checkout: Path, capsys: pytest.CaptureFixture[str]) -> None:

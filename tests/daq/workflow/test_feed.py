@@ -25,7 +25,7 @@ from daq.workflow.feed import (
     Feed,
     end_of,
     facts_of_recorder,
-    sample_dtype,
+    packet_dtype,
     socket_names,
 )
 from drivers.stream.sample import CellEvent, EventKind
@@ -73,7 +73,7 @@ def test_a_console_gets_every_sample_and_event_in_their_order(cell_file: Path, c
         cycle
         for packet, head in zip(packets, heads, strict=True)
         if head[0] == SAMPLES
-        for cycle in np.frombuffer(packet[HEAD.size :], sample_dtype(len(cell.axes)))["cycle"].tolist()
+        for cycle in np.frombuffer(packet[HEAD.size :], packet_dtype(len(cell.axes)))["cycle"].tolist()
     ]
     assert cycles == list(range(5, 40))
     assert heads[-1][2] == 40  # all samples of the run, also those from before

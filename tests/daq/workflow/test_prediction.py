@@ -11,14 +11,15 @@ import pytest
 from daq.config.cell import Cell, model_of
 from daq.config.cell_file import load_cell
 from daq.errors import LogsDiffer
-from daq.workflow.prediction import Predictor
+from daq.workflow.prediction import LEAST_S, RECENT_S, Predictor, Recent, Rows, predictor_of
 from daq.workflow.validate import conditioning_of
+from ident.calibration import Parameter
 from ident.data.dataset import differentiate
 from ident.data.run import Run
-from ident.equations.rows import row_filter
+from ident.equations.rows import row_filter, row_masks
 from ident.model.bodies import Payload
 from ident.prediction import predict_current
-from tests.daq.console.feeds import predicting_calibration
+from tests.daq.console.feeds import facts, predicting_calibration
 
 RATE_HZ, SAMPLES = 500.0, 3000
 CYCLES = np.arange(SAMPLES)
@@ -70,6 +71,11 @@ def test_rows_are_those_of_the_whole_run(cell: Cell, block: int) -> None:
         rows = at_row[on_grid].astype(int)
         assert predicted[on_grid, motor] == pytest.approx(expected[motor, rows], abs=2e-4)
         assert residual[on_grid, motor] == pytest.approx(left[motor, rows], abs=2e-4)
+    # Standstill is that of the fit, row by row.
+    _, use = row_masks(model.drive_train, data, conditioning)
+    rows = at_row[at_row == np.floor(at_row)].astype(int)
+    assert not use[:, rows].all() and use[:, rows].any()
+    assert (np.isfinite(predicted)[at_row == np.floor(at_row)] == use[:, rows].T).all()
 
 
 def test_nothing_is_predicted_at_standstill_and_a_gap_begins_anew(cell: Cell) -> None:
@@ -87,6 +93,44 @@ def test_nothing_is_predicted_at_standstill_and_a_gap_begins_anew(cell: Cell) ->
     assert after.cycle[0] > 10_000
     assert np.isfinite(after.predicted).any()
     assert (after.band > 0.0).all()
+
+
+def _rows(residual: float, seconds: float, motors: int = 2) -> Rows:
+    """Rows of one residual in the first motor, with a band of 1; the others rest."""
+    count = round(50.0 * seconds)
+    column = np.full((count, motors), np.nan)
+    column[:, 0] = residual
+    return Rows(np.arange(count), 0.0 * column, column, np.ones(motors))
+
+
+def test_an_axis_is_judged_by_the_last_ten_seconds_in_which_it_moved() -> None:
+    recent = Recent(50.0)
+    assert recent.axes() == []
+    recent.add(_rows(3.0, 0.9 * LEAST_S))
+    assert not recent.axes()[0].conspicuous  # too short
+    recent.add(_rows(3.0, 8.0 - 0.9 * LEAST_S))
+    for _ in range(10):
+        recent.add(_rows(np.nan, RECENT_S))  # a rest heals nothing
+    found, other = recent.axes()
+    assert (found.measured, found.predicted, found.outside_share, found.conspicuous) == (None, None, 1.0, True)
+    assert found.residual_rms == pytest.approx(3.0)
+    assert (other.residual_rms, other.outside_share, other.conspicuous) == (None, 0.0, False)
+    recent.add(_rows(0.5, 6.0))  # 4 s of 8 s are left in the ten seconds of motion
+    assert recent.axes()[0].outside_share == pytest.approx(0.4)
+    assert not recent.axes()[0].conspicuous
+    recent.add(_rows(0.5, 4.0))
+    assert recent.axes()[0].outside_share == 0.0
+
+
+def test_another_mass_than_that_of_the_calibration_is_refused(cell: Cell) -> None:
+    known = Parameter("m:disc", 4.59, 0.0, "kg"), Parameter("mx:disc", 0.1, 0.01, "kg m")
+    calibration = predicting_calibration()
+    calibration = replace(calibration, parameters=(*calibration.parameters, *known))
+    weighed = replace(cell.payloads[0], name="disc", mounting="disc", mass_kg=4.59)
+    run = replace(facts(cell, None), payload="disc")
+    for mass_kg, remark in ((4.59, ""), (5.0, "carries 5 kg on mounting 'disc'; the calibration has 4.59 kg")):
+        _, found = predictor_of(calibration, replace(cell, payloads=(replace(weighed, mass_kg=mass_kg),)), run)
+        assert remark in found and bool(found) == bool(remark)
 
 
 def test_what_the_calibration_does_not_know_is_not_predicted(cell: Cell) -> None:

@@ -12,9 +12,8 @@ import pytest
 from daq.cli import main
 from daq.errors import CalibrationUnreadable
 from daq.workflow.calibration_file import load_calibration, save_calibration
-from daq.workflow.validate import DataUse, as_calibrated, conditioning_of, together, validate
+from daq.workflow.validate import DataUse, conditioning_of, together, validate, warn_without_temperature
 from ident.calibration import AcceptedEffect, Calibration
-from ident.data.run import Run
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import demo_content, samples, write
 from tests.pipeline.next_step import next_step
@@ -145,13 +144,12 @@ def test_a_run_without_the_temperature_that_an_effect_needs_is_warned_of(caplog:
     effect = AcceptedEffect("temperature-friction", "J2", {}, (), 5.0, 4.0)
     calibration = replace(demo_calibration(), effects=(effect,))
     bare = np.zeros((3, 6))
-    run = Run("monday", np.arange(3.0), bare, bare)
     partly = np.where(np.arange(6) == 1, np.nan, 30.0) + bare
     for temperature_c in (None, partly):
         caplog.clear()
-        as_calibrated(calibration, replace(run, temperature_c=temperature_c))
+        warn_without_temperature(calibration, "monday", temperature_c)
         assert "monday has no temperature of J2: its friction is predicted at 40 °C" in caplog.text
     caplog.clear()
-    as_calibrated(calibration, replace(run, temperature_c=bare + 30.0))
-    as_calibrated(demo_calibration(), run)
+    warn_without_temperature(calibration, "monday", bare + 30.0)
+    warn_without_temperature(demo_calibration(), "monday", None)
     assert not caplog.records
