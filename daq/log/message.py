@@ -34,7 +34,7 @@ DEFINITIONS = {
 uint64 cycle                      # number of the sampling period; one without SYNC leaves a gap
 builtin_interfaces/Time stamp     # of the SYNC, since 1970
 int32[] position_counts           # motor side [encoder counts]
-int32[] current_raw               # current reference, or actual current by the profile [its unit; /cell/currents has it in A]
+int32[] current_raw               # reference or actual current, by the profile [its unit; /cell/currents: A]
 uint16[] statusword               # CiA 402 object 6041h
 uint32 missing                    # bit i: axis i did not answer, its values repeat the last known ones
 """
