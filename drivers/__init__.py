@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from drivers.canopen.network import open_cell as open_cell
     from drivers.canopen.scan import FoundNode as FoundNode
     from drivers.canopen.scan import scan as scan
+    from drivers.canopen.split_bus import BusPart as BusPart
+    from drivers.canopen.split_bus import SplitAddress as SplitAddress
     from drivers.errors import BusBusy as BusBusy
     from drivers.errors import BusError as BusError
     from drivers.errors import DriveFault as DriveFault
@@ -65,8 +67,6 @@ if TYPE_CHECKING:
     from drivers.stream.sample import CellEvent as CellEvent
     from drivers.stream.sample import EventKind as EventKind
     from drivers.stream.sample import Sample as Sample
-    from drivers.stream.split_bus import BusPart as BusPart
-    from drivers.stream.split_bus import SplitAddress as SplitAddress
     from drivers.stream.stream import SyncStream as SyncStream
     from drivers.stream.sync import FollowedSync as FollowedSync
     from drivers.stream.sync import LockstepSync as LockstepSync
@@ -76,6 +76,7 @@ _HOMES = {
     "canopen.bus": "BusAddress",
     "canopen.network": "CanopenNetwork open_cell",
     "canopen.scan": "FoundNode scan",
+    "canopen.split_bus": "BusPart SplitAddress",
     "errors": "BusBusy BusError DriveFault DriverError MotionRefused MotionTimeout NodeError NodeMisplaced NodeMissing "
     "ObjectAccessError ParameterRefused ParametersMixed SampleLost SetupRefused StateRefused",
     "motion.execute": "execute",
@@ -84,7 +85,6 @@ _HOMES = {
     "profiles.profile": "CIA402 Amplitude Axis CurrentScale DriveProfile Identity ObjectEntry TapPoint",
     "stream.answers": "StreamStatistics",
     "stream.sample": "CellEvent EventKind Sample",
-    "stream.split_bus": "BusPart SplitAddress",
     "stream.stream": "SyncStream",
     "stream.sync": "FollowedSync LockstepSync TimedSync",
 }

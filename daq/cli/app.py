@@ -32,7 +32,7 @@ BY_JOB = {
         Listed("demo", "daq.cli.simulate:DEMO", "Run the whole calibration on a simulated six-axis cell."),
         Listed("init", "daq.cli.init:INIT", "Create a folder for a new cell, with templates to fill in."),
         Listed("scan", "daq.cli.scan:SCAN", "Compare the nodes on the bus with the cell file."),
-        Listed("plan", "daq.cli.plan:PLAN", "Choose moves that excite every parameter."),
+        Listed("plan", "daq.cli.plan:PLAN", "Choose moves that show the worst gain best."),
         Listed("record", "daq.cli.record:RECORD", "Execute a plan and log it; this moves the robot."),
         Listed("fit", "daq.cli.fit:FIT", "Identify all drive gains and dynamic parameters."),
         Listed("residual", "daq.cli.fit:RESIDUAL", "Fit, then detect and add missing effects."),

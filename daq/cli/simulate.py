@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from daq.simulation.demo import Outcome
+    from drivers.canopen.split_bus import BusPart
     from drivers.simulation.spec import CellSpec
-    from drivers.stream.split_bus import BusPart
 
 _SHIPPED = ("demo", "clean", "seven-axis", "gantry")
 _SHIPPED_FAULTS = "faults-example"
@@ -55,7 +55,7 @@ def simulate(
     from daq.simulation.simulation_file import load_scenario, load_simulation, require_simulator, shipped_simulation
     from drivers.canopen.bus import BusAddress, open_bus
     from drivers.canopen.hub import Hub
-    from drivers.stream.split_bus import BusPart, SplitAddress, open_cell_bus
+    from drivers.canopen.split_bus import BusPart, SplitAddress, open_cell_bus
 
     require_simulator()
     from drivers.simulation.cell import SimulatedCell

@@ -14,8 +14,8 @@ from drivers.canopen.pdo import HEARTBEAT_MS, SETPOINT_PDOS, STATUSWORD, pack
 from drivers.profiles.profile import Axis, DriveProfile, ObjectEntry
 
 if TYPE_CHECKING:
+    from drivers.canopen.split_bus import CellAddress
     from drivers.stream.monitor import CellReading
-    from drivers.stream.split_bus import CellAddress
 
 # Addresses are made through the lazy front door: reading a cell file checks the load of its buses, and that needs no
 # CAN library.

@@ -22,16 +22,12 @@ from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
 from daq.files import fsync_folder
 from daq.log.conversion import scaling, unwrapped
 from daq.log.message import (
-    CURRENTS_SCHEMA,
     CURRENTS_TOPIC,
     DEFINITIONS,
-    EVENTS_SCHEMA,
     EVENTS_TOPIC,
-    JOINTS_SCHEMA,
     JOINTS_TOPIC,
-    READING_SCHEMA,
     READING_TOPICS,
-    URDF_SCHEMA,
+    SCHEMA_OF,
     URDF_TOPIC,
     currents_bytes,
     event_bytes,
@@ -45,13 +41,6 @@ from ident.arrays import FloatArray
 from ident.model.model import DriveTrain
 
 VELOCITY_S = 0.02  #: Time over which a velocity is the mean, as in a log's own joint states
-_SCHEMAS = {
-    URDF_TOPIC: URDF_SCHEMA,
-    JOINTS_TOPIC: JOINTS_SCHEMA,
-    CURRENTS_TOPIC: CURRENTS_SCHEMA,
-    EVENTS_TOPIC: EVENTS_SCHEMA,
-    **dict.fromkeys(READING_TOPICS.values(), READING_SCHEMA),
-}
 _RELIABLE, _VOLATILE, _TRANSIENT_LOCAL, _KEEP_LAST, _AUTOMATIC = 1, 2, 1, 1, 1  # values of rmw's enumerations
 
 
@@ -170,7 +159,7 @@ def _write(writer: Writer, messages: Sequence[tuple[int, str, bytes]]) -> None:
     schemas: dict[str, int] = {}
     for time_ns, topic, data in messages:
         if topic not in channels:
-            schema = _SCHEMAS[topic]
+            schema = SCHEMA_OF[topic]
             if schema not in schemas:
                 schemas[schema] = writer.register_schema(schema, "ros2msg", DEFINITIONS[schema].encode())
             metadata = {"offered_qos_profiles": "".join(f"{line}\n" for line in _qos(topic))}
@@ -213,7 +202,7 @@ def _metadata(name: str, counts: Counter[str], first_ns: int, last_ns: int) -> s
         lines += [
             "    - topic_metadata:",
             f"        name: {topic}",
-            f"        type: {_SCHEMAS[topic]}",
+            f"        type: {SCHEMA_OF[topic]}",
             "        serialization_format: cdr",
             "        offered_qos_profiles: |",
             *(f"          {line}" for line in _qos(topic)),

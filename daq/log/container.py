@@ -33,8 +33,8 @@ from daq.log.message import (
     LARGEST_AXES,
     READING_SCHEMA,
     READING_TOPICS,
-    SAMPLES_SCHEMA,
     SAMPLES_TOPIC,
+    SCHEMA_OF,
     event_from_bytes,
     reading_from_bytes,
     sample_dtype,
@@ -266,7 +266,7 @@ def _parse(read: Callable[[ReadDataStream], Record], body: bytes, file: RecordFi
 
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 _QUANTITIES = {topic: quantity for quantity, topic in READING_TOPICS.items()}
-_SCHEMAS = {SAMPLES_TOPIC: SAMPLES_SCHEMA, EVENTS_TOPIC: EVENTS_SCHEMA, **dict.fromkeys(_QUANTITIES, READING_SCHEMA)}
+_READ = (SAMPLES_TOPIC, EVENTS_TOPIC, *_QUANTITIES)  #: Topics that a fit needs; the others are for viewers
 
 
 class ChunkContents:
@@ -362,7 +362,7 @@ class ChunkContents:
             self._schemas[record.id] = record
         elif isinstance(record, Channel):
             schema = self._schemas.get(record.schema_id)
-            expected = _SCHEMAS.get(record.topic)
+            expected = SCHEMA_OF[record.topic] if record.topic in _READ else None
             name = schema.name if schema else "no schema"
             if expected and (record.message_encoding != "cdr" or name != expected):
                 raise self._file.foreign(

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from daq.config.cell import DEGREE, Cell
 from daq.config.cell_file import cell_from_bundle
 from daq.errors import ClockImplausible, CurrentSaturated, CyclesLost, LogIncomplete, PositionImplausible, RunInvalid
-from daq.log.metadata import Readback
-from daq.log.reader import Log, LossyLogs, read_log, reports_only_losses
+from daq.log.metadata import Readback, reports_only_losses
+from daq.log.reader import Log, LossyLogs, read_log
 from drivers.stream.sample import CellEvent, EventKind, Quantity
 from ident.arrays import BoolArray, FloatArray
 from ident.data.run import Recording, Run

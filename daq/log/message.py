@@ -31,10 +31,10 @@ _TIME = _SEPARATOR + "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
 DEFINITIONS = {
     SAMPLES_SCHEMA: """\
 # One SYNC cycle of a cell, as the amplifiers sent it.
-uint64 cycle                      # number of the SYNC
+uint64 cycle                      # number of the sampling period; one without SYNC leaves a gap
 builtin_interfaces/Time stamp     # of the SYNC, since 1970
 int32[] position_counts           # motor side [encoder counts]
-int32[] current_raw               # current-loop reference [unit of the drive profile; /cell/currents has it in A]
+int32[] current_raw               # reference or actual current, by the profile [its unit; /cell/currents: A]
 uint16[] statusword               # CiA 402 object 6041h
 uint32 missing                    # bit i: axis i did not answer, its values repeat the last known ones
 """
@@ -74,6 +74,15 @@ float64[] effort                  # [Nm or N], torque of the drives by a calibra
     + _TIME,
 }
 """Full ros2msg definitions by schema name, with the definitions they refer to."""
+SCHEMA_OF = {
+    SAMPLES_TOPIC: SAMPLES_SCHEMA,
+    EVENTS_TOPIC: EVENTS_SCHEMA,
+    JOINTS_TOPIC: JOINTS_SCHEMA,
+    CURRENTS_TOPIC: CURRENTS_SCHEMA,
+    URDF_TOPIC: URDF_SCHEMA,
+    **dict.fromkeys(READING_TOPICS.values(), READING_SCHEMA),
+}
+"""Schema name of every topic of a log."""
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR, little-endian
 _EVENT = struct.Struct("<4siIh2x")

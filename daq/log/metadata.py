@@ -100,6 +100,37 @@ class RunStatistics:
     wall_minus_monotonic_ns: int | None = None
 
 
+class Loss(Enum):
+    """Kinds of frames that make a run invalid. Logs hold these names, so they must not change."""
+
+    MISSING = "missing answers"
+    LATE = "late answers"
+    WRONG_LENGTH = "answers of wrong length"
+    DUPLICATE = "answers twice"
+    SURPLUS = "PDOs that no axis was configured to send"
+    SKIPPED_PERIODS = "periods without SYNC"
+    KERNEL = "frames dropped by the kernel"
+    INTERFACE = "frames dropped by the interface"
+    BACKLOG = "frames dropped by the capture process"
+
+    @property
+    def masked(self) -> bool:
+        """Whether the samples carry the axis in `missing`; the recorder could not interpret the others."""
+        return self not in (Loss.DUPLICATE, Loss.SURPLUS, Loss.SKIPPED_PERIODS)
+
+
+def loss_reason(counts: Mapping[Loss, int]) -> str:
+    """Return the losses above zero as `RunStatistics.reason`; empty without any."""
+    return ", ".join(f"{count} {loss.value}" for loss, count in counts.items() if count)
+
+
+def reports_only_losses(reason: str) -> bool:
+    """Return whether a reason consists of masked losses only, as `loss_reason` writes them."""
+    parts = [part.partition(" ") for part in reason.split(", ")]
+    masked = {loss.value for loss in Loss if loss.masked}
+    return all(count.isdecimal() and name in masked for count, _, name in parts)
+
+
 def run_record(info: RunInfo) -> dict[str, str]:
     """Encode the metadata `drivegain.run`."""
     payload = info.payload

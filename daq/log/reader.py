@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
@@ -38,7 +37,7 @@ BLOCK_SAMPLES = 4096  #: Samples of a block; at most these and one chunk are in 
 class SampleBlock:
     """Samples of k cycles, in the order of the log."""
 
-    cycle: NDArray[np.uint64]  #: number of the SYNC, shape (k,), uint64
+    cycle: NDArray[np.uint64]  #: number of the sampling period, shape (k,), uint64
     time_ns: NDArray[np.int64]  #: time of the SYNC [ns], shape (k,), int64
     position_counts: NDArray[np.int32]  #: shape (k, n), int32
     current_raw: NDArray[np.int32]  #: shape (k, n), int32
@@ -289,28 +288,8 @@ def read_log(path: Path | str) -> Log:
     return Log(path, reader.digest, head, samples, events, readings, statistics, reader.partial)
 
 
-MASKED = (
-    "missing answers",
-    "late answers",
-    "answers of wrong length",
-    "frames dropped by the kernel",
-    "frames dropped by the interface",
-    "frames dropped by the capture process",
-)
-"""Losses that the recorder counts and every reader masks: the samples carry the axis in `missing`."""
-
-
 class LossyLogs(Enum):
-    """Whether to use a log that its recorder marked invalid because of MASKED losses."""
+    """Whether to use a log that its recorder marked invalid because of losses that are masked (`Loss.masked`)."""
 
     REFUSED = "refused"
     ACCEPTED = "accepted"
-
-
-def reports_only_losses(reason: str) -> bool:
-    """Return whether the reason of an invalid run consists only of MASKED losses.
-
-    Duplicate and unexpected frames and periods without SYNC are not among them: the recorder could not interpret them.
-    """
-    kinds = "|".join(map(re.escape, MASKED))
-    return all(re.fullmatch(rf"\d+ (?:{kinds})", part) for part in reason.split(", "))

@@ -19,18 +19,13 @@ from daq.errors import OutputFailed, UsageError
 from daq.files import fsync_folder
 from daq.log.container import UNFINISHED
 from daq.log.message import (
-    CURRENTS_SCHEMA,
     CURRENTS_TOPIC,
     DEFINITIONS,
-    EVENTS_SCHEMA,
     EVENTS_TOPIC,
-    JOINTS_SCHEMA,
     JOINTS_TOPIC,
-    READING_SCHEMA,
     READING_TOPICS,
-    SAMPLES_SCHEMA,
     SAMPLES_TOPIC,
-    URDF_SCHEMA,
+    SCHEMA_OF,
     URDF_TOPIC,
     currents_bytes,
     event_bytes,
@@ -212,7 +207,7 @@ class LogWriter:
         """Append one slow reading."""
         channel = self._reading_channels.get(reading.quantity)
         if channel is None:
-            channel = self._channel(READING_TOPICS[reading.quantity], READING_SCHEMA)
+            channel = self._channel(READING_TOPICS[reading.quantity])
             self._reading_channels[reading.quantity] = channel
         self._held.append((channel, reading.time_ns, reading_bytes(reading)))
 
@@ -305,16 +300,17 @@ class LogWriter:
         for name, data in {**self._content.files, READBACK: readback_bytes(self._content.readback)}.items():
             self._mcap.add_attachment(started_ns, started_ns, name, "application/octet-stream", data)
         self._mcap.add_metadata(RUN, sealed(run_record(self._content.run)))
-        self._samples_channel = self._channel(SAMPLES_TOPIC, SAMPLES_SCHEMA)
-        self._events_channel = self._channel(EVENTS_TOPIC, EVENTS_SCHEMA)
-        self._joints_channel = self._channel(JOINTS_TOPIC, JOINTS_SCHEMA)
-        self._currents_channel = self._channel(CURRENTS_TOPIC, CURRENTS_SCHEMA)
+        self._samples_channel = self._channel(SAMPLES_TOPIC)
+        self._events_channel = self._channel(EVENTS_TOPIC)
+        self._joints_channel = self._channel(JOINTS_TOPIC)
+        self._currents_channel = self._channel(CURRENTS_TOPIC)
         if self._content.urdf:
-            urdf = self._channel(URDF_TOPIC, URDF_SCHEMA)
+            urdf = self._channel(URDF_TOPIC)
             self._held.append((urdf, started_ns, text_bytes(self._content.urdf)))
         self._mcap.flush()
 
-    def _channel(self, topic: str, schema: str) -> int:
+    def _channel(self, topic: str) -> int:
+        schema = SCHEMA_OF[topic]
         identifier = self._mcap.register_schema(schema, "ros2msg", DEFINITIONS[schema].encode())
         return self._mcap.register_channel(topic, "cdr", identifier)
 

@@ -17,7 +17,7 @@ Figure = float | None  #: null where it is not known
 
 
 class Errors(StrictModel):
-    """Relative errors [%], null for an axis that did not move."""
+    """Relative errors [%]; null for an axis that did not move, and in total where none did."""
 
     axes: list[Figure]
     total: Figure
@@ -56,14 +56,19 @@ class RemovedParameter(StrictModel):
     std_percent: Figure
 
 
-class GainWords(StrictModel):
-    """Verdict on how well the data show a gain."""
+class JudgedGain(StrictModel):
+    """Verdict on how well data show a gain."""
 
     axis: str
-    std_percent: Figure
     verdict: str
     seen_by: list[str]
     words: str
+
+
+class GainWords(JudgedGain):
+    """Verdict on how well the data of a fit show a gain."""
+
+    std_percent: Figure
 
 
 class Trial(StrictModel):

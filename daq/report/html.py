@@ -1,14 +1,16 @@
-"""Pieces of a page that needs no other file: no script, no address, pictures inside, every text escaped.
+"""Pieces of a page that needs no other file: no address, pictures inside, every text escaped.
 
 The page reads on a phone (16 px; wide tables scroll in a box of their own, those with a verdict stack their cells), on
 paper (the first sheet is one A4 page, closed sections are left out) and in dark mode. Colour-blind readers can
-distinguish the colours, those of `daq.report.picture`, and no meaning rests on colour alone.
+distinguish the colours, and no meaning rests on colour alone.
 """
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from unicodedata import category
 
@@ -17,12 +19,24 @@ MARK = '<meta name="generator" content="drivegain">'
 _UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")
 """Unicode categories: control, format, surrogates, private, unassigned, separators of lines and paragraphs."""
 LIGHT = {
-    **{"paper": "#fff", "ink": "#1a1a1a", "soft": "#595959", "line": "#d4d4d4", "shade": "#f0f0f0"},
-    **{"data": "#0072B2", "act": "#B34700", "pale": "#6AAFE0"},
+    "paper": "#fff",
+    "ink": "#1a1a1a",
+    "soft": "#595959",
+    "line": "#d4d4d4",
+    "shade": "#f0f0f0",
+    "data": "#0072B2",
+    "act": "#B34700",
+    "pale": "#6AAFE0",
 }
 _DARK = {
-    **{"paper": "#16181a", "ink": "#ececec", "soft": "#b0b0b0", "line": "#44484c", "shade": "#26292d"},
-    **{"data": "#56B4E9", "act": "#F0A060", "pale": "#2F6F99"},
+    "paper": "#16181a",
+    "ink": "#ececec",
+    "soft": "#b0b0b0",
+    "line": "#44484c",
+    "shade": "#26292d",
+    "data": "#56B4E9",
+    "act": "#F0A060",
+    "pale": "#2F6F99",
 }
 _CODE = re.compile("`([^`\n]+)`")
 _NUMBER = re.compile(r"[+\-±]?([\d.]+(e[+-]?\d+)?|nan|inf)( .*)?|-")
@@ -45,16 +59,22 @@ svg .rest { stroke: var(--act); stroke-width: 2.2; stroke-linecap: round; opacit
 """Style of the drawings of `daq.report.svg`."""
 
 
-def _colours(colours: dict[str, str]) -> str:
-    return " ".join(f"--{name}: {colour};" for name, colour in colours.items())
+def palette(light: Mapping[str, str], dark: Mapping[str, str]) -> str:
+    """Return the style of the colours of a page on the screen, those of every page and some of its own."""
+
+    def variables(colours: Mapping[str, str]) -> str:
+        return " ".join(f"--{name}: {colour};" for name, colour in colours.items())
+
+    return f"""
+:root {{ color-scheme: light dark; {variables({**LIGHT, **light})} }}
+@media (prefers-color-scheme: dark) {{ :root {{ {variables({**_DARK, **dark})} }} }}
+@media print {{ :root {{ {variables(LIGHT)} }} }}
+"""
 
 
 _STYLE = (
-    f"""
-:root {{ color-scheme: light dark; {_colours(LIGHT)} }}
-@media (prefers-color-scheme: dark) {{ :root {{ {_colours(_DARK)} }} }}
-@media print {{ :root {{ {_colours(LIGHT)} }} }}
-{DRAWING}"""
+    palette({}, {})
+    + DRAWING
     + """
 * { box-sizing: border-box; }
 body { font: 16px/1.45 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 56rem;
@@ -109,23 +129,38 @@ summary:focus-visible { outline: 3px solid var(--data); }
 
 
 def page(title: str, body: Iterable[str]) -> str:
-    """Build the document; the pieces of the body come from the functions below, which escape every text."""
-    # The security policy keeps a browser from opening an address, whatever text a file holds.
-    pieces = "\n".join(body)
+    """Build a page without script; the pieces of the body come from the functions below, which escape every text."""
+    return document(title, MARK, _STYLE, "\n".join(body))
+
+
+def document(title: str, mark: str, style: str, body: str, script: str = "") -> str:
+    """Build a document that opens no address and runs no script but the given one, whatever text the body holds.
+
+    Args:
+        title: plain text.
+        mark: `meta` element by which the page is recognised.
+        style: content of `style`.
+        body: content of `body`, escaped.
+        script: the only script.
+    """
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    allowed = f" script-src 'sha256-{digest}';" if script else ""
+    policy = f"default-src 'none';{allowed} img-src data:; style-src 'unsafe-inline'"
+    ending = f"<script>{script}</script>\n" if script else ""
     return f"""\
 <!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
-{MARK}
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
+{mark}
+<meta http-equiv="Content-Security-Policy" content="{policy}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{spelled(title)}</title>
-<style>{_STYLE}</style>
+<style>{style}</style>
 </head>
 <body>
-{pieces}
-</body>
+{body}
+{ending}</body>
 </html>
 """
 
@@ -196,9 +231,14 @@ def pair(figures: Iterable[str]) -> str:
 
 
 def spelled(text: str) -> str:
-    """Escape markup and spell out invisible characters.
+    """Escape markup and spell out invisible characters."""
+    return escape(visible(text))
+
+
+def visible(text: str) -> str:
+    """Spell out invisible characters.
 
     HTML allows no control characters, and those that reverse the direction of writing (U+202E and others of category
     Cf) can make a name look like another.
     """
-    return escape("".join(c if c == "\n" or category(c) not in _UNSEEN else f"\\u{ord(c):04x}" for c in text))
+    return "".join(c if c == "\n" or category(c) not in _UNSEEN else f"\\u{ord(c):04x}" for c in text)

@@ -92,8 +92,8 @@ function label(pen, text, x, y, colour, align = "left") {
 function grid(pen, see) {
   const r = Math.ceil(data.radius_m * 2) / 2, step = data.grid_m;
   for (let g = -r; g <= r + 1e-9; g += step) {
-    line(pen, [see([g, -r, 0]), see([g, r, 0])], ink("--grid"), 0.7);
-    line(pen, [see([-r, g, 0]), see([r, g, 0])], ink("--grid"), 0.7);
+    line(pen, [see([g, -r, 0]), see([g, r, 0])], ink("--line"), 0.7);
+    line(pen, [see([-r, g, 0]), see([r, g, 0])], ink("--line"), 0.7);
   }
   [["x", [step, 0, 0]], ["y", [0, step, 0]], ["z", [0, 0, step]]].forEach(([name, end]) => {
     const [from, to] = [see([0, 0, 0]), see(end)];
@@ -196,7 +196,7 @@ function drawClearance() {
   const [low, high] = [Math.min(0, ...known), Math.max(least * 1.5, 1, ...known) * 1.05];
   const y = v => 6 + (bottom - 6) * (high - v) / (high - low);
   for (const tick of ticks(low, high, 4)) {
-    line(pen, [[left, y(tick)], [right, y(tick)]], ink("--grid"), 0.8);
+    line(pen, [[left, y(tick)], [right, y(tick)]], ink("--line"), 0.8);
     label(pen, tick, left - 6, y(tick) + 5, ink("--soft"), "right");
   }
   pen.fillStyle = ink("--act");
@@ -216,7 +216,7 @@ function drawSpeeds() {
   const [pen, x, left, right, bottom, cursor] = timeline(byId("speed"));
   data.speeds.forEach((one, k) => {
     const floor = 34 * (k + 1), y = v => floor - 29 * v / 100;
-    line(pen, [[left, floor], [right, floor]], ink("--grid"), 0.8);
+    line(pen, [[left, floor], [right, floor]], ink("--line"), 0.8);
     label(pen, one.name, 18, floor - 9, ink("--ink"));
     pen.strokeStyle = pen.fillStyle = colourOf(k);
     pen.lineWidth = 1.5;

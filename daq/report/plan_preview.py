@@ -6,13 +6,10 @@ is drawn from the same capsules at every row.
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from html import escape
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,6 +18,7 @@ import numpy as np
 
 from daq.config.cell import Cell
 from daq.files import open_regular, sha256
+from daq.report.html import document, element, listed, palette, visible
 from daq.workflow.experiment import PlannedMove, path_of
 from ident.arrays import FloatArray
 from ident.model.robot import poses
@@ -30,19 +28,22 @@ STEP_S, LARGEST_ROWS = 0.04, 1500  #: Time between two rows of a preview, and th
 MARK = '<meta name="drivegain-plan" content="'  #: Text at the beginning of a page, before the digest of its plan
 _GRID_M = 0.25  #: Side of a square of the drawn plane z = 0
 HEAD_BYTES = 1024  #: Beginning of a page, in which the digest of its plan is
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B58900", "#3B9BD6", "#7F7F7F", "#882255")
-_DARK = ("#4BA3E3", "#F08A4B", "#2FC298", "#E39BC4", "#E0B73C", "#9AD5FF", "#B5B5B5", "#D77AA8")
-_STYLE = """
-:root { color-scheme: light dark; --ink: #1a1a1a; --soft: #595959; --grid: #d4d4d4; --paper: #fff; --act: #B34700;
-  --base: #8a8a8a; --swept: #b9cbe0; --swept-edge: #33567f; --footprint: #a3a3a3; AXES }
-@media (prefers-color-scheme: dark) { :root { --ink: #ececec; --soft: #b0b0b0; --grid: #44484c; --paper: #16181a;
-  --act: #F0A060; --base: #8f8f8f; --swept: #4d6e93; --swept-edge: #bcd6f2; --footprint: #6d6d6d; DARK } }
+_AXES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B58900", "#3B9BD6", "#7F7F7F", "#882255")
+_AXES_DARK = ("#4BA3E3", "#F08A4B", "#2FC298", "#E39BC4", "#E0B73C", "#9AD5FF", "#B5B5B5", "#D77AA8")
+_LIGHT = {"base": "#8a8a8a", "swept": "#b9cbe0", "swept-edge": "#33567f", "footprint": "#a3a3a3"}
+_DARK = {"base": "#8f8f8f", "swept": "#4d6e93", "swept-edge": "#bcd6f2", "footprint": "#6d6d6d"}
+_STYLE = (
+    palette(
+        {**_LIGHT, **{f"axis-{number}": colour for number, colour in enumerate(_AXES)}},
+        {**_DARK, **{f"axis-{number}": colour for number, colour in enumerate(_AXES_DARK)}},
+    )
+    + """\
 body { font: 16px/1.45 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 64rem;
   margin: 1rem auto; padding: 0 1rem; overflow-wrap: anywhere; }
 h1 { font-size: 1.4rem; margin: 0.5rem 0; } h2 { font-size: 1.05rem; margin: 1rem 0 0.2rem; }
 ul { margin: 0.5rem 0; padding-left: 1.2rem; } p { margin: 0.3rem 0; color: var(--soft); } .act { color: var(--act); }
 canvas { width: 100%; display: block; } #clearance { height: 9rem; }
-#arm { height: min(60vh, 34rem); touch-action: none; cursor: grab; border: 1px solid var(--grid); }
+#arm { height: min(60vh, 34rem); touch-action: none; cursor: grab; border: 1px solid var(--line); }
 .controls { display: flex; flex-wrap: wrap; gap: 0.4rem 0.6rem; align-items: center; margin: 0.5rem 0; }
 .controls input[type=range] { flex: 1 1 12rem; } button { font: inherit; padding: 0.35rem 0.9rem; }
 #now { font-variant-numeric: tabular-nums; min-width: 22rem; } #now.act { font-weight: bold; }
@@ -50,8 +51,7 @@ canvas { width: 100%; display: block; } #clearance { height: 9rem; }
 @media print { .controls { display: none; } body { font-size: 10pt; max-width: none; margin: 0; }
   canvas { object-fit: contain; object-position: left; break-inside: avoid; } h2 { break-after: avoid; }
   #arm { height: 9cm; object-position: center; } #clearance { height: 3cm; } #speed { max-height: 6cm; } }
-""".replace("AXES", " ".join(f"--axis-{k}: {colour};" for k, colour in enumerate(_COLOURS))).replace(
-    "DARK", " ".join(f"--axis-{k}: {colour};" for k, colour in enumerate(_DARK))
+"""
 )
 
 
@@ -65,25 +65,11 @@ def preview_page(cell: Cell, moves: Sequence[PlannedMove], checker: Checker, pla
         plan: content of the plan file, whose digest the page carries.
     """
     script = (Path(__file__).parent / "plan_preview.js").read_text(encoding="utf-8")
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     drawn = preview_data(cell, moves, checker)
     data = json.dumps(drawn, separators=(",", ":"), allow_nan=False)
     data = data.replace("<", "\\u003c")  # no name in it ends the script
-    facts = "".join(f"<li>{escape(text)}</li>" for text in _facts(cell, checker, drawn))
-    return f"""\
-<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-{MARK}{sha256(plan)}">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; script-src 'sha256-{digest}'; \
-style-src 'unsafe-inline'">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Plan for {escape(cell.name)}</title>
-<style>{_STYLE}</style>
-</head>
-<body>
-<h1>Plan for cell {escape(cell.name)}: {len(moves)} moves in {drawn["time_s"][-1]:.0f} s</h1>
+    body = f"""\
+{element("h1", f"Plan for cell {cell.name}: {len(moves)} moves in {drawn['time_s'][-1]:.0f} s")}
 <canvas id="arm"></canvas>
 <div class="controls"><button id="play">Play</button><input id="time" type="range" min="0" value="0" aria-label="time">
 <span id="now" role="status"></span></div>
@@ -93,16 +79,13 @@ style-src 'unsafe-inline'">
 <label><input id="swept" type="checkbox" checked> swept volume</label></div>
 <p>Drag to turn. Each link has the colour of the axis that moves it. Pale, with an outline: everywhere that a moving
 part comes; grey on the grid: its footprint. A square of the grid is {1000 * _GRID_M:.0f} mm.</p>
-<ul>{facts}</ul>
+{listed(_facts(cell, checker, drawn))}
 <h2>Clearance [mm]</h2>
 <canvas id="clearance"></canvas>
 <h2>Speed of each axis; full height is 100 % of its limit</h2>
 <canvas id="speed"></canvas>
-<script id="data" type="application/json">{data}</script>
-<script>{script}</script>
-</body>
-</html>
-"""
+<script id="data" type="application/json">{data}</script>"""
+    return document(f"Plan for {cell.name}", f'{MARK}{sha256(plan)}">', _STYLE, body, script)
 
 
 def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> dict[str, Any]:
@@ -130,16 +113,19 @@ def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> 
         "moves": len(moves),
         "origins_m": _rounded(origins, 3),
         "ends_m": _rounded(placed, 3),
-        "capsules": [{"name": one.name, "link": one.link, "radius_m": one.radius_m} for one in capsules],
+        "capsules": [{"name": visible(one.name), "link": one.link, "radius_m": one.radius_m} for one in capsules],
         "boxes": [
             {
-                **{"name": one.name, "lower_m": one.lower_m, "upper_m": one.upper_m},
+                "name": visible(one.name),
+                "lower_m": one.lower_m,
+                "upper_m": one.upper_m,
                 "obstacle": one is not checker.scene.workspace,
             }
             for one in boxes
         ],
         "reach": {
-            **{"lower_m": _rounded(np.array(reach.lower_m), 3), "upper_m": _rounded(np.array(reach.upper_m), 3)},
+            "lower_m": _rounded(np.array(reach.lower_m), 3),
+            "upper_m": _rounded(np.array(reach.upper_m), 3),
             "radius_m": round(reach.radius_m, 3),
         },
         "grid_m": _GRID_M,
@@ -149,7 +135,7 @@ def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> 
         "clearance_mm": [round(value, 1) if np.isfinite(value) else None for value in clearance_mm.tolist()],
         "minimum_mm": 1000.0 * checker.scene.minimum_m,
         "speeds": [
-            {"name": name, "values": _rounded(column, 1)}
+            {"name": visible(name), "values": _rounded(column, 1)}
             for name, column in zip(cell.axis_names, 100.0 * np.abs(speed / limits).T, strict=True)
         ],
     }

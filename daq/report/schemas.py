@@ -25,10 +25,12 @@ from daq.report.controller_schemas import (
 )
 from daq.report.fit_schemas import (
     CasesReport,
+    ComparedGain,
     ContactReport,
     Errors,
     Figure,
     FitReport,
+    JudgedGain,
     ResidualReport,
     ValidateReport,
     WeighReport,
@@ -82,15 +84,11 @@ class ScanReport(StrictModel):
     )
 
 
-class PlannedGain(StrictModel):
+class PlannedGain(JudgedGain):
     """Prediction for one gain."""
 
-    axis: str
     predicted_std_percent: Figure
-    verdict: str
-    seen_by: list[str]
     alone_percent: dict[str, Figure] = Field(description="σ that each source of information gives alone [%]")
-    words: str
 
 
 class PlanReport(StrictModel):
@@ -115,15 +113,25 @@ class BusLoadEntry(StrictModel):
     worst_percent: float
 
 
-class RecordReport(StrictModel):
-    """`record`."""
+class LogSize(StrictModel):
+    """A log and its samples."""
 
     log: str
     samples: int
     lost_cycles: int
-    missing: list[int] = Field(description="samples without an answer, an axis each")
     valid: bool
-    reason: str
+
+
+class WrittenLog(LogSize):
+    """A log that was written, and its losses."""
+
+    missing: list[int] = Field(description="samples without an answer, an axis each")
+    reason: str = Field(description="why it is not valid")
+
+
+class RecordReport(WrittenLog):
+    """`record`."""
+
     warnings: list[str]
     bus_load: list[BusLoadEntry]
 
@@ -197,13 +205,10 @@ class InfoReport(StrictModel):
     attachments: dict[str, int] = Field(description="size of each [bytes]")
 
 
-class FleetGain(StrictModel):
+class FleetGain(ComparedGain):
     """A gain of a cell of the fleet."""
 
-    axis: str
-    value: float
     std: Figure
-    std_percent: Figure
     unit: str
 
 
@@ -250,32 +255,20 @@ class FleetReport(StrictModel):
     failed: int
 
 
-class ImportReport(StrictModel):
+class ImportReport(WrittenLog):
     """`import`."""
 
-    log: str
-    samples: int
-    lost_cycles: int
-    missing: list[int]
-    valid: bool
-    reason: str
     partial: bool
     wall_minus_monotonic_ns: int | None
     timing: Stamps | None
     remarks: list[str]
 
 
-class SalvageReport(StrictModel):
+class SalvageReport(WrittenLog):
     """`salvage`."""
 
-    log: str
     partial: bool
-    samples: int
     duration_s: float
-    lost_cycles: int
-    missing: list[int]
-    valid: bool
-    reason: str
     left_out_bytes: int
     damage: str
 
@@ -419,15 +412,6 @@ class DemoPlan(StrictModel):
     predicted_std_percent: list[Figure]
 
 
-class DemoLog(StrictModel):
-    """A log of the demonstration."""
-
-    log: str
-    samples: int
-    lost_cycles: int
-    valid: bool
-
-
 class DemoReport(StrictModel):
     """`demo`."""
 
@@ -439,7 +423,7 @@ class DemoReport(StrictModel):
     error_before_percent_axes: list[Figure] | None
     error_after_percent_axes: list[Figure] | None
     plans: list[DemoPlan]
-    logs: list[DemoLog]
+    logs: list[LogSize]
     controller_diff: str
     applied: bool
     seconds: float

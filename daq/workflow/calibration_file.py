@@ -86,7 +86,7 @@ class CalibrationBody(StrictModel):
     configuration_sha256: str
     created: str
     software: str
-    # Files of earlier versions lack the following four.
+    # Files of earlier versions lack the following.
     session_began_s: float | None = None
     nameplate_holdout_error_percent: RelativeErrorEntry | None = None
     recording_configuration_sha256: str | None = None

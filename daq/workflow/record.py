@@ -18,7 +18,7 @@ from daq.environment import software
 from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
 from daq.files import sha256
 from daq.log.conversion import SiScaling, scaling
-from daq.log.metadata import RunInfo, RunStatistics, readback_of_drives
+from daq.log.metadata import Loss, RunInfo, RunStatistics, loss_reason, readback_of_drives
 from daq.log.writer import LogContent, LogWriter
 from daq.workflow.experiment import path_of
 from daq.workflow.feed import Feed, RunFacts
@@ -371,19 +371,20 @@ def _checked_moves(
 
 def _verdict(statistics: StreamStatistics) -> tuple[bool, str]:
     """Return whether a run is valid, and its losses: a lost or unexplained frame makes it invalid."""
-    losses = {
-        "missing answers": statistics.missing,
-        "late answers": statistics.late,
-        "answers of wrong length": statistics.wrong_length,
-        "answers twice": statistics.duplicate,
-        "PDOs that no axis was configured to send": statistics.surplus,
-        "periods without SYNC": statistics.skipped_periods,
-        "frames dropped by the kernel": statistics.kernel_dropped,
-        "frames dropped by the interface": statistics.interface_dropped,
-        "frames dropped by the capture process": statistics.backlog_dropped,
-    }
-    found = ", ".join(f"{count} {name}" for name, count in losses.items() if count)
-    return not found, found
+    reason = loss_reason(
+        {
+            Loss.MISSING: statistics.missing,
+            Loss.LATE: statistics.late,
+            Loss.WRONG_LENGTH: statistics.wrong_length,
+            Loss.DUPLICATE: statistics.duplicate,
+            Loss.SURPLUS: statistics.surplus,
+            Loss.SKIPPED_PERIODS: statistics.skipped_periods,
+            Loss.KERNEL: statistics.kernel_dropped,
+            Loss.INTERFACE: statistics.interface_dropped,
+            Loss.BACKLOG: statistics.backlog_dropped,
+        }
+    )
+    return not reason, reason
 
 
 def _sync(cell: Cell) -> declared.Sync:

@@ -1,1 +1,1 @@
-"""One CANopen bus: its nodes, their objects and the services that reach them (CiA 301)."""
+"""The buses of a cell, their nodes, the objects and the services that reach them (CiA 301)."""

@@ -22,8 +22,8 @@ from typing import cast
 import can
 from can.interfaces.virtual import VirtualBus
 
+from drivers.canopen.socketcan import BurstBus, open_socketcan
 from drivers.errors import BusError
-from drivers.stream.socketcan import BurstBus, open_socketcan
 
 CONNECT_TIMEOUT_S = 5.0
 SEND_S = 2.0  #: Longest time in which a server may accept nothing; a frame sent in part cannot be recalled
@@ -81,7 +81,7 @@ def open_bus(address: BusAddress, *, answering: bool = False) -> can.BusABC:
 
     A ``virtual`` bus keeps every unread frame without limit (a limit would block the *sender* for ever), so close ends
     that are not read. No end receives its own frames, except the SYNCs on ``socketcan``, which return with their time
-    and ``is_rx`` False (drivers/stream/socketcan.py).
+    and ``is_rx`` False (drivers/canopen/socketcan.py).
 
     Args:
         address: of the bus.

@@ -16,15 +16,14 @@ import can
 
 from drivers.canopen.bus import bus_errors, send_burst
 from drivers.canopen.emcy import describe
-from drivers.canopen.sdo import Clock, ObjectAccess, SdoPolicy, SynchronousSdoClient
+from drivers.canopen.sdo import SDO_ANSWER, SDO_REQUEST, Clock, ObjectAccess, SdoPolicy, SynchronousSdoClient
+from drivers.canopen.split_bus import BUS_OFF, BUS_OFF_REASON, CellAddress, open_cell_bus
 from drivers.errors import BusError, StateRefused, node_label
 from drivers.stream.sample import CellEvent, EventKind
-from drivers.stream.split_bus import BUS_OFF, BUS_OFF_REASON, CellAddress, open_cell_bus
 
 SYNC_COB_ID = 0x080
 _NMT_COB_ID = 0x000
-SDO_REQUEST = 0x600
-_EMCY, _SDO_ANSWER, HEARTBEAT = 0x080, 0x580, 0x700
+_EMCY, HEARTBEAT = 0x080, 0x700
 _RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))  #: Set-points of a drive (CiA 301, predefined connection set)
 PUMP_S = 1.0  #: Longest time spent on frames that have already arrived, however fast more arrive
 # linux/can/error.h: classes of an error frame, and the controller's state in its second byte.
@@ -205,7 +204,7 @@ class Link:
             kind = EventKind.EMCY if code & 0xFF00 else EventKind.EMCY_RESET
             text = f"EMCY {code:04X}h {describe(code)}, error register {register:02X}h, data {data.hex()}"
             self._events.append((node_id, kind, code, text))
-        elif service == _SDO_ANSWER:
+        elif service == SDO_ANSWER:
             self.answered.add(node_id)
             for listener in self._listeners.get(node_id, ()):
                 listener.receive(message.data)

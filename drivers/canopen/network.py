@@ -18,12 +18,12 @@ from drivers.canopen.pdo import CONTROLWORD, HEARTBEAT_MS, STATUSWORD
 from drivers.canopen.scan import FoundNode, answering, free_ids, read_identity, scan_link
 from drivers.canopen.sdo import Clock, SdoPolicy
 from drivers.canopen.setup import AxisSetup, Guard, producer_of, read_consumers
+from drivers.canopen.split_bus import CellAddress, open_cell_bus
 from drivers.errors import WHILE, BusBusy, DriverError, NodeMissing, SetupRefused, StateRefused
 from drivers.profiles.cia402 import FAULT_RESET_SEQUENCE, POWERLESS, Goal, State, decode, next_command
 from drivers.profiles.profile import Axis, Identity
 from drivers.profiles.scale import ScaleReading, read_scale
 from drivers.stream.sample import Sample
-from drivers.stream.split_bus import CellAddress, open_cell_bus
 
 ASKED_AT_ONCE = 8  #: Candidates for the recorder's node id that are tried together
 LOWEST_USUAL_ID = 112  #: The recorder takes the highest free id: this one or a higher one on any usual bus

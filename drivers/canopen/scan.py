@@ -7,22 +7,20 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-import can
-
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import Link
 from drivers.canopen.pdo import STATUSWORD
-from drivers.canopen.sdo import ObjectAccess, SdoPolicy
+from drivers.canopen.sdo import ObjectAccess, SdoPolicy, upload_request
+from drivers.canopen.split_bus import CellAddress
 from drivers.errors import ObjectAccessError
 from drivers.profiles.cia402 import State, decode
 from drivers.profiles.profile import Identity, ObjectEntry
-from drivers.stream.split_bus import CellAddress
 
 VENDOR_ID = ObjectEntry(0x1018, 1, 32, signed=False)
 PRODUCT_CODE = ObjectEntry(0x1018, 2, 32, signed=False)
 REVISION = ObjectEntry(0x1018, 3, 32, signed=False)
 SERIAL = ObjectEntry(0x1018, 4, 32, signed=False)
-_READ_DEVICE_TYPE = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
+_DEVICE_TYPE = ObjectEntry(0x1000, 0, 32, signed=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,4 +105,4 @@ def free_ids(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, .
 
 
 def _ask(link: Link, node_ids: Sequence[int]) -> None:
-    link.send([can.Message(arbitration_id=0x600 + n, is_extended_id=False, data=_READ_DEVICE_TYPE) for n in node_ids])
+    link.send([upload_request(node_id, _DEVICE_TYPE) for node_id in node_ids])

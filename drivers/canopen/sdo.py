@@ -17,13 +17,51 @@ from drivers.profiles.profile import ObjectEntry
 
 NO_SUCH_OBJECT = frozenset((0x0602_0000, 0x0609_0011))
 """Aborts of a drive that lacks the object or its sub-index (CiA 301); any other may be gone at the next request."""
+SDO_REQUEST, SDO_ANSWER = 0x600, 0x580  #: COB-IDs, to which the node id is added (CiA 301)
 _ABORT_TIMED_OUT = 0x0504_0000
 _ABORT = 0x80
 _INITIATE_DOWNLOAD, _INITIATE_UPLOAD = 1, 2
+_UPLOAD_REQUEST = _INITIATE_UPLOAD << 5
+_EXPEDITED, _SIZE_INDICATED = 0x42, 0x01  #: Bits of an upload answer with its data, and of one that says their size
+_HEAD = struct.Struct("<BHB")
 
 T = TypeVar("T")
 
 Clock = Callable[[], int]  #: Monotonic time [ns]
+
+
+@dataclass(frozen=True, slots=True)
+class UploadAnswer:
+    """Answer to the request for an object of at most four bytes."""
+
+    value: int | None = None  #: None where the answer has no data, or fewer than the object
+    bits: int | None = None  #: size of the data; None where the answer has none
+    abort_code: int | None = None  #: reason for which the node refuses
+
+
+def upload_request(node_id: int, entry: ObjectEntry) -> can.Message:
+    """Return the request for an object."""
+    data = _HEAD.pack(_UPLOAD_REQUEST, entry.index, entry.subindex) + bytes(4)
+    return can.Message(arbitration_id=SDO_REQUEST + node_id, is_extended_id=False, data=data)
+
+
+def upload_answer(data: bytes, entry: ObjectEntry) -> UploadAnswer | None:
+    """Read an SDO answer (CiA 301, SDO upload initiate); None for one that is not about this object.
+
+    Data longer than the object are cut: some drives send four bytes whatever its size is.
+    """
+    if len(data) != 8 or _HEAD.unpack_from(data)[1:] != (entry.index, entry.subindex):
+        return None
+    command = data[0]
+    if command == _ABORT:
+        return UploadAnswer(abort_code=int.from_bytes(data[4:], "little"))
+    if command & 0xE2 != _EXPEDITED:
+        return UploadAnswer()
+    size = 4 - (command >> 2 & 3) if command & _SIZE_INDICATED else 4
+    if 8 * size < entry.bits:
+        return UploadAnswer(bits=8 * size)
+    value = int.from_bytes(data[4 : 4 + entry.bits // 8], "little", signed=entry.signed)
+    return UploadAnswer(value, bits=8 * size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +150,7 @@ class SynchronousSdoClient(SdoClient):
     """
 
     def __init__(self, node_id: int, bus: _Bus, policy: SdoPolicy) -> None:
-        SdoClient.__init__(self, 0x600 + node_id, 0x580 + node_id, ObjectDictionary())
+        SdoClient.__init__(self, SDO_REQUEST + node_id, SDO_ANSWER + node_id, ObjectDictionary())
         self._bus = bus
         self._policy = policy
 

@@ -49,10 +49,11 @@ class MotionBounds:
     #: in 20 cycles of 1 ms are at most 800 counts/s, 0.3 deg/s of such a motor, which is harmless to a brake.
     standstill_cycles: int = 20
     standstill_counts: int = 16  #: largest step between two of those cycles
-    #: Largest distance from a target that bit 10 reports as reached, in counts plus a fraction of the way: it catches a
-    #: drive whose bit 10 is still that of the move before.
+    #: Largest distance from a target that bit 10 reports as reached: these counts plus `arrival_fraction` of the way.
+    #: It catches a drive whose bit 10 is still that of the move before. A short way lies within it from the start, so
+    #: no move ends before the duration of its profile either.
     arrival_counts: int = 2000
-    arrival_fraction: float = 0.05  #: or this share of the move, whichever is smaller
+    arrival_fraction: float = 0.05  #: see `arrival_counts`
 
 
 DEFAULT_BOUNDS = MotionBounds()
@@ -187,7 +188,8 @@ class _Execution:
         self.emit(None, EventKind.MOVE_START, number, f"move {number} to {move.target_counts}")
         yield sample
         yield from self._handshake(number, moving)
-        allowed = 2 * max(move.duration_s(start)) + self._bounds.settle_s
+        duration_s = max(move.duration_s(start))
+        end, allowed = sample.cycle + self._cycles(duration_s), 2 * duration_s + self._bounds.settle_s
         data = FrozenData(move, start, moving, self._stream.pacing.period_ns)
         for _ in range(self._cycles(allowed)):
             for axis in data.frozen(self._sample):
@@ -198,7 +200,7 @@ class _Execution:
                     error = DriveFault(self._nodes[axis], reason, remedy=remedy)
                     self.emit(axis, EventKind.FROZEN, number, str(error))
                     raise error
-            if all(self._arrived(axis, start[axis]) for axis in moving):
+            if self._sample.cycle >= end and all(self._arrived(axis, start[axis]) for axis in moving):
                 break
             yield self._checked()
         else:
@@ -229,6 +231,7 @@ class _Execution:
         return MotionTimeout(number, late, [self._nodes[axis].name for axis in late], waited_s)
 
     def _arrived(self, axis: int, start: int) -> bool:
+        """Return whether bit 10 is set near the target; on a short way it may be that of the move before."""
         tolerance = self._bounds.arrival_counts + self._bounds.arrival_fraction * abs(self._targets[axis] - start)
         near = abs(self._sample.position_counts[axis] - self._targets[axis]) <= tolerance
         return near and bool(self._sample.statusword[axis] & STATUS_TARGET_REACHED)

@@ -11,8 +11,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from drivers.canopen.link import HEARTBEAT, SDO_REQUEST, NmtState, command_name, nmt_name
+from drivers.canopen.link import HEARTBEAT, NmtState, command_name, nmt_name
 from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.sdo import SDO_REQUEST
 from drivers.errors import BusBusy, DriveFault, DriverError, node_label
 from drivers.motion.move import Move
 from drivers.profiles.cia402 import STATE_BITS, STATUS_FAULT, STATUS_FOLLOWING_ERROR, State, decode

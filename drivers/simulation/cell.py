@@ -12,6 +12,7 @@ import can
 import numpy as np
 
 from drivers.canopen.bus import SocketcandBus, send_burst
+from drivers.canopen.split_bus import SplitBus
 from drivers.errors import BusError
 from drivers.simulation.amplifier import AmplifierSet
 from drivers.simulation.drive import ErrorCode, PowerState
@@ -19,7 +20,6 @@ from drivers.simulation.faults import ERROR_FRAMES, FOREIGN_SDO, Disturbance, Fa
 from drivers.simulation.node import NmtCommand, Node
 from drivers.simulation.plant import Plant
 from drivers.simulation.spec import CellSpec, SpecInvalid
-from drivers.stream.split_bus import SplitBus
 
 SYNC_ID = 0x080
 NMT_ID = 0x000

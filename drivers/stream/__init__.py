@@ -1,1 +1,1 @@
-"""Frames in, samples out: capture, SYNC and grouping. No sample is lost silently."""
+"""Frames in, samples out: SYNC and grouping. No sample is lost silently."""

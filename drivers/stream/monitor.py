@@ -7,7 +7,6 @@ all axes, every READING_S. Nothing is ever written.
 
 from __future__ import annotations
 
-import struct
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,17 +17,15 @@ import can
 from drivers.canopen.bus import bus_errors
 from drivers.canopen.link import SYNC_COB_ID, Link
 from drivers.canopen.pdo import feedback_entries
+from drivers.canopen.sdo import SDO_ANSWER, SDO_REQUEST, upload_answer, upload_request
+from drivers.canopen.split_bus import SplitAddress
 from drivers.profiles.profile import Axis, ObjectEntry
 from drivers.stream.answers import slots_of
 from drivers.stream.sample import CellEvent, Sample
-from drivers.stream.split_bus import SplitAddress
 
 QUIET_S = 2.0  #: Silence of other masters after which the axes are read by SDO
 ANSWER_S = 0.3  #: Time allowed for an answer; CiA 301 sets no limit, and drives answer within milliseconds
 READING_S = 0.1  #: Time between two SDO readings of an axis: six axes then load a bus of 1 Mbit/s by some 5 %
-_UPLOAD = 0x40
-_EXPEDITED = {0x4F: 1, 0x4B: 2, 0x47: 3, 0x43: 4, 0x42: 4}
-"""Bytes of data by the command byte of an expedited upload answer (CiA 301, SDO upload initiate)."""
 
 
 class ReadingSource(Enum):
@@ -95,13 +92,12 @@ class _AxisWatch:
         self.seen.clear()
 
     def answer(self, data: bytes, now_ns: int) -> None:
-        entry = self.entries[self.asked]
-        if self.open_until_ns is None or data[1:4] != struct.pack("<HB", entry.index, entry.subindex):
+        answer = upload_answer(data, self.entries[self.asked])
+        if self.open_until_ns is None or answer is None:
             return  # an answer to another program
         self.open_until_ns = None
-        length = _EXPEDITED.get(data[0], 0)
-        if 8 * length >= entry.bits:
-            self.values[self.asked] = int.from_bytes(data[4 : 4 + entry.bits // 8], "little", signed=entry.signed)
+        if answer.value is not None:
+            self.values[self.asked] = answer.value
             if self.asked == len(self.entries) - 1:
                 self.readings += 1
                 self.complete_ns = now_ns
@@ -205,11 +201,10 @@ class CellMonitor:
             self._lead()
             return
         for axis, entry in due:
-            data = struct.pack("<BHB4x", _UPLOAD, entry.index, entry.subindex)
-            request = can.Message(arbitration_id=0x600 + axis.node_id, is_extended_id=False, data=data)
+            request = upload_request(axis.node_id, entry)
             self._link.send((request,))
             for bus in (0,) if self._split is None else self._split.route(request):
-                self._frames[bus, len(data)] += 1
+                self._frames[bus, len(request.data)] += 1
 
     def _hear(self, message: can.Message) -> None:
         bus = 0 if self._split is None else self._buses.index(str(message.channel))
@@ -224,12 +219,12 @@ class CellMonitor:
             self._sample_overheard(message.timestamp)
             for axis in self._axes:
                 axis.sync()
-        elif identifier == 0 or 0x600 <= identifier < 0x680:
+        elif identifier == 0 or SDO_REQUEST <= identifier < SDO_REQUEST + 0x80:
             self._lead()
         elif identifier in self._by_cob_id:
             self._by_cob_id[identifier].hear(identifier, bytes(message.data))
-        elif 0x580 <= identifier < 0x600 and len(message.data) == 8 and identifier - 0x580 in self._by_node:
-            self._by_node[identifier - 0x580].answer(bytes(message.data), self._link.clock())
+        elif identifier - SDO_ANSWER in self._by_node and len(message.data) == 8:
+            self._by_node[identifier - SDO_ANSWER].answer(bytes(message.data), self._link.clock())
         else:
             self._link.dispatch(message)
 

@@ -9,15 +9,13 @@ that it has none.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 import can
 
-from drivers.canopen.link import SDO_REQUEST
 from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.sdo import NO_SUCH_OBJECT
+from drivers.canopen.sdo import NO_SUCH_OBJECT, UploadAnswer, upload_answer, upload_request
 from drivers.errors import BusError, ObjectAccessError
 from drivers.profiles.profile import Axis, ObjectEntry
 from drivers.profiles.scale import ScaleReading
@@ -27,10 +25,6 @@ from drivers.stream.stream import SyncStream
 PERIOD_NS = {Quantity.TORQUE: 200_000_000, Quantity.TEMPERATURE: 1_000_000_000}
 """Time between two readings of an axis: some hundred torques give a slope to a percent; a motor warms in minutes."""
 GIVEN_UP_NS = 250_000_000  #: Time after which an answer is lost: the SDO servers of drives need some milliseconds
-_INITIATE_UPLOAD, _ABORT = 0x40, 0x80
-_SIZE_INDICATED = 0x01  #: Bit of a response that says how many of its bytes are data, in bits 3 and 2
-_EXPEDITED_UPLOAD = 0x42  #: Response with at most four bytes of data: bits 7 to 5 and bit 1 (CiA 301, SDO upload)
-_HEAD = struct.Struct("<BHB")
 
 
 class _Source:
@@ -46,8 +40,8 @@ class _Source:
 
     def receive(self, data: bytearray) -> None:
         """Take an SDO answer of the node, if it is the one that is awaited."""
-        if len(data) == 8 and bytes(data[1:4]) == _HEAD.pack(0, self.entry.index, self.entry.subindex)[1:]:
-            self._polling.answer(self, bytes(data))
+        if (answer := upload_answer(bytes(data), self.entry)) is not None:
+            self._polling.answer(self, answer)
 
 
 class Polling:
@@ -129,23 +123,21 @@ class Polling:
             return ()
         source.due_ns = now_ns + PERIOD_NS[source.quantity]  # from now on: after a pause nothing is caught up
         self._asked, self._asked_ns = source, now_ns
-        data = _HEAD.pack(_INITIATE_UPLOAD, source.entry.index, source.entry.subindex) + bytes(4)
-        return (can.Message(arbitration_id=SDO_REQUEST + source.node_id, is_extended_id=False, data=data),)
+        return (upload_request(source.node_id, source.entry),)
 
-    def answer(self, source: _Source, data: bytes) -> None:
+    def answer(self, source: _Source, answer: UploadAnswer) -> None:
         """Keep the value of an answer to the request on its way; other answers are the business of others."""
         if source is not self._asked or self._stream is None:
             return
         self._asked = None
-        size = 8 * (4 - (data[0] >> 2 & 0x03)) if data[0] & _SIZE_INDICATED else source.entry.bits
-        if data[0] & 0xE2 == _EXPEDITED_UPLOAD and size != source.entry.bits:
-            self._drop(source, f"answers with {size} bits, expected {source.entry.bits}: correct the drive profile")
-        elif data[0] & 0xE2 == _EXPEDITED_UPLOAD:
-            raw = int.from_bytes(data[4 : 4 + source.entry.bits // 8], "little", signed=source.entry.signed)
+        if answer.value is not None:
             # The drive read its object somewhere between the request and this answer.
             time_ns = (self._asked_ns + self._stream.time_ns) // 2
-            self._keep(SlowReading(time_ns, source.axis, source.quantity, raw * source.per_unit))
-        elif data[0] == _ABORT and int.from_bytes(data[4:], "little") in NO_SUCH_OBJECT:
+            self._keep(SlowReading(time_ns, source.axis, source.quantity, answer.value * source.per_unit))
+        elif answer.bits is not None:
+            bits = f"{answer.bits} bits, expected {source.entry.bits}"
+            self._drop(source, f"answers with {bits}: correct the drive profile")
+        elif answer.abort_code in NO_SUCH_OBJECT:
             self._drop(source, "is no longer there")
 
     def _drop(self, source: _Source, why: str) -> None:

@@ -13,11 +13,11 @@ import can
 from drivers.canopen.bus import bus_errors
 from drivers.canopen.link import SYNC_COB_ID
 from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.socketcan import CapturedMessage, Losses, losses_of, remarks_of
 from drivers.errors import BusError, DriveFault, NodeMisplaced, SampleLost, node_label
 from drivers.motion.watch import Watch
 from drivers.stream.answers import Answers, Slot, StreamStatistics
 from drivers.stream.sample import CellEvent, EventKind, EventSink, Sample
-from drivers.stream.socketcan import CapturedMessage, Losses, losses_of, remarks_of
 from drivers.stream.sync import FollowedSync, LockstepSync, Pacing, SyncRate, TimedSync
 
 SHORTENED, STRAGGLING = 16, 4

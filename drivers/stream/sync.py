@@ -2,7 +2,7 @@
 
 Samples and events of all pacings have one epoch: wall time [ns since 1970] at the stream's first SYNC, plus monotonic
 time since, so that setting the wall clock has no effect. On SocketCAN the time of a SYNC is the kernel's, converted to
-the monotonic clock (drivers/stream/capture.py); `clock` must then be that clock.
+the monotonic clock (drivers/canopen/capture.py); `clock` must then be that clock.
 
 A producer is started once the network is prepared and stopped before the network is left:
 
@@ -24,12 +24,12 @@ from dataclasses import dataclass
 from types import TracebackType
 
 from drivers.canopen.bus import BusAddress
+from drivers.canopen.capture import FRAME
 from drivers.canopen.link import SYNC_COB_ID
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.sdo import Clock
 from drivers.errors import WHILE, BusError, DriverError
 from drivers.profiles.profile import ObjectEntry
-from drivers.stream.capture import FRAME
 
 SYNC_COB_ID_OBJECT = ObjectEntry(0x1005, 0, 32, signed=False)
 CYCLE_PERIOD = ObjectEntry(0x1006, 0, 32, signed=False)

@@ -30,10 +30,10 @@ LEAST_WEIGHT = 1e-3
 """Share of the known payload's torque in a joint's, where it is largest. In a recording it is 0.1 and more."""
 LARGEST_TOTAL_PERCENT = 50.0
 LARGEST_AXIS_PERCENT = 100.0
+LARGEST_UNKNOWN_PERCENT = 25.0
 """Largest relative errors of a fit. A robot with every effect undeclared stays below 15 in total and 40 on an axis; a
-model that explains nothing leaves 100."""
+model that explains nothing leaves 100. The last is of an axis whose gain is smaller than its own σ."""
 COLLAPSED_GAIN = 1e-6  #: Share of the largest gain: no two drives differ as much, and the error of nothing is small
-LARGEST_UNKNOWN_PERCENT = 25.0  #: The same, on an axis whose gain is smaller than its own σ
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,8 @@ import numpy as np
 
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.socketcan import SocketcanBus, open_socketcan
 from drivers.profiles.profile import Axis
-from drivers.stream.socketcan import SocketcanBus, open_socketcan
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import FollowedSync
 from tests.bench.stream_sender import FRAMES_A_CYCLE, LAST, NODES

@@ -21,11 +21,11 @@ from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.record import network_of
 from drivers.canopen.bus import open_bus
 from drivers.canopen.network import Bounds, CanopenNetwork
+from drivers.canopen.split_bus import CellAddress, SplitAddress, SplitBus, open_cell_bus
 from drivers.errors import BusError
 from drivers.motion.execute import execute
 from drivers.motion.move import AxisLimits, MotionPermission, synchronised_move
 from drivers.simulation.cell import SimulatedCell
-from drivers.stream.split_bus import CellAddress, SplitAddress, SplitBus, open_cell_bus
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync
 from tests.conftest import CHECKOUT

@@ -23,7 +23,8 @@ import pytest
 
 from daq.cli.app import main
 from daq.errors import ExitCode
-from daq.log.reader import Log, read_log, reports_only_losses
+from daq.log.metadata import reports_only_losses
+from daq.log.reader import Log, read_log
 from drivers.profiles.cia402 import State, decode
 from drivers.stream.sample import EventKind
 from tests.faults.test_scenario import PLAN

@@ -21,8 +21,8 @@ from daq.log.reader import read_log
 from drivers.canopen.bus import BusAddress, open_bus
 from drivers.canopen.link import Link
 from drivers.canopen.sdo import SdoPolicy
+from drivers.canopen.socketcan import CapturedMessage, SocketcanBus, open_socketcan
 from drivers.errors import BusError
-from drivers.stream.socketcan import CapturedMessage, SocketcanBus, open_socketcan
 from tests.vcan.cells import ATTEMPTS, record_once, say, simulated, write_cell, write_simulation
 from tests.vcan.run import INTERFACE
 
@@ -32,7 +32,7 @@ SPARE = "vcan9"
 PERIOD_US = 20_000
 HOLDER = """
 import sys, time
-from drivers.stream.socketcan import open_socketcan
+from drivers.canopen.socketcan import open_socketcan
 bus = open_socketcan(sys.argv[1])
 print(bus.capture_pid, flush=True)
 while True:

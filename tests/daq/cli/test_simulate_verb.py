@@ -14,7 +14,7 @@ from daq.cli.app import main
 from daq.cli.simulate import how_to_reach, nodes_on_buses
 from daq.errors import UsageError
 from drivers.canopen.bus import BusAddress
-from drivers.stream.split_bus import BusPart
+from drivers.canopen.split_bus import BusPart
 
 
 def test_each_bus_has_its_nodes() -> None:

@@ -17,8 +17,8 @@ from daq.config.drive import drive_from_text
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationError, ConfigurationInconsistent, ConfigurationMissing, SchemaMismatch
 from drivers.canopen.bus import BusAddress
+from drivers.canopen.split_bus import SplitAddress
 from drivers.profiles.profile import Amplitude, ObjectEntry, TapPoint
-from drivers.stream.split_bus import SplitAddress
 from ident.model.robot import read_urdf
 from tests.two_buses import LEFT, RIGHT, on_two_buses
 

@@ -110,6 +110,9 @@ def test_the_page_needs_no_other_file_and_runs_only_its_own_script(cell: Cell, c
     page = preview_page(hostile, MOVES, checker, b"plan")
     assert not re.search(r"https?:|src=|url\(", page)
     assert "<script>alert" not in page
+    turned = preview_page(replace(cell, name="a\u202eb"), MOVES, checker, b"plan")
+    assert "\u202e" not in turned
+    assert turned.count("a\\u202eb") == 2
     (script,) = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     assert f"default-src 'none'; script-src 'sha256-{digest}'" in page

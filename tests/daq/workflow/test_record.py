@@ -23,9 +23,9 @@ from daq.workflow.plan_file import load_plan
 from daq.workflow.record import LATE_LOSSES_S, Clocks, Recorded, record
 from daq.workflow.safeguards import NEVER
 from drivers.canopen.network import CanopenNetwork, SignalBlocker
+from drivers.canopen.socketcan import Losses
 from drivers.errors import NodeMisplaced, SampleLost
 from drivers.stream.sample import EventKind
-from drivers.stream.socketcan import Losses
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell
 
 WALL_NS = 1_700_000_000_000_000_000

@@ -20,7 +20,7 @@ from drivers.errors import (
     StateRefused,
 )
 from drivers.motion.execute import MotionBounds, execute
-from drivers.motion.move import Move, synchronised_move
+from drivers.motion.move import AxisLimits, Move, synchronised_move
 from drivers.profiles.profile import Axis
 from drivers.stream.sample import CellEvent, EventKind, Sample
 from drivers.stream.stream import SyncStream
@@ -29,6 +29,7 @@ from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell, permission
 
 Moving = tuple[CanopenNetwork, SyncStream, ScriptedBus, list[CellEvent]]
 BOUNDS = MotionBounds(enable_s=0.1, acknowledge_s=0.05, settle_s=0.05, stop_s=0.1, standstill_cycles=5)
+MARKS = (EventKind.MOVE_START, EventKind.MOVE_END)
 FAR = Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000))
 
 
@@ -64,7 +65,7 @@ def test_axes_start_together_arrive_and_end_without_power(moving: Moving) -> Non
     assert [sample.cycle for sample in samples] == list(range(len(samples)))
     assert bus.nodes[0].setpoint_cycles == bus.nodes[1].setpoint_cycles
     assert len(bus.nodes[0].setpoint_cycles) == 2
-    marks = [event for event in events if event.kind in (EventKind.MOVE_START, EventKind.MOVE_END)]
+    marks = [event for event in events if event.kind in MARKS]
     assert [(mark.kind, mark.code) for mark in marks] == [
         (EventKind.MOVE_START, 0),
         (EventKind.MOVE_END, 0),
@@ -240,6 +241,25 @@ def test_a_target_reached_bit_of_the_move_before_is_not_believed(moving: Moving)
     assert powerless(bus)
 
 
+@pytest.mark.parametrize("way", [40, 1000, 2500])
+def test_a_short_move_does_not_end_by_a_bit_of_the_move_before(moving: Moving, way: int) -> None:
+    _, _, bus, events = moving
+    out = synchronised_move((0, 0), (way, way), (AxisLimits(0, 0, 20_000, 200_000),) * 2)
+    duration_s = max(out.duration_s((0, 0)))
+
+    def hold_bit(_: int) -> None:
+        for node in bus.nodes:
+            node.statusword |= 0x0400
+
+    bus.on_cycle = hold_bit
+    samples = run(moving, out, Move((way, way), (1, 1), (1, 1)))
+    start, end = (event.time_ns for event in events if event.kind in MARKS and event.code == 0)
+    assert (end - start) * 1e-9 == pytest.approx(duration_s, abs=2e-3)
+    assert samples[-1].position_counts == (way, way)
+    at_end = next(sample for sample in samples if sample.time_ns >= end)
+    assert at_end.position_counts == (way, way)
+
+
 def test_a_setpoint_that_still_waits_is_dropped_by_the_stop(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
     _, _, bus, _ = moving
     receive = bus.recv
@@ -304,7 +324,7 @@ def test_every_axis_that_could_not_be_stopped_is_reported(moving: Moving, monkey
             node.position += 50
 
     bus.on_cycle = coast
-    near = Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000))
+    near = Move((5_000, 5_000), (100_000, 100_000), (10_000_000, 10_000_000))
     with monkeypatch.context() as patched:
         patched.setattr(network, "disable", refuse)
         with pytest.raises(StateRefused, match="node 1") as error:

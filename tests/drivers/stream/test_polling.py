@@ -152,6 +152,16 @@ def test_an_answer_of_another_size_is_no_reading(bench: Bench) -> None:
     )
 
 
+def test_more_bytes_than_the_object_has_are_cut_as_at_the_start_of_a_run(bench: Bench) -> None:
+    bench.bus.nodes[0].objects[0x6077, 0] = (-2, 4)
+    polling = bench.poll()
+    for _ in range(CYCLES):
+        next(bench.stream)
+    torques = {r.value for r in bench.readings if (r.axis, r.quantity) == (0, Quantity.TORQUE)}
+    assert torques == {-2 * 1e-3 * 1.5}
+    assert polling.remarks == ()
+
+
 def test_an_object_of_another_type_costs_no_recording(bench: Bench) -> None:
     bench.bus.nodes[0].objects[0x2005, 0] = (31, 1)
     (remark,) = bench.poll().remarks

@@ -20,8 +20,8 @@ from itertools import groupby
 import can
 
 from drivers.canopen.bus import BusAddress, open_bus, send_burst
+from drivers.canopen.socketcan import CapturedMessage, Losses, losses_of, remarks_of
 from drivers.errors import BusError, NodeMisplaced, node_label
-from drivers.stream.socketcan import CapturedMessage, Losses, losses_of, remarks_of
 
 ALTERNATION_S = 0.0005  #: Time to wait at one bus while another may receive, where one of them has no file descriptor
 LARGEST_RUN = 64  #: Frames of one bus in a row while another has one too: a lagging clock must not silence the others

@@ -1,4 +1,4 @@
-"""One end of a SocketCAN bus: a separate process reads it (drivers/stream/capture.py), this one sends.
+"""One end of a SocketCAN bus: a separate process reads it (drivers/canopen/capture.py), this one sends.
 
 See docs/decisions/0017-capture-in-its-own-process.md.
 """
@@ -21,8 +21,8 @@ from typing import NamedTuple
 
 import can
 
-from drivers.stream import capture
-from drivers.stream.capture import FRAME, RECORD, Kind
+from drivers.canopen import capture
+from drivers.canopen.capture import FRAME, RECORD, Kind
 
 RECEIVE_BUFFER_BYTES = 4 << 20  #: The kernel's default of 208 KiB holds 43 ms of a full bus; a busy machine needs more
 START_S = 20.0  #: Time for the capture process to start; a loaded machine is slow to start an interpreter

@@ -17,12 +17,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.canopen.bus import BusAddress
+from drivers.canopen.capture import RECORD, Capture, DropCounter, Kind, MonotonicTime
 from drivers.canopen.link import SYNC_COB_ID, Link
 from drivers.canopen.sdo import SdoPolicy
+from drivers.canopen.socketcan import CapturedMessage, Losses, SocketcanBus, losses_of, open_socketcan, remarks_of
 from drivers.errors import BusError
-from drivers.stream.capture import RECORD, Capture, DropCounter, Kind, MonotonicTime
 from drivers.stream.sample import EventKind
-from drivers.stream.socketcan import CapturedMessage, Losses, SocketcanBus, losses_of, open_socketcan, remarks_of
 from tests.drivers.scripted import FakeClock
 
 ADDRESS = BusAddress("socketcan", "pair")

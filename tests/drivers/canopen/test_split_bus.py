@@ -15,9 +15,9 @@ from drivers.canopen.bus import BusAddress, open_bus, send_burst
 from drivers.canopen.hub import Hub
 from drivers.canopen.link import Link, NmtCommand
 from drivers.canopen.sdo import SdoPolicy
+from drivers.canopen.socketcan import CapturedMessage, Losses, losses_of, remarks_of
+from drivers.canopen.split_bus import BUS_OFF, LARGEST_RUN, BusPart, SplitAddress, SplitBus, open_cell_bus
 from drivers.errors import BusError, NodeMisplaced
-from drivers.stream.socketcan import CapturedMessage, Losses, losses_of, remarks_of
-from drivers.stream.split_bus import BUS_OFF, LARGEST_RUN, BusPart, SplitAddress, SplitBus, open_cell_bus
 from tests.drivers.bus_contract import WAIT_S, BusContract, Ends
 from tests.drivers.scripted import FakeClock
 
@@ -306,7 +306,7 @@ def test_a_bus_that_cannot_be_opened_is_named_and_the_others_are_closed(monkeypa
         opened.append(open_bus(address))
         return opened[-1]
 
-    monkeypatch.setattr("drivers.stream.split_bus.open_bus", remember)
+    monkeypatch.setattr("drivers.canopen.split_bus.open_bus", remember)
     parts = (
         BusPart("left", BusAddress("virtual", "opened first"), LEFT),
         BusPart("right", BusAddress("carrier-pigeon", "can1"), RIGHT),
