@@ -251,10 +251,13 @@ def identity(calibration: Calibration) -> tuple[tuple[str, str], ...]:
     days = list(dict.fromkeys(datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M") for time_s in times))
     same_day = bool(days) and days[0][:10] == days[-1][:10]
     between = days[0] if len(days) == 1 else f"{days[0]} to {days[-1][11 if same_day else 0 :]}" if days else ""
+    payloads = "; ".join(payload_texts(calibration))
+    # No residual shows a wrong mass: it must be on the sheet that a person signs.
+    weighed = f"{payloads}; with a mass wrong by 1 % every gain is wrong by 1 %" if payloads else ""
     return (
         ("Serial numbers", _serials(calibration)),
         ("Operator", ", ".join(operators) or "not known: the recordings name none"),
-        ("Payload", "; ".join(payload_texts(calibration)) or "none: every run was recorded without load"),
+        ("Payload", weighed or "none: every run was recorded without load"),
         ("Recorded", f"{between} UTC" if between else "not known: the logs have no time of day"),
         ("Fitted", f"{_minute(calibration.created)}, {calibration.software or 'software not known'}"),
     )

@@ -89,7 +89,8 @@ def test_every_number_of_the_document_is_on_the_page() -> None:
 def test_the_mass_is_shown_as_it_was_entered_twice_and_what_is_missing_is_said() -> None:
     calibration = with_recordings(demo_calibration(), operator="Ada")
     texts = Reader(_page(calibration)).texts
-    assert "disc: 4.59 kg in the cell file, 4.592 and 4.588 kg on the scale" in texts
+    entered = "disc: 4.59 kg in the cell file, 4.592 and 4.588 kg on the scale"
+    assert f"{entered}; with a mass wrong by 1 % every gain is wrong by 1 %" in texts
     assert "Ada" in texts
     bare = replace(calibration, sources=(), holdout_error_percent=None, effects=())
     texts = Reader(_page(bare)).texts
