@@ -24,11 +24,9 @@ from daq.log.message import (
     CURRENTS_SCHEMA,
     CURRENTS_TOPIC,
     DEFINITIONS,
-    EVENTS_SCHEMA,
     EVENTS_TOPIC,
-    JOINTS_SCHEMA,
     JOINTS_TOPIC,
-    URDF_SCHEMA,
+    SCHEMA_OF,
     URDF_TOPIC,
     currents_bytes,
     event_bytes,
@@ -41,12 +39,9 @@ from ident.arrays import FloatArray
 
 PREDICTED_TOPIC, RESIDUAL_TOPIC = "/cell/predicted", "/cell/residual"
 SCHEMAS = {
-    JOINTS_TOPIC: JOINTS_SCHEMA,
-    CURRENTS_TOPIC: CURRENTS_SCHEMA,
+    **{topic: SCHEMA_OF[topic] for topic in (JOINTS_TOPIC, CURRENTS_TOPIC, EVENTS_TOPIC, URDF_TOPIC)},
     PREDICTED_TOPIC: CURRENTS_SCHEMA,
     RESIDUAL_TOPIC: CURRENTS_SCHEMA,
-    EVENTS_TOPIC: EVENTS_SCHEMA,
-    URDF_TOPIC: URDF_SCHEMA,
 }
 TICK_S = 0.04  #: Time between two looks at the curves
 URDF_S = 2.0  #: Time between two messages with the URDF, for clients that come late
