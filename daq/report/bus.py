@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from daq.config.cell import Cell
     from daq.workflow.monitor import WatchedCell
     from drivers.canopen.scan import FoundNode
-    from drivers.stream.monitor import CellReading
 
 
 def scan_view(
@@ -126,7 +124,7 @@ def monitor_document(cell: Cell, watched: WatchedCell) -> dict[str, Any]:
     addressed = reading.source.value == "asked" or reading.sync_hz > 0.0
     axes: list[dict[str, Any]] = []
     for declared, axis, position, ampere_per_unit in zip(
-        cell.axes, reading.axes, joint_positions(cell, reading), watched.ampere, strict=True
+        cell.axes, reading.axes, watched.position, watched.ampere, strict=True
     ):
         raw, word = axis.current_raw, axis.statusword
         state = None if word is None else decode(word)
@@ -169,24 +167,6 @@ def monitor_document(cell: Cell, watched: WatchedCell) -> dict[str, Any]:
             for event in watched.events
         ],
     }
-
-
-def joint_positions(cell: Cell, reading: CellReading) -> list[float | None]:
-    """Position of each joint [rad or m], q = R⁻¹ q_motor + offset (paper eq. 24); None where a motor is unknown."""
-    to_joint = np.linalg.inv(cell.ratio)
-    turns = [
-        None
-        if axis.position_counts is None or not declared.counts_per_revolution
-        else axis.position_counts / declared.counts_per_revolution
-        for declared, axis in zip(cell.axes, reading.axes, strict=True)
-    ]
-    motor_rad = np.array([0.0 if turn is None else 2.0 * np.pi * turn for turn in turns])
-    unknown = np.array([turn is None for turn in turns])
-    offset = np.array([axis.zero_offset_rad for axis in cell.axes])
-    joint = to_joint @ motor_rad + offset
-    # A joint's position depends on the motors that move it, and on no others.
-    blind = (np.abs(to_joint) > 1e-12 * np.abs(to_joint).max()) @ unknown
-    return [None if hidden else float(value) for hidden, value in zip(blind, joint, strict=True)]
 
 
 _ALARMING = {str(state) for state in (*FAULTY, State.QUICK_STOP_ACTIVE)}

@@ -20,7 +20,7 @@ import numpy as np
 from daq.config.bus import bus_loads_percent
 from daq.config.cell import Cell, PacingMode
 from daq.errors import LogIncomplete
-from daq.log.conversion import scaling
+from daq.log.conversion import SiScaling, scaling
 from daq.log.metadata import AxisReadback, Readback, RunStatistics
 from daq.workflow.events import ALARMING
 from daq.workflow.feed import Feed, RunFacts, facts_of_recorder
@@ -57,6 +57,7 @@ class WatchedCell:
     """One reading of the bus with all that is shown beside it."""
 
     reading: CellReading
+    position: Sequence[float | None]  #: of each joint [rad or m], None where a motor that moves it is unknown
     ampere: Sequence[float | None]  #: amperes per raw unit of each axis' current, None where unknown
     events: Sequence[CellEvent]  #: recent ones, oldest first
     faults: Mapping[str, ErrorCode] = field(default_factory=dict)  #: error code of axes in fault, by name
@@ -118,6 +119,7 @@ class CellWatch:
         self._predict()
         return WatchedCell(
             reading,
+            joint_positions(self._cell, reading),
             tuple(self._ampere),
             sorted((*self._alarms, *self._events), key=lambda event: event.time_ns),
             faults=self._faults(),
@@ -277,6 +279,19 @@ class CellWatch:
             "remark": self._remark,
             "axes": axes,
         }
+
+
+def joint_positions(cell: Cell, reading: CellReading) -> list[float | None]:
+    """Position of each joint [rad or m], None where a motor that moves it is unknown."""
+    rad_per_count = np.array([2.0 * np.pi / (axis.counts_per_revolution or np.inf) for axis in cell.axes])
+    unknown = np.array([axis.position_counts is None for axis in reading.axes]) | (rad_per_count == 0.0)
+    to_joint = np.linalg.inv(cell.ratio).astype(np.float64)
+    offset = np.array([axis.zero_offset_rad for axis in cell.axes])
+    scale = SiScaling(rad_per_count, to_joint, offset, current_per_unit=np.full(len(offset), nan))
+    joint = scale.joint_position(np.array([axis.position_counts or 0 for axis in reading.axes]))
+    # A joint's position depends on the motors that move it, and on no others.
+    blind = (np.abs(to_joint) > 1e-12 * np.abs(to_joint).max()) @ unknown
+    return [None if hidden else float(value) for hidden, value in zip(blind, joint, strict=True)]
 
 
 def _in_fault(axis: AxisReading) -> bool:

@@ -22,12 +22,12 @@ from daq.config.bus import answer_us, bus_loads_percent, drive_axes
 from daq.config.cell import Cell, PacingMode, model_of
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
-from daq.report.bus import joint_positions, monitor_document, monitor_view
+from daq.report.bus import monitor_document, monitor_view
 from daq.report.bus_schemas import MonitorReport
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.events import event_document
 from daq.workflow.feed import Feed, RunFacts
-from daq.workflow.monitor import CellWatch, WatchedCell
+from daq.workflow.monitor import CellWatch, WatchedCell, joint_positions
 from daq.workflow.safeguards import bus_lock, bus_taken
 from drivers.canopen.bus import BusAddress, open_bus
 from drivers.canopen.emcy import explain, remedy_of
@@ -263,7 +263,8 @@ def test_what_is_not_known_is_shown_as_that() -> None:
     reading = _reading([0] * 6)
     reading = CellReading(reading.source, 0.5, (*reading.axes[:5], dead), 0.0, ((0,) * 9,), ())
     event = CellEvent(0, None, EventKind.CONTROLLER, 0, "a\x1b[2Jb")
-    document = monitor_document(CELL, WatchedCell(reading, (0.002, None, None, None, None, None), (event,)))
+    ampere = (0.002, None, None, None, None, None)
+    document = monitor_document(CELL, WatchedCell(reading, joint_positions(CELL, reading), ampere, (event,)))
     Console(file=out, width=100).print(monitor_view(document))
     text = out.getvalue()
     assert "+0.010 A" in text
@@ -330,7 +331,7 @@ def test_our_own_recorder_is_no_other_master(tmp_path: Path) -> None:
     said = []
     for recorder in (False, True):
         out = io.StringIO()
-        document = monitor_document(CELL, WatchedCell(reading, (None,) * 6, (), recorder=recorder))
+        document = monitor_document(CELL, WatchedCell(reading, (None,) * 6, (None,) * 6, (), recorder=recorder))
         Console(file=out, width=200).print(monitor_view(document))
         said.append(out.getvalue())
     assert "another master" in said[0]
