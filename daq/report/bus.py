@@ -222,8 +222,8 @@ def prediction_view(document: dict[str, Any]) -> Iterator[RenderableType]:
             "at rest" if value is None and name == "predicted" else "-" if value is None else f"{value:+.3f}"
             for name, value in ((name, found[name]) for name in ("measured", "predicted"))
         ]
-        rms = "-" if found["residual_rms"] is None else f"{found['residual_rms']:.3f}"
-        cells = (printable(axis["axis"]), *values, f"{found['band']:.3f}", rms, f"{100 * found['outside_share']:.0f} %")
+        band, rms = ("-" if found[name] is None else f"{found[name]:.3f}" for name in ("band", "residual_rms"))
+        cells = (printable(axis["axis"]), *values, band, rms, f"{100 * found['outside_share']:.0f} %")
         table.add_row(*map(Text, cells), style="bold yellow" if found["conspicuous"] else None)
     carried = "without payload" if payload is None else f"with payload {printable(payload)}"
     yield Text(

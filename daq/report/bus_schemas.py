@@ -27,7 +27,7 @@ class PredictedCurrent(StrictModel):
 
     measured: float | None = Field(description="null at standstill, or where the scale of the current is unknown")
     predicted: float | None = Field(description="null at standstill")
-    band: float = Field(description="twice the calibration's error")
+    band: float | None = Field(description="null for a calibration that does not say what it left of the currents")
     residual_rms: float | None = Field(description="over the last 10 s in which the axis moved; null before any")
     outside_share: float = Field(description="share of that time in which the residual is outside the band")
     conspicuous: bool = Field(description="it is outside for more than half of at least 2 s of motion")

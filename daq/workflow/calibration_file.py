@@ -92,6 +92,7 @@ class CalibrationBody(StrictModel):
     recording_configuration_sha256: str | None = None
     covariance_factor: tuple[tuple[float, ...], ...] | None = None
     diagnoses: tuple[Diagnosis, ...] = ()
+    current_residual: tuple[float, ...] | None = None
 
 
 class CalibrationDocument(CalibrationBody):

@@ -8,8 +8,8 @@ The console draws the rows; `drivegain monitor` judges an axis by the last RECEN
 if more than half of them are outside the band. A single row is outside often enough: at each reversal the model's
 friction errs.
 
-*Band.* Twice the calibration's relative error of the axis on its held-out runs (of the fit, without any), times the
-root mean square of the current predicted so far in motion. It is the size that residuals had, not a limit for alarms.
+*Band.* Twice the root mean square of what the calibration left of the motor's current on its held-out run (of the fit,
+without one). It is the size that residuals had, not a limit for alarms, and as large for slow moves as for fast ones.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Rows:
     cycle: IntArray  #: number of the sample at the centre of the window, shape (r,)
     predicted: FloatArray  #: current reference [unit of the gains' current], shape (r, n)
     residual: FloatArray  #: measured minus predicted, both filtered, shape (r, n)
-    band: FloatArray  #: half the band of each motor, shape (n,)
+    band: FloatArray  #: half the band of each motor, shape (n,); inf where the calibration has none
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class RecentCurrent:
 
     measured: float | None  #: filtered, at the last row; None at standstill, or where the scale is unknown
     predicted: float | None  #: at the same moment; None at standstill
-    band: float  #: half the band
+    band: float | None  #: half the band; None where the calibration has none
     residual_rms: float | None  #: over the last RECENT_S of motion; None without any
     outside_share: float  #: share of these rows whose residual is outside the band
     conspicuous: bool  #: more than half of at least LEAST_S of motion are
@@ -92,7 +92,7 @@ class Recent:
                 RecentCurrent(
                     measured=float(predicted + left) if np.isfinite(left) else None,
                     predicted=float(predicted) if np.isfinite(predicted) else None,
-                    band=float(band),
+                    band=float(band) if np.isfinite(band) else None,
                     residual_rms=float(np.sqrt(np.mean(moving**2))) if len(moving) else None,
                     outside_share=share,
                     conspicuous=share > 0.5 and len(moving) >= self._least,
@@ -125,9 +125,9 @@ class Predictor:
         self._margin = self._filter.half + -(-edge // self._filter.factor) * self._filter.factor
         limits = [STANDSTILL_SHARE_OF_LIMIT * axis.limits.velocity for axis in cell.axes]
         self._still = np.array(self._conditioning.standstill_rad_s or limits)
-        error = calibration.holdout_error_percent or calibration.relative_error_percent
-        self._share = 2e-2 * np.array(error.axes)
-        self._squares, self._count = np.zeros(len(cell.axes)), np.zeros(len(cell.axes))
+        self._band = np.full(len(cell.axes), np.inf)  # calibrations of earlier versions do not say what they left
+        if calibration.current_residual is not None:
+            self._band = 2.0 * np.array(calibration.current_residual)
         self._cycle, self._position, self._current = -1, np.zeros((0, 0)), np.zeros((0, 0))
 
     def take(self, cycle: IntArray, position_rad: FloatArray, current: FloatArray) -> list[Rows]:
@@ -177,11 +177,8 @@ class Predictor:
         data = replace(data, moving=moving.T, motor_moving=motor_moving.T)
         still = ~row_masks(self._model.drive_train, data, settings)[1][:, whole]
         predicted, measured = predicted[:, whole], measured[:, whole]
-        self._squares += np.where(still, 0.0, predicted**2).sum(axis=1)
-        self._count += (~still).sum(axis=1)
-        band = self._share * np.sqrt(self._squares / np.maximum(self._count, 1.0))
         predicted = np.where(still, np.nan, predicted)
-        return Rows(self._cycle + 1 + centres[whole], predicted.T, (measured - predicted).T, band)
+        return Rows(self._cycle + 1 + centres[whole], predicted.T, (measured - predicted).T, self._band)
 
 
 def predictor_of(calibration: Calibration, cell: Cell, run: RunFacts) -> tuple[Predictor | None, str]:

@@ -46,6 +46,7 @@ def demo_calibration() -> Calibration:
         software="drivegain 0.1.0",
         nameplate_holdout_error_percent=RelativeError((4.2, 3.9, 4.5, 5.1, 6.6, 6.0), 4.3),
         recording_configuration_sha256=None,
+        current_residual=(0.03, 0.05, 0.02, 0.02, 0.01, 0.01),
     )
 
 
@@ -146,4 +147,5 @@ calibrations = st.builds(
     software=_texts,
     nameplate_holdout_error_percent=st.none() | _errors,
     recording_configuration_sha256=st.none() | _texts,
+    current_residual=st.none() | st.lists(_numbers, max_size=3).map(tuple),
 )

@@ -9,6 +9,7 @@ import pytest
 
 import ident
 from ident.data.conditioning import Conditioning
+from ident.discovery.before_after import error_on
 from ident.effects.effect import ALL_AXES
 from ident.effects.electrical import TimeSkew
 from ident.effects.friction import Coupling
@@ -43,6 +44,17 @@ def searched(small_truth: Truth, late: tuple[ident.Run, ...]) -> tuple[ident.Ide
     families = ((TimeSkew(),), (Coupling(2, 1), Coupling(3, 1)))
     evidence = ident.gather(found, late[:3], late[3:])
     return found, ident.find_effects(evidence, np.random.default_rng(0), families=families)
+
+
+def test_what_is_left_of_the_currents_is_that_of_the_held_out_rows(
+    searched: tuple[ident.Identification, tuple[ident.Step, ...]],
+) -> None:
+    found, steps = searched
+    held = steps[-1].after.holdout
+    assert held is not None
+    left = np.sqrt(error_on(held, steps[-1].after.estimate).left / held.motor_use.sum(axis=1))
+    calibration = ident.calibration_of(found, AXES, NAMEPLATE, steps=steps)
+    assert calibration.current_residual == pytest.approx(left, rel=1e-5)
 
 
 def test_a_skew_found_on_all_axes_is_predicted(
