@@ -87,7 +87,7 @@ def check_replaceable(out: Path, mark: str, kind: str) -> None:
             head = stream.read(4096)
         replaceable = not head or mark.encode() in head
     else:
-        replaceable = not out.exists()
+        replaceable = not (out.exists() or out.is_symlink())  # a dangling link would be followed
     if not replaceable:
         raise UsageError(
             str(out),

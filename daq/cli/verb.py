@@ -60,19 +60,13 @@ class Verb:
             pretty_exceptions_enable=False,
             rich_markup_mode=None,
             no_args_is_help=True,
-            epilog=self._epilog(),
+            epilog=self.example,
         )
         if self.kinds:
             app.callback()(self.function)
         for verb in self.kinds or (self,):
-            app.command(verb.name, cls=_VerbCommand, epilog=verb._epilog())(verb.function)
+            app.command(verb.name, cls=_VerbCommand, epilog=verb.example)(verb.function)
         return typer.main.get_command(app)
-
-    def _epilog(self) -> str:
-        """Example as click shows it; \\b keeps the lines of the command, ready to copy."""
-        width = max(min(shutil.get_terminal_size().columns, 80) - 2, 50)  # as click computes it
-        command = " ".join(str(cell_here()) if word == "CELL" else word for word in self.example.split(" "))
-        return "\b\nExample:\n" + "\n".join(continued(command, width - 2, indent="  "))
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +87,13 @@ class Listed:
 
 
 _HYPHEN = "\u2011"  #: Non-breaking: a line is broken at spaces alone, so that --enable-motion stays whole
+
+
+def _example(command: str) -> str:
+    r"""Example as click shows it; \b keeps the lines of the command, ready to copy."""
+    width = max(min(shutil.get_terminal_size().columns, 80) - 2, 50)  # as click computes it
+    words = " ".join(str(cell_here()) if word == "CELL" else word for word in command.split(" "))
+    return "\b\nExample:\n" + "\n".join(continued(words, width - 2, indent="  "))
 
 
 class _VerbCommand(TyperCommand):
@@ -119,12 +120,21 @@ class _VerbCommand(TyperCommand):
         with formatter.indentation():
             formatter.write_text(inspect.cleandoc(self.help or "").replace("-", _HYPHEN))
 
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        # Made when it is asked for: it looks for the cell files of this folder, and no other command waits for them.
+        self.epilog = _example(self.epilog or "")
+        super().format_epilog(ctx, formatter)
+
     def get_help(self, ctx: Any) -> str:
         return super().get_help(ctx).replace(_HYPHEN, "-")
 
 
 class _Kinds(TyperGroup):
     """Verb with kinds of its own, which are listed with their whole first sentences."""
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        self.epilog = _example(self.epilog or "")
+        super().format_epilog(ctx, formatter)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         rows = [(name, str(kind.help).partition("\n\n")[0]) for name, kind in self.commands.items()]
@@ -196,6 +206,8 @@ def _cells_here(name: str | None) -> Iterator[Path]:
     for pattern in _CELLS:
         for path in sorted(Path().glob(pattern)):
             try:
+                if not path.is_file():  # opening a FIFO would wait for its writer
+                    continue
                 with path.open(encoding="utf-8", errors="replace") as stream:
                     head = stream.read(4096)
             except OSError:

@@ -206,8 +206,12 @@ def certify(calibration: Calibration, comparison: Comparison, earlier: Calibrati
         earlier: another calibration of the same cell to compare with; None for none.
 
     Raises:
-        CalibrationRefused: the earlier calibration is of another cell or of other axes.
+        CalibrationRefused: one of the two has not one error for each gain, or the earlier one is of another cell or of
+            other axes.
     """
+    for one in (calibration, earlier):
+        if one is not None:
+            _require_whole(one)
     since: tuple[AxisRow, ...] = ()
     if earlier is not None:
         _require_same(calibration, earlier)
@@ -241,6 +245,25 @@ def _require_same(calibration: Calibration, earlier: Calibration) -> None:
             expected=f"cell {calibration.cell!r} with axes {', '.join(sorted(axes))}",
             remedy="give an earlier calibration of the same cell",
         )
+
+
+def _require_whole(calibration: Calibration) -> None:
+    count = len(calibration.gains)
+    known = (
+        calibration.relative_error_percent,
+        calibration.holdout_error_percent,
+        calibration.nameplate_holdout_error_percent,
+    )
+    for error in known:
+        if not count or (error is not None and len(error.axes) != count):
+            raise CalibrationRefused(
+                f"calibration of cell {calibration.cell!r}",
+                found=f"{count} gains"
+                if error is None
+                else f"{count} gains and relative errors of {len(error.axes)} axes",
+                expected="at least one gain, and one error for each",
+                remedy="fit the logs again",
+            )
 
 
 def identity(calibration: Calibration) -> tuple[tuple[str, str], ...]:

@@ -84,6 +84,17 @@ def test_an_example_uses_the_cell_file_of_the_folder(
     assert capsys.readouterr().out.splitlines()[-1].strip() == "drivegain scan cells/lathe.yaml"
 
 
+def test_no_verb_waits_for_a_pipe_that_is_named_like_a_cell_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("cell.yaml")
+    for words in (["scan", "--help"], ["export", "--help"]):
+        assert main(words) == ExitCode.OK
+        assert "Example:" in capsys.readouterr().out
+    assert main(["scan", "missing.yaml"]) == ExitCode.CONFIGURATION
+
+
 def test_examples_name_files_that_other_examples_make() -> None:
     examples = [kind.example for listed in VERBS for kind in (listed.load(), *listed.load().kinds)]
     made = {value for one in examples for value in re.findall(r"--(?:out|report) (\S+)", one)}

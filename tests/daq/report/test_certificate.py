@@ -187,3 +187,13 @@ def test_the_verb_writes_one_page_and_never_over_another_file(
     page.write_text("the user's own", encoding="utf-8")
     assert main(["report", str(file)]) == ExitCode.USAGE
     assert page.read_text(encoding="utf-8") == "the user's own"
+
+
+@pytest.mark.parametrize("count", [0, 3, 5])
+def test_a_calibration_without_an_error_for_each_gain_is_refused(count: int) -> None:
+    made = demo_calibration()
+    torn = replace(made, gains=made.gains[:count])
+    compared = without_controller(made, "unread", NOW)
+    for judged, earlier in ((torn, None), (made, torn)):
+        with pytest.raises(CalibrationRefused, match="one error for each"):
+            certify(judged, compared, earlier)
