@@ -550,7 +550,7 @@ def test_the_verb_writes_the_report_and_says_the_same(
                 [*error["axes"], error["total"]], abs=0.005
             )
     assert "scales all gains alike" in text
-    assert text.splitlines()[-1] == f"Written: {folder}/"
+    assert text.splitlines()[-1] == f"Written: {folder}/ (certificate: {folder}/report.html)"
     assert document["noise_floor"]["relative_error_percent"]["total"] is None or math.isfinite(
         document["noise_floor"]["relative_error_percent"]["total"]
     )

@@ -82,7 +82,7 @@ def test_a_disk_that_fills_up_ends_the_run_in_a_controlled_way(
 
     def filling(_: Path) -> int:
         looks.append(len(looks))
-        return GIGABYTE if len(looks) < 4 else RESERVE_BYTES - 1
+        return GIGABYTE if len(looks) < 5 else RESERVE_BYTES - 1
 
     rig = _rig(checkout, tmp_path, monkeypatch, filling)
     with pytest.raises(DiskSpaceShort, match="sent a stop") as caught:
@@ -95,7 +95,7 @@ def test_a_disk_that_fills_up_ends_the_run_in_a_controlled_way(
     assert (log.statistics.valid, log.partial) == (False, False)
     assert "stopped after 1 of 2 moves: 67.1 MB left" in log.statistics.reason
     assert EventKind.STOP in [event.kind for event in log.events]
-    assert 200 <= log.statistics.samples <= 210  # three looks, a tenth of a second apart
+    assert 300 <= log.statistics.samples <= 310  # four looks, a tenth of a second apart
     with pytest.raises(RunInvalid, match="left on its disk"):
         load_run(rig.out)
 
