@@ -8,8 +8,9 @@ import shutil
 import socket
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import asdict
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -20,18 +21,19 @@ from daq.config.cell import Cell
 from daq.workflow.events import event_document
 from daq.workflow.feed import (
     ACCEPTED,
-    HEAD,
     LARGEST_PACKET,
-    SAMPLES,
     STOP,
+    FeedUnfit,
+    Message,
+    ProgramEnd,
     RunFacts,
     connected,
-    packet_dtype,
+    read_packet,
     socket_names,
 )
 from daq.workflow.prediction import Predictor, predictor_of
 from drivers.profiles.cia402 import ENABLED, FAULTY, decode
-from drivers.stream.sample import EventKind
+from drivers.stream.sample import CellEvent, EventKind
 from ident.arrays import FloatArray
 from ident.calibration import Calibration
 from ident.errors import IdentificationError
@@ -50,6 +52,9 @@ GONE = (
     "the recorder is gone without a word: it was killed or has crashed. The amplifiers stop by themselves where they "
     "supervise its heartbeat (1016h); look at the robot, and use the emergency stop if it moves"
 )
+
+
+UNKNOWN = "this page could not follow the recorder, and does not know how it ended"
 
 
 class Ring:
@@ -92,8 +97,9 @@ class Reader:
 class Live:
     """The cell as the feed shows it. All of it runs in one event loop."""
 
-    def __init__(self, cell_file: Path, cell: Cell) -> None:
+    def __init__(self, cell_file: Path, cell: Cell, clock: Callable[[], float] = time.monotonic) -> None:
         self.cell = cell
+        self._clock = clock  # [s]
         self.calibration: Calibration | None = None
         self.epoch = 0  #: Number of the run; readers begin anew when it changes
         self.run: RunFacts | None = None
@@ -101,6 +107,9 @@ class Live:
         self.end: dict[str, Any] | None = None  #: How the program ended
         self.stop_state: dict[str, Any] | None = None  #: Of the last stop
         self.remark = ""  #: Why there is no prediction
+        self.failed = ""  #: What of this console has ended before it should
+        self._unfit = ""  # why the feed cannot be shown
+        self._recorder = 0  # number of the recorder that is followed
         self._file = cell_file
         self._tasks: set[asyncio.Task[None]] = set()
         self.result: dict[str, Any] | None = None
@@ -108,7 +117,7 @@ class Live:
 
     def _clear(self, phase: str, run: RunFacts | None) -> None:
         self.epoch += 1
-        self.phase, self.run, self.remark = phase, run, ""
+        self.phase, self.run, self.remark, self._unfit = phase, run, "", ""
         if phase != "watching":  # how the last recording ended stays on the page
             self.result = self.end = None
         self.points, self.rows, self.events = Ring(KEPT_POINTS), Ring(KEPT_POINTS), Ring(KEPT_EVENTS)
@@ -127,57 +136,61 @@ class Live:
         if run is None:
             return
         self._every = max(1, round(run.rate_hz / POINTS_HZ))
-        self._dtype, self._scale = packet_dtype(len(run.axes)), run.scaling
+        self._scale = run.scaling
         self._unit = np.array([axis.unit.si for axis in self.cell.axes])
-        if run.axes != self.cell.axis_names:
-            self.remark = "the run has other axes than the cell file: restart the console"
-        elif self.calibration is not None:
+        if self.calibration is not None:
             self._predictor, self.remark = predictor_of(self.calibration, self.cell, run)
 
     def take(self, packet: bytes) -> None:
-        """Process one packet of the feed."""
-        kind, number, samples, lost, missing, count = HEAD.unpack_from(packet)
-        content = packet[HEAD.size :]
-        if kind != SAMPLES:
-            self._take_text(json.loads(content))
-        if self._number is not None and number > self._number:
-            self.dropped += number - self._number - 1
-        self._number = number
-        self.samples, self.lost, self.missing = samples, lost, missing
-        self._rate.append((time.monotonic(), samples))
-        if kind == SAMPLES and count and self.run is not None:
-            self._take_samples(np.frombuffer(content, self._dtype, count))
+        """Process one packet of the feed.
 
-    def _take_text(self, message: dict[str, Any]) -> None:
-        if message.get("run") is not None:
-            before, run = self._number, RunFacts.of(message["run"])
+        Raises:
+            FeedUnfit: this version does not understand it, or its run has other axes than the cell.
+        """
+        found = read_packet(packet, len(self.cell.axes))
+        if found.message is not None:
+            self._take_message(found.message)
+        if self._number is not None and found.number > self._number:
+            self.dropped += found.number - self._number - 1
+        self._number = found.number
+        self.samples, self.lost, self.missing = found.samples, found.lost, found.missing
+        self._rate.append((self._clock(), found.samples))
+        if found.rows is not None and self.run is not None:
+            self._take_samples(found.rows)
+
+    def _take_message(self, message: Message) -> None:
+        run = message.run
+        if run is not None:
+            if run.axes != self.cell.axis_names:
+                raise FeedUnfit("its cell file has other axes than this console's")
+            before = self._number
             self._clear("watching" if run.log is None else "running", run)
             self._number = before
-        self.events.add([self._shown(event) for event in message.get("events", ())])
-        self._measured = message.get("bus_load", self._measured)
-        if message.get("result") is not None:
-            self.result = message["result"]
-        if message.get("end") is not None:
-            self._finish(message["end"])
+        self.events.add([self._shown(event) for event in message.events])
+        if message.bus_load is not None:
+            self._measured = message.bus_load
+        if message.result is not None:
+            self.result = asdict(message.result)
+        if message.end is not None:
+            self._finish(message.end)
 
-    def _finish(self, end: dict[str, Any]) -> None:
+    def _finish(self, end: ProgramEnd) -> None:
         if self.phase != "watching":  # a monitor's end says nothing of the axes
-            self.end = end
-        self.phase = "ended"
+            self.end = asdict(end)
+        self.phase, self._unfit = "ended", ""
 
-    def _shown(self, event: dict[str, Any]) -> dict[str, Any]:
+    def _shown(self, event: CellEvent) -> dict[str, Any]:
         """Return an event for the page: time since the start of the run, axis by name, and the remedy."""
         if self.origin_ns is None:
-            self.origin_ns = event["time_ns"]
-        kind = EventKind(event["kind"])
-        if kind is EventKind.MOVE_END:
-            self.done = max(self.done, event["code"] + 1)
-        if kind is EventKind.STATE and event["axis"] is not None:
+            self.origin_ns = event.time_ns
+        if event.kind is EventKind.MOVE_END:
+            self.done = max(self.done, event.code + 1)
+        if event.kind is EventKind.STATE and event.axis is not None:
             # The stop after a fault has no samples, but its states are events.
-            self._words[event["axis"]] = event["code"]
-        axis = None if event["axis"] is None else self.cell.axis_names[event["axis"]]
-        time_s = 1e-9 * (event["time_ns"] - self.origin_ns)
-        return {"time_s": round(time_s, 6), **event_document(kind, event["code"], axis, event["text"])}
+            self._words[event.axis] = event.code
+        axis = None if event.axis is None else self.cell.axis_names[event.axis]
+        time_s = 1e-9 * (event.time_ns - self.origin_ns)
+        return {"time_s": round(time_s, 6), **event_document(event.kind, event.code, axis, event.text)}
 
     def _take_samples(self, samples: Any) -> None:
         if self.origin_ns is None:
@@ -216,8 +229,13 @@ class Live:
             "bus_load": self._measured or {bus: share * load for bus, load in computed.items()},
             "free_bytes": self._free_bytes(),
             "band": self._band,
+            "alarm": self._alarm(),
             **{"remark": self.remark, "result": self.result, "end": self.end, "stop": self.stop_state},
         }
+
+    def _alarm(self) -> str:
+        """Return why this page does not show the cell as it is now; empty where it does."""
+        return self.failed or self._unfit
 
     def _axes(self, last: Any) -> list[dict[str, Any]]:
         position = self._scale.joint_position(last["position_counts"].astype(np.int64)) / self._unit
@@ -259,40 +277,66 @@ class Live:
                     with connection:
                         await self._read(connection, phase)
                     break
+            else:
+                if self._unfit:
+                    self._finish(ProgramEnd(ok=False, axes_stopped=False, text=UNKNOWN))
             await asyncio.sleep(RETRY_S)
 
     async def _read(self, connection: socket.socket, phase: str) -> None:
+        """Follow one program until it ends, or until it sends what does not fit: `follow` then tries again."""
+        if not (self._unfit and self.phase == phase):  # else it is the same program again
+            self._clear(phase, None)
+            if phase == "running":
+                self._recorder += 1
+                self.stop_state = None  # it was asked of another recorder
+        try:
+            with suppress(OSError):
+                await self._take_all(connection, phase)
+                return
+        except FeedUnfit as error:
+            self._refuse(phase, error)
+            return
+        if self.phase != "ended":
+            self._finish(ProgramEnd(ok=False, axes_stopped=False, text=GONE))
+
+    def _refuse(self, phase: str, error: FeedUnfit) -> None:
+        if not self._unfit:
+            self._clear(phase, None)
+        program = "recorder" if phase == "running" else "monitor"
+        self._unfit = f"this page cannot show the {program}: {error}. Restart the console, with the same drivegain"
+
+    async def _take_all(self, connection: socket.socket, phase: str) -> None:
         """Take what has come every READ_S: waiting for each packet would cost as much as taking it.
 
-        A monitor is left when a recorder begins.
+        Returns when a monitor is left because a recorder begins.
+
+        Raises:
+            OSError: the program has ended.
+            FeedUnfit: see `take`.
         """
-        self._clear(phase, None)
-        looked_s = time.monotonic()
-        with suppress(OSError):
-            while True:
-                if phase == "watching" and time.monotonic() - looked_s > RETRY_S:
-                    looked_s = time.monotonic()
-                    recorder = connected(socket_names(self._file).feed, socket.SOCK_SEQPACKET, 0.0)
-                    if recorder is not None:
-                        with recorder:
-                            await self._read(recorder, "running")
-                        return
-                for _ in range(LARGEST_TURN):
-                    try:
-                        packet = connection.recv(LARGEST_PACKET)
-                    except BlockingIOError:
-                        break
-                    if not packet:
-                        raise ConnectionResetError
-                    self.take(packet)
-                await asyncio.sleep(READ_S)
-        if self.phase != "ended":
-            self._finish({"ok": False, "axes_stopped": False, "text": GONE})
+        looked_s = self._clock()
+        while True:
+            if phase == "watching" and self._clock() - looked_s > RETRY_S:
+                looked_s = self._clock()
+                recorder = connected(socket_names(self._file).feed, socket.SOCK_SEQPACKET, 0.0)
+                if recorder is not None:
+                    with recorder:
+                        await self._read(recorder, "running")
+                    return
+            for _ in range(LARGEST_TURN):
+                try:
+                    packet = connection.recv(LARGEST_PACKET)
+                except BlockingIOError:
+                    break
+                if not packet:
+                    raise ConnectionResetError
+                self.take(packet)
+            await asyncio.sleep(READ_S)
 
     async def stop(self) -> dict[str, Any]:
         """Ask the recorder to stop its axes, and return its answer; how it ended comes later, in `stop_state`."""
         asked = time.strftime("%H:%M:%S")
-        place = socket_names(self._file).stop
+        place, recorder = socket_names(self._file).stop, self._recorder
         connection = await asyncio.to_thread(connected, place, socket.SOCK_STREAM, STOP_ACCEPTED_S)
         answer = b"" if connection is None else await asyncio.to_thread(_ask, connection)
         if connection is None or answer != ACCEPTED:
@@ -301,19 +345,20 @@ class Live:
             self.stop_state = {"accepted": False, "at": asked, "text": text}
             return self.stop_state
         self.stop_state = {"accepted": True, "at": asked, "text": "the recorder stops the axes"}
-        task = asyncio.create_task(self._await_end(connection, asked))
+        task = asyncio.create_task(self._await_end(connection, asked, recorder))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return self.stop_state
 
-    async def _await_end(self, connection: socket.socket, asked: str) -> None:
+    async def _await_end(self, connection: socket.socket, asked: str, recorder: int) -> None:
         connection.settimeout(STOP_ENDED_S)
         ended: dict[str, Any] = {}
         with connection, suppress(OSError, ValueError):
             ended = json.loads(await asyncio.to_thread(connection.recv, LARGEST_PACKET))
         sure = bool(ended.get("axes_stopped"))
         text = "the recorder has ended, its axes are stopped" if sure else f"NOT CONFIRMED: {ended.get('text', GONE)}"
-        self.stop_state = {"accepted": True, "at": asked, "text": text, "axes_stopped": sure}
+        if recorder == self._recorder:  # the next one may move its axes already
+            self.stop_state = {"accepted": True, "at": asked, "text": text, "axes_stopped": sure}
 
 
 def _ask(connection: socket.socket) -> bytes:

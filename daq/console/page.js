@@ -222,7 +222,11 @@ function grouped(count) {
 function showStatus(status) {
   const run = shown.run;
   const running = status.phase === "running";
-  byId("phase").replaceChildren(...prose("p", running && run ? "Recording" : PHASES[status.phase]).childNodes);
+  const blind = status.alarm && (running || status.phase === "watching");
+  const phase = blind ? "This page does not show the cell as it is now." : running && run ? "Recording" : PHASES[status.phase];
+  byId("phase").replaceChildren(...prose("p", phase).childNodes);
+  byId("blind").textContent = status.alarm && `${status.alarm}.`;
+  byId("blind").hidden = !status.alarm;
   byId("stop").disabled = !running;
   const watching = status.phase === "watching";
   byId("log").textContent = run && run.log ? run.log.split("/").at(-1) : watching ? "no recording" : "no run yet";

@@ -121,10 +121,17 @@ class Page:
     @asynccontextmanager
     async def _background(self, _: Starlette) -> AsyncIterator[None]:
         tasks = [asyncio.create_task(one()) for one in (self._live.follow, self._look, *self._beside)]
+        for task in tasks:
+            task.add_done_callback(self._note_end)
         yield
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+
+    def _note_end(self, task: asyncio.Task[None]) -> None:
+        if not task.cancelled():
+            cause = repr(task.exception())
+            self._live.failed = f"a part of this console has ended ({cause}), so this page is old: restart the console"
 
     async def _look(self) -> None:
         """Look at the files again and again."""

@@ -20,12 +20,15 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from math import inf
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from daq.log.conversion import SiScaling
 from daq.log.metadata import RunStatistics
@@ -62,15 +65,96 @@ class RunFacts:
     payload: str | None  #: name in the cell file
     bus_load: dict[str, float]  #: computed mean load of each bus at this rate, as a share; empty for a monitor
 
-    @classmethod
-    def of(cls, document: dict[str, Any]) -> RunFacts:
-        """Return the facts in a packet's object."""
-        return cls(**{**document, "axes": tuple(document["axes"])})
-
     @property
     def scaling(self) -> SiScaling:
         """Factors from raw numbers to SI."""
         return SiScaling(*map(np.array, (self.rad_per_count, self.to_joint, self.offset_rad, self.current_per_unit)))
+
+
+class FeedUnfit(ValueError):
+    """A packet that this version does not understand: its program is of another version, or no recorder."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """Result of a run whose log is complete."""
+
+    valid: bool
+    reason: str  #: why it is not valid
+    samples: int
+
+
+@dataclass(frozen=True, slots=True)
+class ProgramEnd:
+    """How a program ended."""
+
+    ok: bool
+    axes_stopped: bool  #: whether all axes are known to be stopped
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """The JSON object of a packet."""
+
+    run: RunFacts | None = None
+    events: list[CellEvent] = field(default_factory=list)
+    bus_load: dict[str, float] | None = None
+    result: RunResult | None = None
+    end: ProgramEnd | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Packet:
+    """A packet as a console reads it."""
+
+    number: int
+    samples: int  #: of the run so far
+    lost: int  #: cycles of the run so far
+    missing: int  #: answers of the run so far
+    message: Message | None  #: of a TEXT packet
+    rows: NDArray[np.void] | None  #: of a SAMPLES packet, in the layout of `packet_dtype`
+
+
+_MESSAGE = TypeAdapter(Message)
+
+
+def read_packet(packet: bytes, axes: int | None) -> Packet:
+    """Decode a packet; keys that a later version added are ignored.
+
+    Args:
+        packet: as it was received.
+        axes: number of axes of the samples; None where only the facts of a run are wanted.
+
+    Raises:
+        FeedUnfit: its layout, a key, a type or a length is not that of this version.
+    """
+    try:
+        kind, number, samples, lost, missing, count = HEAD.unpack_from(packet)
+        message = rows = None
+        if kind == TEXT:
+            message = _MESSAGE.validate_json(packet[HEAD.size :])
+            fits = _fits(message, axes)
+        else:
+            rows = None if axes is None else np.frombuffer(packet, packet_dtype(axes), offset=HEAD.size)
+            fits = kind == SAMPLES and (rows is None or len(rows) == count > 0)
+    except (struct.error, ValueError) as error:
+        raise FeedUnfit("it sends packets that this version does not understand") from error
+    if not fits:
+        raise FeedUnfit("it sends packets whose numbers do not fit together")
+    return Packet(number, samples, lost, missing, message, rows)
+
+
+def _fits(message: Message, axes: int | None) -> bool:
+    run = message.run
+    count = axes if run is None else len(run.axes)
+    lists: list[list[float]] = [] if run is None else [run.rad_per_count, run.current_per_unit, run.offset_rad]
+    matrix: list[list[float]] = [] if run is None else run.to_joint
+    return (
+        all(len(one) == count for one in (*lists, *matrix))
+        and (run is None or (len(matrix) == count and 0.0 < run.rate_hz < inf))
+        and all(event.axis is None or 0 <= event.axis < (count or 0) for event in message.events)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,10 +189,10 @@ def facts_of_recorder(cell_file: Path, within_s: float) -> RunFacts | None:
     connection = connected(socket_names(cell_file).feed, socket.SOCK_SEQPACKET, within_s)
     if connection is None:
         return None
-    with connection, suppress(OSError):
-        packet = connection.recv(LARGEST_PACKET)  # a new console first gets what it missed
-        if packet and HEAD.unpack_from(packet)[0] == TEXT and (run := json.loads(packet[HEAD.size :]).get("run")):
-            return RunFacts.of(run)
+    with connection, suppress(OSError, FeedUnfit):
+        # A new console first gets what it missed.
+        message = read_packet(connection.recv(LARGEST_PACKET), None).message
+        return None if message is None else message.run
     return None
 
 

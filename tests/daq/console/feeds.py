@@ -11,14 +11,13 @@ from contextlib import contextmanager
 from dataclasses import replace
 from http.client import HTTPConnection, HTTPResponse
 from pathlib import Path
-from typing import Any
 
 from daq.config.cell import Cell
 from daq.console.live import Live
 from daq.console.results import Results
 from daq.console.server import Page, listen, server_of
 from daq.log.metadata import RunStatistics
-from daq.workflow.feed import Feed, RunFacts
+from daq.workflow.feed import Feed, FeedUnfit, ProgramEnd, RunFacts
 from drivers.stream.sample import Sample
 from ident.calibration import Calibration, Parameter
 from ident.data.conditioning import Conditioning
@@ -107,8 +106,12 @@ class WatchedLive(Live):
         super()._clear(phase, run)
         self._notify()
 
-    def _finish(self, end: dict[str, Any]) -> None:
+    def _finish(self, end: ProgramEnd) -> None:
         super()._finish(end)
+        self._notify()
+
+    def _refuse(self, phase: str, error: FeedUnfit) -> None:
+        super()._refuse(phase, error)
         self._notify()
 
     def _notify(self) -> None:

@@ -1,0 +1,133 @@
+"""What the console says when its feed does not fit, stalls, or changes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.applications import Starlette
+
+from daq.config.cell import Cell
+from daq.console.live import Live
+from daq.console.results import Results
+from daq.console.server import Page
+from daq.workflow.feed import HEAD, SAMPLES, TEXT, Feed, FeedUnfit, facts_of_recorder, packet_struct, socket_names
+from tests.daq.console.feeds import Recording, arrivals, facts, served
+
+EVENT = {"time_ns": 0, "axis": 2, "kind": "emcy", "code": 0x7305, "text": "EMCY 7305h"}
+
+
+def _text(message: Any) -> bytes:
+    return HEAD.pack(TEXT, 0, 0, 0, 0, 0) + json.dumps(message).encode()
+
+
+def _samples(axes: int, count: int) -> bytes:
+    sample = packet_struct(axes).pack(0, 0, 0, *[0] * axes, *[0] * axes, *[0x237] * axes)
+    return HEAD.pack(SAMPLES, 1, 1, 0, 0, count) + sample
+
+
+def _run(cell: Cell, **changed: Any) -> dict[str, Any]:
+    return {"run": {**asdict(facts(cell, Path("run.mcap"))), **changed}}
+
+
+UNFIT: dict[str, Callable[[Cell], bytes]] = {
+    "one byte": lambda _: b"x",
+    "no JSON": lambda _: HEAD.pack(TEXT, 0, 0, 0, 0, 0) + b"{",
+    "a list": lambda _: _text([1]),
+    "an unknown packet": lambda _: HEAD.pack(7, 0, 0, 0, 0, 0),
+    "an unknown event": lambda _: _text({"events": [{**EVENT, "kind": "surprise"}]}),
+    "an event of axis 9": lambda _: _text({"events": [{**EVENT, "axis": 9}]}),
+    "a run without a key": lambda cell: _text({"run": {k: v for k, v in _run(cell)["run"].items() if k != "moves"}}),
+    "a run of five axes": lambda cell: _text({"run": asdict(facts(replace(cell, axes=cell.axes[:5]), None))}),
+    "a run of no rate": lambda cell: _text(_run(cell, rate_hz=0.0)),
+    "a run with a short list": lambda cell: _text(_run(cell, rad_per_count=[1.0])),
+    "too many samples": lambda cell: _samples(len(cell.axes), 2),
+    "samples of fewer axes": lambda cell: _samples(len(cell.axes) - 1, 1),
+}
+
+
+@pytest.mark.parametrize("packet", UNFIT.values(), ids=UNFIT.keys())
+def test_a_packet_that_does_not_fit_is_one_kind_of_error(
+    cell: Cell, cell_file: Path, packet: Callable[[Cell], bytes]
+) -> None:
+    live = Live(cell_file, cell)
+    live.take(_text(_run(cell)))
+    with pytest.raises(FeedUnfit):
+        live.take(packet(cell))
+
+
+def test_keys_of_a_later_version_are_ignored(cell: Cell, cell_file: Path) -> None:
+    live = Live(cell_file, cell)
+    live.take(_text({**_run(cell, of_tomorrow=1), "of_tomorrow": 2}))
+    live.take(_samples(len(cell.axes), 1))
+    assert (live.phase, live.samples) == ("running", 1)
+
+
+@contextmanager
+def _other_program(cell_file: Path, packet: bytes) -> Iterator[None]:
+    """A feed that sends one packet to each console, until the block ends."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind(socket_names(cell_file).feed)
+        listener.listen(8)
+
+        def serve() -> None:
+            while True:
+                try:
+                    console, _ = listener.accept()
+                except OSError:
+                    return
+                with console:
+                    console.send(packet)
+                    console.recv(1)  # until the console goes
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield
+        listener.shutdown(socket.SHUT_RDWR)
+        thread.join(30)
+
+
+def test_a_recorder_of_another_version_is_said_and_the_next_one_is_shown(cell: Cell, cell_file: Path) -> None:
+    with served(cell_file, cell) as console:
+        live = console.live
+        with _other_program(cell_file, _text(_run(cell, rate_hz="fast"))):
+            live.wait(lambda: "cannot show the recorder" in live.status()["alarm"])
+            assert facts_of_recorder(cell_file, 10.0) is None  # monitor goes on with its own
+            assert live.phase == "running"  # so that the page's button can stop it
+        live.wait(lambda: live.phase == "ended")
+        assert live.end is not None and not live.end["axes_stopped"]
+        assert live.status()["alarm"] == ""
+        feed = Feed(cell_file, lambda: None)
+        accepted = arrivals(feed)
+        with feed:
+            recording = Recording(feed, cell, cell_file)
+            assert accepted.wait(30)
+            recording.run(100)
+            live.wait(lambda: live.samples == 100)
+            status = live.status()
+            assert (status["phase"], status["end"], status["alarm"]) == ("running", None, "")
+
+
+def test_a_background_task_that_ends_is_said(cell: Cell, cell_file: Path) -> None:
+    live = Live(cell_file, cell)
+
+    async def broken() -> None:
+        raise LookupError("a defect")
+
+    async def lived() -> None:
+        page = Page(cell, live, Results(cell_file, cell), broken)
+        async with page._background(Starlette()):
+            while not live.failed:
+                await asyncio.sleep(0)
+
+    asyncio.run(asyncio.wait_for(lived(), 30))
+    assert "a defect" in live.status()["alarm"]
+    assert "restart the console" in live.status()["alarm"]
