@@ -45,6 +45,7 @@ DISK_S = 1.0  #: Time between two looks at the free space of the disk
 READ_S = 0.03  #: Time between two looks at the feed
 LARGEST_TURN = 100  #: Packets at one look; requests are answered between two
 RETRY_S = 0.5  #: Time between two tries to find a feed
+OLD_S = {"running": 2.0, "watching": 65.0}  #: Silence after which values are old; readings of a monitor are rare
 STOP_ACCEPTED_S = 3.0  #: Time for the recorder's answer to a stop
 STOP_ENDED_S = 60.0  #: Time until the recorder must have ended
 
@@ -54,6 +55,10 @@ GONE = (
 )
 
 
+HANGS = (
+    "The recorder hangs or is held; the amplifiers stop by themselves where they supervise its heartbeat (1016h). "
+    "If the robot moves, use the emergency stop"
+)
 UNKNOWN = "this page could not follow the recorder, and does not know how it ended"
 
 
@@ -130,6 +135,7 @@ class Live:
         self._band = [nan] * len(self.cell.axes)
         self._rate: deque[tuple[float, int]] = deque(maxlen=50)
         self._measured: dict[str, float] = {}  # load of the buses, by a monitor
+        self._came_s = self._clock()  # when the last packet came
         self._free: int | None = None
         self._free_s = -DISK_S
         self._every = 1
@@ -150,11 +156,12 @@ class Live:
         found = read_packet(packet, len(self.cell.axes))
         if found.message is not None:
             self._take_message(found.message)
+        self._came_s = self._clock()
         if self._number is not None and found.number > self._number:
             self.dropped += found.number - self._number - 1
         self._number = found.number
         self.samples, self.lost, self.missing = found.samples, found.lost, found.missing
-        self._rate.append((self._clock(), found.samples))
+        self._rate.append((self._came_s, found.samples))
         if found.rows is not None and self.run is not None:
             self._take_samples(found.rows)
 
@@ -230,12 +237,24 @@ class Live:
             "free_bytes": self._free_bytes(),
             "band": self._band,
             "alarm": self._alarm(),
+            "old": bool(self._silent_s) or bool(self.failed),
             **{"remark": self.remark, "result": self.result, "end": self.end, "stop": self.stop_state},
         }
 
     def _alarm(self) -> str:
         """Return why this page does not show the cell as it is now; empty where it does."""
-        return self.failed or self._unfit
+        if self.failed or self._unfit or not self._silent_s:
+            return self.failed or self._unfit
+        said = f"nothing has come for {self._silent_s} s; states and values below are of that time"
+        return f"{said}. {HANGS}" if self.phase == "running" else said
+
+    @property
+    def _silent_s(self) -> int:
+        """Time since the last packet of a run that is under way [s]; 0 where no packet is late."""
+        if not self.samples or self.result is not None or self.phase not in OLD_S:
+            return 0  # before the first sample and between two runs there is nothing to send
+        silent_s = self._clock() - self._came_s
+        return int(silent_s) if silent_s > OLD_S[self.phase] else 0
 
     def _axes(self, last: Any) -> list[dict[str, Any]]:
         position = self._scale.joint_position(last["position_counts"].astype(np.int64)) / self._unit
@@ -255,7 +274,7 @@ class Live:
     @property
     def rate_hz(self) -> float:
         """Samples a second by this computer's clock, over the last packets."""
-        if len(self._rate) < 2 or self.phase not in ("running", "watching"):
+        if len(self._rate) < 2 or self._silent_s or self.phase not in ("running", "watching"):
             return 0.0
         (begin_s, first), (end_s, last) = self._rate[0], self._rate[-1]
         return (last - first) / max(end_s - begin_s, 1e-3)
@@ -340,7 +359,9 @@ class Live:
         connection = await asyncio.to_thread(connected, place, socket.SOCK_STREAM, STOP_ACCEPTED_S)
         answer = b"" if connection is None else await asyncio.to_thread(_ask, connection)
         if connection is None or answer != ACCEPTED:
-            found = "no recorder of this cell runs" if connection is None else "the recorder did not answer"
+            found = (
+                "this console reaches no recorder of this cell" if connection is None else "the recorder did not answer"
+            )
             text = f"{found}; if the robot moves, use the emergency stop"
             self.stop_state = {"accepted": False, "at": asked, "text": text}
             return self.stop_state
@@ -350,6 +371,10 @@ class Live:
         task.add_done_callback(self._tasks.discard)
         return self.stop_state
 
+    def _note_stop(self, state: dict[str, Any], recorder: int) -> None:
+        if recorder == self._recorder:  # the next one may move its axes already
+            self.stop_state = state
+
     async def _await_end(self, connection: socket.socket, asked: str, recorder: int) -> None:
         connection.settimeout(STOP_ENDED_S)
         ended: dict[str, Any] = {}
@@ -357,8 +382,7 @@ class Live:
             ended = json.loads(await asyncio.to_thread(connection.recv, LARGEST_PACKET))
         sure = bool(ended.get("axes_stopped"))
         text = "the recorder has ended, its axes are stopped" if sure else f"NOT CONFIRMED: {ended.get('text', GONE)}"
-        if recorder == self._recorder:  # the next one may move its axes already
-            self.stop_state = {"accepted": True, "at": asked, "text": text, "axes_stopped": sure}
+        self._note_stop({"accepted": True, "at": asked, "text": text, "axes_stopped": sure}, recorder)
 
 
 def _ask(connection: socket.socket) -> bytes:

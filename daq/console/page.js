@@ -76,9 +76,9 @@ function showAxis(axis, status) {
   if (!now) return;
   const words = STATES[now.state] || now.state;
   axis.card.classList.add("live");
-  axis.state.textContent = now.silent ? `${words}, DOES NOT ANSWER` : words;
+  axis.state.textContent = status.old ? `last: ${words}` : now.silent ? `${words}, DOES NOT ANSWER` : words;
   axis.state.title = now.state;
-  axis.state.className = `state${now.fault || now.silent ? " fault" : now.power ? " power" : ""}`;
+  axis.state.className = `state${now.fault || now.silent ? " fault" : now.power && !status.old ? " power" : ""}`;
   axis.values.textContent =
     `position ${number(now.position, 2)} ${axis.unit}, current ${number(now.current, 3)} ${axis.current_unit}`;
   const share = (now.position - axis.lower) / (axis.upper - axis.lower);

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from http.client import HTTPConnection, HTTPResponse
 from pathlib import Path
+from typing import Any
 
 from daq.config.cell import Cell
 from daq.console.live import Live
@@ -112,6 +113,10 @@ class WatchedLive(Live):
 
     def _refuse(self, phase: str, error: FeedUnfit) -> None:
         super()._refuse(phase, error)
+        self._notify()
+
+    def _note_stop(self, state: dict[str, Any], recorder: int) -> None:
+        super()._note_stop(state, recorder)
         self._notify()
 
     def _notify(self) -> None:

@@ -20,7 +20,7 @@ from daq.console.live import Live
 from daq.console.results import Results
 from daq.console.server import Page
 from daq.workflow.feed import HEAD, SAMPLES, TEXT, Feed, FeedUnfit, facts_of_recorder, packet_struct, socket_names
-from tests.daq.console.feeds import Recording, arrivals, facts, served
+from tests.daq.console.feeds import TOKEN, Recording, arrivals, facts, served
 
 EVENT = {"time_ns": 0, "axis": 2, "kind": "emcy", "code": 0x7305, "text": "EMCY 7305h"}
 
@@ -29,9 +29,9 @@ def _text(message: Any) -> bytes:
     return HEAD.pack(TEXT, 0, 0, 0, 0, 0) + json.dumps(message).encode()
 
 
-def _samples(axes: int, count: int) -> bytes:
+def _samples(axes: int, count: int, so_far: int = 1) -> bytes:
     sample = packet_struct(axes).pack(0, 0, 0, *[0] * axes, *[0] * axes, *[0x237] * axes)
-    return HEAD.pack(SAMPLES, 1, 1, 0, 0, count) + sample
+    return HEAD.pack(SAMPLES, 1, so_far, 0, 0, count) + sample
 
 
 def _run(cell: Cell, **changed: Any) -> dict[str, Any]:
@@ -131,3 +131,43 @@ def test_a_background_task_that_ends_is_said(cell: Cell, cell_file: Path) -> Non
     asyncio.run(asyncio.wait_for(lived(), 30))
     assert "a defect" in live.status()["alarm"]
     assert "restart the console" in live.status()["alarm"]
+
+
+def test_a_recorder_that_hangs_is_said_and_its_states_are_marked_as_old(cell: Cell, cell_file: Path) -> None:
+    now_s = [0.0]
+    live = Live(cell_file, cell, clock=lambda: now_s[0])
+    live.take(_text(_run(cell)))
+    now_s[0] = 60.0
+    assert live.status()["alarm"] == ""  # the drives are prepared
+    for number in range(10):
+        now_s[0] += 0.02
+        live.take(_samples(len(cell.axes), 1, so_far=10 * number))
+    fresh = live.status()
+    assert (fresh["alarm"], fresh["old"], fresh["rate_hz"] > 0.0) == ("", False, True)
+    now_s[0] += 4.1
+    old = live.status()
+    assert "nothing has come for 4 s" in old["alarm"]
+    assert "use the emergency stop" in old["alarm"]
+    assert (old["old"], old["rate_hz"]) == (True, 0.0)
+    live.take(_samples(len(cell.axes), 1, so_far=91))
+    assert live.status()["old"] is False
+    live.take(_text({"result": {"valid": True, "reason": "", "samples": 91}}))
+    now_s[0] += 60.0
+    assert live.status()["alarm"] == ""  # between two runs of a job
+
+
+def test_a_stop_is_forgotten_when_the_next_recorder_begins(cell: Cell, cell_file: Path) -> None:
+    with served(cell_file, cell) as console:
+        live, own = console.live, f"http://127.0.0.1:{console.port}"
+        for number in range(2):
+            asked = threading.Event()
+            feed = Feed(cell_file, asked.set)
+            accepted = arrivals(feed)
+            with feed:
+                recording = Recording(feed, cell, cell_file)
+                assert accepted.wait(30)
+                recording.run(100)
+                live.wait(lambda: live.samples == 100 and live.stop_state is None)
+                assert json.loads(console.ask(f"/{TOKEN}/stop", "POST", origin=own)[1])["accepted"]
+                assert asked.wait(30), number
+            live.wait(lambda: bool(live.stop_state and live.stop_state.get("axes_stopped")))
