@@ -359,9 +359,7 @@ class Live:
         connection = await asyncio.to_thread(connected, place, socket.SOCK_STREAM, STOP_ACCEPTED_S)
         answer = b"" if connection is None else await asyncio.to_thread(_ask, connection)
         if connection is None or answer != ACCEPTED:
-            found = (
-                "this console reaches no recorder of this cell" if connection is None else "the recorder did not answer"
-            )
+            found = "the recorder did not answer" if connection else "this console reaches no recorder of this cell"
             text = f"{found}; if the robot moves, use the emergency stop"
             self.stop_state = {"accepted": False, "at": asked, "text": text}
             return self.stop_state

@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import select
+import selectors
 import signal
 import socket
 import struct
@@ -38,10 +38,11 @@ from drivers.stream.sample import CellEvent, Sample
 BATCH_S = 0.02  #: Time of the samples in one packet
 SEND_BUFFER_BYTES = 1 << 20  #: Asked of the kernel, which may give less: seconds of samples for a console that pauses
 EVENTS_KEPT = 200  #: Events that a console gets which comes late
-REQUEST_S = 2.0  #: Time that a client of the stop socket has to ask
+BACKLOG = 128  #: Clients that may connect before the next is accepted; beyond, they are refused
+WAITER_ENDS_S = 3.0  #: Time for the thread that waits to end
 STOP, ACCEPTED = b"stop\n", b"accepted\n"
 LARGEST_PACKET = 1 << 18  #: [bytes]
-LARGEST_CONSOLES = 8  #: Served at the same time
+LARGEST_CONSOLES = 8  #: Served at the same time, and clients of the stop that have not asked yet
 
 SAMPLES, TEXT = 0, 1
 """Kinds of packets: samples, or a JSON object with some of the keys run, events, bus_load, result and end."""
@@ -266,7 +267,7 @@ class Feed:
                 listener = socket.socket(socket.AF_UNIX, kind)
                 self._listening.append(listener)
                 listener.bind(name)
-                listener.listen(LARGEST_CONSOLES)
+                listener.listen(BACKLOG)
         except OSError as error:
             for listener in self._listening:
                 listener.close()
@@ -284,7 +285,7 @@ class Feed:
             for listener in self._listening:
                 with suppress(OSError):
                     listener.shutdown(socket.SHUT_RDWR)  # wakes the thread
-            self._waiter.join(REQUEST_S + 1.0)
+            self._waiter.join(WAITER_ENDS_S)
         for connection in self._stopping:
             with suppress(OSError):
                 connection.send(json.dumps(ended).encode() + b"\n", socket.MSG_DONTWAIT)
@@ -381,31 +382,49 @@ class Feed:
             self._accept_all()
 
     def _accept_all(self) -> None:
-        while True:
-            ready, _, _ = select.select(self._listening, (), ())
-            try:
-                connection, _ = ready[0].accept()
-            except OSError:
-                return
-            if not of_this_user(connection):
-                connection.close()
-            elif ready[0] is self._listening[0]:
-                with suppress(OSError):
-                    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
-                self._new.append(connection)
-            elif self._stop is not None:
-                self._take_stop(connection, self._stop)
+        """Accept consoles, and wait for all clients of the stop at once: a silent one delays no other."""
+        asking: deque[socket.socket] = deque()
+        with selectors.DefaultSelector() as selector:
+            for listener in self._listening:
+                selector.register(listener, selectors.EVENT_READ)
+            while True:
+                for key, _ in selector.select():
+                    ready = key.fileobj
+                    assert isinstance(ready, socket.socket)
+                    if ready in asking:
+                        asking.remove(ready)
+                        selector.unregister(ready)
+                        self._take_stop(ready)
+                        continue
+                    try:
+                        connection, _ = ready.accept()
+                    except OSError:
+                        for silent in asking:
+                            silent.close()
+                        return
+                    if not of_this_user(connection):
+                        connection.close()
+                    elif ready is self._listening[0]:
+                        with suppress(OSError):
+                            connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+                        self._new.append(connection)
+                    else:
+                        asking.append(connection)
+                        selector.register(connection, selectors.EVENT_READ)
+                while len(asking) > LARGEST_CONSOLES:  # the one that has been silent for longest
+                    silent = asking.popleft()
+                    selector.unregister(silent)
+                    silent.close()
 
-    def _take_stop(self, connection: socket.socket, stop: Callable[[], None]) -> None:
-        connection.settimeout(REQUEST_S)
+    def _take_stop(self, connection: socket.socket) -> None:
         try:
-            if connection.recv(len(STOP), socket.MSG_WAITALL) != STOP:
+            if self._stop is None or connection.recv(len(STOP), socket.MSG_DONTWAIT) != STOP:
                 connection.close()
                 return
-            stop()
+            self._stop()
             # It receives the outcome of the stop when the program ends.
             self._stopping.append(connection)
-            connection.send(ACCEPTED)
+            connection.send(ACCEPTED, socket.MSG_DONTWAIT)
         except OSError:
             connection.close()
 

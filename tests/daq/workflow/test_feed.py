@@ -8,6 +8,7 @@ import socket
 import struct
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +20,12 @@ from daq.workflow import feed as feeds
 from daq.workflow.feed import (
     ACCEPTED,
     HEAD,
+    LARGEST_CONSOLES,
     LARGEST_PACKET,
     SAMPLES,
     STOP,
     Feed,
+    connected,
     end_of,
     facts_of_recorder,
     packet_dtype,
@@ -128,6 +131,21 @@ def test_a_stop_is_acknowledged_and_its_end_reported_while_the_curves_stall(cell
             assert stopped.wait(10)
             feed.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
         assert json.loads(asking.recv(4096)) == {"ok": False, "axes_stopped": True, "text": "stopped"}
+
+
+def test_silent_clients_delay_no_stop(cell_file: Path) -> None:
+    stopped, name = threading.Event(), socket_names(cell_file).stop
+    with ExitStack() as closing, Feed(cell_file, stopped.set):
+        clients = [connected(name, socket.SOCK_STREAM, 10.0) for _ in range(2 * LARGEST_CONSOLES)]
+        for silent in clients:
+            assert silent is not None
+            closing.enter_context(silent)
+        asking = connected(name, socket.SOCK_STREAM, 10.0)
+        assert asking is not None
+        with asking:
+            asking.sendall(STOP)
+            assert asking.recv(len(ACCEPTED)) == ACCEPTED
+            assert stopped.wait(10)
 
 
 def test_another_word_stops_nothing(cell_file: Path) -> None:
