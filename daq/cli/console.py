@@ -41,10 +41,18 @@ def console_verb(
     from daq.console.live import Live
     from daq.console.results import Results
     from daq.console.server import Page, listen, new_token, server_of
+    from daq.workflow.calibration_file import load_calibration
 
     declared = load_cell(cell)
+    if report is not None and not report.is_dir():
+        raise UsageError(
+            str(report),
+            found="no such folder",
+            expected="the folder of a report",
+            remedy="check the name, or leave --report out",
+        )
     results = Results(cell, declared, calibration, report)
-    known = results.calibration()
+    known = results.calibration() if calibration is None else (calibration, load_calibration(calibration))
     live = Live(cell, declared)
     live.calibration = None if known is None else known[1]
     beside = []

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from daq.config.cell import Cell
+from daq.config.cell import Cell, PacingMode
 from daq.workflow.events import event_document
 from daq.workflow.feed import (
     ACCEPTED,
@@ -224,7 +224,9 @@ class Live:
 
     def status(self) -> dict[str, Any]:
         """Return everything that is shown as a number or a word."""
-        computed = {} if self.run is None else self.run.bus_load
+        # A simulated cell in lockstep runs faster than its time, on no real bus.
+        lockstep = self.cell.sync is not None and self.cell.sync.pacing is PacingMode.LOCKSTEP
+        computed = {} if self.run is None or lockstep else self.run.bus_load
         share = 0.0 if self.run is None else self.rate_hz / self.run.rate_hz
         return {
             "phase": self.phase,

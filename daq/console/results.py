@@ -19,8 +19,11 @@ from daq.ledger.watch import alarm_text, watch
 from daq.report.residual_page import PAGE
 from daq.workflow.calibration_file import load_calibration
 from ident.calibration import Calibration
+from ident.errors import IdentificationError
 
 LARGEST_REPORT_BYTES = 64 << 20
+#: Of reading files that anyone may have written; what no reader expected must not end the looking.
+UNREADABLE = (DaqError, IdentificationError, OSError, ValueError, LookupError, TypeError, ArithmeticError)
 
 
 class Results:
@@ -63,9 +66,10 @@ class Results:
         for name, read in (("gains", self._gains), ("history", self._history), ("session", self._session)):
             try:
                 found[name] = read()
-            except (DaqError, OSError) as error:
+            except UNREADABLE as error:
                 found[name] = None
-                problems.append(str(error))
+                known = isinstance(error, DaqError | IdentificationError | OSError)
+                problems.append(str(error) if known else f"{name} cannot be shown, a file does not fit: {error}")
         return found
 
     def _newest(self) -> Session | None:

@@ -17,7 +17,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict
 from importlib.resources import files
-from typing import Any
+from typing import Any, cast
 
 import uvicorn
 from starlette.applications import Starlette
@@ -26,17 +26,18 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from daq.config.cell import Cell
 from daq.console.live import KEPT_POINTS, Live, Reader
-from daq.console.results import Results
-from daq.errors import DaqError
+from daq.console.results import UNREADABLE, Results
 from daq.report.text import json_safe
 
 TICK_S = 0.04  #: Time between two messages to a page: 25 a second
 RESULTS_S = 2.0  #: Time between two looks at the files
 LARGEST_READERS = 8  #: Pages that are served curves at the same time
-CONNECTIONS = 64
+CONNECTIONS = 64  #: Without a request at the same time
+REQUEST_S = 5.0  #: Time for the first request of a connection
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -73,6 +74,7 @@ class Guard:
 
         refusal = self._refusal(scope)
         if refusal is not None:
+            refusal.headers["connection"] = "close"  # one that may not ask holds nothing open
             await refusal(scope, receive, send_guarded)
             return
         # The token is not part of the routes: they are few, and compared as they are.
@@ -102,7 +104,7 @@ class Page:
         self._cell, self._live, self._results, self._beside = cell, live, results, beside
         self._document: dict[str, Any] = {}
         self.over: Callable[[], bool] = lambda: False  #: Whether the server ends
-        self._readers = 0
+        self._readers = 0  # pages that have asked for the curves
 
     def app(self, token: str, hosts: frozenset[str]) -> ASGIApp:
         """Build the application; its routes are all that there is."""
@@ -136,10 +138,13 @@ class Page:
     async def _look(self) -> None:
         """Look at the files again and again."""
         while True:
-            with suppress(DaqError, OSError):
+            with suppress(*UNREADABLE):  # the document has the reason
                 known = await asyncio.to_thread(self._results.calibration)
                 self._live.calibration = None if known is None else known[1]
-            self._document = await asyncio.to_thread(self._results.document)
+            try:
+                self._document = await asyncio.to_thread(self._results.document)
+            except UNREADABLE as error:
+                self._document = {"problems": [f"the results cannot be read: {error}"], "report": False}
             await asyncio.sleep(RESULTS_S)
 
     @staticmethod
@@ -169,7 +174,7 @@ class Page:
         return Response(_json({**self._document, "stop": self._live.stop_state}), media_type="application/json")
 
     async def _report(self, _: Request) -> Response:
-        with suppress(DaqError, OSError):
+        with suppress(*UNREADABLE):
             content = await asyncio.to_thread(self._results.report)
             if content is not None:
                 # Its own styles and pictures are inside; a script would not run.
@@ -183,24 +188,58 @@ class Page:
         """Everything that changes, as server-sent events; a page that does not read gets less, and delays no other."""
         if self._readers >= LARGEST_READERS:
             return PlainTextResponse(f"{LARGEST_READERS} pages are open already: close one", 503)
-        return StreamingResponse(self._messages(), media_type="text/event-stream")
+        return _Curves(self._messages(), self._count)
+
+    def _count(self, change: int) -> None:
+        self._readers += change
 
     async def _messages(self) -> AsyncIterator[bytes]:
         live, reader, before = self._live, Reader(self._live), b""
-        self._readers += 1
+        while not self.over():
+            begun, news = reader.news()
+            message: dict[str, Any] = {**news}
+            if begun:
+                message["run"] = None if live.run is None else asdict(live.run)
+            status = _json(live.status())
+            if message or status != before:
+                before = status
+                yield b'data: {"status": %b, "new": %b}\n\n' % (status, _json(message))
+            await asyncio.sleep(TICK_S)
+
+
+class _Curves(StreamingResponse):
+    """Messages for one page, which is counted from its request until it has gone."""
+
+    def __init__(self, messages: AsyncIterator[bytes], count: Callable[[int], None]) -> None:
+        super().__init__(messages, media_type="text/event-stream")
+        self._count = count
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        self._count(1)
         try:
-            while not self.over():
-                begun, news = reader.news()
-                message: dict[str, Any] = {**news}
-                if begun:
-                    message["run"] = None if live.run is None else asdict(live.run)
-                status = _json(live.status())
-                if message or status != before:
-                    before = status
-                    yield b'data: {"status": %b, "new": %b}\n\n' % (status, _json(message))
-                await asyncio.sleep(TICK_S)
+            await super().__call__(scope, receive, send)
         finally:
-            self._readers -= 1
+            self._count(-1)
+
+
+class _Connection(H11Protocol):
+    """A connection that is closed where no request comes: any program of this computer may open as many as it likes.
+
+    A limit of all connections would refuse the page's stop while others hold them.
+    """
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Begin to wait; where too many wait, close the one that has waited for longest."""
+        super().connection_made(cast("asyncio.Transport", transport))
+        self._begun_s = self.loop.time()
+        self.loop.call_later(REQUEST_S, self._close_unasked)
+        waiting = [one for one in self.connections if isinstance(one, _Connection) and not one.headers]
+        if len(waiting) > CONNECTIONS:
+            min(waiting, key=lambda one: one._begun_s)._close_unasked()
+
+    def _close_unasked(self) -> None:
+        if not self.headers:  # of its first request
+            self.transport.close()
 
 
 def _json(document: Any) -> bytes:
@@ -247,7 +286,7 @@ def server_of(page: Page, token: str, port: int) -> uvicorn.Server:
         server_header=False,
         proxy_headers=False,
         ws="none",
-        limit_concurrency=CONNECTIONS,
+        http=_Connection,
         timeout_graceful_shutdown=1,
     )
     server = uvicorn.Server(config)

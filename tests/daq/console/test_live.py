@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from starlette.applications import Starlette
 
-from daq.config.cell import Cell
+from daq.config.cell import Cell, PacingMode
 from daq.console.live import Live
 from daq.console.results import Results
 from daq.console.server import Page
@@ -171,3 +171,11 @@ def test_a_stop_is_forgotten_when_the_next_recorder_begins(cell: Cell, cell_file
                 assert json.loads(console.ask(f"/{TOKEN}/stop", "POST", origin=own)[1])["accepted"]
                 assert asked.wait(30), number
             live.wait(lambda: bool(live.stop_state and live.stop_state.get("axes_stopped")))
+
+
+def test_a_simulated_cell_in_lockstep_has_no_load_of_a_bus(cell: Cell, cell_file: Path) -> None:
+    assert cell.sync is not None
+    for pacing, buses in ((PacingMode.LOCKSTEP, set()), (PacingMode.TIMED, {"can0"})):
+        live = Live(cell_file, replace(cell, sync=replace(cell.sync, pacing=pacing)))
+        live.take(_text(_run(cell)))
+        assert live.status()["bus_load"].keys() == buses

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
+import socket
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
+from daq.cli.app import main
 from daq.config.cell import Cell
+from daq.console.live import Live
+from daq.console.results import Results
+from daq.console.server import CONNECTIONS, LARGEST_READERS, Page
+from daq.errors import ExitCode
 from daq.workflow.feed import Feed
 from drivers.canopen.emcy import remedy_of
 from drivers.stream.sample import CellEvent, EventKind
+from ident.calibration import Calibration
+from tests.daq.calibrations import demo_calibration
 from tests.daq.console.feeds import TOKEN, Recording, Served, arrivals, served
 
 
@@ -161,3 +171,63 @@ def test_a_monitor_is_shown_until_a_recorder_begins_and_again_after_it(cell: Cel
         (event,) = live.events.since(0)
         assert (event["axis"], event["text"], event["remedy"]) == ("J3", "EMCY 7305h", remedy_of(0x7305))
     assert watching.remark == feed.remark == ""
+
+
+def test_connections_without_a_request_do_not_hold_back_a_stop(console: Served) -> None:
+    with ExitStack() as closing:
+        silent = [
+            closing.enter_context(socket.create_connection(("127.0.0.1", console.port), timeout=30))
+            for _ in range(2 * CONNECTIONS)
+        ]
+        answer, _ = console.ask(f"/{TOKEN}/stop", "POST", origin=f"http://127.0.0.1:{console.port}")
+        assert answer.status == 200
+        assert silent[0].recv(1) == b""  # the oldest are closed
+    refused, _ = console.ask("/wrong/")
+    assert refused.headers["connection"] == "close"
+
+
+def test_more_pages_than_are_served_are_refused_also_at_once(console: Served) -> None:
+    with ExitStack() as closing:
+        pages = [closing.enter_context(console.reader()) for _ in range(3 * LARGEST_READERS)]
+        answers = [closing.enter_context(page.makefile("rb")).readline() for page in pages]
+    assert sum(b" 200 " in line for line in answers) == LARGEST_READERS
+    assert sum(b" 503 " in line for line in answers) == 2 * LARGEST_READERS
+
+
+def test_a_file_that_no_reader_expected_does_not_end_the_looking(cell: Cell, cell_file: Path) -> None:
+    results = Results(cell_file, cell)
+    page = Page(cell, Live(cell_file, cell), results)
+    given: list[Calibration | ValueError] = [ValueError("5 errors for 6 axes"), demo_calibration()]
+
+    def calibration() -> tuple[Path, Calibration]:
+        found = given[0]
+        if isinstance(found, ValueError):
+            raise found
+        return cell_file, found
+
+    async def looked() -> None:
+        task = asyncio.create_task(page._look())
+        while not page._document:
+            await asyncio.sleep(0)
+        assert page._document["gains"] is None
+        assert "5 errors for 6 axes" in page._document["problems"][0]
+        given.pop(0)
+        while not page._document["gains"]:
+            await asyncio.sleep(0)
+        assert page._document["problems"] == []
+        task.cancel()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(results, "calibration", calibration)
+        patch.setattr("daq.console.server.RESULTS_S", 0.0)
+        asyncio.run(asyncio.wait_for(looked(), 30))
+
+
+@pytest.mark.parametrize("option", ["--calibration", "--report"])
+def test_a_named_file_that_does_not_exist_is_an_error(
+    checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
+) -> None:
+    missing = tmp_path / "missing.yaml"
+    assert main(["console", str(checkout / "configs" / "cells" / "demo.yaml"), option, str(missing)]) != ExitCode.OK
+    error = capsys.readouterr().err
+    assert all(word in error for word in ("missing.yaml", "found", "expected"))
