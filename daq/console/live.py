@@ -53,11 +53,9 @@ GONE = (
     "the recorder is gone without a word: it was killed or has crashed. The amplifiers stop by themselves where they "
     "supervise its heartbeat (1016h); look at the robot, and use the emergency stop if it moves"
 )
-
-
 HANGS = (
-    "The recorder hangs or is held; the amplifiers stop by themselves where they supervise its heartbeat (1016h). "
-    "If the robot moves, use the emergency stop"
+    "The recorder is held, or waits for disk or bus; the amplifiers stop by themselves where they supervise its "
+    "heartbeat (1016h). If the robot moves, use the emergency stop"
 )
 UNKNOWN = "this page could not follow the recorder, and does not know how it ended"
 
@@ -247,7 +245,7 @@ class Live:
         """Return why this page does not show the cell as it is now; empty where it does."""
         if self.failed or self._unfit or not self._silent_s:
             return self.failed or self._unfit
-        said = f"nothing has come for {self._silent_s} s; states and values below are of that time"
+        said = f"Nothing has come for {self._silent_s} s; states and values below are of that time"
         return f"{said}. {HANGS}" if self.phase == "running" else said
 
     @property
@@ -324,7 +322,7 @@ class Live:
         if not self._unfit:
             self._clear(phase, None)
         program = "recorder" if phase == "running" else "monitor"
-        self._unfit = f"this page cannot show the {program}: {error}. Restart the console, with the same drivegain"
+        self._unfit = f"This page cannot show the {program}: {error}. Restart the console, with the same drivegain"
 
     async def _take_all(self, connection: socket.socket, phase: str) -> None:
         """Take what has come every READ_S: waiting for each packet would cost as much as taking it.

@@ -22,7 +22,7 @@ from ident.calibration import Calibration
 from ident.errors import IdentificationError
 
 LARGEST_REPORT_BYTES = 64 << 20
-#: Of reading files that anyone may have written; what no reader expected must not end the looking.
+#: Errors of reading files, also of those whose content no reader expected
 UNREADABLE = (DaqError, IdentificationError, OSError, ValueError, LookupError, TypeError, ArithmeticError)
 
 

@@ -133,7 +133,7 @@ class Page:
     def _note_end(self, task: asyncio.Task[None]) -> None:
         if not task.cancelled():
             cause = repr(task.exception())
-            self._live.failed = f"a part of this console has ended ({cause}), so this page is old: restart the console"
+            self._live.failed = f"A part of this console has ended ({cause}), so this page is old: restart the console"
 
     async def _look(self) -> None:
         """Look at the files again and again."""

@@ -1,4 +1,4 @@
-"""What the console says when its feed does not fit, stalls, or changes."""
+"""The page when its feed does not fit, stalls or changes: it says so."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def test_a_recorder_that_hangs_is_said_and_its_states_are_marked_as_old(cell: Ce
     assert (fresh["alarm"], fresh["old"], fresh["rate_hz"] > 0.0) == ("", False, True)
     now_s[0] += 4.1
     old = live.status()
-    assert "nothing has come for 4 s" in old["alarm"]
+    assert "Nothing has come for 4 s" in old["alarm"]
     assert "use the emergency stop" in old["alarm"]
     assert (old["old"], old["rate_hz"]) == (True, 0.0)
     live.take(_samples(len(cell.axes), 1, so_far=91))
