@@ -10,6 +10,7 @@ import daq
 import drivers
 import ident
 from daq.errors import CalibrationRefused, DaqError, OutputFailed, SchemaMismatch, UsageError, exit_code
+from daq.workflow.feed import FeedUnfit
 from drivers.errors import DriverError, SetupRefused
 from drivers.simulation.spec import SdoAbort
 from ident.errors import IdentificationError, RankDeficient
@@ -27,8 +28,9 @@ def _exceptions() -> set[type[BaseException]]:
 def test_every_exception_class_has_an_exit_code() -> None:
     kinds = _exceptions()
     assert {SetupRefused, RankDeficient, SchemaMismatch} <= kinds
-    # The root of daq is never raised; SdoAbort is how a simulated node says no on the bus, it never reaches a user.
-    unmapped = {kind.__qualname__ for kind in kinds - {DaqError, SdoAbort} if exit_code(kind) is None}
+    # The root of daq is never raised; SdoAbort is how a simulated node says no on the bus, FeedUnfit is said on the
+    # console's page: they end no command.
+    unmapped = {kind.__qualname__ for kind in kinds - {DaqError, SdoAbort, FeedUnfit} if exit_code(kind) is None}
     assert not unmapped
 
 
