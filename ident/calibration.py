@@ -205,21 +205,8 @@ def calibration_of(
         software="",
         session_began_s=None if last is None else session_began_s(last.fit_runs),
         covariance_factor=factor_of(estimate.covariance),
-        current_residual=_current_residual(found),
+        current_residual=found.current_residual,
     )
-
-
-def _current_residual(found: Identification) -> tuple[float, ...] | None:
-    """What is left of each motor's current; None where a motor has no rows."""
-    from ident.estimators.maximum_likelihood import noise_of  # noqa: PLC0415 - reading a calibration needs no estimator
-
-    left = np.full(len(found.estimate.gains), np.nan)
-    for system in (found.system, found.holdout):
-        if system is not None:
-            seen = system.motors.rows > 0
-            size = noise_of(system.motors, 1.0 / found.estimate.gains, found.estimate.parameters, 0)
-            left[seen] = size[seen]
-    return tuple(float(f"{one:.6g}") for one in left) if np.isfinite(left).all() else None
 
 
 def factor_of(covariance: FloatArray) -> tuple[tuple[float, ...], ...] | None:

@@ -40,15 +40,20 @@ def export_log_verb(
     kind = TableFormat.CSV if csv else TableFormat.PARQUET
     with status(f"writing {kind.value}"):
         done = export_log(log, out, kind)
-    if done.partial:
-        typer.echo(f"{log} is PARTIAL: saved from an unfinished recording", err=True)
-    if not done.valid:
-        typer.echo(f"{log} is INVALID: {done.reason or 'no reason given'}; a fit refuses it", err=True)
+    _warn(log, done.partial, done.valid, done.reason)
     if json:
         print_json({"log": str(log), "table": str(out), "format": kind.value, "rows": done.rows,
                     "columns": list(done.columns), "partial": done.partial, "valid": done.valid})  # fmt: skip
     else:
         print_view([f"{done.rows} rows of {len(done.columns)} columns"], out)
+
+
+def _warn(log: Path, partial: bool, valid: bool, reason: str) -> None:
+    """Say on stderr what a log lacks."""
+    if partial:
+        typer.echo(f"{log} is PARTIAL: saved from an unfinished recording", err=True)
+    if not valid:
+        typer.echo(f"{log} is INVALID: {reason or 'no reason given'}; a fit refuses it", err=True)
 
 
 def export_bag_verb(
@@ -70,10 +75,7 @@ def export_bag_verb(
     gains = None if calibration is None else {gain.axis: gain.value for gain in load_calibration(calibration).gains}
     with status("writing the bag"):
         done = export_bag(log, out, gains)
-    if done.partial:
-        typer.echo(f"{log} is PARTIAL: saved from an unfinished recording", err=True)
-    if not done.valid:
-        typer.echo(f"{log} is INVALID: {done.reason or 'no reason given'}; a fit refuses it", err=True)
+    _warn(log, done.partial, done.valid, done.reason)
     if json:
         print_json({"log": str(log), "bag": str(out), "duration_s": done.duration_s, "messages": done.messages,
                     "effort": gains is not None, "partial": done.partial, "valid": done.valid})  # fmt: skip

@@ -45,7 +45,7 @@ class JudgedChange:
 
 
 NOT_JUDGED = JudgedChange()
-"""Of a gain whose numbers are not finite."""
+"""Judgement of a gain whose numbers are not finite."""
 
 
 def query_history(cell: Cell, target: str, request: Request, changes: Sequence[GainChange]) -> Spread:

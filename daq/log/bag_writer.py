@@ -95,9 +95,8 @@ def export_bag(path: Path, out: Path, gains: Mapping[str, float] | None = None) 
                 _write(Writer(stream, compression=CompressionType.ZSTD), messages)
             (unfinished / "metadata.yaml").write_text(_metadata(name, counts, first_ns, last_ns), encoding="utf-8")
             unfinished.rename(out)
-        except BaseException:
-            shutil.rmtree(unfinished, ignore_errors=True)
-            raise
+        finally:
+            shutil.rmtree(unfinished, ignore_errors=True)  # once renamed, it is gone
         fsync_folder(out)
     except OSError as error:
         raise OutputFailed.of(out, error) from error

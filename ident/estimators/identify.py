@@ -19,7 +19,7 @@ from ident.errors import DataUnfit, IdentificationError, ModelContradicted, Mode
 from ident.estimators.diagnosis import idle_joints, joint_torques, require_signs, require_weight
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import ls, tls, wls
-from ident.estimators.maximum_likelihood import iv, ml
+from ident.estimators.maximum_likelihood import iv, ml, noise_of
 from ident.estimators.method import Method
 from ident.model.bodies import Payload
 from ident.model.model import Model
@@ -57,6 +57,20 @@ class Identification:
     def holdout_error(self) -> RelativeError | None:
         """On the rows that the fit has not seen [%]."""
         return None if self.holdout is None else self.estimate.relative_error(self.holdout)
+
+    @property
+    def current_residual(self) -> tuple[float, ...] | None:
+        """Root mean square of what is left of each motor's current, as `Calibration.current_residual`.
+
+        None where a motor has no rows.
+        """
+        left = np.full(len(self.estimate.gains), np.nan)
+        for system in (self.system, self.holdout):
+            if system is not None:
+                seen = system.motors.rows > 0
+                size = noise_of(system.motors, 1.0 / self.estimate.gains, self.estimate.parameters, 0)
+                left[seen] = size[seen]
+        return tuple(float(f"{one:.6g}") for one in left) if np.isfinite(left).all() else None
 
 
 def identify(

@@ -181,7 +181,7 @@ def test_a_quiet_bus_is_asked_by_uploads_alone_and_silence_is_counted(bus: Quiet
     assert all(8 <= axis.lost <= 10 and axis.position_counts is None and axis.rate_hz == 0 for axis in reading.axes)
 
 
-def test_asking_leaves_the_bus_to_others(bus: QuietBus) -> None:
+def test_asking_leaves_the_bus_to_others(bus: QuietBus, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every request is answered at once; still a reading is asked for ten times a second and no more."""
     samples: list[Sample] = []
     monitor = _monitor(bus, samples)
@@ -194,7 +194,7 @@ def test_asking_leaves_the_bus_to_others(bus: QuietBus) -> None:
         reply = bytes((0x43, *msg.data[1:4])) + bytes(4)
         bus.coming.append((bus.clock.now_ns, _frame(msg.arbitration_id - 0x80, reply)))
 
-    bus.send = answer  # type: ignore[method-assign]
+    monkeypatch.setattr(bus, "send", answer)
     reading = monitor.watch(5.0)
     assert all(axis.rate_hz == pytest.approx(1 / READING_S, rel=0.15) for axis in reading.axes)
     assert answered == pytest.approx(6 * 3 * 5.0 / READING_S, rel=0.15)
@@ -395,7 +395,7 @@ def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong
     bus.coming.clear()
     document = monitor_document(CELL, watch.read(0.5))
     assert document["prediction"]["remark"] == "no prediction: there is no SYNC"
-    assert not any(axis["silent"] for axis in document["axes"])  # nobody has asked them
+    assert not any(axis["silent"] for axis in document["axes"])  # they were not asked
 
 
 def test_the_rate_of_another_master_is_measured_once_its_sync_is_steady(bus: QuietBus, tmp_path: Path) -> None:
@@ -416,7 +416,7 @@ def test_the_rate_of_another_master_is_measured_once_its_sync_is_steady(bus: Qui
 
 
 def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_remedy(
-    bus: QuietBus, tmp_path: Path
+    bus: QuietBus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     values = {0x6041: 0x1208, 0x603F: 0x7305}
 
@@ -426,7 +426,7 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
         reply = bytes((0x43, *msg.data[1:4])) + value.to_bytes(4, "little")
         bus.coming.append((bus.clock.now_ns, _frame(msg.arbitration_id - 0x80, reply)))
 
-    bus.send = answer  # type: ignore[method-assign]
+    monkeypatch.setattr(bus, "send", answer)
     feed = Feed(tmp_path / "cell.yaml", stop=None)
     watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), feed)
     watch.listen(QUIET_S)

@@ -58,7 +58,7 @@ def series(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, tuple[Series,
     with HistoryStore(tmp_path_factory.mktemp("tables") / "history.sqlite") as store:
         fill(store, 6, lambda week: (1.0, 1.0, 1.0, 1.0 + 0.01 * week, 1.0, 1.0))
         entries = store.entries()
-    actions = {entry.digest: "applied by somebody with quite a long name, rolled back by another" for entry in entries}
+    actions = {entry.digest: "applied by a person with quite a long name, rolled back by another" for entry in entries}
     return entries, watch(entries, ()), actions
 
 
