@@ -159,7 +159,7 @@ def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[P
 
 
 def _gains(calibration: Calibration, model: Model) -> FloatArray:
-    count = model.robot.joint_count
+    count = model.robot.axis_count
     if len(calibration.gains) != count:
         raise ModelError(f"the calibration has {len(calibration.gains)} gains, the model {count} joints")
     return np.array([gain.value for gain in calibration.gains])

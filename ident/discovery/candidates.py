@@ -54,7 +54,7 @@ class SearchProblem:
     @property
     def axes(self) -> int:
         """Number of axes."""
-        return self.observation.joint_count
+        return self.observation.axis_count
 
     def test(
         self, families: Iterable[Sequence[Effect]], axis: int, *, at_rows: bool = False

@@ -134,7 +134,7 @@ def find_effects(
     """
     gates, cache = gates or Gates(), ColumnCache()
     model = _linearised(start, cache)
-    names = axes or [joint.name for joint in start.model.robot.joints]
+    names = axes or [joint.name for joint in start.model.robot.axes]
     steps: list[Step] = []
     seen = {_keys(start)}
     for _ in range(MAX_EFFECTS):

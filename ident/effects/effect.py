@@ -236,8 +236,8 @@ def at_joints(effect: Effect, axis: int, columns: FloatArray, drive_train: Drive
 
 def is_placeable(effect: Effect, axis: int, robot: Robot) -> bool:
     """Whether an effect can act on an axis; an effect of two joints is placed on the one with the lower number."""
-    if effect.needs_revolute and robot.joints[axis].kind is JointKind.PRISMATIC:
+    if effect.needs_revolute and robot.axes[axis].kind is JointKind.PRISMATIC:
         return False
     if effect.side is Side.ALL_MOTORS:
         return axis == 0
-    return effect.side is not Side.TWO_JOINTS or axis + 1 < int(effect.settings["other_axis"]) <= robot.joint_count
+    return effect.side is not Side.TWO_JOINTS or axis + 1 < int(effect.settings["other_axis"]) <= robot.axis_count

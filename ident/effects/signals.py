@@ -14,8 +14,7 @@ from ident.data.dataset import Dataset
 from ident.equations.rows import Observation
 from ident.estimators.estimate import Estimate
 from ident.model.bodies import LINK_PARAMETERS, Payload
-from ident.model.model import Model, link_columns
-from ident.model.regressor import mass_matrix
+from ident.model.model import Model
 
 STICKING_RAD_S = 0.005  #: Below this speed the noise of the filtered encoder decides the sign
 UNIX_S = 1e9  #: Times from here on, September 2001, are since 1970; earlier ones since some start
@@ -201,11 +200,10 @@ def session_began_s(datasets: Sequence[Dataset]) -> float | None:
 
 
 def _inertia_of_joints(model: Model, data: Dataset, standard: FloatArray) -> FloatArray:
-    """Mass matrix of links and payload in some postures, shape (n, n, postures)."""
-    samples, count = data.position_rad.shape
+    """Mass matrix of links and payload in some postures, shape (m, m, postures)."""
+    samples = len(data.position_rad)
     postures = _postures(samples, max(2, samples // POSTURE_SAMPLES))
-    links = standard[link_columns(count)]
-    return mass_matrix(model.robot, np.ascontiguousarray(data.position_rad[postures].T), links)
+    return model.inertia(data.position_rad[postures], standard)
 
 
 def _postures(samples: int, count: int) -> IntArray:
