@@ -35,7 +35,7 @@ help:
 	@echo "make drift-study  detection delay and false alarms of a drifting gain (docs/evidence/drift.md); a minute"
 	@echo "make holdout-study  which wrong gains the hold-out gate detects (docs/evidence/hold-out.md); a minute"
 	@echo "make diagnosis-study  false alarms of the diagnoses on clean recordings, and planted mistakes that are named; a minute"
-	@echo "make robot-study  gains of a 7-axis arm and a gantry (docs/evidence/robots.md); minutes"
+	@echo "make robot-study  gains and a second payload of every shipped robot (docs/evidence/robots.md); resumable, half an hour"
 	@echo "make effects-study  undeclared effects of every family: named, error before and after (docs/evidence/effects-study.md); hours, resumable"
 	@echo "make tx40-study  the loop closed on a real robot, scored on blocks that were left out (docs/evidence/tx40.md); minutes"
 	@echo "make weigh-study  coverage of the error bars of a weighed payload (docs/evidence/estimators.md); resumable, half an hour"

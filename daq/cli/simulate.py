@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from drivers.canopen.split_bus import BusPart
     from drivers.simulation.spec import CellSpec
 
-_SHIPPED = ("demo", "clean", "seven-axis", "gantry")
+_SHIPPED = ("demo", "clean", "rx90", "kr270", "seven-axis", "gantry")
 _SHIPPED_FAULTS = "faults-example"
 
 

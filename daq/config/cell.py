@@ -135,6 +135,16 @@ class WeighedPayload:
         return Payload(self.name, self.mounting, {**self.known, "m": self.mass_kg})
 
 
+@dataclass(frozen=True, slots=True)
+class DeclaredEffect:
+    """An effect beyond rigid links and friction that the robot is known to have, such as a counterbalance."""
+
+    name: str  #: family, as a calibration names it
+    axis: int  #: index of the axis that it acts on
+    #: Its settings by name, where they are known; a fit of the effect begins with them. Empty: the fit finds them.
+    settings: dict[str, float]
+
+
 class MotionPolicy(Enum):
     """Permission that a recording needs to move the axes."""
 
@@ -158,6 +168,7 @@ class Cell:
     conditioning: Conditioning  #: the filters
     controller: Controller | None  #: destination of the gains, None without write-back
     clearance: Clearance | None  #: the room around the arm, None if it is not declared
+    effects: tuple[DeclaredEffect, ...]  #: part of every fit, whatever a search finds beside them
     folder: Path | None  #: folder of the cell file; None for a cell from a log
     digest: str  #: sha256 of the cell file and all files it refers to, hex
     #: sha256 of the content that a recording or its fit depends on, hex: without comments, and without the later use of

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from daq.config.cell import MILLIMETRE, Axis, Cell, Limits, WeighedPayload
-from daq.config.cell_schema import AxisModel, CellModel, ConditioningModel, PayloadModel, ratio_of
+from daq.config.cell import MILLIMETRE, Axis, Cell, DeclaredEffect, Limits, WeighedPayload
+from daq.config.cell_schema import AxisModel, CellModel, ConditioningModel, EffectModel, PayloadModel, ratio_of
 from daq.config.checks import check
 from daq.config.clearance import clearance_of
 from daq.config.closed_chain import chain_of
@@ -89,6 +89,7 @@ def cell_from_bundle(
         controller=model.controller,
         chain=chain_of(model.robot, model.closures),
         clearance=clearance_of(model.workspace, model.clearance, [axis.name for axis in model.axes]),
+        effects=tuple(_effect(effect, model) for effect in model.effects),
         folder=None if file is None else file.parent,
         digest=digest({name: files[name] for name in used}),
         recording_digest=digest({name: _canonical(name, files[name], names.get(name, name)) for name in used}),
@@ -212,6 +213,10 @@ def _conditioning(model: ConditioningModel) -> Conditioning:
         for about, along in zip(radians, millimetres, strict=True)
     )
     return Conditioning(**rest, standstill_rad_s=tuple(speeds))
+
+
+def _effect(effect: EffectModel, model: CellModel) -> DeclaredEffect:
+    return DeclaredEffect(effect.name, [axis.name for axis in model.axes].index(effect.axis), dict(effect.settings))
 
 
 def _payload(model: PayloadModel) -> WeighedPayload:

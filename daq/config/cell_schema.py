@@ -175,6 +175,14 @@ class PayloadModel(StrictModel):
         return self
 
 
+class EffectModel(StrictModel):
+    """An effect that the robot is known to have, and its settings where they are known."""
+
+    name: Name
+    axis: Name
+    settings: dict[str, float] = Field(default_factory=dict)
+
+
 class ConditioningModel(StrictModel):
     """The filters."""
 
@@ -211,6 +219,7 @@ class CellModel(StrictModel):
     ] = ()
     axes: Annotated[tuple[AxisModel, ...], Field(min_length=1, max_length=32)]
     payloads: tuple[PayloadModel, ...] = ()
+    effects: tuple[EffectModel, ...] = ()
     conditioning: ConditioningModel = ConditioningModel()
     controller: Controller | None = None
     workspace: WorkspaceSection | None = None

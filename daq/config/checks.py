@@ -61,6 +61,7 @@ def check(
         *_producer_faults(model),
         *_axis_faults(model, joints),
         *_list_faults(model),
+        *_effect_faults(model),
         *signer_faults(model.policy.apply.signers),
         *clearance_faults(model.workspace, model.clearance, names),
         *max_change_faults(model.policy.apply, names),
@@ -138,6 +139,16 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
                 "each mounting a name of its own: it denotes one body in one place",
             )
         yield from _inertia_faults(payload, index)
+
+
+def _effect_faults(model: CellModel) -> Iterator[Fault]:
+    names = [axis.name for axis in model.axes]
+    placed = [(effect.name, effect.axis) for effect in model.effects]
+    for index, effect in enumerate(model.effects):
+        if effect.axis not in names:
+            yield Fault(("effects", index, "axis"), repr(effect.axis), f"one of {', '.join(names)}")
+        elif placed.index((effect.name, effect.axis)) < index:
+            yield Fault(("effects", index), f"{effect.name} on {effect.axis} twice", "each effect once on an axis")
 
 
 def _mass_faults(model: CellModel) -> Iterator[Fault]:

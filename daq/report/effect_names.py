@@ -39,6 +39,7 @@ WORDS = {
     "inertial-coupling": "inertia shared with another joint",
     "hinge": "a cable or hose that pulls from some position on",
     "gravity-compensator": "a gravity compensator, or another torque that repeats with the joint",
+    "counterbalance": "a balancer between two links",
 }
 """Words by family; an effect that is not listed is called by its name."""
 
@@ -51,6 +52,7 @@ _WHERE = {
     "presliding": "within about {distance_rad:.2g} rad",
     "hinge": "from a position of {start_rad:.2g} rad on",
     "gravity-compensator": "{order:g} times in a turn of the joint",
+    "counterbalance": "with a lever of {ratio:.2g} of its foot's distance",
 }
 """Where or how fast an effect acts, by family, from its searched parameters; other families need no such words."""
 _SIGMAS = 2.0  #: Of the band around a curve

@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.report import paper_tables
+from daq.report.effect_names import size_text
 from daq.report.gains import diagnosis_texts, gain_table, partial_note, torque_document, torque_sentences, torque_table
 from daq.report.text import percent_text, picked, plain_table, printable
 from daq.workflow.calibration_file import as_document
@@ -33,6 +34,8 @@ def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | 
     if (note := partial_note(calibration)) is not None:
         yield Text(note, style="bold")
     yield from (Text(printable(text), style="bold") for text in diagnosis_texts(calibration.diagnoses))
+    for effect in calibration.effects:
+        yield f"{effect.axis}: {effect.name}, declared in the cell file: {size_text(effect, calibration)}"
     if (note := actual_current_note(fitted.cell)) is not None:
         yield note
     if fitted.torque_slopes:

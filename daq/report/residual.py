@@ -71,7 +71,11 @@ def residual_view(fitted: Fit, account: Account, calibration: Calibration) -> It
 
 def turns_view(fitted: Fit) -> Iterator[RenderableType]:
     """Candidates of each turn of the loop, and the one that was added."""
-    for number, step in enumerate(fitted.steps, start=1):
+    for declared in (step.accepted for step in fitted.steps if step.declared):
+        if declared is not None:
+            placed = PlacedEffect(declared.effect, declared.axis)
+            yield f"Declared in the cell file: {placed.name_among(fitted.cell.axis_names)}.\n"
+    for number, step in enumerate((step for step in fitted.steps if not step.declared), start=1):
         headings = ("effect", "axis", "p", "folds", "explains", "left-out error", "gates")
         table = plain_table(headings, title=f"Turn {number}: best candidates on left-out moves")
         for finding in step.findings[:_SHOWN]:

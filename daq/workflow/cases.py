@@ -12,6 +12,7 @@ import numpy as np
 from daq.config.cell import Cell, model_of
 from daq.errors import ConfigurationInconsistent
 from daq.workflow.choices import Known
+from daq.workflow.declared_effects import refuse_effects
 from daq.workflow.fit import Fit, Reading, calibration_of, check_signs, with_diagnoses
 from ident.calibration import Calibration, Parameter, Source, factor_of
 from ident.equations.reduction import Reduction, reduce_runs
@@ -75,8 +76,10 @@ def reduce_logs(
 
     Raises:
         DataError, ConfigurationError, IdentificationError: a log cannot be used, or not with the others.
+        UsageError: the cell declares effects.
     """
     reading = Reading(logs, cell)
+    refuse_effects(reading.cell, "--known, --cases")
     model, conditioning = model_of(reading.cell), reading.cell.conditioning
     used = reduce_runs(model, reading.runs(logs, "fit"), conditioning, instruments=instruments)
     rest = each_run(reading.runs(holdout, "holdout"), used.payloads)
@@ -117,7 +120,9 @@ def essential_fit(fitted: Fit, ratio: float) -> CaseFit:
 
     Raises:
         IdentificationError: the estimator refuses.
+        UsageError: the cell declares effects.
     """
+    refuse_effects(fitted.cell, "--essential")
     before = fitted.identification
     estimate = before.estimate
     fixed = estimate.gains if estimate.gains_fixed else None

@@ -19,6 +19,7 @@ from daq.environment import software
 from daq.errors import ConfigurationError, EffectsRefuted, LogRepeated, LogsDiffer, UsageError
 from daq.log.conversion import load_run
 from daq.log.reader import LossyLogs
+from daq.workflow.declared_effects import declared_effects, refuse_effects, with_declared_again, with_effects_of_cell
 from daq.workflow.experiment import LAG_ONE, experiment_of, extra_moves
 from ident.calibration import Calibration, Source
 from ident.calibration import calibration_of as identified_calibration
@@ -69,7 +70,8 @@ class Fit:
     holdout: tuple[Path, ...]  #: held out of the fit; read again likewise
     sources: tuple[Source, ...]  #: all of these, with digests and roles
     identification: Identification  #: the estimate without effects
-    steps: tuple[Step, ...]  #: turns of the loop, empty without a search for effects
+    #: A step for each effect that the cell declares, then the turns of the loop; empty without either.
+    steps: tuple[Step, ...]
     paper: Estimate | None  #: the paper's total least squares on the same equations, None with fixed gains
     lossy: LossyLogs = LossyLogs.REFUSED  #: how logs with losses were handled
     diagnoses: tuple[Diagnosis, ...] = ()  #: of the fit, or with effects of the last one
@@ -80,7 +82,7 @@ class Fit:
 
     @property
     def estimate(self) -> Estimate:
-        """Estimate with all accepted effects."""
+        """Estimate with all declared and accepted effects."""
         return self.steps[-1].after.estimate if self.steps else self.identification.estimate
 
     @property
@@ -212,6 +214,9 @@ def fit(
         reading = Reading(used, cell, lossy)
         declared = reading.cell
         nameplate = np.array([axis.nameplate_gain for axis in declared.axes])
+        effects = declared_effects(declared)
+        if method is Method.IV:
+            refuse_effects(declared, "--method iv")
         result = identify(
             model_of(declared),
             reading.runs(used, "fit"),
@@ -219,18 +224,21 @@ def fit(
             holdout=reading.runs(unseen, "holdout"),
             method=method,
             fixed_gains=nameplate if gains_fixed else None,
-            keep_rows=keep_rows,
+            keep_rows=keep_rows or bool(effects),
+            judge=not effects,
         )
+        steps = with_effects_of_cell(result, effects, declared.axis_names) if effects else ()
+        last = steps[-1].after.identification if steps else result
         if not gains_fixed:
-            check_signs(result.estimate, nameplate)
-        paper = None if gains_fixed else tls(result.system)
+            check_signs(last.estimate, nameplate)
+        paper = None if gains_fixed else tls(last.system)
         return Fit(
             cell=declared,
             logs=tuple(used),
             holdout=tuple(unseen),
             sources=tuple(reading.sources),
             identification=result,
-            steps=(),
+            steps=steps,
             paper=paper,
             lossy=lossy,
             torque_slopes=reading.torque_slopes(),
@@ -304,7 +312,7 @@ def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: 
     """Every estimator on the logs of a fit, which are read again for each filter.
 
     Raises:
-        UsageError: its gains were held fixed.
+        UsageError: its gains were held fixed, or the cell declares effects.
     """
     if fitted.estimate.gains_fixed:
         raise UsageError(
@@ -313,6 +321,7 @@ def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: 
             expected="free gains: it is their estimators that differ",
             remedy="leave out one of the two",
         )
+    refuse_effects(fitted.cell, "--compare")
     found = fitted.identification
     return compare(
         found.model,
@@ -348,7 +357,8 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
     Raises:
         IdentificationError: a refit failed.
     """
-    evidence = start.evidence()
+    known = start.steps  # with what the cell declares
+    evidence = known[-1].after if known else start.evidence()
     cold = [data.name for data in evidence.fit_runs if data.temperature_c is None]
     if 0 < len(cold) < len(evidence.fit_runs):
         _LOG.warning("%s without temperatures: %s is not looked for", ", ".join(cold), TemperatureFriction.name)
@@ -356,10 +366,11 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
     if before.estimate.method is not Method.ML:
         fixed = before.estimate.gains if before.estimate.gains_fixed else None
         before = replace(before, estimate=estimate_with(Method.ML, before.system, fixed))
-        evidence = replace(evidence, estimate=before.estimate)
+        by_ml = before.estimate
+        evidence = with_declared_again(evidence, by_ml) if known else replace(evidence, estimate=by_ml)
     rng = np.random.default_rng(seed)
     steps = find_effects(evidence, rng, progress=progress, axes=start.cell.axis_names)
-    closed = replace(start, identification=before, steps=steps)
+    closed = replace(start, identification=before, steps=(*known, *steps))
     return closed if closed.estimate is start.estimate else with_diagnoses(closed)
 
 

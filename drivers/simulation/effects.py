@@ -85,6 +85,27 @@ def spring(moment: Moment, axis: int, stiffness_nm_per_rad: float, rest_rad: flo
     moment.torque_nm[axis] -= stiffness_nm_per_rad * (moment.position_rad[axis] - rest_rad)
 
 
+def counterbalance(
+    moment: Moment,
+    axis: int,
+    base_m: float,
+    lever_m: float,
+    phase_rad: float,
+    stiffness_n_per_m: float,
+    preload_n: float,
+) -> None:
+    """A balancer between the link before the joint and a lever on the link behind it, which pulls both ends together.
+
+    With x = q − phase, 0 where the lever points at the balancer's foot, its length is s = √(a² + L² − 2 a L cos x); the
+    force preload + k (s − |a − L|) gives the torque −F ds/dq. Foot and lever are a = base_m and L = lever_m from the
+    joint's axis. (A hydropneumatic one differs by its gas law.)
+    """
+    x = moment.position_rad[axis] - phase_rad
+    length_m = math.sqrt(base_m**2 + lever_m**2 - 2.0 * base_m * lever_m * math.cos(x))
+    force_n = preload_n + stiffness_n_per_m * (length_m - abs(base_m - lever_m))
+    moment.torque_nm[axis] -= force_n * base_m * lever_m * math.sin(x) / length_m
+
+
 def position_friction(moment: Moment, axis: int, amplitude_nm: float, phase_rad: float) -> None:
     """Dry friction Fs + amplitude·cos(q − phase), never below zero: an eccentric gear, a bearing out of line."""
     change = amplitude_nm * math.cos(moment.position_rad[axis] - phase_rad)
@@ -246,6 +267,7 @@ UNDECLARED_EFFECTS: dict[str, Callable[..., None] | type[WithState | Lag]] = {
     "nonlinear-viscous": nonlinear_viscous,
     "asymmetric-viscous": asymmetric_viscous,
     "spring": spring,
+    "counterbalance": counterbalance,
     "position-friction": position_friction,
     "cogging": cogging,
     "saturation": saturation,

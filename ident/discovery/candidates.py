@@ -63,7 +63,7 @@ class SearchProblem:
 
         Columns built `at_rows` are fast, and good for effects that change slowly.
         """
-        torque = self._torque_at_rows if at_rows else self.torque
+        torque = self.torque_at_rows if at_rows else self.torque
         placed = [
             (number, effect)
             for number, family in enumerate(families)
@@ -95,7 +95,8 @@ class SearchProblem:
         columns = kept.astype(np.float64)
         return at_joints(effect, axis, columns, self.model.drive_train)
 
-    def _torque_at_rows(self, effect: Effect, axis: int) -> FloatArray:
+    def torque_at_rows(self, effect: Effect, axis: int) -> FloatArray:
+        """Build the same from signals that are decimated already: fast, and good for effects that change slowly."""
         if effect.abscissa in FAST:
             return self.torque(effect, axis)
         columns = np.concatenate([effect.columns(run, axis) for run in self.rows], axis=-1)

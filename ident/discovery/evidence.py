@@ -38,6 +38,7 @@ class Evidence:
     holdout: Observation | None  #: rows of the held-out runs, None without any
     effects: tuple[PlacedEffect, ...]  #: in the model, in the order of their columns
     estimate: Estimate  #: of the training rows
+    declared: int = 0  #: how many of the effects, the first ones, the cell declares: no search takes them out
     _identification: list[Identification] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
@@ -152,7 +153,7 @@ def _torques(
 def without_effects(evidence: Evidence, estimate: Estimate) -> Evidence:
     """Return the same data under the declared model alone, with its estimate by ``ml``."""
     training, rest = _split_holdout(evidence.rows_without_effects, evidence.held_out)
-    return replace(evidence, training=training, holdout=rest, effects=(), estimate=estimate)
+    return replace(evidence, training=training, holdout=rest, effects=(), estimate=estimate, declared=0)
 
 
 def _split_holdout(observation: Observation, held_out: int) -> tuple[Observation, Observation | None]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.arrays import FloatArray
+from ident.discovery.balancer import propose_balancers
 from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, prepare_search, score_candidates
 from ident.discovery.choice import choice_covariance, is_small
 from ident.discovery.evidence import Evidence, by_instruments, with_effects
@@ -24,6 +25,7 @@ from ident.discovery.gates import (
     whitened_columns,
     without_effects_of,
 )
+from ident.discovery.refinement import refine_together
 from ident.discovery.resonance import propose_resonances
 from ident.discovery.ripple import propose_orders
 from ident.discovery.search import (
@@ -42,13 +44,15 @@ from ident.discovery.search import (
 )
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.position import Counterbalance
 from ident.effects.transmission import Ripple
 from ident.effects.unnamed import is_unnamed
-from ident.errors import NotConverged, RankDeficient
+from ident.errors import EffectRefused, NotConverged, RankDeficient
 
 UNFITTED = (NotConverged, RankDeficient, np.linalg.LinAlgError)
 MAX_EFFECTS = 12  #: More effects than this on one robot mean that the declared model is wrong
 SHOWN = 0.999  #: Confidence of what instruments show: a dozen effects may ask them in one search
+REFINEMENTS = 4  #: Refits of an effect whose settings are fitted; each moves them by a fraction of the one before
 PIECES_PER_EFFECT = 3  #: Fewer pieces of moves than this for each effect cannot show that all of them are there
 
 
@@ -84,6 +88,7 @@ class Step:
     ended: str = ""  #: reason why the search ended here although the residual may call for more; else empty
     #: σ of each gain [Nm/A] from the choice of the effects, contained in that of `after`, shape (n,); last turn only.
     choice_std: FloatArray | None = None
+    declared: bool = False  #: the cell declares the effect that joined: it was not searched for
 
 
 def find_effects(
@@ -149,6 +154,50 @@ def find_effects(
     else:
         steps[-1] = _settled(steps[-1], model.search_problem, (), rng, gates)
     return (*steps[:-1], _with_choice(steps, model, gates))
+
+
+def with_declared(
+    start: Evidence,
+    declared: Sequence[PlacedEffect],
+    rng: np.random.Generator,
+    progress: Callable[[str], None] = lambda _: None,
+    axes: Sequence[str] = (),
+) -> tuple[Step, ...]:
+    """Add effects that the cell declares, and refit everything with each; settings that are refined are fitted, too.
+
+    Args:
+        start: identified by ``ml``, from `gather`, without effects.
+        declared: the effects, with the settings to begin with.
+        rng: of the bootstrap, for what the findings say; no gate keeps an effect out.
+        progress: called with a description of each step.
+        axes: their names in it; those of the robot's joints when empty.
+
+    Returns:
+        a step an effect; a search that begins with the last one's evidence keeps them.
+
+    Raises:
+        EffectRefused: the model contains an effect already, or its coefficients are impossible.
+        NotConverged, RankDeficient: see `ident.identify`.
+    """
+    gates, cache, evidence, steps = Gates(), ColumnCache(), start, list[Step]()
+    names = axes or [joint.name for joint in start.model.robot.joints]
+    for placed in declared:
+        name = placed.name_among(names)
+        progress(f"fitting the declared {name}")
+        joined = with_effects(evidence, (*evidence.effects, placed))
+        model = _resettled(_linearised(replace(joined, declared=len(joined.effects)), cache))
+        evidence, estimate, last = model.evidence, model.evidence.estimate, model.evidence.effects[-1]
+        reduced = without_effects_of(model.search_problem, estimate, (last,))
+        problem, columns = reduced.search_problem, reduced.columns
+        (trial,) = score_candidates(problem.folds, columns, (slice(0, columns.shape[1]),))
+        own = own_unknowns(estimate, (last,))
+        wrong = impossible(last.effect.coefficients, estimate.parameters[own], estimate.parameters_std[own])
+        if trial is None or wrong:
+            raise EffectRefused(f"the declared {name}: {wrong or 'the model contains it already'}")
+        (finding,) = rank_families(problem, (FamilyTrials(last.axis, ((last.effect, trial),)),), rng, gates)
+        limits_nm = detection_limits_nm(model.search_problem, gates)
+        steps.append(Step((), (), limits_nm, finding, evidence, declared=True))
+    return tuple(steps)
 
 
 def _with_choice(steps: Sequence[Step], model: _JointFit, gates: Gates) -> Step:
@@ -232,6 +281,7 @@ def _turn(
         progress(f"adding {effect.name} on {names[accepted.axis]}")
         joined = _join(model, accepted, rng, gates, seen)
         if isinstance(joined, _JointFit):
+            accepted = _as_joined(accepted, joined.evidence)
             if named is not None and is_unnamed(effect):
                 rival = PlacedEffect(effect, accepted.axis)
                 aside.append(SetAside(named, "{rival} explains clearly more of the same residual", rival))
@@ -260,7 +310,10 @@ def _proposals(
     kinds = {type(family[0]) for family in families}
     ripples = propose_orders(search_problem, effects, rng, gates) if Ripple in kinds else {}
     resonances = propose_resonances(search_problem, gates, kinds)
-    return {axis: (*ripples.get(axis, ()), *resonances.get(axis, ())) for axis in {*ripples, *resonances}}
+    balanced = [placed.axis for placed in effects if isinstance(placed.effect, Counterbalance)]
+    balancers = propose_balancers(search_problem, gates, families, balanced)
+    found = (ripples, resonances, balancers)
+    return {axis: tuple(f for one in found for f in one.get(axis, ())) for axis in {a for one in found for a in one}}
 
 
 def _first_of_axis(aside: Sequence[SetAside], new: SetAside) -> tuple[SetAside, ...]:
@@ -279,6 +332,8 @@ def _join(
 ) -> _JointFit | SetAside:
     """Refit with a finding in the model and drop what no longer passes; or say why it may not join."""
     joined = _refit(model, accepted)
+    if isinstance(joined, _JointFit):
+        accepted = _as_joined(accepted, joined.evidence)
     pruned = joined if isinstance(joined, SetAside) else _pruned(joined, accepted, rng, gates)
     if isinstance(pruned, SetAside):
         return pruned
@@ -302,16 +357,42 @@ def _refit(model: _JointFit, accepted: Finding) -> _JointFit | SetAside:
         # Asked here: after it, the linearised problem would take memory beside the instruments.
         if why := _refuted_by_instruments(refitted, last):
             return SetAside(accepted, why)
-        joined = _linearised(refitted, problem.cache)
+        joined = _resettled(_linearised(refitted, problem.cache))
     except UNFITTED as error:
         # The linearised problem distinguished the effect from the model, the whole one does not.
         return SetAside(accepted, f"it cannot be fitted: {error}")
     terms = [placed for placed in refitted.effects if is_unnamed(placed.effect)]
-    if last in terms:
+    if last in terms:  # no setting of theirs is refined
         together = without_effects_of(joined.search_problem, refitted.estimate, terms)
         if moved := moved_gains(together.gain_shifts, gains_std):
             return SetAside(accepted, moved=moved)
     return joined
+
+
+def _resettled(model: _JointFit) -> _JointFit:
+    """Refine the settings of the last effect around the joint fit and refit, until they stay as they are.
+
+    The model without an effect may be far off, and the settings that fit its residual best with it.
+    """
+    for _ in range(REFINEMENTS):
+        evidence, last = model.evidence, model.evidence.effects[-1]
+        if not last.effect.refined:
+            break
+        reduced = without_effects_of(model.search_problem, evidence.estimate, (last,))
+        effect = refine_together(reduced.search_problem, last.effect, last.axis)
+        if effect == last.effect:
+            break
+        others = evidence.effects[:-1]
+        refitted = with_effects(evidence, (*others, PlacedEffect(effect, last.axis)), model.search_problem.runs)
+        model = _linearised(refitted, model.search_problem.cache)
+    return model
+
+
+def _as_joined(accepted: Finding, evidence: Evidence) -> Finding:
+    """A finding with the settings that its effect has in a joint fit."""
+    key = effect_key(accepted.effect, accepted.axis)
+    found = (placed.effect for placed in evidence.effects if effect_key(placed.effect, placed.axis) == key)
+    return replace(accepted, effect=next(found, accepted.effect))
 
 
 def _refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
@@ -346,7 +427,9 @@ def _pruned(model: _JointFit, accepted: Finding, rng: np.random.Generator, gates
     needed: set[PlacedEffect] = set()
     while True:
         evidence = model.evidence
-        judged = [(placed, *_beside_others(model, placed, rng, gates)) for placed in evidence.effects]
+        judged = [
+            (placed, *_beside_others(model, placed, rng, gates)) for placed in evidence.effects[evidence.declared :]
+        ]
         failing = [one for one in judged if one[2] and one[0] not in needed]
         if not failing:
             return model

@@ -33,6 +33,7 @@ import scipy  # loads scipy.special when it is first used: a fit needs none of i
 from ident.arrays import BoolArray, FloatArray
 from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial
 from ident.discovery.gates import impossible
+from ident.discovery.refinement import refine_together
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.signals import Abscissa
@@ -160,8 +161,9 @@ def rank_families(
 def choose_effect(findings: Sequence[Finding], taken: Collection[EffectKey] = ()) -> Finding | None:
     """Choose the best that passed; of those as good on the same axis, the one with the fewest parameters.
 
-    So a hinge that starts outside the joint's range is reported as a spring. Places that are taken, in the model or
-    refused, are not chosen again.
+    So a hinge that starts outside the joint's range is reported as a spring. Beside an effect whose settings are fitted
+    to the residual, nearly as good is not enough: folds must not distinguish them, or a balancer would be a spring with
+    harmonics. Places that are taken, in the model or refused, are not chosen again.
     """
     passed = [found for found in findings if found.passed and effect_key(found.effect, found.axis) not in taken]
     if not passed:
@@ -170,7 +172,9 @@ def choose_effect(findings: Sequence[Finding], taken: Collection[EffectKey] = ()
     alike = [
         finding
         for finding in passed
-        if finding.axis == best.axis and finding.held_out_fall >= AS_GOOD * best.held_out_fall
+        if finding.axis == best.axis
+        and finding.held_out_fall >= AS_GOOD * best.held_out_fall
+        and not (best.effect.refined and _better(best.fold_errors, finding.fold_errors))
     ]
     return min(alike, key=lambda finding: len(finding.effect.coefficients) + len(finding.effect.settings))
 
@@ -199,8 +203,10 @@ def refine_setting(
     """Refine the first real setting by golden section on the squared residual, between its neighbours in the family.
 
     The search is over the logarithm. An effect without a positive real setting, or at the end of its family, is
-    returned unchanged.
+    returned unchanged. Settings that an effect refines together are left to `refine_together`.
     """
+    if effect.refined:
+        return refine_together(search_problem, effect, axis)
     family = next((members for members in families if effect in members), ())
     for name, value in effect.settings.items():
         if not isinstance(value, float):

@@ -50,6 +50,11 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
     tuple(transmission.InertialCoupling(other) for other in PAIRED),
     tuple(position.Hinge(start_rad, sense) for start_rad in np.linspace(-2.5, 2.5, 11).tolist() for sense in (1, -1)),
     tuple(position.Compensator(order) for order in (1, 2)),
+    tuple(
+        position.Counterbalance(ratio, phase_rad)
+        for ratio in (0.2, 0.5)
+        for phase_rad in np.linspace(-np.pi, np.pi, 6, endpoint=False).tolist()
+    ),  # and what fits the residual best (ident.discovery.balancer)
 )
 """One family a row, with the values of its searched parameters that the search tries."""
 

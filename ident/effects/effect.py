@@ -106,6 +106,11 @@ class Effect(ABC):
         """Whether the effect exists only where the joint's position is an angle."""
         return False
 
+    @property
+    def refined(self) -> tuple[str, ...]:
+        """Settings that are fitted together with the whole model; those of the dictionary are only where to begin."""
+        return ()
+
     @abstractmethod
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Torque per unit coefficient [Nm], (p, k); (2, p, k) of two joints, (n, p, k) of all joints or motors."""
@@ -123,6 +128,11 @@ class Effect(ABC):
     def with_settings(self, settings: Mapping[str, float]) -> Self:
         """Return the same effect with some of its searched parameters changed."""
         return replace(self, **settings)
+
+
+def setting_range(effect: Effect, setting: str) -> Range:
+    """Return the values that a setting of an effect can have."""
+    return _ranges(type(effect))[setting]
 
 
 @cache

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.effects.effect import Effect, Property, Range, Sense
+from ident.effects.effect import Effect, Property, Range, Sense, Switch
 from ident.effects.signals import Abscissa, Signals
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
@@ -50,6 +50,46 @@ class Compensator(Effect):
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k)."""
         return np.stack(cos_sin(self.order * signals.position_rad[axis]))
+
+
+@dataclass(frozen=True, slots=True)
+class Counterbalance(Effect):
+    """τ = c₀ sin x / w + c₁ sin x (1 − (1 − ρ)/w),  w = √(1 + ρ² − 2ρ cos x),  x = q − α;  c₀, c₁ > 0: it pulls.
+
+    A balancer pulls a lever of length L on the moving link towards its foot, at a from the axis on the link before;
+    ρ = L/a (or a/L), and α is the position where the lever points at the foot. Its length is s = a w, shortest at
+    s₁ = a (1 − ρ), and its force F = F₁ + k (s − s₁) gives the torque F ds/dq: c₀ = F₁ L is the preload's share and
+    c₁ = k a L the spring's. The motor must push away from q = α. Source: Klimchik, Wu, Caro, Dumas, Furet & Pashkevich
+    (2013), "Modelling of the gravity compensators in robotic manufacturing cells".
+
+    sin x is gravity's torque, too. Where nothing else shows the first moments of the links, it belongs to them, and
+    only c sin x / w is new, with c = (F₁ − k s₁) L of either sign: `with_spring` = 0. Signature: position, at any
+    speed, with harmonics.
+    """
+
+    name = "counterbalance"
+    declares = Property.INDEPENDENT_OF_VELOCITY
+    abscissa = Abscissa.POSITION
+    needs_revolute = True
+    refined = ("ratio", "phase_rad")
+
+    #: ρ; with a shorter lever the torque is that of gravity and its second harmonic, and ρ and α do not show.
+    ratio: Annotated[float, Range(0.05, 0.95)]
+    phase_rad: Annotated[float, Range(-10.0, 10.0)]  #: α
+    with_spring: Switch = 1  #: 1 where sin x is identified beside gravity, else 0
+
+    @property
+    def coefficients(self) -> tuple[Column, ...]:
+        """c₀ and c₁, or c alone."""
+        if not self.with_spring:
+            return (Column("harmonics", "Nm"),)
+        return (Column("preload", "Nm", least=0.0), Column("stiffness", "Nm", least=0.0))
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Columns, shape (2, k) or (1, k)."""
+        cosine, sine = cos_sin(signals.position_rad[axis] - self.phase_rad)
+        bent = sine / np.sqrt(1.0 + self.ratio**2 - 2.0 * self.ratio * cosine)
+        return np.stack((bent, sine - (1.0 - self.ratio) * bent)) if self.with_spring else np.asarray(bent)[None]
 
 
 @dataclass(frozen=True, slots=True)

@@ -82,6 +82,7 @@ def identify(
     method: Method | str = Method.ML,
     fixed_gains: FloatArray | None = None,
     keep_rows: bool = False,
+    judge: bool = True,
 ) -> Identification:
     """Identify all gains and parameters in one global step; runs are read one after the other.
 
@@ -93,6 +94,7 @@ def identify(
         method: estimator, or its name.
         fixed_gains: known gains, shape (n,).
         keep_rows: keep all runs and their rows, for a search for effects by ``ml``; otherwise no run is kept.
+        judge: refuse a fit that its data contradict; False where effects are declared that the model lacks here.
 
     Raises:
         ModelError: an argument is of another type, there is no such method, or no gain for each motor.
@@ -124,8 +126,9 @@ def identify(
     if fixed_gains is not None:
         require_weight(system, estimate)
         require_signs(system, estimate, axes)
-    idle = idle_joints(model, *joint_torques(system, estimate))
-    require_plausible(jackknifed, estimate.relative_error(system), axes, idle)
+    if judge:
+        idle = idle_joints(model, *joint_torques(system, estimate))
+        require_plausible(jackknifed, estimate.relative_error(system), axes, idle)
     rest = reduce_runs(
         model, each_run(holdout, system.payloads), conditioning, payloads=system.payloads, keep_rows=keep_rows
     )

@@ -29,12 +29,14 @@ class Job:
         cell_file, cell: a copy of the shipped one.
         folder: with plans, logs and calibration.yaml.
         truth: true gain by axis.
+        simulation: name of the shipped simulation.
     """
 
     cell_file: Path
     cell: Cell
     folder: Path
     truth: dict[str, float]
+    simulation: str
 
     @property
     def calibration(self) -> dict[str, Any]:
@@ -54,42 +56,76 @@ class Job:
         }
 
 
-def run_job(name: str, folder: Path, *, seconds: float, pairs: int, seed: int) -> Job:
+def run_job(
+    name: str,
+    folder: Path,
+    *,
+    seconds: float,
+    pairs: int,
+    seed: int,
+    simulation: str | None = None,
+    exchanges: int = 100,
+) -> Job:
     """Plan, record in turn without and with the cell's first payload, and fit.
 
     Args:
-        name: of a shipped cell and of the simulation of the same name.
+        name: of a shipped cell.
         folder: to fill.
         seconds: of each run [s].
         pairs: of runs, each with a plan of its own.
         seed: of plans and noise.
+        simulation: name of the shipped simulation; that of the cell when None.
+        exchanges: of moves in planning.
     """
     # A copy: what is written to a controller leaves an audit and a history beside the cell file.
     shutil.copytree(shipped_configurations(), folder / "configs")
     cell_file = folder / "configs" / "cells" / f"{name}.yaml"
     cell = load_cell(cell_file)
-    payload, mass = cell.payloads[0].name, str(cell.payloads[0].mass_kg)
+    plant = load_simulation(shipped_simulation(simulation or name))
+    truth = {axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, plant.axes, strict=True)}
+    job = Job(cell_file, cell, folder, truth, simulation or name)
     logs = []
     for pair in range(pairs):
-        plan = folder / f"plan-{pair}.yaml"
-        arguments = ["--seed", str(10 * seed + pair), "--duration", str(seconds), "--exchanges", "100"]
-        # The condition number is one of mixed units; how well the gains are seen is judged by their σ.
-        _do(["plan", str(cell_file), "--out", str(plan), *arguments, "--condition", "1e6"])
-        for mounted in (None, payload):
+        plan = make_plan(job, f"plan-{pair}.yaml", seed=10 * seed + pair, seconds=seconds, exchanges=exchanges)
+        for mounted in (None, cell.payloads[0].name):
             logs.append(folder / f"{'bare' if mounted is None else 'loaded'}-{pair}.mcap")
-            spec = load_simulation(shipped_simulation(name), mounted)
-            bus = open_bus(bus_address(cell))
-            try:
-                with SimulatedCell(replace(spec, seed=100 * seed + len(logs)), bus):
-                    chosen = [] if mounted is None else ["--payload", mounted, "--mass", mass]
-                    moving = ["--enable-motion", "--operator", "test"]
-                    _do(["record", str(cell_file), str(plan), "--out", str(logs[-1]), *moving, *chosen])
-            finally:
-                bus.shutdown()
+            record_run(job, plan, logs[-1], mounted=mounted, declared=mounted is not None, seed=100 * seed + len(logs))
     _do(["fit", *map(str, logs), "--out", str(folder / "calibration.yaml")])
-    spec = load_simulation(shipped_simulation(name))
-    truth = {axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, spec.axes, strict=True)}
-    return Job(cell_file, cell, folder, truth)
+    return job
+
+
+def make_plan(job: Job, name: str, *, seed: int, seconds: float, exchanges: int = 100) -> Path:
+    """Plan a run of a job's cell; return the plan's file in its folder."""
+    path = job.folder / name
+    arguments = ["--seed", str(seed), "--duration", str(seconds), "--exchanges", str(exchanges)]
+    # The condition number is one of mixed units; how well the gains are seen is judged by their σ.
+    _do(["plan", str(job.cell_file), "--out", str(path), *arguments, "--condition", "1e6"])
+    return path
+
+
+def record_run(job: Job, plan: Path, log: Path, *, mounted: str | None, declared: bool, seed: int) -> None:
+    """Record a plan over the driver.
+
+    Args:
+        job: whose cell is simulated.
+        plan: its file.
+        log: to write.
+        mounted: body of the simulation, or None.
+        declared: whether the recording names it as a weighed payload of the cell.
+        seed: of the noise.
+    """
+    spec = load_simulation(shipped_simulation(job.simulation), mounted)
+    chosen = []
+    if declared:
+        mass_kg = next(payload.mass_kg for payload in job.cell.payloads if payload.name == mounted)
+        chosen = ["--payload", str(mounted), "--mass", str(mass_kg)]
+    bus = open_bus(bus_address(job.cell))
+    try:
+        with SimulatedCell(replace(spec, seed=seed), bus):
+            moving = ["--enable-motion", "--operator", "test"]
+            _do(["record", str(job.cell_file), str(plan), "--out", str(log), *moving, *chosen])
+    finally:
+        bus.shutdown()
 
 
 def _do(arguments: list[str]) -> None:

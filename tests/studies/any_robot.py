@@ -1,67 +1,196 @@
-"""The seven-axis arm and the gantry, several seeds: how far the gains are off, and whether σ shows it.
+"""Gains of every shipped robot and the mass of a second payload, over the whole driver path.
 
-    python -m tests.studies.any_robot
+    python -m tests.studies.any_robot --only kr270 --seeds 1 2
 
-writes out/any-robot.json and prints the table of docs/evidence/robots.md; some minutes on one core.
+Each seed has plans and noise of its own: runs in turn without load and with the weighed payload, a fit, then
+recordings with a second body, which `weigh` finds with the calibration alone. A finished seed is kept in
+out/robot-study/ and not made again while the robot's row of ROBOTS and its files are the same. Writes
+out/robot-study.json and prints the table of docs/evidence/robots.md.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import io
 import json
 import shutil
 import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tests.pipeline.cells import run_job
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.files import replace_file
+from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from daq.workflow.calibration_file import load_calibration
+from daq.workflow.weigh import weigh_logs
+from ident.arrays import BoolArray, FloatArray
+from tests.pipeline.cells import make_plan, record_run, run_job
+from tests.studies.fingerprint import digest, finish, is_finished
 
-OUT = Path("out/any-robot")
-ROBOTS = ("seven-axis", "gantry")
+OUT = Path("out/robot-study")
 SEEDS = (1, 2, 3, 4)
-SECONDS = 30.0
-PAIRS = 2
+SECOND_PLAN, SECOND_NOISE = 9, 99
+"""Of a seed's plans and noises, those of the first recording with the second body; the others count down."""
+WITHIN = 1.96  #: σ of a 95 % interval
 
 
-def one(name: str, seed: int) -> dict[str, Any]:
-    """Two runs without load and two with, and a fit."""
-    folder = OUT / f"{name}-{seed}"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
+@dataclass(frozen=True, slots=True)
+class StudiedRobot:
+    """A robot, its experiment, and the body that is weighed afterwards."""
+
+    name: str  #: in the table
+    cell: str  #: shipped cell file
+    simulation: str  #: shipped simulation file
+    seconds: float  #: of each run [s]
+    pairs: int  #: of runs without and with the cell's payload, each with a plan of its own
+    second: str  #: second body in the simulation file
+    weighed: int = 2  #: recordings with it, each with a plan of its own
+    exchanges: int = 200  #: tries of the planner
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the row and of the files that it names."""
+        cell = shipped_configurations() / "cells" / f"{self.cell}.yaml"
+        simulation = shipped_simulation(self.simulation)
+        files = (cell.read_text(), load_cell(cell).urdf, simulation.read_text(), load_simulation(simulation).urdf)
+        return digest(self, files)
+
+
+ROBOTS = (
+    StudiedRobot("TX-40", "demo", "clean", 40.0, 3, "plate", weighed=3),
+    StudiedRobot("RX-90", "rx90", "rx90", 40.0, 2, "plate", weighed=3),
+    StudiedRobot("KR270", "kr270", "kr270", 60.0, 3, "tool"),
+    StudiedRobot("seven-axis", "seven-axis", "seven-axis", 40.0, 2, "bar"),
+    StudiedRobot("gantry", "gantry", "gantry", 60.0, 2, "box"),
+)
+"""To study another robot, ship its cell and simulation, with two bodies, and add a row."""
+
+
+def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
+    """Gains and second payload of one seed; the folder is filled with its plans, logs and calibration."""
     with contextlib.redirect_stdout(io.StringIO()):
-        job = run_job(name, folder, seconds=SECONDS, pairs=PAIRS, seed=seed)
+        job = run_job(
+            robot.cell,
+            folder,
+            seconds=robot.seconds,
+            pairs=robot.pairs,
+            seed=seed,
+            simulation=robot.simulation,
+            exchanges=robot.exchanges,
+        )
+        logs = []
+        for number in range(robot.weighed):
+            name, own = f"second-{number}", 10 * seed + SECOND_PLAN - number
+            plan = make_plan(job, f"{name}.yaml", seed=own, seconds=robot.seconds, exchanges=0)
+            logs.append(folder / f"{name}.mcap")
+            noise = 100 * seed + SECOND_NOISE - number
+            record_run(job, plan, logs[-1], mounted=robot.second, declared=False, seed=noise)
+        body = weigh_logs(load_calibration(folder / "calibration.yaml"), logs).body
+    true = load_simulation(shipped_simulation(robot.simulation), robot.second).payload
+    assert true is not None
     return {
-        "robot": name,
+        "robot": robot.name,
         "seed": seed,
-        "error_percent": {axis: error for axis, (error, _) in job.gains.items()},
-        "std_percent": {axis: std for axis, (_, std) in job.gains.items()},
+        "gain_error_percent": {axis: error for axis, (error, _) in job.gains.items()},
+        "gain_std_percent": {axis: std for axis, (_, std) in job.gains.items()},
         "floor_percent": job.calibration["relative_error_percent"]["total"],
+        "payload_kg": true.mass_kg,
+        "payload_error_percent": 100.0 * (body.mass_kg / true.mass_kg - 1.0),
+        "payload_std_percent": 100.0 * body.mass_std_kg / true.mass_kg,
     }
 
 
-def table(rows: list[dict[str, Any]]) -> list[str]:
-    """One line an axis: the errors of all seeds, their root mean square, and the mean σ."""
-    lines = ["| axis | " + " | ".join(f"seed {row['seed']} %" for row in rows) + " | RMS % | mean σ % |"]
-    lines.append("|---" * (len(rows) + 3) + "|")
-    for axis in rows[0]["error_percent"]:
-        errors = [row["error_percent"][axis] for row in rows]
-        rms = float(np.sqrt(np.mean(np.square(errors))))
-        std = float(np.mean([row["std_percent"][axis] for row in rows]))
-        lines.append(f"| {axis} | " + " | ".join(f"{e:+.2f}" for e in errors) + f" | {rms:.2f} | {std:.2f} |")
-    return lines
+def kept(robot: StudiedRobot, seed: int, out: Path = OUT) -> dict[str, Any]:
+    """Return the row of a seed, which is made unless it is there; logs are deleted once it is."""
+    path = out / f"{robot.name}-{seed}.json"
+    if not is_finished(path, robot.fingerprint):
+        folder = out / f"{robot.name}-{seed}"
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        replace_file(path, f"{json.dumps(study(robot, seed, folder), indent=2)}\n".encode())
+        finish(path, robot.fingerprint)
+        shutil.rmtree(folder)
+    row: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return row
 
 
-def main() -> int:
-    """All robots and seeds, one after the other."""
-    rows = [one(name, seed) for name in ROBOTS for seed in SEEDS]
-    OUT.with_suffix(".json").write_text(json.dumps(rows, indent=2) + "\n")
-    for name in ROBOTS:
-        mine = [row for row in rows if row["robot"] == name]
-        floor = ", ".join(f"{row['floor_percent']:.1f}" for row in mine)
-        sys.stdout.write("\n".join([f"{name}, relative error {floor} %", "", *table(mine), "", ""]))
+def figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Figures of one robot over its seeds [%]: magnitudes of errors, and the share of 95 % intervals that hold."""
+    errors, inside = gain_errors(rows)
+    payload = np.abs([row["payload_error_percent"] for row in rows])
+    return {
+        "robot": rows[0]["robot"],
+        "seeds": [row["seed"] for row in rows],
+        "gains": len(rows[0]["gain_error_percent"]),
+        "floor_percent": float(np.mean([row["floor_percent"] for row in rows])),
+        "mean_gain_error_percent": float(np.mean(errors)),
+        "worst_gain_error_percent": float(np.max(errors)),
+        "mean_payload_error_percent": float(np.mean(payload)),
+        "worst_payload_error_percent": float(np.max(payload)),
+        "coverage_percent": 100.0 * float(np.mean(inside)),
+    }
+
+
+def gain_errors(rows: Iterable[dict[str, Any]]) -> tuple[FloatArray, BoolArray]:
+    """Magnitude of each gain's error [%] and whether it is inside its 95 % interval, all axes and seeds in a row."""
+    pairs = [
+        (abs(error), row["gain_std_percent"][axis]) for row in rows for axis, error in row["gain_error_percent"].items()
+    ]
+    errors, std = np.array(pairs).T
+    return errors, errors < WITHIN * std
+
+
+def pooled(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Coverage of the 95 % intervals over all robots, of gains and of weighed masses [%]."""
+    inside = gain_errors(rows)[1]
+    masses = [abs(row["payload_error_percent"]) < WITHIN * row["payload_std_percent"] for row in rows]
+    return {
+        "gains": len(inside),
+        "gain_coverage_percent": 100.0 * float(np.mean(inside)),
+        "masses": len(masses),
+        "mass_coverage_percent": 100.0 * float(np.mean(masses)),
+    }
+
+
+def table(robots: list[dict[str, Any]]) -> str:
+    """One line a robot."""
+    lines = [
+        "| robot | gains | relative error % | gain error mean % | worst % | second payload mean % | coverage % |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for one in robots:
+        shown = ("floor_percent", "mean_gain_error_percent", "worst_gain_error_percent", "mean_payload_error_percent")
+        numbers = " | ".join(f"{one[key]:.2f}" for key in shown)
+        lines.append(f"| {one['robot']} | {one['gains']} | {numbers} | {one['coverage_percent']:.0f} |")
+    return "\n".join(lines)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Make the seeds that are missing, one after the other, and print the table."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.any_robot", description=__doc__)
+    parser.add_argument("--only", nargs="+", choices=[robot.name for robot in ROBOTS], metavar="ROBOT")
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
+    options = parser.parse_args(arguments)
+    OUT.mkdir(parents=True, exist_ok=True)
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for robot in ROBOTS:
+        if options.only is None or robot.name in options.only:
+            rows[robot.name] = [kept(robot, seed) for seed in options.seeds]
+    everything = [row for mine in rows.values() for row in mine]
+    robots = [figures(mine) for mine in rows.values()]
+    over_all = pooled(everything)
+    document = {"robots": robots, "pooled": over_all, "rows": everything}
+    replace_file(OUT.with_suffix(".json"), f"{json.dumps(document, indent=2)}\n".encode())
+    sys.stdout.write(
+        f"{table(robots)}\n\n95 % intervals that hold: {over_all['gain_coverage_percent']:.0f} % of "
+        f"{over_all['gains']} gains, {over_all['mass_coverage_percent']:.0f} % of {over_all['masses']} masses\n"
+    )
     return 0
 
 

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daq.config.cell_file import load_cell
+from daq.simulation.simulation_file import load_simulation
 from drivers.simulation.plant import Plant
+from tests.conftest import CHECKOUT
+from tests.studies.any_robot import ROBOTS, StudiedRobot, figures, pooled
 from tests.studies.blind_cells import FAMILIES, NOTHING, blind_cases, confusion
 from tests.studies.direct_cell import RawRun, demand_rad, run_of
 from tests.studies.followed_cell import follow, without_rest
@@ -25,6 +30,40 @@ def test_the_shards_of_a_study_have_every_task_once(count: int, tasks: int) -> N
     shards = [Shard(number, count).of(range(tasks)) for number in range(1, count + 1)]
     assert sorted(task for part in shards for task in part) == list(range(tasks))
     assert max(map(len, shards)) - min(map(len, shards)) <= 1
+
+
+@pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
+def test_a_studied_robot_has_a_weighed_payload_and_a_second_body_that_no_cell_declares(robot: StudiedRobot) -> None:
+    cell = load_cell(CHECKOUT / f"configs/cells/{robot.cell}.yaml")
+    simulation = CHECKOUT / f"configs/simulation/{robot.simulation}.yaml"
+    assert robot.second not in {payload.name for payload in cell.payloads}
+    first, second = (load_simulation(simulation, name).payload for name in (cell.payloads[0].name, robot.second))
+    assert first is not None
+    assert second is not None
+    assert first.mass_kg == cell.payloads[0].mass_kg
+    assert second.mass_kg < 0.7 * first.mass_kg
+    assert robot.fingerprint != replace(robot, seconds=robot.seconds + 1.0).fingerprint
+
+
+def test_the_figures_of_a_robot_are_over_all_its_gains_and_seeds() -> None:
+    row = {"robot": "arm", "floor_percent": 3.0, "payload_std_percent": 0.2}
+    errors = ({"J1": -0.5, "J2": 0.1}, 0.3), ({"J1": 0.2, "J2": 1.0}, -0.5)
+    rows = [
+        {**row, "seed": seed, "gain_error_percent": gains, "gain_std_percent": {"J1": 0.3, "J2": 0.3},
+         "payload_error_percent": payload}
+        for seed, (gains, payload) in enumerate(errors, start=1)
+    ]  # fmt: skip
+    found = figures(rows)
+    assert found["mean_gain_error_percent"] == pytest.approx(0.45)
+    assert found["worst_gain_error_percent"] == 1.0
+    assert found["mean_payload_error_percent"] == pytest.approx(0.4)
+    assert found["coverage_percent"] == 75.0
+    assert pooled(rows) == {
+        "gains": 4,
+        "gain_coverage_percent": 75.0,
+        "masses": 2,
+        "mass_coverage_percent": 50.0,
+    }
 
 
 def test_runs_come_back_with_their_demand(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from daq.log.metadata import AxisReadback, Readback
 from daq.report.plots import plot_torques
 from daq.simulation.simulation_file import load_simulation
 from ident.model.model import DriveTrain
-from ident.model.robot import JointKind
+from ident.model.robot import JointKind, robot_from_urdf
 from tests.conftest import CHECKOUT
 
 GANTRY = load_cell(CHECKOUT / "configs/cells/gantry.yaml")
@@ -69,7 +69,7 @@ def test_a_turn_of_the_screw_is_its_lead() -> None:
     assert scale.joint_position(np.array([65536, 65536, 0, 0, 0])) == pytest.approx([0.030, 0, 0, 0, 0])
 
 
-@pytest.mark.parametrize("name", ["gantry", "seven-axis"])
+@pytest.mark.parametrize("name", ["gantry", "seven-axis", "rx90", "kr270"])
 def test_declaration_and_truth_speak_of_one_robot(name: str) -> None:
     cell = load_cell(CHECKOUT / f"configs/cells/{name}.yaml")
     spec = load_simulation(CHECKOUT / f"configs/simulation/{name}.yaml", cell.payloads[0].name)
@@ -77,6 +77,11 @@ def test_declaration_and_truth_speak_of_one_robot(name: str) -> None:
     assert spec.gravity_m_s2 == cell.gravity_m_s2
     assert spec.payload is not None
     assert spec.payload.mass_kg == cell.payloads[0].mass_kg
+    declared, plant = (robot_from_urdf(text, spec.gravity_m_s2) for text in (cell.urdf, spec.urdf))
+    for one, other in zip(declared.joints, plant.joints, strict=True):
+        np.testing.assert_array_equal(one.translation_m, other.translation_m)
+        np.testing.assert_array_equal(one.rotation, other.rotation)
+        np.testing.assert_array_equal(one.axis, other.axis)
     for start, axis, true in zip(spec.start_rad, cell.axes, spec.axes, strict=True):
         assert axis.limits.position[0] < start < axis.limits.position[1]
         assert axis.identity is not None

@@ -120,6 +120,24 @@ def test_spring_depends_on_position_alone() -> None:
         np.testing.assert_allclose(extra_torque_nm(effect, speed), only(1, -30.0 * (POSTURE[1] - 0.2)), atol=1e-6)
 
 
+@given(angle=st.floats(-3.0, 3.0))
+@settings(max_examples=10)
+def test_a_counterbalance_gives_the_work_of_its_force(angle: float) -> None:
+    """Foot, lever and joint make a triangle; the torque is the slope of the energy F ds summed from the shortest."""
+    base_m, lever_m, phase_rad, stiffness, preload = 0.5, 0.2, 0.4, 900.0, 60.0
+    parameters = {"base_m": base_m, "lever_m": lever_m, "phase_rad": phase_rad, "stiffness_n_per_m": stiffness}
+    effect = UndeclaredEffect("counterbalance", 1, {**parameters, "preload_n": preload})
+
+    def energy(q: float) -> float:
+        lever = lever_m * np.array([math.cos(q - phase_rad), math.sin(q - phase_rad)])
+        longer_m = float(np.linalg.norm(lever - [base_m, 0.0])) - (base_m - lever_m)
+        return preload * longer_m + 0.5 * stiffness * longer_m**2
+
+    expected = -(energy(angle + 1e-5) - energy(angle - 1e-5)) / 2e-5
+    posture = np.where(np.arange(6) == 1, angle, POSTURE)
+    np.testing.assert_allclose(extra_torque_nm(effect, posture=posture), only(1, expected), atol=1e-4)
+
+
 def test_position_friction_follows_the_joint_angle_and_the_sign_of_speed() -> None:
     effect = UndeclaredEffect("position-friction", 2, {"amplitude_nm": 2.0, "phase_rad": 0.4})
     for turn in (0.0, 1.0, 2.5):

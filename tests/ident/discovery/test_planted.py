@@ -152,6 +152,13 @@ def _inertial(t: TrueSignals, other: int) -> FloatArray:
     return torque
 
 
+def _lengthening(angle: FloatArray, foot_m: float, lever_m: float, force_n: float) -> FloatArray:
+    """A constant force along a balancer: its work F Δs between neighbouring angles, over their difference."""
+    ends = [np.array([np.cos(angle + way), np.sin(angle + way)]) * lever_m for way in (-1e-6, 1e-6)]
+    shorter, longer = (np.hypot(foot_m - x, y) for x, y in ends)
+    return np.asarray(force_n * (longer - shorter) / 2e-6)
+
+
 def _cold(t: TrueSignals, clock_s: FloatArray, constant_s: float) -> FloatArray:
     return np.asarray(np.exp2(-clock_s / (constant_s * np.log(2.0))) * (5.0 * np.sign(t.velocity) + 2.0 * t.velocity))
 
@@ -188,6 +195,7 @@ SMALL_CASES = (
     Planted("inertial-coupling", 0, lambda t: _inertial(t, 2), (0.25,)),
     Planted("hinge", 1, lambda t: np.where(t.position > 0.5, 12.0 * (t.position - 0.5), 0.0), (12.0,)),
     Planted("gravity-compensator", 1, lambda t: 5.0 * np.cos(2.0 * t.position - np.arctan2(3.0, 4.0)), (4.0, 3.0)),
+    Planted("counterbalance", 1, lambda t: _lengthening(t.position - np.pi / 3.0, 1.0, 0.5, 16.0), (8.0, 0.0)),
 )  # fmt: skip
 """On the arm of three axes, which needs a third of the time."""
 

@@ -1,4 +1,4 @@
-"""Any robot: the same questions to an arm of six axes, one of seven and a gantry with a wrist."""
+"""Any robot: the same questions to arms of six axes, one of seven and a gantry with a wrist."""
 
 from __future__ import annotations
 
@@ -65,6 +65,19 @@ KINDS = (
         _with([32, 32, 45, -48, 45, 32], {(5, 4): 32}),
         np.array([33.9, 32.4, 24.2, -9.21, 16.3, 6.79]),
         np.array([2.5, 1.8, 2.0, 3.0, 1.8, 3.0]),
+    ),
+    Kind(
+        "rx90.urdf",
+        _with([128, 128, 101, -75, 75, 60], {(5, 4): 60}),
+        np.array([44.1, 40.1, 33.6, -16.1, 18.2, 10.9]),
+        np.array([2.5, 1.6, 2.2, 3.0, 1.8, 3.0]),
+    ),
+    # An in-line wrist: motor 5 also turns with joint 4, motor 6 with joints 4 and 5.
+    Kind(
+        "kr270.urdf",
+        _with([256.857, 267.429, 252.333, 221, 239.619, 154.323], {(4, 3): -59.905, (5, 3): 38.581, (5, 4): -51.441}),
+        np.array([353.2, 344.5, 320.4, 196.1, 195.3, 137.6]),
+        np.array([2.0, 1.1, 2.2, 3.0, 2.0, 3.0]),
     ),
     # A differential: motors 6 and 7 turn together with joint 6, against each other with joint 7.
     Kind(

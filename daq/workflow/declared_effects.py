@@ -1,0 +1,96 @@
+"""Effects that a cell file declares, in a fit: a counterbalance that the robot is known to have needs no search."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from daq.config.cell import Cell, model_of
+from daq.errors import ConfigurationInconsistent, UsageError
+from ident.discovery.evidence import Evidence, gather, with_effects, without_effects
+from ident.discovery.loop import Step, with_declared
+from ident.effects.dictionary import EFFECTS
+from ident.effects.effect import PlacedEffect, check_settings, is_placeable
+from ident.errors import EffectRefused
+from ident.estimators.estimate import Estimate
+from ident.estimators.identify import Identification, estimate_with, require_plausible
+from ident.estimators.method import Method
+
+SEED = 0  #: Of the bootstrap; no decision depends on it here
+
+
+def declared_effects(cell: Cell) -> tuple[PlacedEffect, ...]:
+    """Return the effects that a cell declares, where no setting is given with those of the dictionary's first member.
+
+    Raises:
+        ConfigurationInconsistent: there is no such effect, or it has no such setting, on this axis.
+    """
+    families = {family[0].name: family[0] for family in EFFECTS}
+    robot, placed = model_of(cell).robot, []
+    for declared in cell.effects:
+        subject = f"effects of cell {cell.name!r}: {declared.name} on {cell.axis_names[declared.axis]}"
+        if declared.name not in families:
+            raise _wrong(subject, "no such effect", f"one of {', '.join(families)}")
+        known = families[declared.name]
+        unknown = sorted(set(declared.settings) - set(known.settings))
+        if unknown:
+            raise _wrong(subject, f"settings {', '.join(unknown)}", ", ".join(known.settings) or "no settings")
+        settings = {**known.settings, **declared.settings}
+        try:
+            check_settings(known, settings, declared.axis, len(cell.axes))
+        except EffectRefused as error:
+            raise _wrong(subject, str(error), "settings in their range") from error
+        # A file knows one kind of number; an order is whole.
+        effect = known.with_settings({name: type(known.settings[name])(value) for name, value in settings.items()})
+        if not is_placeable(effect, declared.axis, robot):
+            raise _wrong(subject, "an effect that this axis cannot have", "another axis, or the pair the other way")
+        placed.append(PlacedEffect(effect, declared.axis))
+    return tuple(placed)
+
+
+def _wrong(subject: str, found: str, expected: str) -> ConfigurationInconsistent:
+    return ConfigurationInconsistent(subject, found=found, expected=expected, remedy="correct the cell file")
+
+
+def refuse_effects(cell: Cell, option: str) -> None:
+    """Refuse a way of fitting that leaves out what the cell declares.
+
+    Raises:
+        UsageError: the cell declares effects.
+    """
+    if cell.effects:
+        names = ", ".join(f"{effect.name} on {cell.axis_names[effect.axis]}" for effect in cell.effects)
+        raise UsageError(
+            option,
+            found=f"a cell that declares effects: {names}",
+            expected="a cell without effects: this way of fitting leaves them out",
+            remedy="fit without the option, or name a cell file without `effects` with --cell",
+        )
+
+
+def with_effects_of_cell(
+    start: Identification, effects: tuple[PlacedEffect, ...], axes: Sequence[str]
+) -> tuple[Step, ...]:
+    """Add the effects that a cell declares; settings are fitted by ``ml``, then all by the method that was asked for.
+
+    Raises:
+        IdentificationError: a refit failed, or the model with the effects contradicts the data.
+    """
+    estimate = start.estimate
+    fixed = estimate.gains if estimate.gains_fixed else None
+    by_ml = estimate if estimate.method is Method.ML else estimate_with(Method.ML, start.system, fixed)
+    steps = with_declared(replace(gather(start), estimate=by_ml), effects, np.random.default_rng(SEED), axes=axes)
+    after = steps[-1].after
+    if estimate.method is not Method.ML:
+        after = with_declared_again(after, estimate)
+        steps = (*steps[:-1], replace(steps[-1], after=after))
+    require_plausible(after.estimate, after.estimate.relative_error(after.identification.system), axes)
+    return steps
+
+
+def with_declared_again(evidence: Evidence, estimate: Estimate) -> Evidence:
+    """Fit the same data and effects by the estimator, and with the gains, of an estimate without effects."""
+    refitted = with_effects(without_effects(evidence, estimate), evidence.effects)
+    return replace(refitted, declared=evidence.declared)

@@ -1,0 +1,67 @@
+"""Propose the geometry of a balancer: where its lever points, and the ratio of its two lengths.
+
+Both are settings on which the torque depends strongly, so no grid of a usual size comes close: a spline would always
+explain more, and the effect would get no name. They are fitted beside the model on each axis whose residual a member of
+the dictionary's grid explains a part of, and compete together with the grid, which stands for the search over them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from ident.discovery.candidates import SearchProblem
+from ident.discovery.refinement import is_possible, refine_together
+from ident.discovery.search import Gates
+from ident.effects.effect import Effect
+from ident.effects.position import Counterbalance
+
+
+def propose_balancers(
+    search_problem: SearchProblem,
+    gates: Gates,
+    families: tuple[tuple[Effect, ...], ...],
+    taken: Collection[int] = (),
+) -> Mapping[int, tuple[tuple[Effect, ...], ...]]:
+    """Return a family of balancers for each axis whose residual could hold one.
+
+    Args:
+        search_problem: around the model.
+        gates: what the grid explains of a motor's squared residual must reach their least share.
+        families: the dictionary; without a balancer in it nothing is proposed.
+        taken: axes that have one already.
+    """
+    grid = next((family for family in families if isinstance(family[0], Counterbalance)), ())
+    problem = search_problem.folds.linearisation
+    left = np.bincount(problem.motor, problem.residual**2)
+    proposed: dict[int, tuple[tuple[Effect, ...], ...]] = {}
+    for axis in range(search_problem.axes) if grid else ():
+        if axis in taken:
+            continue
+        tested = search_problem.test((grid,), axis, at_rows=True)
+        if not tested:  # gravity's parameters hold the spring's share
+            bare = tuple(effect.with_settings({"with_spring": 0}) for effect in grid)
+            tested = search_problem.test((bare,), axis, at_rows=True)
+        found = [
+            (float(np.max(trial.fallen / left)), effect)
+            for family in tested
+            for effect, trial in family.members
+            if is_possible(effect, trial)
+        ]
+        members = [effect for share, effect in sorted(found, key=lambda one: -one[0]) if share >= gates.smallest_share]
+        refined = [refine_together(search_problem, start, axis) for start in _apart(members)]
+        if refined:
+            tried = (effect for family in tested for effect, _ in family.members)
+            proposed[axis] = ((*tried, *refined),)
+    return proposed
+
+
+def _apart(members: Sequence[Effect]) -> Iterator[Effect]:
+    """The first member, and the first that points the other way.
+
+    Turned by half a revolution the second harmonic is the same, and the simplex does not find the way.
+    """
+    away = (one for one in members if np.cos(one.settings["phase_rad"] - members[0].settings["phase_rad"]) < 0.0)
+    yield from members[:1]
+    yield from list(away)[:1]

@@ -1,0 +1,61 @@
+"""Fit the settings of an effect that are refined together, beside everything else in the model.
+
+The fall of the squared residual is a smooth function of them, and each value costs products of columns, no refit. It is
+maximised by the simplex of Nelder and Mead (1965), which needs no derivatives and no scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy  # loads scipy.optimize when it is first used
+
+from ident.arrays import FloatArray
+from ident.discovery.candidates import SearchProblem, Trial
+from ident.effects.effect import Effect, setting_range
+
+MOST_TRIALS = 80  #: Of settings, in one refinement
+FIRST_STEP = 0.15  #: Of the simplex: rad of an angle, or of a ratio
+CLOSE_ENOUGH = 1e-3  #: Change of a setting at which the simplex stops
+DIGITS = 4  #: Of a setting, as a calibration shows it
+
+
+def is_possible(effect: Effect, trial: Trial) -> bool:
+    """Whether physics allows the coefficients of a trial."""
+    return all(
+        column.least <= value <= column.largest
+        for column, value in zip(effect.coefficients, trial.coefficients, strict=True)
+    )
+
+
+def refine_together(search_problem: SearchProblem, effect: Effect, axis: int) -> Effect:
+    """Refine the settings that an effect names in `Effect.refined`, or return it unchanged where none is better.
+
+    Args:
+        search_problem: around the model without the effect.
+        effect: where to begin.
+        axis: index of its joint.
+    """
+    names = effect.refined
+    ranges = [setting_range(effect, name) for name in names]
+
+    def changed(values: Sequence[float] | FloatArray) -> Effect:
+        return effect.with_settings({n: float(f"{v:.{DIGITS}g}") for n, v in zip(names, values, strict=True)})
+
+    def cost(values: FloatArray) -> float:
+        if not all(one.least <= value <= one.largest for one, value in zip(ranges, values, strict=True)):
+            return 0.0  # it explains nothing
+        (trial,) = search_problem.trials([search_problem.torque_at_rows(changed(values), axis)])
+        return -float(trial.fallen.sum()) if trial is not None and is_possible(effect, trial) else 0.0
+
+    start = np.array([effect.settings[name] for name in names])
+    simplex = start + np.vstack((np.zeros(len(names)), FIRST_STEP * np.eye(len(names))))
+    simplex[:, :] = np.clip(simplex, [one.least for one in ranges], [one.largest for one in ranges])
+    found = scipy.optimize.minimize(
+        cost,
+        start,
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "maxfev": MOST_TRIALS, "xatol": CLOSE_ENOUGH, "fatol": 0.1},
+    )
+    return changed(found.x) if found.fun < cost(start) else effect

@@ -1,0 +1,118 @@
+"""A balancer on the second axis of a heavy arm: declared it is fitted, left out it is found, and it bends no gain."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ident.arrays import FloatArray
+from ident.calibration import calibration_of
+from ident.discovery.evidence import Evidence, gather
+from ident.discovery.loop import Step, find_effects, with_declared
+from ident.discovery.search import Gates
+from ident.effects.dictionary import EFFECTS
+from ident.effects.effect import PlacedEffect
+from ident.effects.position import Counterbalance
+from ident.errors import EffectRefused
+from ident.estimators.identify import identify
+from ident.prediction import predict_torque
+from tests.ident.balanced import (
+    AXIS,
+    CONDITIONING,
+    FOOT_M,
+    GAINS,
+    LEVER_M,
+    TOWARDS_RAD,
+    heavy_model,
+    heavy_runs,
+)
+
+GATES = Gates(draws=99)
+LIKE_IT = tuple(family for family in EFFECTS if family[0].name in ("counterbalance", "gravity-compensator", "spring"))
+NEAR = PlacedEffect(Counterbalance(0.35, -1.2), AXIS)
+
+
+def _gathered(balanced: bool) -> Evidence:
+    return gather(identify(heavy_model(), heavy_runs(balanced), CONDITIONING, keep_rows=True, judge=False))
+
+
+@pytest.fixture(scope="module")
+def balanced() -> Evidence:
+    return _gathered(balanced=True)
+
+
+@pytest.fixture(scope="module")
+def declared(balanced: Evidence) -> tuple[Step, ...]:
+    return with_declared(balanced, [NEAR], np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def unbalanced() -> Evidence:
+    return _gathered(balanced=False)
+
+
+def _errors(evidence: Evidence) -> FloatArray:
+    """Error of each gain over its σ."""
+    return np.asarray((evidence.estimate.gains - GAINS) / evidence.estimate.gains_std)
+
+
+def _assert_known(evidence: Evidence) -> None:
+    """The gains are true, and so is the torque of the balancer but for what gravity holds of it."""
+    assert np.max(np.abs(evidence.estimate.gains / GAINS - 1.0)) < 0.005
+    assert np.max(np.abs(_errors(evidence))) < 3.5
+    (placed,) = evidence.effects
+    assert isinstance(placed.effect, Counterbalance)
+    assert placed.axis == AXIS
+    assert placed.effect.ratio == pytest.approx(LEVER_M / FOOT_M, abs=0.1)
+    assert placed.effect.phase_rad == pytest.approx(TOWARDS_RAD, abs=0.1)
+
+
+def test_declared_it_is_fitted_from_a_rough_geometry(balanced: Evidence, declared: tuple[Step, ...]) -> None:
+    after = declared[-1].after
+    assert declared[-1].declared
+    assert after.declared == 1
+    _assert_known(after)
+    before, error = (one.identification.training_error.axes[AXIS] for one in (balanced, after))
+    assert error < 0.7 * before
+    # What it is for: without it the gain of its axis is wrong, and σ larger.
+    assert abs(balanced.estimate.gains[AXIS] / GAINS[AXIS] - 1.0) > 0.01
+    assert after.estimate.gains_std[AXIS] < 0.2 * balanced.estimate.gains_std[AXIS]
+
+
+def test_left_out_it_is_found_on_its_joint(balanced: Evidence) -> None:
+    steps = find_effects(balanced, np.random.default_rng(0), GATES, LIKE_IT)
+    found = [(step.accepted.effect.name, step.accepted.axis) for step in steps if step.accepted is not None]
+    assert found == [("counterbalance", AXIS)]
+    _assert_known(steps[-1].after)
+
+
+def test_a_search_keeps_what_is_declared_and_finds_nothing_beside_it(declared: tuple[Step, ...]) -> None:
+    start = declared[-1].after
+    steps = find_effects(start, np.random.default_rng(0), GATES, LIKE_IT)
+    assert [step.accepted for step in steps] == [None]
+    assert steps[-1].after.effects == start.effects
+    assert steps[-1].after.estimate.gains == pytest.approx(start.estimate.gains)
+
+
+def test_no_balancer_is_found_where_there_is_none(unbalanced: Evidence) -> None:
+    steps = find_effects(unbalanced, np.random.default_rng(0), GATES, LIKE_IT)
+    assert [step.accepted for step in steps] == [None]
+
+
+def test_declared_where_there_is_none_it_bends_no_gain(unbalanced: Evidence) -> None:
+    after = with_declared(unbalanced, [NEAR], np.random.default_rng(0))[-1].after
+    shift = (after.estimate.gains - unbalanced.estimate.gains) / after.estimate.gains_std
+    assert np.max(np.abs(shift)) < 1.5
+    assert np.max(np.abs(_errors(after))) < 3.5
+
+
+def test_a_calibration_predicts_with_it(balanced: Evidence, declared: tuple[Step, ...]) -> None:
+    axes = [f"J{number}" for number in range(1, 7)]
+    made = calibration_of(balanced.identification, axes, GAINS, steps=declared)
+    assert [(effect.name, effect.axis) for effect in made.effects] == [("counterbalance", "J2")]
+    data = balanced.datasets[0]
+    torque = predict_torque(made, balanced.model, data)[:, AXIS]
+    measured = GAINS[AXIS] * data.current_a[:, AXIS]
+    assert np.linalg.norm(torque - measured) < 0.12 * np.linalg.norm(measured)
+    with pytest.raises(EffectRefused, match="physics allows"):
+        with_declared(balanced, [PlacedEffect(Counterbalance(0.35, 1.7), AXIS)], np.random.default_rng(0))
