@@ -73,10 +73,10 @@ def tuned_inertia_a_s2(spec: CellSpec, plant: Plant) -> FloatArray:
     """Return the current per motor acceleration [A per count/s²] to which the loops are tuned, shape (n,).
 
     It is the geometric mean of the smallest and largest inertia that each motor meets over the postures, signed as the
-    axis is wired.
+    axis is wired. A closed chain has only the posture of its start: in others its loops would have to be closed.
     """
     # The first joint's position changes no inertia; of long chains the joints behind the seventh stay where they are.
-    swept = range(1, min(len(spec.axes), 7))
+    swept = range(1, 1 if spec.closures else min(len(spec.axes), 7))
     tried = plant.postures(spec.start_rad, POSTURES)
     inertias = []
     for posture in itertools.product(*(tried[joint] for joint in swept)):
@@ -296,7 +296,7 @@ class AmplifierSet:
         for state in ("counts", "demand", "target"):
             self.loops[state] = np.rint(plant.motor_rad * self._counts_per_rad)
         self._piece_s, self._piece_acceleration = np.zeros((n, SEGMENTS)), np.zeros((n, SEGMENTS))
-        built = (build_effect(effect, n) for effect in spec.effects)
+        built = (build_effect(effect, n) for effect in spec.effects if effect.joint is None)
         self._lags = tuple(effect for effect in built if isinstance(effect, Lag))
         self._lagged_a = np.zeros(n)
         self._noise = ColouredNoise(
