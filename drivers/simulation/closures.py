@@ -340,8 +340,9 @@ class Mechanism:
         ids = [model.getJointId(name) for name in self.joints]
         self.order = np.array([model.joints[i].idx_v for i in ids], dtype=np.int64)
         self._closures = spec.closures
-        self.constants = tuple(_tree(model, ids, spec))
-        self.rows = int(Tree(*self.constants).closed.sum())
+        tree = _tree(model, ids, spec)
+        self.constants: tuple[Any, ...] = tuple(tree)
+        self.rows = int(tree.closed.sum())
         motors = len(spec.motors)
         assembled = self.closed(np.array([spec.assembly_rad[name] for name in self.joints]), (motors, 0))
         self.mobility = len(ids) - _rank(self.at(assembled)[1])

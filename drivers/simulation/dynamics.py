@@ -51,6 +51,10 @@ SWEEPS_A_ROUND = 10  #: Sweeps that find which directions stick, before these ar
 
 DEPENDENT = 1e-9  #: Relative pivot below which a sticking direction depends on those before it
 
+DEPENDENT_CLOSED = 1e-13  #: The same in a closed chain, where joints turn nearly alike close to a symmetric pose
+
+TOLERANCE_CLOSED = 1e-6  #: Speed that a direction of a closed chain may keep in addition, over the largest speed
+
 IMMOBILE = 1e-14  #: Relative mobility below which the closures of a closed chain hold a direction
 
 SPANNED = 1e-6  #: Sine of the angle below which a direction lies in the span of others
@@ -166,6 +170,9 @@ def advance_closed(
         mass, bias, viscous, motor_torque, torque, bound, impulse, position, velocity: as for `advance`.
         load_torque: torque that passes from each joint to the links [Nm], shape (n,), output.
         resting: coordinates whose speed became exactly zero, shape (N,), output.
+
+    Returns:
+        zero, or the certificate of a step that was not done.
     """
     mechanics = Mechanics(*constants)
     step_s, n, d, total = mechanics.step_s, basis.shape[0], basis.shape[1], len(velocity)
@@ -186,8 +193,10 @@ def advance_closed(
     _substitute(reduced, free)
     response, free_speed, delassus = _respond(reduced, free, directions)
     _leave_out_immobile(delassus, free_speed, impulse, directions, response)
-    residual = solve(delassus, free_speed, bound, impulse, TOLERANCE_RAD_S, MAX_SWEEPS)
-    if not residual <= TOLERANCE_RAD_S:
+    # Of two joints that turn alike but for 1e-8, one may slide while the other still sticks: too fine to solve for.
+    tolerance = TOLERANCE_RAD_S + TOLERANCE_CLOSED * np.abs(free_speed).max()
+    residual = solve(delassus, free_speed, bound, impulse, tolerance, MAX_SWEEPS, DEPENDENT_CLOSED)
+    if not residual <= tolerance:
         return residual
     after = _times(whole, free + _times(response, impulse))
     _resting_closed(impulse, bound, directions, mechanics.lone, resting)
@@ -198,7 +207,7 @@ def advance_closed(
     for i in range(total):
         velocity[i] = after[i]
         position[i] += step_s * after[i]
-    return residual
+    return 0.0
 
 
 @compiled
@@ -417,7 +426,13 @@ def _resting(
 
 @compiled
 def solve(
-    delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: FloatArray, tolerance: float, sweeps: int
+    delassus: FloatArray,
+    free: FloatArray,
+    bound: FloatArray,
+    impulse: FloatArray,
+    tolerance: float,
+    sweeps: int,
+    dependent: float = DEPENDENT,
 ) -> float:
     """Solve for the impulses in place, starting from those of the step before.
 
@@ -431,6 +446,7 @@ def solve(
         impulse: λ, start value in and solution out, shape (m,).
         tolerance: largest accepted certificate [rad/s].
         sweeps: largest number of Gauss-Seidel sweeps.
+        dependent: relative pivot below which a sticking direction depends on those before it.
 
     Returns:
         the certificate: the largest |λ_k − clip(λ_k − w_k/W_kk, −b_k, b_k)| W_kk [rad/s], recomputed after the last
@@ -456,7 +472,7 @@ def solve(
             if residual <= tolerance:
                 break
         if sweep % SWEEPS_A_ROUND == SWEEPS_A_ROUND - 1:
-            _stick(delassus, free, bound, impulse)
+            _stick(delassus, free, bound, impulse, dependent)
     return residual
 
 
@@ -470,7 +486,7 @@ def _relaxed(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse:
 
 
 @compiled
-def _stick(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: FloatArray) -> None:
+def _stick(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: FloatArray, dependent: float) -> None:
     """Bring the directions inside their bounds to rest by Cholesky, in as many pieces as bounds are met on the way."""
     m = len(free)
     lower = np.zeros((m, m))
@@ -495,7 +511,7 @@ def _stick(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: F
                     lower[i, j] = s / lower[j, j]
                     pivot -= lower[i, j] ** 2
                     step[i] -= lower[i, j] * step[j]
-            if pivot <= DEPENDENT * delassus[i, i]:
+            if pivot <= dependent * delassus[i, i]:
                 inside[i] = False
                 step[i] = 0.0
             else:

@@ -158,11 +158,11 @@ class Plant:
         self._acting = tuple(e for e in effects if not isinstance(e, Lag))
         self._rows = motor_rows(spec.ratio)
         self._gain = np.array([a.gain_nm_per_a for a in axes])
-        self._viscous = np.array([a.viscous_nm_s_rad for a in (*axes, *passive)] + added)
+        self._viscous = np.array([a.viscous_nm_s_rad for a in axes] + [p.viscous_nm_s_rad for p in passive] + added)
         # The paper's offset is on the motor's side of eq. 1, so it acts against the joint.
         self._torque = np.array([-a.offset_nm for a in axes] + [0.0] * len(passive) + added)
         self._free_bound = np.zeros(m)
-        self._free_bound[: self._joints] = [a.coulomb_nm for a in (*axes, *passive)]
+        self._free_bound[: self._joints] = [a.coulomb_nm for a in axes] + [p.coulomb_nm for p in passive]
         np.add.at(self._free_bound, self._mechanics.own_row, [a.motor_coulomb_nm for a in axes])
         self._brake_nm = np.array([BRAKE_FACTOR * abs(a.gain_nm_per_a) * a.peak_current_a for a in axes])
         self._bound = self._free_bound.copy()

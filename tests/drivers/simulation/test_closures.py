@@ -282,7 +282,7 @@ def test_closures_hold_in_a_long_run_and_friction_only_takes_energy(name: str) -
         pull = stiffness * (place - plant.position_rad[:n]) - 0.1 * stiffness * plant.velocity_rad_s[:n]
         plant.step(np.linalg.solve(motor_rows(spec.ratio).T, pull) / plant._gain)
         rubbing = plant._mechanics.directions.T @ plant._impulse
-        assert rubbing @ plant.velocity_rad_s <= 1e-10
+        assert rubbing @ plant.velocity_rad_s <= 1e-9
         if k % 20 == 0:
             worst = max(worst, float(np.abs(plant.mechanism.at(plant.position_rad)[0]).max()))
     assert worst < 1e-11
@@ -410,12 +410,12 @@ def test_motors_that_do_not_actuate_are_refused() -> None:
         )
 
 
-def test_a_mechanism_in_a_singular_pose_says_so() -> None:
-    spec = frictionless(cell("five-bar"))
-    plant = released(spec)
-    with pytest.raises(ClosureLost, match="singular"):
-        for _ in range(4000):
-            plant.step(np.array([-1.0, -1.0]) * np.sign(spec.ratio.diagonal()) * [1, -1] * 8.0)
+def test_closures_that_cannot_be_met_are_reported() -> None:
+    plant = released(cell("orthoglide"))
+    plant.position_rad[0] = 2.0  # no rod is that long
+    plant._resting[:3] = True
+    with pytest.raises(ClosureLost, match=r"closures at .* keep the limits of motion away"):
+        plant._settle()
 
 
 def test_a_closure_of_two_rotations_leaves_the_third_free() -> None:
