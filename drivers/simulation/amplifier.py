@@ -21,6 +21,11 @@ VELOCITY_BANDWIDTH_RAD_S = 220.0
 POSITION_BANDWIDTH_RAD_S = VELOCITY_BANDWIDTH_RAD_S / 4.0
 INTEGRAL_BANDWIDTH_RAD_S = VELOCITY_BANDWIDTH_RAD_S / 5.0
 
+REDUNDANT_BANDWIDTH_RAD_S = 48.0
+"""Bandwidth of the velocity loops of redundant drives. Each drive follows a trapezoid of its own, and between two poses
+these agree only nearly: what they disagree about becomes preload, in proportion to the stiffness of the loops. Such
+drives have no integral part either, for their integrals would wind up against each other (Müller and Hufnagel 2012)."""
+
 VELOCITY_FILTER_S = 0.0008  #: Time constant of the velocity filter: one encoder count a substep is a coarse velocity
 
 POSTURES = 3  #: Positions tried for each joint in tuning
@@ -285,6 +290,10 @@ class AmplifierSet:
         self.loops["position_1_s"] = POSITION_BANDWIDTH_RAD_S
         self.loops["velocity_1_s"] = VELOCITY_BANDWIDTH_RAD_S
         self.loops["integral_1_s"] = INTEGRAL_BANDWIDTH_RAD_S
+        if plant.mechanism is not None and plant.mechanism.mobility < n:
+            self.loops["velocity_1_s"] = REDUNDANT_BANDWIDTH_RAD_S
+            self.loops["position_1_s"] = REDUNDANT_BANDWIDTH_RAD_S / 4.0
+            self.loops["integral_1_s"] = 0.0
         self.loops["filter"] = -np.expm1(-self.step_s / VELOCITY_FILTER_S)
         self.loops["limit_a"] = [axis.peak_current_a for axis in spec.axes]
         self.loops["piece"] = SEGMENTS
