@@ -80,5 +80,5 @@ def test_redundant_drives_preload_the_platform_while_their_trapezoids_disagree()
         torque = plant._rows.T @ (plant._gain * amplifiers.loops["current_a"])
         hidden = np.linalg.svd(plant._basis[:4].T)[2][3]  # the null space of Aᵀ
         inner.append(abs(hidden @ torque))
-    assert max(inner[500:1500]) > 3.0
-    assert inner[-1] < 0.5 * max(inner[500:1500])
+    assert max(inner[:2000]) > 1.0  # [Nm]; friction of a motor is 0.3
+    assert inner[-1] < 0.5 * max(inner[:2000])
