@@ -91,7 +91,7 @@ part comes; grey on the grid: its footprint. A square of the grid is {1000 * _GR
 def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> dict[str, Any]:
     """Compute what the page draws, in rows of equal time steps; lengths in m and mm."""
     time_s, position, speed, move = _rows(cell, moves)
-    at, capsules = poses(checker.robot, position), checker.scene.capsules
+    at, capsules = poses(checker.robot, checker.joints(position)), checker.scene.capsules
     frame = [capsule.link + 1 for capsule in capsules]
     ends = np.array([(capsule.start_m, capsule.end_m) for capsule in capsules]).reshape(-1, 1, 2, 3)
     placed = np.einsum("ckij,cxej->kcei", at.rotation[frame], ends) + at.origin_m[frame].swapaxes(0, 1)[:, :, None]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import cycle, pairwise
 
@@ -51,6 +51,8 @@ class CheckedScene:
         """Remarks for the operator."""
         scene = self.checker.scene
         shape = "a guess from the joint chain; declare `clearance` in the cell file" if self.guessed else "as declared"
+        if self.guessed and self.checker.robot.closures:
+            shape = "of a closed chain is not guessed; declare `clearance` in the cell file"
         lines = [f"arm of {len(scene.capsules)} capsules, {shape}; {1000 * scene.minimum_m:.0f} mm kept"]
         if self.together:
             pairs = ", ".join(f"{first} and {second}" for first, second in self.together)
@@ -64,10 +66,10 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     """The cell's own capsules, or guessed ones, and the pairs of them that must keep apart."""
     declared = cell.clearance or Clearance(None, DEFAULT_MINIMUM_M, (), ())
     capsules = declared.capsules or guessed_capsules(robot)
-    last = robot.joint_count - 1
+    last = robot.carrier
     if not any(capsule.link == last for capsule in capsules):
         # Around a steel body of that mass on the last link, from a side in front of the joint to three of them.
-        side, axis = side_of_cube(mass_kg), robot.joints[-1].axis
+        side, axis = side_of_cube(mass_kg), robot.joints[last].axis
         capsules = (*capsules, Capsule("payload", last, _point(side * axis), _point(2.0 * side * axis), side))
     links = [capsule.link for capsule in capsules]
     parents = [robot.joints[link].parent if link != BASE else None for link in links]
@@ -94,7 +96,10 @@ def guessed_capsules(robot: Robot) -> tuple[Capsule, ...]:
     """One from each joint to the next revolute one; the far end is drawn in, so that a bent elbow is no collision.
 
     A way along a prismatic joint changes its length, and a guess would be no better than none: those links get none.
+    Neither do those of a closed chain, whose legs lie in front of and behind each other.
     """
+    if robot.closures:
+        return ()
     radius = LINK_RADIUS * max(sum(float(np.linalg.norm(joint.translation_m)) for joint in robot.joints), 0.1)
     capsules = []
     for joint in robot.joints:
@@ -161,7 +166,8 @@ class Experiment:
         slowest = np.minimum(*(np.abs(train.direction @ path.at(time_s + s)[1].T) for s in (-self.edge_s, self.edge_s)))
         turned = slowest > standstill
         needed = (np.abs(train.to_motor) > 0) | (np.abs(train.direction) > 0)
-        return np.stack([moving[needed[motor]].all(axis=0) & turned[motor] for motor in range(len(moving))])
+        use = np.stack([moving[needed[motor]].all(axis=0) & turned[motor] for motor in range(len(moving))])
+        return use.all(axis=0) & use if self.design.expectation.model.is_redundant else use
 
 
 def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
@@ -187,10 +193,10 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     expected = nominal_payload(model.robot, mounted.drawn)
     velocity = np.array([axis.limits.velocity for axis in cell.axes])
     acceleration = np.array([axis.limits.acceleration for axis in cell.axes])
-    fast_motion = _fast_motion(cell, velocity, acceleration)
+    fast_motion = _fast_motion(cell, Checker(model.robot, NOTHING), velocity, acceleration)
     links, from_urdf = nominal_links(model.robot, cell.urdf)
     loaded = links.copy()
-    loaded[-1] += expected.parameters
+    loaded[model.robot.carrier] += expected.parameters
     torque = nominal_torque_limits(model, cell.urdf, loaded, fast_motion)
     gains = np.array([axis.nameplate_gain for axis in cell.axes])
     noise = NOISE_SHARE * (np.abs(model.drive_train.to_motor) * torque).max(axis=1) / np.abs(gains)
@@ -217,16 +223,43 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     return Experiment(cell, design, scene, mounted, period, edge, remarks)
 
 
-def _fast_motion(cell: Cell, velocity: FloatArray, acceleration: FloatArray) -> Motion:
+NOTHING = Scene((), (), (), None, (), 0.0)  #: Without bodies, a checker knows what closures allow
+
+
+def _fast_motion(cell: Cell, checker: Checker, velocity: FloatArray, acceleration: FloatArray) -> Motion:
     """Random moves as fast as the limits allow: which parameters there are does not depend on a plan's seed."""
     rng = np.random.default_rng(0)
     lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
     targets = rng.uniform(lower, upper, (40, len(lower)))
+    if checker.robot.closures:
+        targets = _allowed(checker, rng, lower, upper, len(targets))
     parts = []
     for start, end in pairwise(targets):
         path = synchronised(start, end, velocity, acceleration)
         parts.append(path.at(np.linspace(0.02, 0.98, 24) * path.duration_s))
     return Motion(*(np.concatenate([part[kind] for part in parts]) for kind in range(3)))
+
+
+def _allowed(
+    checker: Checker, rng: np.random.Generator, lower: FloatArray, upper: FloatArray, count: int
+) -> FloatArray:
+    """Positions of a closed chain that can be reached one after the other, shape (count, m)."""
+    found = [checker.home]
+    while len(found) <= count:
+        found.append(next(towards(checker, found[-1], rng.uniform(lower, upper))))
+    return np.array(found[1:])
+
+
+SHARES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
+
+
+def towards(checker: Checker, start: FloatArray, target: FloatArray) -> Iterator[FloatArray]:
+    """Positions from which a closed chain can go to a target, the farthest first; at last the start itself."""
+    for share in SHARES:
+        end = checker.fitting(start + share * (target - start))
+        if checker.obstruction(start, end) is None:
+            yield end
+    yield start
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,6 +310,8 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     margin = POSITION_MARGIN * (upper - lower)
     low, high = lower + margin, upper - margin
     sampled = np.random.default_rng(0).uniform(low, high, (EXTRA_POSTURES, len(low)))
+    if checker.robot.closures:
+        sampled = _allowed(checker, np.random.default_rng(0), low, high, EXTRA_POSTURES // 5)
     clear = sampled[checker.margins(sampled) > 0.0]
     found: list[ExtraMoves] = []
 
@@ -288,6 +323,7 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
                 inwards = 0.5 * (1.0 - stroke) * (high - low)
                 start, end = posture.copy(), posture.copy()
                 start[moved], end[moved] = (low + inwards)[moved], (high - inwards)[moved]
+                start, end = checker.fitting(start), checker.fitting(end)
                 if checker.obstruction(start, end) is None:
                     there = synchronised(start, end, velocity * speed, acceleration)
                     paths += [there, Trapezoid(end, start, there.duration_s, there.ramp_s)]
@@ -306,12 +342,12 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
 
     names = cell.axis_names
     robot = experiment.design.expectation.model.robot
-    at = poses(robot, clear)
-    for axis, name in enumerate(names):
-        # Distance of the last link's frame from the axis; of a prismatic one, from the axis' own frame [m].
-        way = at.origin_m[-1] - at.origin_m[axis + 1]
-        if robot.joints[axis].kind is not JointKind.PRISMATIC:
-            way = np.cross(at.rotation[axis + 1] @ robot.joints[axis].axis, way)
+    at = poses(robot, checker.joints(clear))
+    for axis, (name, joint) in enumerate(zip(names, robot.axis_joints, strict=True)):
+        # Distance of the link with the payload from the axis; of a prismatic one, from the axis' own frame [m].
+        way = at.origin_m[robot.carrier + 1] - at.origin_m[joint + 1]
+        if robot.joints[joint].kind is not JointKind.PRISMATIC:
+            way = np.cross(at.rotation[joint + 1] @ robot.joints[joint].axis, way)
         lever = np.linalg.norm(way, axis=1)
         stretched, folded = clear[np.argsort(-lever, kind="stable")], clear[np.argsort(lever, kind="stable")]
         swing(f"fast moves of {name} with the arm stretched", stretched, [axis])

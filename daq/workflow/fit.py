@@ -285,7 +285,7 @@ def with_diagnoses(fitted: Fit) -> Fit:
     cell = fitted.cell
     nameplate = np.array([axis.nameplate_gain for axis in cell.axes])
     kept = (one for one in fitted.diagnoses if one.name == "channels-exchanged")
-    found = diagnose(fitted.final, cell.axis_names, nameplate, read_urdf(cell.urdf).effort_limit)
+    found = diagnose(fitted.final, cell.axis_names, nameplate, read_urdf(cell.urdf).effort_limit[list(robot_of(cell).axis_joints)])
     return replace(fitted, diagnoses=(*kept, *found))
 
 

@@ -17,7 +17,15 @@ import numpy as np
 from daq.config.cell import Cell, JointUnit
 from daq.errors import UsageError
 from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_STD_PERCENT
-from daq.workflow.experiment import POSITION_MARGIN, Experiment, PlannedMove, duration_of, experiment_of, path_of
+from daq.workflow.experiment import (
+    POSITION_MARGIN,
+    Experiment,
+    PlannedMove,
+    duration_of,
+    experiment_of,
+    path_of,
+    towards,
+)
 from drivers.motion.move import Trapezoid
 from ident.arrays import FloatArray
 
@@ -223,15 +231,22 @@ class Search:
 
     def _clear_start(self) -> PlannedMove:
         for _ in range(MAX_TRIES):
-            move = self._random_move()
-            if self._experiment.scene.checker.margins(np.array(move.target_rad)[None])[0] > 0.0:
+            move, checker = self._random_move(), self._experiment.scene.checker
+            if checker.robot.closures:
+                near = next(towards(checker, checker.home, np.array(move.target_rad)))
+                move = replace(move, target_rad=self._written(near))
+            if checker.margins(np.array(move.target_rad)[None])[0] > 0.0:
                 return move
         raise self._blocked("posture")
 
     def _clear_move(self, start: FloatArray) -> PlannedMove | None:
         for _ in range(MAX_TRIES):
             move = self._random_move()
-            if self._experiment.scene.checker.obstruction(start, np.array(move.target_rad)) is None:
+            checker, target = self._experiment.scene.checker, np.array(move.target_rad)
+            if checker.robot.closures:  # a way to a far target often leaves the workspace
+                target = next(towards(checker, start, target))
+                move = replace(move, target_rad=self._written(target))
+            if not np.array_equal(target, start) and checker.obstruction(start, np.array(move.target_rad)) is None:
                 return move
         return None
 
@@ -246,6 +261,7 @@ class Search:
 
     def _written(self, target: FloatArray) -> tuple[float, ...]:
         """As the plan file will say it: what is judged is what is made."""
+        target = self._experiment.scene.checker.fitting(target)
         units = [axis.unit.si for axis in self._cell.axes]
         return tuple(round(float(value) / si, PLACES) * si for value, si in zip(target, units, strict=True))
 

@@ -21,7 +21,7 @@ import numpy as np
 from scipy import linalg
 from scipy.interpolate import CubicSpline
 
-from ident.arrays import FloatArray
+from ident.arrays import BoolArray, FloatArray
 from ident.errors import ModelError
 from ident.model.robot import Closure, JointKind, Motion, Place, Poses, Robot, poses
 
@@ -33,7 +33,8 @@ LARGEST_GAP = 0.3  #: |φ| at the declared assembly pose, in units of the robot'
 LONGEST_STRIDE = 64
 """At most every so manyth sample is reached from the assembly pose; the others start from their neighbours."""
 STRIDE_RAD = 0.25  #: Largest motion between two such samples [rad, or m divided by the robot's size]
-STEP_RAD = 0.1  #: Longest step on that way [rad, or m divided by the robot's size]
+STEP_RAD = 0.25  #: Longest step on that way [rad, or m divided by the robot's size]
+LONGEST_STEP_RAD = 1.5  #: Longer steps of Newton lead to another pose, or nowhere
 MAX_ITERATIONS = 30
 
 _AFTER = {"x": "y", "y": "z", "z": "x"}
@@ -156,10 +157,45 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
     return TreeMotion(Motion(position, velocity, acceleration), to_joints, to_motors, condition)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Reach:
+    """Poses that belong to positions of the motors' joints, where there are any."""
+
+    position_rad: FloatArray  #: of all joints; where the loops do not close, of some pose near by, shape (k, n)
+    gap: FloatArray  #: |φ| that is left, in units of the robot's size or radians, shape (k,)
+    #: Largest difference between a motor's position and that of its joint [rad or m], shape (k,): not zero where motors
+    #: of a redundant drive do not fit each other.
+    misfit: FloatArray
+    condition: FloatArray  #: of J_d by the Frobenius norm, shape (k,)
+
+    @property
+    def closed(self) -> BoolArray:
+        """Where the loops close, shape (k,)."""
+        return self.gap < CLOSED
+
+
 def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatArray:
-    """Positions of all joints, shape (k, n), of those of the motors' joints, shape (k, m); see `follow`."""
-    samples = len(axes_rad)
-    motors = list(robot.axis_joints)
+    """Positions of all joints, shape (k, n), of those of the motors' joints, shape (k, m); see `follow`.
+
+    Raises:
+        ModelError: the loops cannot be closed at a position.
+    """
+    found = reach(robot, assembly, axes_rad)
+    if not found.closed.all():
+        worst = int(np.argmax(found.gap))
+        at = ", ".join(f"{joint.name} {value:.4g}" for joint, value in zip(robot.axes, axes_rad[worst], strict=True))
+        raise ModelError(
+            f"the loops cannot be closed at {at} (rad or m): {found.gap[worst]:.2g} of the robot's size is left open; "
+            "expected positions inside the workspace: are signs, zeros and units of the axes right?"
+        )
+    return found.position_rad
+
+
+def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
+    """Close the loops at positions of the motors' joints, shape (k, m), as far as they close; see `follow`."""
+    samples, motors = len(axes_rad), list(robot.axis_joints)
+    if not robot.closures:
+        return Reach(axes_rad, np.zeros(samples), np.zeros(samples), np.ones(samples))
     start = assembly.position_rad[motors]
     units = np.array([1.0 if joint.kind is JointKind.REVOLUTE else assembly.size_m for joint in robot.axes])
     largest = float(np.max(np.abs(np.diff(axes_rad, axis=0)) / units, initial=0.0))
@@ -167,22 +203,24 @@ def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatAr
     coarse = np.unique(np.append(np.arange(0, samples, stride), samples - 1))
     steps = int(np.ceil(np.max(np.abs(axes_rad[coarse] - start) / units, initial=0.0) / STEP_RAD))
     found = np.tile(assembly.position_rad, (len(coarse), 1))
+    gap, condition = np.zeros(len(coarse)), np.full(len(coarse), assembly.condition)
     for step in range(1, steps + 1):
         # On the way, motors of a redundant drive need not fit each other.
         way = start + (axes_rad[coarse] - start) * (step / steps)
-        found = _newton(robot, assembly, found, way, 1e-9 if step == steps else 1e-3)
+        found, gap, condition = _newton(robot, assembly, found, way, 1e-9 if step == steps else 1e-3)
     while len(coarse) < samples:
         stride = max(1, stride // 8)
         finer = np.unique(np.append(np.arange(0, samples, stride), samples - 1))
         near = CubicSpline(coarse, found)(finer) if len(coarse) > 1 else np.repeat(found, len(finer), axis=0)
-        coarse, found = finer, _newton(robot, assembly, near, axes_rad[finer])
-    return found
+        coarse = finer
+        found, gap, condition = _newton(robot, assembly, near, axes_rad[finer])
+    return Reach(found, gap, np.max(np.abs(found[:, motors] - axes_rad), axis=1), condition)
 
 
 def _newton(
     robot: Robot, assembly: Assembly, position: FloatArray, axes_rad: FloatArray, tolerance_rad: float = 1e-9
-) -> FloatArray:
-    """Close the loops at given positions of the motors' joints, from near by."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Close the loops at given positions of the motors' joints, from near by: positions, gaps and conditions."""
     motors, x, rest = list(robot.axis_joints), list(assembly.independent), list(assembly.dependent)
     position = position.copy()
     redundant = len(motors) > len(x)
@@ -190,10 +228,10 @@ def _newton(
         position[:, motors] = axes_rad
     for _ in range(MAX_ITERATIONS):
         loops = _loops(robot, position, assembly.size_m)
-        size = float(np.max(np.abs(loops.residual), initial=0.0))
+        gap = np.max(np.abs(loops.residual), axis=1)
         q, r = np.linalg.qr(loops.jacobian[:, :, rest])
         wanted = np.concatenate((loops.residual[:, :, None], loops.jacobian[:, :, x]), axis=2)
-        answer = -np.linalg.solve(r, np.swapaxes(q, 1, 2) @ wanted)
+        answer = -_solve_each(r, np.swapaxes(q, 1, 2) @ wanted)
         change = np.zeros_like(position)
         change[:, rest] = answer[:, :, 0]
         if redundant:
@@ -201,18 +239,24 @@ def _newton(
             to_joints[:, x], to_joints[:, rest] = np.eye(len(x)), answer[:, :, 1:]
             left = axes_rad - position[:, motors] - change[:, motors]
             change += np.einsum("knd,kd->kn", to_joints, _least_squares(to_joints[:, motors], left))
-        step = float(np.max(np.abs(change), initial=0.0))
-        if not np.isfinite(step) or step > np.pi:
-            break
+        step = np.max(np.abs(change), axis=1)
+        lost = ~(step < LONGEST_STEP_RAD)  # where there is no pose, Newton's steps become longer and longer
+        change[lost] = 0.0
         position += change
-        if size < CLOSED and step < tolerance_rad:
-            return position
-    worst = int(np.argmax(np.max(np.abs(loops.residual), axis=1)))
-    at = ", ".join(f"{joint.name} {value:.4g}" for joint, value in zip(robot.axes, axes_rad[worst], strict=True))
-    raise ModelError(
-        f"the loops cannot be closed at {at} (rad or m): {np.abs(loops.residual[worst]).max():.2g} of the robot's size "
-        "is left open; expected positions inside the workspace: are signs, zeros and units of the axes right?"
-    )
+        if np.all(lost | ((gap < CLOSED) & (step < tolerance_rad))):
+            break
+    condition = np.linalg.norm(r, axis=(1, 2)) * np.linalg.norm(_solve_each(r, np.eye(len(rest))), axis=(1, 2))
+    return position, gap, condition
+
+
+def _solve_each(triangle: FloatArray, right: FloatArray) -> FloatArray:
+    """Solution of R x = b in each sample; huge where R is singular."""
+    diagonal = np.einsum("kii->ki", triangle)
+    tiny = np.finfo(np.float64).tiny
+    if not np.all(np.abs(diagonal) > tiny):
+        triangle = triangle.copy()
+        np.einsum("kii->ki", triangle)[np.abs(diagonal) <= tiny] = 1e-300
+    return np.asarray(np.linalg.solve(triangle, np.broadcast_to(right, (len(triangle), *right.shape[-2:]))))
 
 
 def _closed_near(robot: Robot, start: FloatArray, size_m: float) -> FloatArray:

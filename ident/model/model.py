@@ -147,7 +147,7 @@ class Model:
     @property
     def flange(self) -> slice:
         """The ten columns of the link that carries the payload; a payload on it has the same."""
-        first = JOINT_COLUMNS * (self.robot.platform % self.robot.joint_count)
+        first = JOINT_COLUMNS * self.robot.carrier
         return slice(first, first + 10)
 
     @property
@@ -255,7 +255,7 @@ class Model:
             cross = np.outer(r, r) - np.diag(r**2)
             whole += cross @ (inertia * acceleration + viscous * velocity) + r[:, None] * dry * np.sign(r @ velocity)
         if self.is_redundant:
-            seen = without_preload(np.transpose(self.follow(motion).to_motors, (2, 1, 0)))
+            seen = seen_torques(np.transpose(self.follow(motion).to_motors, (2, 1, 0)))
             load, geared, whole = (np.einsum("amk,mk->ak", seen, part) for part in (load, geared, whole))
         return load, geared, whole
 
@@ -320,6 +320,6 @@ def spread(columns: FloatArray, to_motors: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("kmd,d...k->m...k", back, columns, optimize=True))
 
 
-def without_preload(to_motors: FloatArray) -> FloatArray:
+def seen_torques(to_motors: FloatArray) -> FloatArray:
     """B Aᵀ, which takes the preload out of torques of the axes, shapes (d, m, k) and (m, m, k)."""
     return spread(to_motors, to_motors)

@@ -65,12 +65,17 @@ class Robot:
     motors: tuple[int, ...] = ()  #: joint that each axis drives, in the order of the axes; empty: every joint is driven
     #: Positions of all joints at which the closures hold: which of several ways of assembly is meant. Shape (n,).
     assembly_rad: FloatArray | None = None
-    platform: int = -1  #: joint whose link carries the payload; -1: the last one
+    platform: int = -1  #: joint whose link carries the payload; -1: the last one, see `carrier`
 
     @property
     def joint_count(self) -> int:
         """n, passive joints included."""
         return len(self.joints)
+
+    @property
+    def carrier(self) -> int:
+        """Index of the joint whose link carries the payload."""
+        return self.platform % len(self.joints)
 
     @property
     def axis_joints(self) -> tuple[int, ...]:

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident.arrays import FloatArray
+from ident.arrays import BoolArray, FloatArray
+from ident.model.closed_chain import assemble, reach
 from ident.model.robot import JointKind, Robot, poses
 
 BASE = -1  #: Index of the link that does not move
@@ -62,15 +63,32 @@ class Obstruction:
     first: str  #: name of one body
     second: str  #: name of the other
     distance_m: float  #: found there; negative when they overlap
-    position: tuple[float, ...]  #: of the joints there [rad or m]
+    position: tuple[float, ...]  #: of the axes there [rad or m]
+
+
+LARGEST_CONDITION = 60.0
+"""Of the closures in a planned pose, by the Frobenius norm: nearer to a singularity, forces in the loops grow."""
+LARGEST_MISFIT = 0.01
+"""Motors of a redundant drive may differ by this on the way between two poses that fit [rad or m]: they work against
+each other there, which is what tells their gains apart, and no more than their position loops can bear."""
+STEP_SHARE = 0.05  #: Of the way between two poses of a closed chain that are looked at
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Reached:
+    """Poses of a closed chain, and which of them may be used."""
+
+    joints: FloatArray  #: shape (k, n)
+    usable: BoolArray  #: shape (k,)
 
 
 class Checker:
-    """Distances of the pairs of bodies in a scene, for many postures of the arm."""
+    """Distances of the pairs of bodies in a scene, for many postures of the arm; whether a closed chain gets there."""
 
     def __init__(self, robot: Robot, scene: Scene) -> None:
         self.robot = robot
         self.scene = scene
+        self._assembly = assemble(robot)
         capsules, boxes = scene.capsules, scene.boxes
         moving = [index for index, capsule in enumerate(capsules) if capsule.link != BASE]
         # Bodies are the capsules in their order, then the boxes; the ends of a box are opposite corners.
@@ -90,15 +108,45 @@ class Checker:
         """Compute the smallest distance beyond the minimum in each posture [m], negative where it is not kept.
 
         Args:
-            position: of the joints [rad or m], shape (k, n).
+            position: of the axes [rad or m], shape (k, m).
 
         Returns:
-            shape (k,); inf where there is nothing to keep away from.
+            shape (k,); inf where there is nothing to keep away from, −inf where the loops of a closed chain do not
+            close, or nearly have a singularity.
         """
-        return np.asarray(self._margins(position, self._everywhere).min(axis=0, initial=np.inf))
+        if not self.robot.closures:
+            return np.asarray(self._margins(position, self._everywhere).min(axis=0, initial=np.inf))
+        found = self._reached(position)
+        return np.where(
+            found.usable, self._margins(found.joints, self._everywhere).min(axis=0, initial=np.inf), -np.inf
+        )
+
+    def fitting(self, position: FloatArray) -> FloatArray:
+        """Positions of the axes that fit each other, near given ones, shape (…, m): the same where they are free."""
+        if not self.robot.closures:
+            return position
+        found = reach(self.robot, self._assembly, np.atleast_2d(position)).position_rad
+        return found[:, list(self.robot.axis_joints)].reshape(position.shape)
+
+    def joints(self, position: FloatArray) -> FloatArray:
+        """Positions of all joints, shape (k, n), for those of the axes, shape (k, m)."""
+        return reach(self.robot, self._assembly, position).position_rad
+
+    @property
+    def home(self) -> FloatArray:
+        """Positions of the axes in the assembly pose, shape (m,)."""
+        return self._assembly.position_rad[list(self.robot.axis_joints)]
+
+    def _reached(self, position: FloatArray) -> _Reached:
+        found = reach(self.robot, self._assembly, position)
+        usable = found.closed & (found.condition < LARGEST_CONDITION) & (found.misfit < LARGEST_MISFIT)
+        return _Reached(found.position_rad, usable)
 
     def apart(self, position: FloatArray) -> FloatArray:
         """Share of postures, shape (k, n), in which each of the scene's pairs does not touch, shape (pairs,)."""
+        if self.robot.closures:
+            found = self._reached(position)
+            position = found.joints[found.usable]
         margins = self._margins(position, self._everywhere)[: len(self.scene.pairs)]
         return np.asarray((margins + self.scene.minimum_m > 0.0).mean(axis=1))
 
@@ -106,8 +154,10 @@ class Checker:
         """Find an obstruction on a straight line in joint space, None when all of it is clear.
 
         Args:
-            start, end: positions of the joints [rad or m], shape (n,).
+            start, end: positions of the axes [rad or m], shape (m,).
         """
+        if self.robot.closures:
+            return self._obstruction_of_chain(start, end)
         # A bound on the path of any point of one body relative to the other, for each row of `_margins` [m].
         rows = [*self._pairs, *((index, len(self.scene.capsules)) for index in self._confined)]
         travel = np.array([self._relative_travel(first, second, start, end) for first, second in rows])
@@ -131,13 +181,43 @@ class Checker:
             middles = np.concatenate((open_ - half, open_ + half))
         return None
 
+    def _obstruction_of_chain(self, start: FloatArray, end: FloatArray) -> Obstruction | None:
+        """Look at poses so close to each other that nothing happens between them."""
+        way = np.arange(0.0, 1.0 + 0.5 * STEP_SHARE, STEP_SHARE)
+        position = start + (end - start) * way[:, None]
+        found = self._reached(position)
+        if not found.usable.all():
+            at = tuple(position[int(np.argmin(found.usable))].tolist())
+            return Obstruction("the closures", "a pose that they allow", 0.0, at)
+        margins = self._margins(found.joints, self._everywhere)
+        if not len(margins):
+            return None
+        # A body moves at most as far between two poses as the fastest of its ends.
+        placed = self._placed(found.joints)
+        travel = np.linalg.norm(np.diff(placed, axis=1), axis=2).max(initial=0.0)
+        row, sample = np.unravel_index(int(np.argmin(margins)), margins.shape)
+        if margins[row, sample] >= 0.5 * travel:
+            return None
+        first, second = self._names_of(int(row))
+        return Obstruction(first, second, float(margins[row, sample]), tuple(position[sample].tolist()))
+
+    def _names_of(self, row: int) -> tuple[str, str]:
+        if row < len(self._pairs):
+            first, second = self._pairs[row]
+            return self._names[first], self._names[second]
+        return self.scene.capsules[self._confined[row - len(self._pairs)]].name, "the end of the workspace"
+
+    def _placed(self, joints: FloatArray) -> FloatArray:
+        """Both ends of every body in each posture, shape (bodies, k, 3, 2)."""
+        at = poses(self.robot, joints)
+        return np.asarray(at.rotation[self._frame] @ self._ends[:, None] + at.origin_m[self._frame][..., None])
+
     def _margins(self, position: FloatArray, needed: FloatArray) -> FloatArray:
         """Margin of each pair, then of each confined capsule, shape (pairs + confined, k).
 
         Where spheres around both bodies are farther apart than needed, it is the margin of the spheres.
         """
-        at = poses(self.robot, position)
-        placed = at.rotation[self._frame] @ self._ends[:, None] + at.origin_m[self._frame][..., None]
+        placed = self._placed(position)
         start, end = placed[..., 0], placed[..., 1]
         out = np.empty((len(needed), len(position)))
         pairs, first, second = len(self._pairs), self._first, self._second

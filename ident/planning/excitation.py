@@ -29,10 +29,11 @@ from numpy.typing import NDArray
 from ident.arrays import BoolArray, FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
+from ident.equations.currents import without_preload
 from ident.equations.rows import row_filter, row_masks
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, Body, Payload
-from ident.model.model import DriveTrain, Model
+from ident.model.model import DriveTrain, Model, seen_torques
 from ident.model.robot import Motion, Robot
 from ident.model.urdf import read_urdf
 
@@ -131,20 +132,44 @@ class Design:
         return len(self.base.independent) + sum(len(payload.unknown) for payload in self.expectation.payloads)
 
     @property
+    def width(self) -> int:
+        """Number of columns of base parameters and of a payload."""
+        return len(self.base.independent) + 10
+
+    @property
     def size(self) -> int:
         """Number of all unknowns."""
         return self.others + len(self.expectation.gains)
 
     def whitened(self, excitation: Excitation) -> FloatArray:
-        """γ_i (T W)_i / σ_i of base columns and the ten of a payload, shape (n, b + 10, k); masked rows are zero."""
+        """γ_i (T W)_i / σ_i of base columns and the ten of a payload, shape (n, b + 10, k); masked rows are zero.
+
+        Of a redundant drive more columns, for `information_of`.
+        """
         expected = self.expectation
         flange = np.arange(expected.model.flange.start, expected.model.flange.stop)
         columns = expected.model.regressor(excitation.motion)[
             :, np.concatenate((self.base.independent, flange)).astype(np.intp)
         ]
         motors = np.tensordot(expected.model.drive_train.to_motor, columns, axes=1)
+        if expected.model.is_redundant:
+            return self._without_preload(excitation, motors)
         motors *= excitation.use[:, None, :] / (expected.gains * expected.noise_a)[:, None, None]
         return np.asarray(motors)
+
+    def _without_preload(self, excitation: Excitation, torque: FloatArray) -> FloatArray:
+        """Whitened columns of a redundant drive, its torques, and its gains, shape (n, 2 (b + 10) + n, k).
+
+        The currents that are expected are those without preload: with it, gains become better known, not worse.
+        """
+        expected = self.expectation
+        _, to_motors = expected.model.balance(excitation.motion)
+        whole, _ = np.linalg.qr(to_motors.transpose(2, 1, 0), mode="complete")
+        transform = without_preload(whole[:, :, len(to_motors) :], expected.gains, expected.noise_a)
+        transform *= np.all(excitation.use, axis=0).astype(np.float64)[:, None, None]
+        gains = transform @ seen_torques(to_motors).transpose(2, 0, 1)
+        columns = np.einsum("kij,jak->iak", transform, torque, optimize=True)
+        return np.concatenate((columns, torque, gains.transpose(1, 2, 0)), axis=1)
 
     def information(self, excitation: Excitation, payloads: Sequence[int | None]) -> FloatArray:
         """Information of one motion, repeated once with each of these payloads, shape (p, p)."""
@@ -161,6 +186,8 @@ class Design:
             blind: motor whose own gain column omits the known part of the payload's torque, so that only coupling with
                 the other axes identifies it.
         """
+        if whitened.shape[1] > self.width:
+            return self._information_without_preload(whitened, payloads, blind)
         grams = whitened @ whitened.transpose(0, 2, 1)
         summed = grams.sum(axis=0)
         out = np.zeros((self.size, self.size))
@@ -174,6 +201,25 @@ class Design:
             seen = np.einsum("nab,nb->na", grams, torque)
             out[np.ix_(place, gains)] -= seen[:, source].T
             out[gains, gains] += np.einsum("na,na->n", seen, torque)
+        out[self.others :, : self.others] = out[: self.others, self.others :].T
+        return out
+
+    def _information_without_preload(
+        self, whitened: FloatArray, payloads: Sequence[int | None], blind: int | None
+    ) -> FloatArray:
+        """The same of a redundant drive, where a gain shows in the rows of all motors."""
+        columns, torques, gains = np.split(whitened, [self.width, 2 * self.width], axis=1)
+        summed = np.einsum("nak,nbk->ab", columns, columns, optimize=True)
+        out, own = np.zeros((self.size, self.size)), slice(self.others, None)
+        for payload in payloads:
+            place, source = self.columns(payload)
+            out[np.ix_(place, place)] += summed[np.ix_(source, source)]
+            torque = np.einsum("nck,c->nk", torques, self.expected(payload))
+            if blind is not None and payload is not None:
+                torque[blind] -= self.known(payload) @ torques[blind]
+            shown = gains * torque
+            out[place, own] -= np.einsum("nak,njk->aj", columns[:, source], shown, optimize=True)
+            out[own, own] += np.einsum("nik,njk->ij", shown, shown, optimize=True)
         out[self.others :, : self.others] = out[: self.others, self.others :].T
         return out
 
@@ -263,7 +309,7 @@ def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
     """
     mass = payload.known.get("m", LINK_MASS_KG)
     side = side_of_cube(mass)
-    axis = robot.joints[-1].axis
+    axis = robot.joints[robot.carrier].axis
     across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     across /= np.linalg.norm(across)
     centre = side * (axis + 0.7 * across + 0.7 * np.cross(axis, across))
@@ -284,7 +330,7 @@ def nominal_torque_limits(model: Model, urdf: str, links: FloatArray, fast_motio
     columns = model.regressor(fast_motion)
     rigid = np.concatenate([columns[:, 14 * index : 14 * index + 10] for index in range(len(links))], axis=1)
     largest = np.abs(np.einsum("jck,c->jk", rigid, links.reshape(-1))).max(axis=1)
-    declared = read_urdf(urdf).effort_limit
+    declared = read_urdf(urdf).effort_limit[list(model.robot.axis_joints)]
     usable = (declared > 0.0) & (declared < 1e6)  # some exporters write 0, others 1e9 for "not known"
     return np.where(usable, declared, TORQUE_RESERVE * np.maximum(largest, 1e-3))
 
@@ -297,16 +343,18 @@ def nominal_parameters(
     acceleration_limit: FloatArray,
 ) -> FloatArray:
     """Return standard parameters of links, shape (n, 10), and of drives with these limits of the joints, shape (c,)."""
-    parameters = np.zeros(len(model.columns))
+    parameters, joints = np.zeros(len(model.columns)), model.robot.axis_joints
     for index, link in enumerate(links):
-        first = 14 * index
-        parameters[first : first + 10] = link
+        parameters[14 * index : 14 * index + 10] = link
+    for index, joint in enumerate(joints):
+        first = 14 * joint
         parameters[first + 10] = ROTOR * torque_limit[index] / acceleration_limit[index]
         parameters[first + 11] = VISCOUS_FRICTION * torque_limit[index] / velocity_limit[index]
         parameters[first + 12] = DRY_FRICTION * torque_limit[index]
     for number, motor in enumerate(model.drive_train.coupled):
         first = 14 * len(links) + 3 * number
-        parameters[first : first + 3] = parameters[14 * motor + 10 : 14 * motor + 13]
+        own = 14 * joints[motor]
+        parameters[first : first + 3] = parameters[own + 10 : own + 13]
     return parameters
 
 
@@ -445,15 +493,16 @@ def _own_rows(
         motion = excitation.motion
         still = np.zeros_like(motion.position_rad)
         static = design.whitened(Excitation(Motion(motion.position_rad, still, still), excitation.use))
+        static, moving = static[:, : design.width], columns[:, : design.width]
         weights += np.einsum("nck,nck->n", static[:, -10:], static[:, -10:])
-        wholes += np.einsum("nck,nck->n", columns[:, -10:], columns[:, -10:])
+        wholes += np.einsum("nck,nck->n", moving[:, -10:], moving[:, -10:])
         for payload in payloads:
             place, source = design.columns(payload)
-            rest = np.zeros((count, columns.shape[2], design.others))  # columns of J for all unknowns but the gains
-            rest[:, :, place] = columns[:, source].transpose(0, 2, 1)
-            mounted = np.zeros(columns.shape[1]) if payload is None else design.known(payload)
+            rest = np.zeros((count, moving.shape[2], design.others))  # columns of J for all unknowns but the gains
+            rest[:, :, place] = moving[:, source].transpose(0, 2, 1)
+            mounted = np.zeros(design.width) if payload is None else design.known(payload)
             gravity = np.einsum("nck,c->nk", static, mounted)
-            inertia = np.einsum("nck,c->nk", columns, mounted) - gravity
+            inertia = np.einsum("nck,c->nk", moving, mounted) - gravity
             for motor in range(count):
                 others[motor].append(rest[motor])
                 known[motor].append(np.stack((gravity[motor], inertia[motor]), axis=1))
