@@ -196,6 +196,7 @@ def reduce_runs(
         DataUnfit: a run is unfit, leaves no usable row, or contradicts another about a mounting.
     """
     count, plan = model.robot.axis_count, layout(model)
+    instruments = instruments and not model.is_redundant
     width = tuple(len(columns) for columns in plan.joint)
     seen_payloads = list(payloads)
     joints = [[np.zeros((c, c)) for c in width] for _ in range(len(seen_payloads) + 1)]

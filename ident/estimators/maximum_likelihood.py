@@ -25,6 +25,7 @@ from ident.estimators.method import Method
 MAX_ITERATIONS = 100
 STEP_TOLERANCE = 1e-7  #: Relative step of the gains; their standard deviations are some 1e-3
 LARGEST_DAMPING = 1e6
+NOISE_ITERATIONS = 20  #: After these σ stays: with internal preload it would settle more slowly than the gains
 
 
 def ml(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
@@ -58,6 +59,12 @@ def iv(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
     """
     if fixed_gains is None:
         require_known_payload(system)
+    if system.model.is_redundant:
+        raise DataUnfit(
+            ", ".join(system.runs),
+            "the robot has more motors than degrees of freedom, and iv needs an equation for each motor alone; "
+            "choose the method ml",
+        )
     if not system.instruments:
         raise DataUnfit(
             ", ".join(system.runs),
@@ -139,6 +146,7 @@ def _gauss_newton(system: System) -> tuple[FloatArray, int]:
             if damping > LARGEST_DAMPING:
                 raise NotConverged("ml", iteration, tuple(cost), step)
         gains, damping = trial, max(damping * 0.1, 1e-12)
-        noise = currents.noise(gains, candidate, 0, noise)
+        if iteration <= NOISE_ITERATIONS:
+            noise = currents.noise(gains, candidate, 0, noise)
         cost.append(currents.cost(gains, candidate, noise))
     raise NotConverged("ml", MAX_ITERATIONS, tuple(cost), step)

@@ -30,7 +30,9 @@ LARGEST_CONDITION = 500.0
 CLOSED = 1e-12  #: |φ| at which Newton's iteration ends, in units of the robot's size or radians
 SMALLEST_RANK = 1e-7  #: Singular value of J, relative to the largest, that counts as zero
 LARGEST_GAP = 0.3  #: |φ| at the declared assembly pose, in units of the robot's size or radians
-STRIDES = (64, 8, 1)  #: Every 64th sample is reached from the assembly pose; the others start from their neighbours
+LONGEST_STRIDE = 64
+"""At most every so manyth sample is reached from the assembly pose; the others start from their neighbours."""
+STRIDE_RAD = 0.25  #: Largest motion between two such samples [rad, or m divided by the robot's size]
 STEP_RAD = 0.1  #: Longest step on that way [rad, or m divided by the robot's size]
 MAX_ITERATIONS = 30
 
@@ -157,21 +159,23 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
 def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatArray:
     """Positions of all joints, shape (k, n), of those of the motors' joints, shape (k, m); see `follow`."""
     samples = len(axes_rad)
-    coarse = np.unique(np.append(np.arange(0, samples, STRIDES[0]), samples - 1))
     motors = list(robot.axis_joints)
     start = assembly.position_rad[motors]
     units = np.array([1.0 if joint.kind is JointKind.REVOLUTE else assembly.size_m for joint in robot.axes])
+    largest = float(np.max(np.abs(np.diff(axes_rad, axis=0)) / units, initial=0.0))
+    stride = min(LONGEST_STRIDE, max(1, int(STRIDE_RAD / max(largest, 1e-9))))
+    coarse = np.unique(np.append(np.arange(0, samples, stride), samples - 1))
     steps = int(np.ceil(np.max(np.abs(axes_rad[coarse] - start) / units, initial=0.0) / STEP_RAD))
     found = np.tile(assembly.position_rad, (len(coarse), 1))
     for step in range(1, steps + 1):
         # On the way, motors of a redundant drive need not fit each other.
         way = start + (axes_rad[coarse] - start) * (step / steps)
         found = _newton(robot, assembly, found, way, 1e-9 if step == steps else 1e-3)
-    for stride in STRIDES[1:]:
-        if len(coarse) < samples:
-            finer = np.unique(np.append(np.arange(0, samples, stride), samples - 1))
-            near = CubicSpline(coarse, found)(finer) if len(coarse) > 1 else np.repeat(found, len(finer), axis=0)
-            coarse, found = finer, _newton(robot, assembly, near, axes_rad[finer])
+    while len(coarse) < samples:
+        stride = max(1, stride // 8)
+        finer = np.unique(np.append(np.arange(0, samples, stride), samples - 1))
+        near = CubicSpline(coarse, found)(finer) if len(coarse) > 1 else np.repeat(found, len(finer), axis=0)
+        coarse, found = finer, _newton(robot, assembly, near, axes_rad[finer])
     return found
 
 

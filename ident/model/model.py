@@ -276,6 +276,12 @@ class Model:
         per_axis = np.linalg.pinv(followed.to_motors)
         return self.at_axes(followed, np.einsum("idk,kda->iak", per_x, per_axis))
 
+    def leverage(self, followed: TreeMotion) -> FloatArray:
+        """Torque at each axis per unit of torque on each joint without a motor, shape (n − m, m, k)."""
+        unit = np.eye(self.robot.joint_count)[:, list(self.robot.passive_joints)]
+        torque = np.repeat(unit[:, :, None], len(followed.to_joints), axis=2)
+        return np.ascontiguousarray(np.swapaxes(self.at_axes(followed, torque), 0, 1))
+
     def at_axes(self, followed: TreeMotion, torque: FloatArray) -> FloatArray:
         """Torques of all joints as torques of the axes, B Gᵀ τ [Nm or N], shapes (n, …, k) and (m, …, k)."""
         projected = np.einsum("knd,n...k->d...k", followed.to_joints, torque)

@@ -83,6 +83,16 @@ class Robot:
         return tuple(self.joints[joint] for joint in self.axis_joints)
 
     @property
+    def passive_joints(self) -> tuple[int, ...]:
+        """Joints without a motor: none of a serial robot."""
+        return tuple(joint for joint in range(len(self.joints)) if joint not in self.axis_joints)
+
+    @property
+    def places(self) -> tuple[Joint, ...]:
+        """Where an effect can act: the driven joints, then those without a motor."""
+        return (*self.axes, *(self.joints[joint] for joint in self.passive_joints))
+
+    @property
     def axis_count(self) -> int:
         """m: motors, and what a recording has columns of."""
         return len(self.axis_joints)

@@ -131,5 +131,5 @@ def test_rows_and_triangles_are_the_same_equations(mechanism: Mechanism) -> None
 
 
 def test_instruments_need_an_equation_a_motor() -> None:
-    with pytest.raises(DataUnfit):
+    with pytest.raises(DataUnfit, match="more motors than degrees of freedom"):
         iv(_fitted(PLANAR.name).system)
