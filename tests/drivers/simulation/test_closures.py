@@ -188,6 +188,40 @@ def test_accelerations_from_rest_are_those_of_pinocchio(name: str) -> None:
     np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
 
 
+def slides_of(place_m: FloatArray) -> FloatArray:
+    """Inverse kinematics of an Orthoglide with rods of 310 mm, zero in the isotropic pose (Pashkevich et al. 2006)."""
+    others = np.array([np.hypot(place_m[1], place_m[2]), np.hypot(place_m[2], place_m[0]), np.hypot(*place_m[:2])])
+    return np.asarray(place_m + 0.310 - np.sqrt(0.310**2 - others**2))
+
+
+def test_an_orthoglide_moves_as_it_should_and_turns_nothing() -> None:
+    spec = cell("orthoglide")
+    plant = Plant(spec)
+    assert plant.mechanism is not None
+    model = link_model(spec.urdf, spec.gravity_m_s2, None, spec.platform)
+    data = model.createData()
+    frame = model.getFrameId("plate-centre", pin.FrameType.BODY)
+    for place_m in np.random.default_rng(6).uniform(-0.04, 0.1, (5, 3)):
+        position = plant.mechanism.start_rad
+        for share in np.linspace(0.1, 1.0, 10):
+            position = plant.mechanism.closed(np.concatenate([slides_of(share * place_m), position[3:]]), (3,))
+        sorted_position = np.empty(len(position))
+        sorted_position[plant.mechanism.order] = position
+        pin.framesForwardKinematics(model, data, sorted_position)
+        np.testing.assert_allclose(data.oMf[frame].translation, place_m, atol=1e-10)
+        np.testing.assert_allclose(data.oMf[frame].rotation, np.eye(3), atol=1e-10)
+
+
+def test_the_rods_of_the_orthoglide_follow_from_its_design_rule() -> None:
+    """Transmission factors of 0.5 to 2 in a cube of 200 mm (Chablat and Wenger 2003)."""
+    factors = []
+    for corner in np.stack(np.meshgrid(*[np.linspace(-0.073, 0.127, 5)] * 3), axis=-1).reshape(-1, 3):
+        columns = [(slides_of(corner + 1e-6 * e) - slides_of(corner - 1e-6 * e)) / 2e-6 for e in np.eye(3)]
+        factors.append(1.0 / np.linalg.svd(np.array(columns).T, compute_uv=False))
+    assert np.min(factors) == pytest.approx(0.5, abs=0.005)
+    assert np.max(factors) == pytest.approx(2.0, abs=0.02)
+
+
 def test_a_five_bar_follows_its_lagrangian() -> None:
     """Absolute angles θ of the cranks and ϕ of the rods, written out by hand with two multipliers."""
     spec = frictionless(cell("five-bar"))
