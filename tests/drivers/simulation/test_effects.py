@@ -314,7 +314,7 @@ def test_unknown_names_and_parameters_are_refused_with_what_exists() -> None:
         build_effect(UndeclaredEffect("coupling", 3, {"other_axis": 4, "coulomb_nm": 0.4, "viscous_nm_s_rad": 0.3}), 6)
     with pytest.raises(SpecInvalid, match="unknown parameter bristle"):
         build_effect(UndeclaredEffect("presliding", 0, {"torque_nm": 1.0, "distance_rad": 0.1, "bristle": 1.0}), 6)
-    assert len(UNDECLARED_EFFECTS) == 16
+    assert len(UNDECLARED_EFFECTS) == 17
 
 
 def test_a_drive_too_stiff_for_the_step_is_refused() -> None:
