@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from ident.model.model import Model as Model
     from ident.model.robot import Motion as Motion
     from ident.model.robot import Robot as Robot
-    from ident.model.robot import robot_from_urdf as robot_from_urdf
+    from ident.model.urdf import robot_from_urdf as robot_from_urdf
     from ident.prediction import measured_torque as measured_torque
     from ident.prediction import predict_current as predict_current
     from ident.prediction import predict_torque as predict_torque
@@ -88,7 +88,8 @@ _HOMES = {
     "ident.estimators.method": "Method",
     "ident.model.bodies": "Payload",
     "ident.model.model": "DriveTrain Model",
-    "ident.model.robot": "Motion Robot robot_from_urdf",
+    "ident.model.robot": "Motion Robot",
+    "ident.model.urdf": "robot_from_urdf",
     "ident.prediction": "measured_torque predict_current predict_torque",
     "ident.weighing": "WeighedBody weigh",
 }

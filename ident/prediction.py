@@ -10,7 +10,7 @@ from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import EFFECTS, UNNAMED
-from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, Side, at_joints, check_settings
+from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, Side, at_joints, check_settings, columns_at
 from ident.effects.signals import declared_signals, payload_parameters
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload
@@ -41,8 +41,8 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
     run = declared_signals(model, data, standard, gains, calibration.session_began_s)
     torque = model.drive_train.direction.T @ run.motor_torque_nm
     for accepted in calibration.effects:
-        placed, coefficients = placed_effect(accepted, calibration)
-        columns = placed.effect.columns(run, placed.axis)
+        placed, coefficients = placed_effect(accepted, calibration, model)
+        columns = columns_at(placed.effect, run, placed.axis)
         at_all = at_joints(placed.effect, placed.axis, columns, model.drive_train)
         torque += np.einsum("p,npk->nk", coefficients, at_all)
     return np.asarray(torque.T)
@@ -124,13 +124,22 @@ def as_calibrated(calibration: Calibration, payload: Payload | None, run: str) -
     return replace(payload, known={name: value for name, value in payload.known.items() if name not in own})
 
 
-def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[PlacedEffect, FloatArray]:
+def placed_effect(
+    accepted: AcceptedEffect, calibration: Calibration, model: Model | None = None
+) -> tuple[PlacedEffect, FloatArray]:
     """The effect that a calibration names, on its axis, and its coefficients, shape (p,).
+
+    Args:
+        accepted: of the calibration.
+        calibration: whose axes these are.
+        model: names the joints without a motor, on which an effect of a closed chain may act.
 
     Raises:
         EffectRefused: no such effect, setting, axis or coefficient exists.
     """
     axes = tuple(gain.axis for gain in calibration.gains)
+    if model is not None:
+        axes += tuple(joint.name for joint in model.robot.places[len(axes) :])
     families = {known.name: known for known in (*(family[0] for family in EFFECTS), *UNNAMED)}
     if accepted.name not in families:
         raise EffectRefused(f"there is no effect {accepted.name!r}; there are {', '.join(sorted(families))}")
@@ -159,7 +168,7 @@ def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[P
 
 
 def _gains(calibration: Calibration, model: Model) -> FloatArray:
-    count = model.robot.joint_count
+    count = model.robot.axis_count
     if len(calibration.gains) != count:
         raise ModelError(f"the calibration has {len(calibration.gains)} gains, the model {count} joints")
     return np.array([gain.value for gain in calibration.gains])

@@ -30,10 +30,10 @@ from ident.effects.effect import effect_torque
 from ident.effects.signals import Signals, declared_signals
 from ident.equations.linearisation import jackknife_covariance
 from ident.equations.rows import Observation, observe
-from ident.equations.system import Equations, System, solve
+from ident.equations.system import Equations, System
+from ident.equations.triangles import solve
 from ident.errors import DataUnfit
 from ident.estimators.estimate import RelativeError, relative_error
-from ident.estimators.maximum_likelihood import settled
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
 from ident.model.model import Column, Model
@@ -192,7 +192,7 @@ def rows_to_weigh(
     names = tuple(column.name for column in model.columns)
     every = BaseParameters(tuple(range(len(names))), np.eye(len(names)), names)
     runs = tuple(data.name for data in datasets)
-    standard = Equations(model.drive_train, every, model.columns, (), (), runs)
+    standard = Equations(model, every, model.columns, (), (), runs)
     rows = observe(model, datasets, conditioning, standard)
     body = tuple(Column(f"{name}:body", unit) for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True))
     rows = rows.extended(body, rows.flange * (rows.run >= len(without)))
@@ -203,7 +203,7 @@ def weigh_rows(calibration: Calibration, given: RowsToWeigh) -> WeighedBody:
     """Weigh the body with rows that are at hand; errors are those of `weigh`."""
     model, standard = given.model, standard_parameters(calibration, given.model)
     gains = np.array([gain.value for gain in calibration.gains])
-    effects = [placed_effect(accepted, calibration) for accepted in calibration.effects]
+    effects = [placed_effect(accepted, calibration, model) for accepted in calibration.effects]
     known = np.concatenate((standard, np.zeros(10), *(coefficients for _, coefficients in effects)))
     ten = np.arange(len(standard), len(standard) + 10)
     depends = not all(placed.effect.abscissa.is_kinematic for placed, _ in effects)
@@ -224,13 +224,13 @@ def weigh_rows(calibration: Calibration, given: RowsToWeigh) -> WeighedBody:
         system = rows.system()
         unknowns, free, blurred = _unknowns(system, ten, model, beside_bare_runs=given.bare > 0)
         held = [index for index in range(len(known)) if index not in free]
-        parameters, noise = settled(system.holding({i: float(known[i]) for i in held}).motors, 1.0 / gains, len(free))
+        unknown = system.holding({i: float(known[i]) for i in held})
+        parameters, noise = unknown.currents.settled(gains, len(free))
         found = known.copy()
         found[list(free)] = parameters
         before, body = body, found[ten]
         if np.linalg.norm(body - before) <= STAYS * np.linalg.norm(body):
             break
-    unknown = system.holding({i: float(known[i]) for i in held})
     count, own = len(gains), np.isin(free, ten)
     shown = np.isin(ten, free)
     moves = jackknife_covariance(unknown, gains, parameters, noise, gains_fixed=True)[count:, count:]
@@ -238,10 +238,9 @@ def weigh_rows(calibration: Calibration, given: RowsToWeigh) -> WeighedBody:
     weight = 1.0 / (gains * noise)
     # A motor that never moved is as noisy as the others, should further moves need it.
     weight[~seen] = np.median(np.abs(weight[seen]))
-    stacked = system.motors.stacked(weight)
-    columns = stacked[:, 1:-1]
-    motor_of = np.repeat(np.arange(count), [len(factor) for factor in system.motors.factors])
-    right = np.concatenate((stacked[:, :1] * np.eye(count)[motor_of], -columns[:, held]), axis=1)
+    whitened = system.currents.whitened(gains, 1.0 / (gains * weight))
+    columns = whitened.linear
+    right = np.concatenate((whitened.drive, -columns[:, held]), axis=1)
     slope = np.zeros((10, count + len(held)))
     slope[shown] = solve(columns[:, list(free)], right)[0][own]
     of_moves = np.zeros((10, 10))
@@ -271,7 +270,7 @@ def _unknowns(
     if not beside_bare_runs:
         robot = [index for index in robot[: len(model.columns)] if names[index].startswith(FRICTION)]
     order = np.array([*robot, *ten])
-    columns = np.concatenate([factor[:, system.joint_count : -1] for factor in system.joints.factors])[:, order]
+    columns = np.concatenate([factor[:, system.axis_count : -1] for factor in system.joints.factors])[:, order]
     base = base_parameters(columns, tuple(names[index] for index in order))
     free = order[list(base.independent)]
     regrouped = np.setdiff1d(np.arange(len(order)), base.independent)

@@ -187,7 +187,7 @@ def _plain(urdf: str) -> tuple[Model, FloatArray]:
     import numpy as np
 
     from ident.model.model import DriveTrain, Model
-    from ident.model.robot import robot_from_urdf
+    from ident.model.urdf import robot_from_urdf
 
     robot = robot_from_urdf(urdf)
     count = robot.joint_count

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from drivers.canopen.split_bus import BusPart
     from drivers.simulation.spec import CellSpec
 
-_SHIPPED = ("demo", "clean", "rx90", "kr270", "seven-axis", "gantry")
+_SHIPPED = ("demo", "clean", "rx90", "kr270", "seven-axis", "gantry", "five-bar", "orthoglide", "dualv")
 _SHIPPED_FAULTS = "faults-example"
 
 
@@ -58,7 +58,9 @@ def simulate(
     from drivers.canopen.split_bus import BusPart, SplitAddress, open_cell_bus
 
     require_simulator()
+    from daq.errors import ConfigurationInconsistent
     from drivers.simulation.cell import SimulatedCell
+    from drivers.simulation.spec import SpecInvalid
 
     at_most_one(payload_from=payload_from, payload=payload)
     shipped = simulation.name in _SHIPPED and not simulation.exists()
@@ -86,7 +88,11 @@ def simulate(
         address = SplitAddress(parts) if bus else parts[0].address
         end = open_cell_bus(address) if isinstance(address, SplitAddress) else open_bus(address, answering=True)
         stack.callback(end.shutdown)
-        cell = SimulatedCell(spec, end, mounted=mounted)
+        try:
+            cell = SimulatedCell(spec, end, mounted=mounted)
+        except SpecInvalid as error:
+            expected, remedy = "a cell that can be built", "correct it, or the URDF that it names"
+            raise ConfigurationInconsistent(str(truth), found=str(error), expected=expected, remedy=remedy) from error
         what = payload or "none" if payload_from is None else f"as {payload_from} says"
         faulty = len(spec.faults) or "no"
         typer.echo(f"{len(spec.axes)} amplifiers on {address}, payload {what}, {faulty} faults; Ctrl-C ends it")

@@ -12,6 +12,7 @@ from typing import Annotated
 from pydantic import Field
 
 from daq.config.clearance import Clearance
+from daq.config.closed_chain import ClosedChain, robot_with
 from daq.config.controller import Controller
 from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistoryPlace
 from daq.config.recalibration import Recalibration
@@ -21,7 +22,7 @@ from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.model.bodies import Payload
 from ident.model.model import DriveTrain, Model
-from ident.model.robot import JointKind, robot_from_urdf
+from ident.model.robot import JointKind, Robot
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +178,7 @@ class Cell:
     apply: ApplyPolicy = DEFAULT_APPLY_POLICY  #: bounds and permissions of the write-back
     history: HistoryPlace | None = None  #: files of the history; None for a cell from a log
     recalibration: Recalibration | None = None  #: the scheduled job; None without one, or for a cell from a log
+    chain: ClosedChain | None = None  #: how the loops of a closed chain close; None of a serial robot
 
     @property
     def controller_path(self) -> Path | None:
@@ -202,13 +204,22 @@ class Cell:
         return tuple(axis.name for axis in self.axes)
 
 
+def robot_of(cell: Cell) -> Robot:
+    """Return the robot of a cell, the loops of a closed chain closed.
+
+    Raises:
+        ModelError: the URDF describes no robot.
+    """
+    return robot_with(cell.chain, cell.urdf, cell.gravity_m_s2)
+
+
 def joint_names(cell: Cell) -> tuple[str, ...]:
     """Return the URDF's name of each axis's joint.
 
     Raises:
         ModelError: the URDF describes no robot.
     """
-    return tuple(joint.name for joint in robot_from_urdf(cell.urdf).joints)
+    return tuple(joint.name for joint in robot_of(cell).axes)
 
 
 def model_of(cell: Cell) -> Model:
@@ -217,4 +228,4 @@ def model_of(cell: Cell) -> Model:
     Raises:
         ModelError: the URDF or the drive train describes no robot.
     """
-    return Model(robot_from_urdf(cell.urdf, cell.gravity_m_s2), DriveTrain(cell.ratio))
+    return Model(robot_of(cell), DriveTrain(cell.ratio))

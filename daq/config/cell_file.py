@@ -14,6 +14,7 @@ from daq.config.cell import MILLIMETRE, Axis, Cell, DeclaredEffect, Limits, Weig
 from daq.config.cell_schema import AxisModel, CellModel, ConditioningModel, EffectModel, PayloadModel, ratio_of
 from daq.config.checks import check
 from daq.config.clearance import clearance_of
+from daq.config.closed_chain import chain_of
 from daq.config.drive import drive_from_text
 from daq.config.hold import held_urdf
 from daq.config.yaml_file import parse_yaml, read_bytes, read_model
@@ -86,6 +87,7 @@ def cell_from_bundle(
         payloads=tuple(_payload(payload) for payload in model.payloads),
         conditioning=_conditioning(model.conditioning),
         controller=model.controller,
+        chain=chain_of(model.robot, model.closures),
         clearance=clearance_of(model.workspace, model.clearance, [axis.name for axis in model.axes]),
         effects=tuple(_effect(effect, model) for effect in model.effects),
         folder=None if file is None else file.parent,

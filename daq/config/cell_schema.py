@@ -15,6 +15,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from daq.config.cell import DEGREE, MILLIMETRE, Bus, JointUnit, MotionPolicy, Sync, UnnamedBus
 from daq.config.clearance import ClearanceSection, WorkspaceSection
+from daq.config.closed_chain import ChainModel, ClosureModel
 from daq.config.controller import Controller
 from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistorySection
 from daq.config.recalibration import RecalibrationSection
@@ -25,7 +26,7 @@ ONE_BUS, SEVERAL_BUSES = not_in_file("one bus"), not_in_file("several buses")
 U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 
-class RobotModel(StrictModel):
+class RobotModel(ChainModel):
     """The arm."""
 
     urdf: FileName
@@ -213,6 +214,9 @@ class CellModel(StrictModel):
     ] = Field(default_factory=dict)
     bus: Buses | None = None
     sync: Sync | None = None
+    closures: Annotated[
+        tuple[ClosureModel, ...], Field(description="Where the loops of a closed chain close; none of a serial robot.")
+    ] = ()
     axes: Annotated[tuple[AxisModel, ...], Field(min_length=1, max_length=32)]
     payloads: tuple[PayloadModel, ...] = ()
     effects: tuple[EffectModel, ...] = ()

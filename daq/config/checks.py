@@ -14,6 +14,7 @@ from daq.config.bus import LARGEST_MEAN, bus_load, shortest_period_us, split_ans
 from daq.config.cell import DEGREE, KERNEL, MILLIMETRE, RECORDER, Bus, PacingMode, joint_unit
 from daq.config.cell_schema import AxisModel, CellModel, PayloadModel, gain_joints, ratio_of
 from daq.config.clearance import clearance_faults
+from daq.config.closed_chain import chain_faults, chain_of, robot_with
 from daq.config.controller import controller_faults
 from daq.config.policy import max_change_faults
 from daq.config.signers import signer_faults
@@ -21,7 +22,7 @@ from daq.config.yaml_file import Document, Fault, Location, describe
 from daq.errors import ConfigurationInconsistent
 from drivers.profiles.profile import DriveProfile
 from ident.errors import ModelError
-from ident.model.robot import Joint, JointKind, robot_from_urdf
+from ident.model.robot import Joint, JointKind
 from ident.plausible import (
     FARTHEST_DEG,
     FARTHEST_MM,
@@ -79,11 +80,18 @@ def _robot(model: CellModel, urdf: str) -> tuple[tuple[Joint, ...], list[Fault]]
         found = f"{gravity:.4g} m/s² in all"
         faults.append(Fault(("robot", "gravity_m_s2"), found, "9.78 to 9.83 m/s², anywhere on Earth"))
     try:
-        joints = robot_from_urdf(urdf, model.robot.gravity_m_s2).joints
+        of_chain = [*chain_faults(model.robot, model.closures, urdf)]
+        if of_chain:
+            return (), [*faults, *of_chain]
+        chain = chain_of(model.robot, model.closures)
+        joints = robot_with(chain, urdf, model.robot.gravity_m_s2).axes
     except ModelError as error:
         expected = "a URDF of an arm; `hold: {JOINT: POSITION}` fixes a joint that is no axis"
         return (), [*faults, Fault(("robot", "urdf"), str(error), expected)]
-    if len(joints) != len(model.axes):
+    if chain is not None and len(joints) != len(model.axes):
+        found, motors = f"{len(model.axes)} axes", ", ".join(model.robot.motors)
+        faults.append(Fault(("axes",), found, f"one for each joint in `robot.motors` ({motors})"))
+    elif len(joints) != len(model.axes):
         names = [joint.name for joint in joints]
         expected = f"one for each moving joint of the URDF ({', '.join(names)})"
         if len(joints) > len(model.axes):
@@ -272,7 +280,8 @@ def _limit_faults(path: Location, axis: AxisModel) -> Iterator[Fault]:
 
 def _si_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
     """Find limits in rad or m: the numbers of the URDF, or no revolute axis with a range of some degrees."""
-    of_urdf = dict(enumerate(_urdf_limits(urdf)))
+    limits = _urdf_limits(urdf)
+    of_urdf = dict(enumerate(limits.get(name) for name in model.robot.motors or limits))
     ranges = [axis.limits.position for axis in model.axes if axis.limits.unit is DEGREE]
     narrow = all(SHORTEST_DEG < upper - lower < SHORTEST_OF_ALL_DEG for lower, upper in ranges)
     for index, axis in enumerate(model.axes):
@@ -332,23 +341,23 @@ def _standstill_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fa
                 )
 
 
-def _urdf_limits(urdf: str) -> list[_UrdfLimits | None]:
-    """Read the limits of the moving joints from the URDF, in document order; [] if it cannot be read."""
+def _urdf_limits(urdf: str) -> dict[str, _UrdfLimits | None]:
+    """Read the limits of the moving joints from the URDF by name, in document order; {} if it cannot be read."""
     try:
         joints = ElementTree.fromstring(urdf).iter("joint")
-        limits: list[_UrdfLimits | None] = []
+        limits: dict[str, _UrdfLimits | None] = {}
         for joint in joints:
             if joint.get("type") not in {"revolute", "continuous", "prismatic"}:
                 continue
-            limit = joint.find("limit")
+            limit, name = joint.find("limit"), joint.get("name", "")
+            limits[name] = None
             if limit is None:
-                limits.append(None)
                 continue
             position = float(limit.get("lower", "0")), float(limit.get("upper", "0"))
             unlimited = joint.get("type") == "continuous"
-            limits.append(_UrdfLimits(None if unlimited else position, float(limit.get("velocity", "0"))))
+            limits[name] = _UrdfLimits(None if unlimited else position, float(limit.get("velocity", "0")))
     except (ElementTree.ParseError, ValueError):
-        return []
+        return {}
     return limits
 
 

@@ -10,7 +10,7 @@ from daq.config.cell_schema import CellModel
 from daq.config.yaml_file import Document, Fault, describe
 from daq.errors import ConfigurationInconsistent
 from ident.errors import ModelError
-from ident.model.robot import hold_joints
+from ident.model.urdf import hold_joints
 
 
 def held_urdf(document: Document, model: CellModel, urdf: str) -> str:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, ClassVar
+from xml.etree import ElementTree
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -16,7 +17,7 @@ from daq.config.yaml_file import Document, Fault, StrictModel, describe, parse_y
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent, ConfigurationMissing, UsageError
 from drivers.simulation.faults import FaultKind, FaultSpec
-from drivers.simulation.spec import AxisSpec, Body, CellSpec, UndeclaredEffect
+from drivers.simulation.spec import AxisSpec, Body, CellSpec, Closure, PassiveFriction, UndeclaredEffect
 
 AxisName = Annotated[str, Field(pattern=r"^J[1-9][0-9]?$")] | Annotated[int, Field(ge=1)]  #: J3, or 3
 
@@ -93,11 +94,23 @@ def axis_index(axis: str | int) -> int:
 
 
 class EffectModel(StrictModel):
-    """An undeclared effect."""
+    """An undeclared effect, on an axis or on a passive joint of a closed chain."""
 
     name: Annotated[str, Field(min_length=1)]
-    axis: AxisName
+    axis: AxisName | None = None
+    joint: Annotated[str, Field(min_length=1)] | None = None
     parameters: dict[str, float] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _one_place(self) -> EffectModel:
+        if (self.axis is None) == (self.joint is None):
+            raise ValueError("axis, or joint for a passive joint: one of them")
+        return self
+
+    def effect(self) -> UndeclaredEffect:
+        """As the plant knows it."""
+        axis = -1 if self.axis is None else axis_index(self.axis)
+        return UndeclaredEffect(self.name, axis, dict(self.parameters), self.joint)
 
 
 class SimulationModel(StrictModel):
@@ -117,6 +130,12 @@ class SimulationModel(StrictModel):
     payloads: dict[str, Body] = Field(default_factory=dict)
     effects: tuple[EffectModel, ...] = ()
     faults: tuple[FaultModel, ...] = ()
+    closures: tuple[Closure, ...] = ()
+    motors: tuple[str, ...] = ()
+    platform: str | None = None
+    assembly_deg: dict[str, float] = Field(default_factory=dict)
+    assembly_mm: dict[str, float] = Field(default_factory=dict)
+    passive: dict[str, PassiveFriction] = Field(default_factory=dict)
 
 
 def require_simulator() -> None:
@@ -149,6 +168,9 @@ def load_simulation(path: Path, payload: str | None = None) -> CellSpec:
     document = parse_yaml(read_bytes(path), str(path))
     model = read_model(document, SimulationModel)
     _check(document, model)
+    urdf = read_bytes(path.parent / model.urdf).decode("utf-8", errors="replace")
+    if model.closures and (wrong := [*_closed_chain_faults(model, urdf)]):
+        raise ConfigurationInconsistent(**describe(document, wrong), remedy="correct the simulation file")
     if payload is not None and payload not in model.payloads:
         raise UsageError(
             f"payload {payload!r}",
@@ -157,7 +179,7 @@ def load_simulation(path: Path, payload: str | None = None) -> CellSpec:
             remedy=f"choose one, or add it to {path}",
         )
     return CellSpec(
-        urdf=read_bytes(path.parent / model.urdf).decode("utf-8", errors="replace"),
+        urdf=urdf,
         gravity_m_s2=model.gravity_m_s2,
         ratio=np.array(model.ratio, dtype=np.float64),
         axes=model.axes,
@@ -168,11 +190,17 @@ def load_simulation(path: Path, payload: str | None = None) -> CellSpec:
             ]
         ),
         payload=None if payload is None else model.payloads[payload],
-        effects=tuple(UndeclaredEffect(e.name, axis_index(e.axis), dict(e.parameters)) for e in model.effects),
+        effects=tuple(effect.effect() for effect in model.effects),
         sync_period_us=model.sync_period_us,
         substeps=model.substeps,
         seed=model.seed,
         faults=tuple(fault.spec(model.sync_period_us) for fault in model.faults),
+        closures=model.closures,
+        motors=model.motors,
+        platform=model.platform,
+        assembly_rad={name: DEGREE.si * degrees for name, degrees in model.assembly_deg.items()}
+        | {name: MILLIMETRE.si * millimetres for name, millimetres in model.assembly_mm.items()},
+        passive=model.passive,
     )
 
 
@@ -189,7 +217,11 @@ def _starts(model: SimulationModel) -> list[tuple[float | None, float | None]]:
 
 def _check(document: Document, model: SimulationModel) -> None:
     n = len(model.axes)
-    faults = []
+    faults = [
+        Fault((key,), "given without closures", "closures of a closed chain, or none of its keys")
+        for key in ("motors", "platform", "assembly_deg", "assembly_mm", "passive")
+        if getattr(model, key) and not model.closures
+    ]
     if len(model.ratio) != n or any(len(row) != n for row in model.ratio):
         faults.append(Fault(("ratio",), f"{len(model.ratio)} rows", f"{n} × {n}, a row for each motor"))
     if len(model.start_deg) != n and (model.start_deg or not model.start_mm):
@@ -212,8 +244,52 @@ def _check(document: Document, model: SimulationModel) -> None:
     faults += [
         Fault(("effects", index, "axis"), f"axis {effect.axis}", f"J1 to J{n}")
         for index, effect in enumerate(model.effects)
-        if axis_index(effect.axis) >= n
+        if effect.axis is not None and axis_index(effect.axis) >= n
     ]
     faults += absent_axes(model.faults, n)
     if faults:
         raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the simulation file")
+
+
+def _closed_chain_faults(model: SimulationModel, urdf: str) -> Iterator[Fault]:
+    """Find names of a closed chain that the URDF lacks, and joints with two places or none."""
+    try:
+        root = ElementTree.fromstring(urdf)
+    except ElementTree.ParseError:
+        return  # the plant says so
+    yield from _link_faults(model, [link.get("name", "") for link in root.iter("link")])
+    kinds = {joint.get("name", ""): joint.get("type", "") for joint in root.iter("joint")}
+    yield from _joint_faults(model, {name: kind for name, kind in kinds.items() if kind != "fixed"})
+
+
+def _link_faults(model: SimulationModel, links: list[str]) -> Iterator[Fault]:
+    """Find closures and a platform of links that the URDF lacks, and closures of nothing."""
+    wanted = f"a link of the URDF: {', '.join(links)}"
+    for number, closure in enumerate(model.closures):
+        for key, link in (("first", closure.first), ("second", closure.second)):
+            if link not in links:
+                yield Fault(("closures", number, key), link, wanted)
+        if closure.first == closure.second:
+            yield Fault(("closures", number, "second"), f"{closure.second} twice", "two links")
+        if len(set(closure.directions)) != len(closure.directions):
+            yield Fault(("closures", number, "directions"), "a direction twice", "each direction once")
+    if model.platform is not None and model.platform not in links:
+        yield Fault(("platform",), model.platform, wanted)
+
+
+def _joint_faults(model: SimulationModel, joints: dict[str, str]) -> Iterator[Fault]:
+    """Find motors, positions and friction of joints that the URDF lacks, given the kinds of its joints."""
+    wanted = f"joints of the URDF: {', '.join(joints)}"
+    unknown = set(model.motors) - set(joints)
+    if unknown or len(set(model.motors)) != len(model.motors) or len(model.motors) != len(model.axes):
+        yield Fault(("motors",), ", ".join(model.motors) or "none", f"{len(model.axes)} different {wanted}")
+    prismatic = {name for name, kind in joints.items() if kind == "prismatic"}
+    for key, there in (("assembly_deg", set(joints) - prismatic), ("assembly_mm", prismatic)):
+        given = set(getattr(model, key))
+        if wrong := sorted(given - there):
+            yield Fault((key,), ", ".join(wrong), f"{'prismatic' if key == 'assembly_mm' else 'revolute'} {wanted}")
+        if missing := sorted(there - given):
+            yield Fault((key,), f"no {', '.join(missing)}", "a rough position of every joint")
+    for name in model.passive:
+        if name not in joints or name in model.motors:
+            yield Fault(("passive", name), "a joint with a motor" if name in joints else name, "a passive joint")

@@ -46,7 +46,7 @@ from ident.estimators.identify import Identification, estimate_with, identify
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS
-from ident.model.robot import read_urdf
+from ident.model.urdf import read_urdf
 from ident.planning.excitation import (
     GOOD_PERCENT,
     Design,

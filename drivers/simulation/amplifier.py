@@ -21,6 +21,11 @@ VELOCITY_BANDWIDTH_RAD_S = 220.0
 POSITION_BANDWIDTH_RAD_S = VELOCITY_BANDWIDTH_RAD_S / 4.0
 INTEGRAL_BANDWIDTH_RAD_S = VELOCITY_BANDWIDTH_RAD_S / 5.0
 
+REDUNDANT_BANDWIDTH_RAD_S = 48.0
+"""Bandwidth of the velocity loops of redundant drives. Each drive follows a trapezoid of its own, and between two poses
+these agree only nearly: what they disagree about becomes preload, in proportion to the stiffness of the loops. Such
+drives have no integral part either, for their integrals would wind up against each other (Müller and Hufnagel 2012)."""
+
 VELOCITY_FILTER_S = 0.0008  #: Time constant of the velocity filter: one encoder count a substep is a coarse velocity
 
 POSTURES = 3  #: Positions tried for each joint in tuning
@@ -73,10 +78,10 @@ def tuned_inertia_a_s2(spec: CellSpec, plant: Plant) -> FloatArray:
     """Return the current per motor acceleration [A per count/s²] to which the loops are tuned, shape (n,).
 
     It is the geometric mean of the smallest and largest inertia that each motor meets over the postures, signed as the
-    axis is wired.
+    axis is wired. A closed chain has only the posture of its start: in others its loops would have to be closed.
     """
     # The first joint's position changes no inertia; of long chains the joints behind the seventh stay where they are.
-    swept = range(1, min(len(spec.axes), 7))
+    swept = range(1, 1 if spec.closures else min(len(spec.axes), 7))
     tried = plant.postures(spec.start_rad, POSTURES)
     inertias = []
     for posture in itertools.product(*(tried[joint] for joint in swept)):
@@ -285,6 +290,10 @@ class AmplifierSet:
         self.loops["position_1_s"] = POSITION_BANDWIDTH_RAD_S
         self.loops["velocity_1_s"] = VELOCITY_BANDWIDTH_RAD_S
         self.loops["integral_1_s"] = INTEGRAL_BANDWIDTH_RAD_S
+        if plant.mechanism is not None and plant.mechanism.mobility < n:
+            self.loops["velocity_1_s"] = REDUNDANT_BANDWIDTH_RAD_S
+            self.loops["position_1_s"] = REDUNDANT_BANDWIDTH_RAD_S / 4.0
+            self.loops["integral_1_s"] = 0.0
         self.loops["filter"] = -np.expm1(-self.step_s / VELOCITY_FILTER_S)
         self.loops["limit_a"] = [axis.peak_current_a for axis in spec.axes]
         self.loops["piece"] = SEGMENTS
@@ -296,7 +305,7 @@ class AmplifierSet:
         for state in ("counts", "demand", "target"):
             self.loops[state] = np.rint(plant.motor_rad * self._counts_per_rad)
         self._piece_s, self._piece_acceleration = np.zeros((n, SEGMENTS)), np.zeros((n, SEGMENTS))
-        built = (build_effect(effect, n) for effect in spec.effects)
+        built = (build_effect(effect, n) for effect in spec.effects if effect.joint is None)
         self._lags = tuple(effect for effect in built if isinstance(effect, Lag))
         self._lagged_a = np.zeros(n)
         self._noise = ColouredNoise(

@@ -13,6 +13,11 @@ joint, or a motor that turns with several joints) it gives an impulse λ_k with
 where w = D v⁺ are the speeds at the end of the step and b_k is the bound [Nm] times the step [s]. This is the
 optimality condition of the convex problem min ½ λᵀ W λ + w_freeᵀ λ over the box |λ| ≤ b, so v⁺ is unique even where λ
 is not (dependent directions, eq. 25 of the seed paper), and no smoothing constant enters.
+
+In a closed chain the speeds are v⁺ = G x, G the basis of the speeds that its closures allow. That is the same step with
+Gᵀ A G, Gᵀ of the right side and D G in place of A, the right side and D: the impulses of the closures, of any size,
+drop out exactly, however many of them are redundant. Directions depend on each other then (a passive joint turns with
+the motors), which the solver is made for.
 """
 
 from __future__ import annotations
@@ -45,6 +50,14 @@ MAX_SWEEPS = 2_000
 SWEEPS_A_ROUND = 10  #: Sweeps that find which directions stick, before these are solved for directly
 
 DEPENDENT = 1e-9  #: Relative pivot below which a sticking direction depends on those before it
+
+DEPENDENT_CLOSED = 1e-13  #: The same in a closed chain, where joints turn nearly alike close to a symmetric pose
+
+TOLERANCE_CLOSED = 1e-6  #: Speed that a direction of a closed chain may keep in addition, over the largest speed
+
+IMMOBILE = 1e-14  #: Relative mobility below which the closures of a closed chain hold a direction
+
+SPANNED = 1e-6  #: Sine of the angle below which a direction lies in the span of others
 
 
 class Mechanics(NamedTuple):
@@ -129,6 +142,171 @@ def advance(
             s += mechanics.rotor_direction[i, j] * position[j]
         motor_rad[i] = s
     return residual
+
+
+@compiled
+def advance_closed(
+    constants: tuple[Any, ...],
+    order: NDArray[np.int64],
+    basis: FloatArray,
+    mass: FloatArray,
+    bias: FloatArray,
+    viscous: FloatArray,
+    motor_torque: FloatArray,
+    torque: FloatArray,
+    bound: FloatArray,
+    impulse: FloatArray,
+    position: FloatArray,
+    velocity: FloatArray,
+    load_torque: FloatArray,
+    resting: NDArray[np.bool_],
+) -> float:
+    """Advance a closed chain as `advance` does; the positions still have to be settled on its closures.
+
+    Args:
+        constants: of the plant, its Mechanics as a plain tuple.
+        order: place of each joint in the mass matrix and bias, shape (n,).
+        basis: G at the position, shape (n, d).
+        mass, bias, viscous, motor_torque, torque, bound, impulse, position, velocity: as for `advance`.
+        load_torque: torque that passes from each joint to the links [Nm], shape (n,), output.
+        resting: coordinates whose speed became exactly zero, shape (N,), output.
+
+    Returns:
+        zero, or the certificate of a step that was not done.
+    """
+    mechanics = Mechanics(*constants)
+    step_s, n, d, total = mechanics.step_s, basis.shape[0], basis.shape[1], len(velocity)
+    ordered_mass, ordered_bias = np.empty((n, n)), np.empty(n)
+    for i in range(n):
+        ordered_bias[i] = bias[order[i]]
+        for j in range(n):
+            ordered_mass[i, j] = mass[order[i], order[j]]
+    inertia, momentum = _assemble(mechanics, ordered_mass, ordered_bias, viscous, motor_torque, torque, velocity)
+    whole = np.zeros((total, d + total - n))
+    whole[:n, :d] = basis
+    for i in range(total - n):
+        whole[n + i, d + i] = 1.0
+    reduced = _product(whole.T, _product(inertia, whole))
+    free = _times(whole.T, momentum)
+    directions = _product(mechanics.directions, whole)
+    _factorise(reduced)
+    _substitute(reduced, free)
+    response, free_speed, delassus = _respond(reduced, free, directions)
+    _leave_out_immobile(delassus, free_speed, impulse, directions, response)
+    # Of two joints that turn alike but for 1e-8, one may slide while the other still sticks: too fine to solve for.
+    tolerance = TOLERANCE_RAD_S + TOLERANCE_CLOSED * np.abs(free_speed).max()
+    residual = solve(delassus, free_speed, bound, impulse, tolerance, MAX_SWEEPS, DEPENDENT_CLOSED)
+    if not residual <= tolerance:
+        return residual
+    after = _times(whole, free + _times(response, impulse))
+    _resting_closed(impulse, bound, directions, mechanics.lone, resting)
+    for i in range(total):
+        if resting[i]:
+            after[i] = 0.0
+    _pass_on(mechanics, viscous, motor_torque, torque, impulse, velocity, after, load_torque)
+    for i in range(total):
+        velocity[i] = after[i]
+        position[i] += step_s * after[i]
+    return 0.0
+
+
+@compiled
+def _leave_out_immobile(
+    delassus: FloatArray, free_speed: FloatArray, impulse: FloatArray, directions: FloatArray, response: FloatArray
+) -> None:
+    """Leave out the directions that the closures hold: any impulse is a solution there, and none does anything."""
+    largest = 0.0
+    for k in range(len(impulse)):
+        largest = max(largest, delassus[k, k])
+    for k in range(len(impulse)):
+        if delassus[k, k] <= IMMOBILE * largest:
+            delassus[k, :] = 0.0
+            delassus[:, k] = 0.0
+            delassus[k, k] = 1.0
+            free_speed[k] = impulse[k] = 0.0
+            directions[k] = 0.0
+            response[:, k] = 0.0
+
+
+@compiled
+def _pass_on(
+    mechanics: Mechanics,
+    viscous: FloatArray,
+    motor_torque: FloatArray,
+    torque: FloatArray,
+    impulse: FloatArray,
+    before: FloatArray,
+    after: FloatArray,
+    load_torque: FloatArray,
+) -> None:
+    """Compute what each joint passes to the links in a step: torques less rotors and friction, λ with them."""
+    step_s = mechanics.step_s
+    for i in range(len(load_torque)):
+        load_torque[i] = torque[i] - viscous[i] * after[i]
+        for k in range(len(impulse)):
+            load_torque[i] += mechanics.directions[k, i] * impulse[k] / step_s
+    for k in range(len(motor_torque)):
+        given = motor_torque[k]
+        for j in range(len(after)):
+            rotor = mechanics.motor_inertia[k] * (after[j] - before[j]) / step_s + mechanics.motor_viscous[k] * after[j]
+            given -= mechanics.motor_direction[k, j] * rotor
+        for i in range(len(load_torque)):
+            load_torque[i] += mechanics.motor_direction[k, i] * given
+
+
+@compiled
+def _product(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Return left · right; for these sizes faster than a library call."""
+    product = np.zeros((left.shape[0], right.shape[1]))
+    for i in range(left.shape[0]):
+        for k in range(left.shape[1]):
+            if left[i, k] != 0.0:
+                for j in range(right.shape[1]):
+                    product[i, j] += left[i, k] * right[k, j]
+    return product
+
+
+@compiled
+def _times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
+    """Return matrix · vector."""
+    product = np.zeros(matrix.shape[0])
+    for i in range(matrix.shape[0]):
+        for k in range(matrix.shape[1]):
+            product[i] += matrix[i, k] * vector[k]
+    return product
+
+
+@compiled
+def _resting_closed(
+    impulse: FloatArray,
+    bound: FloatArray,
+    directions: FloatArray,
+    lone: NDArray[np.int64],
+    resting: NDArray[np.bool_],
+) -> None:
+    """Find the coordinates at rest: all where the sticking directions span the speeds, else those that stick alone."""
+    size = directions.shape[1]
+    span = np.zeros((size, size))
+    rank = 0
+    resting[:] = False
+    for k in range(len(impulse)):
+        if abs(impulse[k]) >= bound[k] or not directions[k].any():
+            continue
+        if lone[k] >= 0:
+            resting[lone[k]] = True
+        if rank == size:
+            continue
+        # Gram-Schmidt, twice for rounding.
+        rest = directions[k] / np.sqrt((directions[k] ** 2).sum())
+        for _ in range(2):
+            for i in range(rank):
+                rest -= (span[i] * rest).sum() * span[i]
+        length = np.sqrt((rest**2).sum())
+        if length > SPANNED:
+            span[rank] = rest / length
+            rank += 1
+    if rank == size:
+        resting[:] = True
 
 
 @compiled
@@ -248,7 +426,13 @@ def _resting(
 
 @compiled
 def solve(
-    delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: FloatArray, tolerance: float, sweeps: int
+    delassus: FloatArray,
+    free: FloatArray,
+    bound: FloatArray,
+    impulse: FloatArray,
+    tolerance: float,
+    sweeps: int,
+    dependent: float = DEPENDENT,
 ) -> float:
     """Solve for the impulses in place, starting from those of the step before.
 
@@ -262,6 +446,7 @@ def solve(
         impulse: λ, start value in and solution out, shape (m,).
         tolerance: largest accepted certificate [rad/s].
         sweeps: largest number of Gauss-Seidel sweeps.
+        dependent: relative pivot below which a sticking direction depends on those before it.
 
     Returns:
         the certificate: the largest |λ_k − clip(λ_k − w_k/W_kk, −b_k, b_k)| W_kk [rad/s], recomputed after the last
@@ -287,7 +472,7 @@ def solve(
             if residual <= tolerance:
                 break
         if sweep % SWEEPS_A_ROUND == SWEEPS_A_ROUND - 1:
-            _stick(delassus, free, bound, impulse)
+            _stick(delassus, free, bound, impulse, dependent)
     return residual
 
 
@@ -301,7 +486,7 @@ def _relaxed(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse:
 
 
 @compiled
-def _stick(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: FloatArray) -> None:
+def _stick(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: FloatArray, dependent: float) -> None:
     """Bring the directions inside their bounds to rest by Cholesky, in as many pieces as bounds are met on the way."""
     m = len(free)
     lower = np.zeros((m, m))
@@ -326,7 +511,7 @@ def _stick(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: F
                     lower[i, j] = s / lower[j, j]
                     pivot -= lower[i, j] ** 2
                     step[i] -= lower[i, j] * step[j]
-            if pivot <= DEPENDENT * delassus[i, i]:
+            if pivot <= dependent * delassus[i, i]:
                 inside[i] = False
                 step[i] = 0.0
             else:

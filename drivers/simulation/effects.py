@@ -24,7 +24,8 @@ class Moment:
     """State of the plant in one substep: what an effect reads and what it may change.
 
     There are n joints and motors, N coordinates and m directions of dry friction. The coordinates are the joints,
-    then the motors behind a flexible drive. A prismatic joint has N for Nm and m for rad.
+    then the motors behind a flexible drive; a closed chain has passive joints between them. A prismatic joint has N for
+    Nm and m for rad.
     """
 
     time_s: float  #: since power-on
@@ -282,8 +283,17 @@ UNDECLARED_EFFECTS: dict[str, Callable[..., None] | type[WithState | Lag]] = {
 """Physics by its name in a simulation file; their arguments beside the moment and the axis are the parameters."""
 
 
-def build_effect(effect: UndeclaredEffect, axes: int) -> Effect | Lag:
+OF_MOTORS = ("cogging", "saturation", "lag", "temperature-friction", "backlash", "elasticity", "coupling")
+"""Effects that need a motor."""
+
+
+def build_effect(effect: UndeclaredEffect, axes: int, passive: tuple[str, ...] = ()) -> Effect | Lag:
     """Build the physics of an undeclared effect for a cell with a number of axes.
+
+    Args:
+        effect: on an axis or on a passive joint.
+        axes: of the cell.
+        passive: joints without a motor, whose coordinates follow those of the axes.
 
     Raises:
         SpecInvalid: the name, a parameter or the axis does not exist, or a parameter is missing.
@@ -292,7 +302,15 @@ def build_effect(effect: UndeclaredEffect, axes: int) -> Effect | Lag:
     if physics is None:
         names = ", ".join(UNDECLARED_EFFECTS)
         raise SpecInvalid(f"undeclared effect {effect.name!r} does not exist; there are {names}")
-    if not 0 <= effect.axis < axes:
+    joint = effect.axis
+    if effect.joint is not None:
+        if effect.joint not in passive:
+            joints = ", ".join(passive) or "none: each has a motor"
+            raise SpecInvalid(f"{effect.name}: no passive joint {effect.joint!r}; there are {joints}")
+        if effect.name in OF_MOTORS:
+            raise SpecInvalid(f"{effect.name}: joint {effect.joint} has no motor; name an axis, J1 to J{axes}")
+        joint = axes + passive.index(effect.joint)
+    elif not 0 <= effect.axis < axes:
         raise SpecInvalid(f"{effect.name}: axis {effect.axis + 1} does not exist; the cell has axes 1 to {axes}")
     known = {p.name: p.default for p in signature(physics).parameters.values() if p.name not in ("moment", "axis")}
     unknown = sorted(set(effect.parameters) - set(known))
@@ -302,8 +320,8 @@ def build_effect(effect: UndeclaredEffect, axes: int) -> Effect | Lag:
     if wrong:
         raise SpecInvalid(f"{effect.name}: {'; '.join(wrong)}; its parameters are {', '.join(known)}")
     if not isinstance(physics, type):
-        return partial(physics, axis=effect.axis, **effect.parameters)
-    built: WithState | Lag = physics(axis=effect.axis, **effect.parameters)
+        return partial(physics, axis=joint, **effect.parameters)
+    built: WithState | Lag = physics(axis=joint, **effect.parameters)
     if isinstance(built, Coupling) and (not 0 <= built.other < axes or built.other == built.axis):
         raise SpecInvalid(f"{effect.name}: other_axis {built.other_axis:g} is not another axis from 1 to {axes}")
     return built

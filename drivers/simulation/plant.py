@@ -8,18 +8,32 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from drivers.simulation.dynamics import TOLERANCE_RAD_S, Mechanics, advance
+from drivers.simulation.closures import OPEN, SINGULAR, Mechanism, link_frame, settle
+from drivers.simulation.dynamics import TOLERANCE_RAD_S, Mechanics, advance, advance_closed
 from drivers.simulation.effects import AMBIENT_C, Coupling, Effect, Elasticity, Lag, Moment, build_effect
 from drivers.simulation.noise import ColouredNoise, random_streams
-from drivers.simulation.spec import Body, CellSpec, FloatArray, FrictionUnsolved, SpecInvalid
+from drivers.simulation.spec import (
+    Body,
+    CellSpec,
+    ClosureLost,
+    FloatArray,
+    FrictionUnsolved,
+    PassiveFriction,
+    SpecInvalid,
+)
 
 BRAKE_FACTOR = 2.0  #: Holding torque of a brake over the peak torque of its motor
 
 DISTURBANCE = 1  #: Kind of the random streams of the torque disturbance; those of the current noise have none
 
 
-def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag]) -> tuple[Mechanics, tuple[Elasticity, ...]]:
+def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag], joints: int) -> tuple[Mechanics, tuple[Elasticity, ...]]:
     """Assign coordinates and directions, and set them in the effects that add some.
+
+    Args:
+        spec: of the cell.
+        effects: undeclared ones.
+        joints: number of joints, those of the motors first.
 
     Returns:
         the mechanics, and the drives between a motor and its joints in the order of their coordinates.
@@ -31,9 +45,9 @@ def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag]) -> tuple[Mechanics,
     flexible = tuple(effect for effect in effects if isinstance(effect, Elasticity))
     if len({drive.axis for drive in flexible}) < len(flexible):
         raise SpecInvalid("two flexible drives on one motor; give elasticity and gap in one backlash effect")
-    total = n + len(flexible)
-    motor_direction = np.hstack([rows, np.zeros((n, len(flexible)))])
-    for coordinate, drive in enumerate(flexible, start=n):
+    total = joints + len(flexible)
+    motor_direction = np.hstack([rows, np.zeros((n, total - n))])
+    for coordinate, drive in enumerate(flexible, start=joints):
         drive.coordinate, drive.row = coordinate, rows[drive.axis]
         motor_direction[drive.axis] = np.eye(total)[coordinate]
         # A quarter of the stability bound of the explicit spring, stiffness h² = 4 inertia.
@@ -43,11 +57,11 @@ def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag]) -> tuple[Mechanics,
                 f"the flexible drive of axis {drive.axis + 1} is too stiff for steps of {step_s * 1e6:g} us and a "
                 f"motor inertia of {inertia:g} kg m²; lower stiffness or damping"
             )
-    directions = list(np.eye(n, total))
+    directions = list(np.eye(joints, total))
     own_row = np.zeros(n, dtype=np.int64)
     for motor, row in enumerate(motor_direction):
         moved = np.flatnonzero(row)
-        if len(moved) == 1 and moved[0] < n:
+        if len(moved) == 1 and moved[0] < joints:
             # A motor that turns with one joint alone shares that joint's direction; r_i is 1 there by its making.
             own_row[motor] = moved[0]
         else:
@@ -94,17 +108,19 @@ def motor_rows(ratio: FloatArray) -> FloatArray:
 
 
 class Plant:
-    """Robot of n joints, revolute or prismatic, driven by the currents of n motors.
+    """Robot of n joints, revolute or prismatic, driven by the currents of m motors.
 
-    The coordinates are the joints, then each motor behind a flexible drive. Motor torques are in joint units
-    (τ_joint = Σ r_i g_i i_i). At power-on the robot is at rest with closed brakes.
+    A serial robot has as many motors as joints. The joints of a closed chain are in the order of its `Mechanism`: those
+    of the motors first, then the passive ones. The coordinates are the joints, then each motor behind a flexible drive.
+    Motor torques are in joint units (τ_joint = Σ r_i g_i i_i). At power-on the robot is at rest with closed brakes.
 
     Attributes:
+        mechanism: the closed chain, or None for a serial robot.
         position_rad, velocity_rad_s: of the coordinates, shape (N,).
         load_torque_nm: torque of the links on the joints in the last step, shape (n,).
-        motor_rad: angle of each rotor [rad], shape (n,); zero at joint position zero.
-        temperature_c: temperature of each motor [°C], shape (n,); AMBIENT_C without an effect that warms it.
-        disturbance_nm: random torque on each motor in the last step, in joint units, shape (n,).
+        motor_rad: angle of each rotor [rad], shape (m,); zero at joint position zero.
+        temperature_c: temperature of each motor [°C], shape (m,); AMBIENT_C without an effect that warms it.
+        disturbance_nm: random torque on each motor in the last step, in joint units, shape (m,).
         time_s: since power-on.
     """
 
@@ -112,36 +128,41 @@ class Plant:
         """Build the equations of motion.
 
         Raises:
-            SpecInvalid: URDF, drive train, axes and start position do not fit together, or an undeclared effect or its
-                parameters do not exist.
+            SpecInvalid: URDF, drive train, axes, closures and start position do not fit together, or an undeclared
+                effect or its parameters do not exist.
         """
-        model = link_model(spec.urdf, spec.gravity_m_s2, spec.payload)
+        model = link_model(spec.urdf, spec.gravity_m_s2, spec.payload, spec.platform)
         n = len(spec.axes)
-        if model.nv != n or spec.ratio.shape != (n, n) or spec.start_rad.shape != (n,):
+        self.mechanism = Mechanism(model, spec) if spec.closures else None
+        if (self.mechanism is None and model.nv != n) or spec.ratio.shape != (n, n) or spec.start_rad.shape != (n,):
             raise SpecInvalid(
                 f"{n} axes, a URDF of {model.nv} joints, a drive train of shape {spec.ratio.shape} and a start "
                 f"position of shape {spec.start_rad.shape}; all must have the same number of axes"
             )
-        effects = [build_effect(effect, n) for effect in spec.effects]
-        self._mechanics, flexible = lay_out(spec, effects)
+        start_rad = spec.start_rad if self.mechanism is None else self.mechanism.start_rad
+        self._passive_joints = () if self.mechanism is None else self.mechanism.joints[n:]
+        effects = [build_effect(effect, n, self._passive_joints) for effect in spec.effects]
+        self._joints = n + len(self._passive_joints)
+        self._mechanics, flexible = lay_out(spec, effects, self._joints)
         self._constants = tuple(self._mechanics)
         m, total = self._mechanics.directions.shape
         axes, added = spec.axes, [0.0] * len(flexible)
+        passive = [spec.passive.get(name, PassiveFriction()) for name in self._passive_joints]
         self.time_s = 0.0
-        self.position_rad = np.concatenate([spec.start_rad, [drive.row @ spec.start_rad for drive in flexible]])
+        self.position_rad = np.concatenate([start_rad, [drive.row @ start_rad[:n] for drive in flexible]])
         self.velocity_rad_s = np.zeros(total)
-        self.load_torque_nm = np.zeros(n)
+        self.load_torque_nm = np.zeros(self._joints)
         self.motor_rad = self._mechanics.rotor_direction @ self.position_rad
         self.temperature_c = np.full(n, AMBIENT_C)
         self._model, self._data = model, model.createData()
         self._acting = tuple(e for e in effects if not isinstance(e, Lag))
         self._rows = motor_rows(spec.ratio)
         self._gain = np.array([a.gain_nm_per_a for a in axes])
-        self._viscous = np.array([a.viscous_nm_s_rad for a in axes] + added)
+        self._viscous = np.array([a.viscous_nm_s_rad for a in axes] + [p.viscous_nm_s_rad for p in passive] + added)
         # The paper's offset is on the motor's side of eq. 1, so it acts against the joint.
-        self._torque = np.array([-a.offset_nm for a in axes] + added)
+        self._torque = np.array([-a.offset_nm for a in axes] + [0.0] * len(passive) + added)
         self._free_bound = np.zeros(m)
-        self._free_bound[:n] = [a.coulomb_nm for a in axes]
+        self._free_bound[: self._joints] = [a.coulomb_nm for a in axes] + [p.coulomb_nm for p in passive]
         np.add.at(self._free_bound, self._mechanics.own_row, [a.motor_coulomb_nm for a in axes])
         self._brake_nm = np.array([BRAKE_FACTOR * abs(a.gain_nm_per_a) * a.peak_current_a for a in axes])
         self._bound = self._free_bound.copy()
@@ -160,6 +181,9 @@ class Plant:
             temperature_c=self.temperature_c,
         )
         self._impulse = np.zeros(m)
+        self._resting = np.zeros(total, dtype=np.bool_)
+        self._basis = np.zeros((self._joints, n if self.mechanism is None else self.mechanism.mobility))
+        self._settle()
         self.disturbance_nm = np.zeros(n)
         self._disturbance = _disturbance(spec, self._mechanics.step_s)
         self.set_brakes(np.ones(n, dtype=np.bool_))
@@ -171,7 +195,7 @@ class Plant:
 
     def mount(self, spec: CellSpec) -> None:
         """Replace the payload by that of another description of the same cell; the state is kept."""
-        self._model = link_model(spec.urdf, spec.gravity_m_s2, spec.payload)
+        self._model = link_model(spec.urdf, spec.gravity_m_s2, spec.payload, spec.platform)
         self._data = self._model.createData()
 
     def postures(self, start_rad: FloatArray, count: int) -> tuple[FloatArray, ...]:
@@ -189,19 +213,30 @@ class Plant:
         )
 
     def motor_inertia_at(self, position_rad: FloatArray) -> FloatArray:
-        """Return the inertia seen by each motor with the others at rest, in joint units [kg m²], shape (n,)."""
+        """Return the inertia seen by each motor with the others at rest, in joint units [kg m²], shape (m,).
+
+        Redundant drives cannot rest alone: with A = P G theirs is (A⁺ᵀ Gᵀ M G A⁺)ᵢᵢ / (A A⁺)ᵢᵢ, the share of motor i by
+        least squares in the motion that turns it most. A closed chain has the position of its last step alone.
+        """
+        if self.mechanism is not None:
+            n = len(self._gain)
+            links = self._mass(self.position_rad[: self._joints])
+            motors = self._rows @ self._basis[:n]
+            to_speed = np.linalg.pinv(motors)
+            shared = to_speed.T @ self._basis.T @ links @ self._basis @ to_speed
+            return np.asarray(np.diag(shared) / np.diag(motors @ to_speed) + self._mechanics.motor_inertia)
         to_joint = np.linalg.inv(self._rows)
         links = np.array(pin.crba(self._model, self._data, position_rad))
         return np.asarray(np.diag(to_joint.T @ links @ to_joint) + self._mechanics.motor_inertia)
 
     def step(self, current_a: FloatArray) -> None:
-        """Advance by one substep with the motor currents, shape (n,).
+        """Advance by one substep with the motor currents, shape (m,).
 
         Raises:
             FrictionUnsolved: dry friction was not solved to its tolerance.
+            ClosureLost: the closures of a closed chain were not met.
         """
-        n, moment = len(self._gain), self._moment
-        position = self.position_rad[:n]
+        moment = self._moment
         moment.bound_nm[...] = self._bound
         np.multiply(self._gain, current_a, out=moment.motor_torque_nm)
         moment.viscous_nm_s_rad[...] = self._viscous
@@ -214,7 +249,21 @@ class Plant:
         if self._disturbance is not None:
             self.disturbance_nm = self._disturbance.advance()
             moment.motor_torque_nm += self.disturbance_nm
-        residual = advance(
+        residual = self._advance() if self.mechanism is None else self._advance_closed(self.mechanism)
+        if not residual <= TOLERANCE_RAD_S:
+            raise FrictionUnsolved(
+                f"dry friction at {self.time_s:.6f} s: residual {residual:.3g} rad/s, expected at most "
+                f"{TOLERANCE_RAD_S:.3g}; check the inertias and friction of the cell for values that differ by many "
+                "orders of magnitude"
+            )
+        if self.mechanism is not None and not self._resting.all():
+            self._settle()
+        self.time_s += self._mechanics.step_s
+
+    def _advance(self) -> float:
+        n, moment = self._joints, self._moment
+        position = self.position_rad[:n]
+        return advance(
             self._constants,
             np.ascontiguousarray(pin.crba(self._model, self._data, position)),
             pin.nonLinearEffects(self._model, self._data, position, self.velocity_rad_s[:n]),
@@ -228,13 +277,54 @@ class Plant:
             self.load_torque_nm,
             self.motor_rad,
         )
-        if not residual <= TOLERANCE_RAD_S:
-            raise FrictionUnsolved(
-                f"dry friction at {self.time_s:.6f} s: residual {residual:.3g} rad/s, expected at most "
-                f"{TOLERANCE_RAD_S:.3g}; check the inertias and friction of the cell for values that differ by many "
-                "orders of magnitude"
+
+    def _advance_closed(self, mechanism: Mechanism) -> float:
+        n, moment = self._joints, self._moment
+        position, velocity = np.empty(n), np.empty(n)
+        position[mechanism.order], velocity[mechanism.order] = self.position_rad[:n], self.velocity_rad_s[:n]
+        return advance_closed(
+            self._constants,
+            mechanism.order,
+            self._basis,
+            np.ascontiguousarray(pin.crba(self._model, self._data, position)),
+            pin.nonLinearEffects(self._model, self._data, position, velocity),
+            moment.viscous_nm_s_rad,
+            moment.motor_torque_nm,
+            moment.torque_nm,
+            moment.bound_nm * self._mechanics.step_s,
+            self._impulse,
+            self.position_rad,
+            self.velocity_rad_s,
+            self.load_torque_nm,
+            self._resting,
+        )
+
+    def _settle(self) -> None:
+        """Return the joints of a closed chain to its closures; nothing is done for a serial robot."""
+        if self.mechanism is None:
+            return
+        open_by, pivot = settle(
+            self.mechanism.constants,
+            self._mechanics.rotor_direction,
+            self._resting,
+            self.position_rad,
+            self._basis,
+            self.motor_rad,
+        )
+        if not (open_by <= OPEN and pivot >= SINGULAR):
+            raise ClosureLost(
+                f"closures at {self.time_s:.6f} s: open by {open_by:.3g} m or rad, smallest pivot {pivot:.3g} of the "
+                f"largest; expected at most {OPEN:g} and at least {SINGULAR:g}; the mechanism ran into a singular "
+                "pose: keep the limits of motion away from it"
             )
-        self.time_s += self._mechanics.step_s
+
+    def _mass(self, position_rad: FloatArray) -> FloatArray:
+        """Return the mass matrix of the links of a closed chain in the order of the plant, shape (n, n)."""
+        assert self.mechanism is not None
+        order = self.mechanism.order
+        position = np.empty(len(order))
+        position[order] = position_rad
+        return np.array(pin.crba(self._model, self._data, position))[np.ix_(order, order)]
 
 
 def _disturbance(spec: CellSpec, step_s: float) -> ColouredNoise | None:
@@ -247,11 +337,14 @@ def _disturbance(spec: CellSpec, step_s: float) -> ColouredNoise | None:
     return ColouredNoise(random_streams(spec.seed, len(spec.axes), DISTURBANCE), sigma_nm, correlation_s, step_s)
 
 
-def link_model(urdf: str, gravity_m_s2: tuple[float, float, float], payload: Body | None) -> pin.Model:
-    """Return the links of a URDF, with a payload fixed to the last one.
+def link_model(
+    urdf: str, gravity_m_s2: tuple[float, float, float], payload: Body | None, platform: str | None = None
+) -> pin.Model:
+    """Return the links of a URDF, with a payload fixed to the last joint or to the link `platform`.
 
     Raises:
-        SpecInvalid: the text is no URDF, or a joint is neither revolute nor prismatic with limits.
+        SpecInvalid: the text is no URDF, a joint is neither revolute nor prismatic with limits, or there is no such
+            link.
     """
     try:
         model = pin.buildModelFromXML(urdf)
@@ -267,5 +360,9 @@ def link_model(urdf: str, gravity_m_s2: tuple[float, float, float], payload: Bod
         xx, xy, xz, yy, yz, zz = payload.inertia_kg_m2
         inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         body = pin.Inertia(payload.mass_kg, np.asarray(payload.centre_m, dtype=np.float64), inertia)
-        model.appendBodyToJoint(model.njoints - 1, body, pin.SE3.Identity())
+        if platform is None:
+            model.appendBodyToJoint(model.njoints - 1, body, pin.SE3.Identity())
+        else:
+            frame = link_frame(model, platform)
+            model.appendBodyToJoint(frame.parentJoint, body, frame.placement)
     return model

@@ -7,12 +7,13 @@ For a prismatic joint read N for Nm, m for rad and kg for kg m².
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Annotated, Literal
 
 import numpy as np
-from annotated_types import Ge, Gt, Interval
+from annotated_types import Ge, Gt, Interval, MinLen
 from numpy.typing import NDArray
 
 from drivers.errors import DriverError
@@ -22,6 +23,8 @@ FloatArray = NDArray[np.float64]
 Positive = Annotated[float, Gt(0)]
 ToggleBit = Literal[8, 14, 15]
 NotNegative = Annotated[float, Ge(0)]
+Direction = Literal["x", "y", "z", "rx", "ry", "rz"]
+DIRECTIONS: tuple[Direction, ...] = ("x", "y", "z", "rx", "ry", "rz")
 U32 = Annotated[int, Interval(ge=0, le=0xFFFFFFFF)]
 
 
@@ -84,13 +87,35 @@ class UndeclaredEffect:
     """Physical effect of the plant that no configuration declares."""
 
     name: str  #: key in `effects.EFFECTS`
-    axis: int  #: index of the joint, from 0
+    axis: int  #: index of the joint, from 0; of a closed chain that of the motor
     parameters: dict[str, float]  #: by name, with units in the names
+    joint: str | None = None  #: joint of the URDF in place of the axis, for the passive joints of a closed chain
+
+
+@dataclass(frozen=True, slots=True)
+class Closure:
+    """Two frames of a closed chain that coincide."""
+
+    name: Annotated[str, MinLen(1)]  #: for messages
+    first: str  #: link of the URDF
+    second: str  #: link of the URDF
+    directions: Annotated[tuple[Direction, ...], MinLen(1)]  #: closed ones, along and about the axes of the first frame
+
+
+@dataclass(frozen=True, slots=True)
+class PassiveFriction:
+    """Friction of a joint without a motor."""
+
+    viscous_nm_s_rad: NotNegative = 0.0  #: viscous friction
+    coulomb_nm: NotNegative = 0.0  #: dry friction
 
 
 @dataclass(frozen=True, slots=True)
 class CellSpec:
-    """A whole simulated cell."""
+    """A whole simulated cell.
+
+    The fields from `closures` on describe a closed chain, whose URDF is a tree of n joints, m of them with motors.
+    """
 
     urdf: str  #: text of the URDF with the true inertial parameters of the links
     gravity_m_s2: tuple[float, float, float]  #: in the base frame, (x, y, z)
@@ -104,6 +129,11 @@ class CellSpec:
     substeps: int  #: control and integration steps in one SYNC period
     seed: int  #: seed of the current noise and the torque disturbance
     faults: tuple[FaultSpec, ...] = ()  #: injected faults
+    closures: tuple[Closure, ...] = ()  #: frames that coincide; none for a serial robot
+    motors: tuple[str, ...] = ()  #: joint of each axis; the ratio, the start and the axes are theirs
+    platform: str | None = None  #: link that carries the payload, or None for the last joint
+    assembly_rad: Mapping[str, float] = field(default_factory=dict)  #: rough position of every joint [rad or m]
+    passive: Mapping[str, PassiveFriction] = field(default_factory=dict)  #: by the names of the other joints
 
 
 class SimulationError(DriverError):
@@ -116,6 +146,10 @@ class SpecInvalid(SimulationError):
 
 class FrictionUnsolved(SimulationError):
     """The dry-friction problem was not solved to its tolerance."""
+
+
+class ClosureLost(SimulationError):
+    """The closures of a closed chain were not met: it ran into a singular pose."""
 
 
 class SdoAbort(Exception):

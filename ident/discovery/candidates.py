@@ -17,7 +17,7 @@ from scipy import linalg
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.dataset import Dataset
 from ident.discovery.noise_floor import noise_floors
-from ident.effects.effect import Effect, at_joints, is_placeable
+from ident.effects.effect import Effect, at_joints, columns_at, is_placeable
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.linearisation import Folds, MotorRows, cut_into_folds, linearise
 from ident.equations.rows import Observation, decimate_rows
@@ -54,7 +54,7 @@ class SearchProblem:
     @property
     def axes(self) -> int:
         """Number of axes."""
-        return self.observation.joint_count
+        return self.observation.axis_count
 
     def test(
         self, families: Iterable[Sequence[Effect]], axis: int, *, at_rows: bool = False
@@ -88,7 +88,7 @@ class SearchProblem:
         if kept is None:
             conditioning = self.observation.conditioning
             pairs = zip(self.datasets, self.runs, strict=True)
-            parts = [decimate_rows(data, conditioning, effect.columns(run, axis)) for data, run in pairs]
+            parts = [decimate_rows(data, conditioning, columns_at(effect, run, axis)) for data, run in pairs]
             kept = np.concatenate(parts, axis=-1, dtype=np.float32)
             if effect.abscissa.is_kinematic:
                 self.cache[effect, axis] = kept
@@ -99,7 +99,7 @@ class SearchProblem:
         """Build the same from signals that are decimated already: fast, and good for effects that change slowly."""
         if effect.abscissa in FAST:
             return self.torque(effect, axis)
-        columns = np.concatenate([effect.columns(run, axis) for run in self.rows], axis=-1)
+        columns = np.concatenate([columns_at(effect, run, axis) for run in self.rows], axis=-1)
         return at_joints(effect, axis, columns, self.model.drive_train)
 
 

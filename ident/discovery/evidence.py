@@ -90,7 +90,7 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequ
     """
     around, current, began_s = before, before, session_began_s(before.fit_runs)  # held-out runs must not affect the fit
     fixed = before.estimate.gains if before.estimate.gains_fixed else None
-    joints = before.model.robot.joints
+    joints = before.model.robot.places
     columns = tuple(column.at(joints[placed.axis].kind) for placed in effects for column in placed.columns)
     bare, unseen = _split_holdout(before.rows_without_effects, before.held_out)
     for signals in (runs,) if all(placed.effect.abscissa.is_kinematic for placed in effects) else (runs, ()):
@@ -118,6 +118,8 @@ def by_instruments(evidence: Evidence) -> Estimate | None:
 
 def _with_instruments(evidence: Evidence) -> System | None:
     model, conditioning = evidence.model, evidence.conditioning
+    if model.is_redundant:
+        return None
     asked = tuple(with_demand(data, model.drive_train, conditioning) for data in evidence.fit_runs)
     if all(data.demanded is None for data in asked):
         return None

@@ -23,7 +23,6 @@ from ident.effects.friction import LoadFriction
 from ident.effects.transmission import Efficiency
 from ident.equations.rows import Observation
 from ident.estimators.estimate import Estimate
-from ident.model.model import dry_friction_columns, link_columns
 
 CERTAIN = 2.0  #: Standard deviations of the loss that count against the gain
 SMALL_SHIFT = 0.01  #: Relative error of a gain below which an unseen loss does not matter
@@ -80,15 +79,14 @@ def driving_shares(observation: Observation, estimate: Estimate) -> tuple[tuple[
 
     The load torque is the model's, for links and payload; the direction of motion is that of the dry friction.
     """
-    count = observation.joint_count
     standard = np.array(observation.base.independent)
     # Payload columns follow those of the effects, which follow the base parameters.
     is_load = np.ones(len(estimate.parameters), dtype=np.bool_)
     is_load[: len(observation.columns)] = False
-    is_load[: len(standard)] = np.isin(standard, link_columns(count))
+    is_load[: len(standard)] = np.isin(standard, observation.model.link_columns)
     known = observation.known()
     shares: list[tuple[float, float]] = []
-    for joint, (used, friction) in enumerate(zip(observation.use, dry_friction_columns(count), strict=True)):
+    for joint, (used, friction) in enumerate(zip(observation.use, observation.model.dry_friction_columns, strict=True)):
         dry = np.flatnonzero(standard == friction)
         if not len(dry) or not used.any():
             shares.append((float("nan"), float("nan")))

@@ -139,7 +139,7 @@ def find_effects(
     """
     gates, cache = gates or Gates(), ColumnCache()
     model = _linearised(start, cache)
-    names = axes or [joint.name for joint in start.model.robot.joints]
+    names = axes or [joint.name for joint in start.model.robot.places]
     steps: list[Step] = []
     seen = {_keys(start)}
     for _ in range(MAX_EFFECTS):
@@ -262,6 +262,7 @@ def _turn(
             aside += _first_of_axis(aside, SetAside(named, why))
             continue
         axes = range(problem.axes) if named is None else range(named.axis, named.axis + 1)
+        axes = axes if axes.stop <= problem.axes else range(0)  # terms without a name are of driven joints
         if axes != searched:
             if named is None:
                 progress("searching for structure that no named effect explains")

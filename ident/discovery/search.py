@@ -35,7 +35,7 @@ from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial
 from ident.discovery.gates import impossible
 from ident.discovery.refinement import refine_together
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.effect import Effect, PlacedEffect, is_placeable
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import FOLDED, INTERVALS, Periodic, Smooth
 
@@ -109,10 +109,11 @@ def rank_effects(
     in the model: see `rank_families`.
     """
     tested: list[FamilyTrials] = []
-    for axis in range(search_problem.axes):
+    for axis in range(len(search_problem.model.robot.places)):
         own = (proposed or {}).get(axis, ())
         names = {family[0].name for family in own}
         shared = (family for family in families if family[0].name not in names)
+        shared = (family for family in shared if is_placeable(family[0], axis, search_problem.model.robot))
         fitting = (tuple(one for one in family if one.fits_in(search_problem.runs, axis)) for family in (*shared, *own))
         tested += search_problem.test((family for family in fitting if family), axis)
     return rank_families(search_problem, tested, rng, gates or Gates(), known)

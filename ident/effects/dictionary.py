@@ -32,6 +32,7 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
     (friction.AsymmetricViscous(),),
     tuple(friction.LoadFriction(speed_exponent) for speed_exponent in (0, 1)),
     (position.Spring(),),
+    (position.PassiveSpring(),),
     (friction.PositionFriction(),),
     tuple(electrical.Cogging(order) for order in ORDERS),
     (transmission.Ripple(0.5),),  # and what the periodogram proposes (ident.discovery.ripple)
@@ -42,6 +43,7 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
         friction.WarmUp(constant_s, whole) for constant_s in (20.0, 40.0, 80.0, 160.0, 320.0, 900.0) for whole in (0, 1)
     ),
     (friction.TemperatureFriction(),),
+    (friction.PassiveFriction(),),
     tuple(friction.Presliding(distance_rad) for distance_rad in (0.005, 0.01, 0.02, 0.04, 0.08, 0.16)),
     tuple(transmission.Backlash(share) for share in (0.02, 0.05, 0.15, 0.4)),
     (transmission.Elasticity(),),

@@ -107,6 +107,11 @@ class Effect(ABC):
         return False
 
     @property
+    def with_motor(self) -> bool | None:
+        """Whether it acts on driven joints alone (True), on joints without a motor alone (False), or on both (None)."""
+        return True
+
+    @property
     def refined(self) -> tuple[str, ...]:
         """Settings that are fitted together with the whole model; those of the dictionary are only where to begin."""
         return ()
@@ -189,7 +194,7 @@ ALL_AXES = "all axes"  #: Where an effect is that acts on every motor alike
 
 @dataclass(frozen=True, slots=True)
 class PlacedEffect:
-    """An effect on an axis (index from 0)."""
+    """An effect on an axis (index from 0), or on a joint without a motor: those follow the axes (`Robot.places`)."""
 
     effect: Effect
     axis: int
@@ -225,13 +230,24 @@ def effect_torque(
 ) -> FloatArray:
     """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (n, p, r)."""
     parts = [
-        decimate_rows(data, conditioning, effect.columns(run, axis)) for run, data in zip(runs, datasets, strict=True)
+        decimate_rows(data, conditioning, columns_at(effect, run, axis))
+        for run, data in zip(runs, datasets, strict=True)
     ]
     return at_joints(effect, axis, np.concatenate(parts, axis=-1), model.drive_train)
 
 
+def columns_at(effect: Effect, signals: Signals, axis: int) -> FloatArray:
+    """Columns of an effect where it is placed; on a joint without a motor, as torques of all axes, (m, p, k)."""
+    columns, count = effect.columns(signals, axis), len(signals.current_a)
+    if axis < count:
+        return columns
+    return np.asarray(signals.leverage[axis - count][:, None] * columns)
+
+
 def at_joints(effect: Effect, axis: int, columns: FloatArray, drive_train: DriveTrain) -> FloatArray:
     """Convert an effect's columns, shape (p, k) or (joints, p, k), to torques of all joints, shape (n, p, k)."""
+    if axis >= len(drive_train.ratio):
+        return columns
     if effect.side is Side.MOTOR:
         return np.asarray(drive_train.direction[axis][:, None, None] * columns[None])
     if effect.side is Side.ALL_JOINTS:
@@ -246,8 +262,11 @@ def at_joints(effect: Effect, axis: int, columns: FloatArray, drive_train: Drive
 
 def is_placeable(effect: Effect, axis: int, robot: Robot) -> bool:
     """Whether an effect can act on an axis; an effect of two joints is placed on the one with the lower number."""
-    if effect.needs_revolute and robot.joints[axis].kind is JointKind.PRISMATIC:
+    driven = axis < robot.axis_count
+    if effect.with_motor is not None and effect.with_motor != driven:
+        return False
+    if effect.needs_revolute and robot.places[axis].kind is JointKind.PRISMATIC:
         return False
     if effect.side is Side.ALL_MOTORS:
         return axis == 0
-    return effect.side is not Side.TWO_JOINTS or axis + 1 < int(effect.settings["other_axis"]) <= robot.joint_count
+    return effect.side is not Side.TWO_JOINTS or axis + 1 < int(effect.settings["other_axis"]) <= robot.axis_count

@@ -155,6 +155,27 @@ class Presliding(Effect):
 
 
 @dataclass(frozen=True, slots=True)
+class PassiveFriction(Effect):
+    """τ = a sign(q̇) + b q̇ on a joint without a motor;  a, b > 0: bearings of a closed chain brake.
+
+    Source: Coulomb's law and a film of oil; in the equations of the motors it appears through the leverage of the joint
+    (Briot & Gautier, Multibody System Dynamics 2015, friction of passive joints). Signature: odd in the speed of the
+    passive joint, on all motors of its loop.
+    """
+
+    name = "passive-friction"
+    declares = Property.ODD_IN_VELOCITY
+    abscissa = Abscissa.VELOCITY
+    with_motor = False
+    coefficients = (Column("dry", "Nm", least=0.0), Column("viscous", "Nm/(rad/s)", least=0.0))
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Columns, shape (2, k)."""
+        v = signals.velocity_rad_s[axis]
+        return np.stack((np.sign(v), v))
+
+
+@dataclass(frozen=True, slots=True)
 class WarmUp(Effect):
     """τ = e^(−t/η) · (c_s · sign(q̇) + c_v · q̇);  c_s, c_v > 0: more friction while cold.
 

@@ -32,6 +32,26 @@ class Spring(Effect):
 
 
 @dataclass(frozen=True, slots=True)
+class PassiveSpring(Effect):
+    """τ = c q + a on a joint without a motor;  c > 0: pulls towards −a/c.
+
+    Source: Hooke's law. Signature: position of the passive joint, on all motors of its loop. The torque a at position
+    zero is no declared offset there, so it is a parameter of its own.
+    """
+
+    name = "passive-spring"
+    declares = Property.INDEPENDENT_OF_VELOCITY
+    abscissa = Abscissa.POSITION
+    with_motor = False
+    coefficients = (Column("stiffness", "Nm/rad"), Column("preload", "Nm"))
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Columns, shape (2, k)."""
+        q = signals.position_rad[axis]
+        return np.stack((q, np.ones_like(q)))
+
+
+@dataclass(frozen=True, slots=True)
 class Compensator(Effect):
     """τ = a cos kq + b sin kq;  a > 0: the motor pushes in the positive direction at q = 0.
 

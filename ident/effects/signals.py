@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from itertools import pairwise
 
@@ -14,8 +14,7 @@ from ident.data.dataset import Dataset
 from ident.equations.rows import Observation
 from ident.estimators.estimate import Estimate
 from ident.model.bodies import LINK_PARAMETERS, Payload
-from ident.model.model import Model, link_columns
-from ident.model.regressor import mass_matrix
+from ident.model.model import Model
 
 STICKING_RAD_S = 0.005  #: Below this speed the noise of the filtered encoder decides the sign
 UNIX_S = 1e9  #: Times from here on, September 2001, are since 1970; earlier ones since some start
@@ -59,9 +58,9 @@ class Signals:
     time_s: FloatArray  #: since the start of the run, shape (k,)
     #: Since the first run of the session began, shape (k,); equal to time_s without a common clock.
     session_s: FloatArray
-    position_rad: FloatArray  #: position of the joints
-    velocity_rad_s: FloatArray  #: velocity of the joints
-    acceleration_rad_s2: FloatArray  #: acceleration of the joints
+    position_rad: FloatArray  #: position of the joints; in a closed chain those without a motor follow the driven ones
+    velocity_rad_s: FloatArray  #: velocity of the same joints
+    acceleration_rad_s2: FloatArray  #: acceleration of the same joints
     motor_position_rad: FloatArray  #: of the motors, R q
     #: Mass matrix of links and payload: torque at joint i per unit of acceleration of joint j, with a rotor's inertia
     #: where it is regrouped with theirs, in postures spread evenly over the run, shape (n, n, postures); none where it
@@ -73,6 +72,8 @@ class Signals:
     current_a: FloatArray  #: the same in the unit of the current reference
     #: Of each motor or its drive [°C], NaN for one without; None where none was recorded.
     temperature_c: FloatArray | None = None
+    #: Torque at each axis per unit of torque on each joint without a motor, shape (n − m, m, k); empty without any.
+    leverage: FloatArray = field(default_factory=lambda: np.empty((0, 0, 0)))
 
     def temperature(self, axis: int) -> FloatArray:
         """Temperature of an axis [°C], shape (k,); REFERENCE_C where it was not recorded."""
@@ -162,16 +163,23 @@ def declared_signals(
         inertia: whether the mass matrix is needed, by effects through the links.
     """
     # A base parameter is named after its leading standard one; Ia of J1, regrouped into Izz1, thus counts as load.
-    load, geared, total = model.torques(data.motion(), standard)
+    motion, leverage = data.motion(), np.empty((0, 0, 0))
+    load, geared, total = model.torques(motion, standard)
+    position, velocity, acceleration = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
+    if model.robot.closures:
+        followed, joints = model.follow(motion), [*model.robot.axis_joints, *model.robot.passive_joints]
+        states = followed.joints.position_rad, followed.joints.velocity_rad_s, followed.joints.acceleration_rad_s2
+        position, velocity, acceleration = (state[:, joints] for state in states)
+        leverage = model.leverage(followed)
     motor = model.drive_train.to_motor @ total
     began = None if data.started_s is None or session_began_s is None else data.started_s - session_began_s
     return Signals(
         rate_hz=data.rate_hz,
         time_s=data.time_s - data.time_s[0],
         session_s=data.time_s - data.time_s[0] + (0.0 if began is None else max(0.0, began)),
-        position_rad=data.position_rad.T,
-        velocity_rad_s=data.velocity_rad_s.T,
-        acceleration_rad_s2=data.acceleration_rad_s2.T,
+        position_rad=position.T,
+        velocity_rad_s=velocity.T,
+        acceleration_rad_s2=acceleration.T,
         motor_position_rad=model.drive_train.ratio @ data.position_rad.T,
         inertia_kg_m2=_inertia_of_joints(model, data, standard) if inertia else np.empty((len(load), len(load), 0)),
         load_torque_nm=load,
@@ -179,6 +187,7 @@ def declared_signals(
         motor_torque_nm=motor,
         current_a=motor / gains[:, None],
         temperature_c=None if data.temperature_c is None else data.temperature_c.T,
+        leverage=leverage,
     )
 
 
@@ -201,11 +210,10 @@ def session_began_s(datasets: Sequence[Dataset]) -> float | None:
 
 
 def _inertia_of_joints(model: Model, data: Dataset, standard: FloatArray) -> FloatArray:
-    """Mass matrix of links and payload in some postures, shape (n, n, postures)."""
-    samples, count = data.position_rad.shape
+    """Mass matrix of links and payload in some postures, shape (m, m, postures)."""
+    samples = len(data.position_rad)
     postures = _postures(samples, max(2, samples // POSTURE_SAMPLES))
-    links = standard[link_columns(count)]
-    return mass_matrix(model.robot, np.ascontiguousarray(data.position_rad[postures].T), links)
+    return model.inertia(data.position_rad[postures], standard)
 
 
 def _postures(samples: int, count: int) -> IntArray:

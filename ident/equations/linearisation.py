@@ -8,7 +8,7 @@ time (`left_out_shifts`); the search for effects leaves out folds of moves (`cut
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -16,6 +16,7 @@ import numpy as np
 from scipy import linalg
 
 from ident.arrays import FloatArray, IntArray
+from ident.equations.currents import PreloadedCurrents, without_preload
 from ident.equations.rows import Observation
 from ident.equations.system import System
 from ident.errors import TooFewMoves
@@ -83,6 +84,8 @@ class Linearisation:
     free: IntArray  #: which of (gains, parameters) are free, shape (f,)
     #: Unit of each free unknown: a step of one in the scaled unknown is this much of the real one, shape (f,).
     scale: FloatArray
+    #: T_D of each of the observation's rows for a redundantly driven robot, shape (r, m, m); None where it is D⁻¹.
+    transform: FloatArray | None = None
 
     @property
     def cluster_count(self) -> int:
@@ -106,6 +109,12 @@ class Linearisation:
             to_motor: T (DriveTrain.to_motor).
         """
         felt: dict[int, FloatArray] = {}
+        if self.transform is not None:
+            for motor in range(len(self.gamma)):
+                source = self.source[self.rows_of(motor)]
+                torque = torque_nm.take(source, axis=2)
+                felt[motor] = np.einsum("rj,jer->er", self.transform[source, motor], torque)
+            return felt
         for joint in np.flatnonzero(torque_nm.any(axis=(1, 2))):
             for motor in np.flatnonzero(to_motor[:, joint]).tolist():
                 own = torque_nm[joint].take(self.source[self.rows_of(motor)], axis=1)
@@ -131,14 +140,14 @@ def linearise(
     parts: list[FloatArray] = []
     seen: list[IntArray] = []
     residual, current, squares = [], [], np.zeros(width)
-    for motor, (columns, rows) in enumerate(zip(observation.motor_columns(), used, strict=True)):
-        own = columns[:, rows]
-        whole, left = motor_jacobian(own.T, motor, gains, parameters, noise)
+    rows_of = (columns[:, rows].T for columns, rows in zip(observation.motor_columns(), used, strict=True))
+    preload = observation.preload[:, :, used[0]].transpose(2, 0, 1)
+    for whole, left, measured in motor_jacobians(rows_of, preload, gains, parameters, noise):
         squares += np.einsum("rf,rf->f", whole, whole)
         seen.append(np.flatnonzero(whole[:, first:].any(axis=0)))
         parts.append(np.ascontiguousarray(whole[:, first + seen[-1]].T))
         residual.append(left)
-        current.append(own[0] / noise[motor])
+        current.append(measured)
     norms = np.sqrt(squares[count:])
     unit = np.concatenate((gains, np.divide(1.0, norms, where=norms > 0, out=np.ones(len(parameters)))))[first:]
     for part, held in zip(parts, seen, strict=True):
@@ -155,7 +164,30 @@ def linearise(
         noise=noise,
         free=np.arange(first, width),
         scale=unit,
+        transform=without_preload(observation.preload.transpose(2, 0, 1), gains, noise) if preload.size else None,
     )
+
+
+def motor_jacobians(
+    rows: Iterable[FloatArray], preload: FloatArray, gains: FloatArray, parameters: FloatArray, noise: FloatArray
+) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
+    """J, e and the measured current in units of its noise, of each motor's equations in turn.
+
+    Args:
+        rows: of each motor, see `motor_jacobian`; with preload [V_i | …] of all of them alike.
+        preload: N of the rows, shape (r, m, m − d).
+        gains, parameters, noise: see `motor_jacobian`.
+    """
+    if not preload.size:
+        for motor, own in enumerate(rows):
+            yield *motor_jacobian(own, motor, gains, parameters, noise), own[:, 0] / noise[motor]
+        return
+    currents = PreloadedCurrents.of_rows(list(rows), preload)
+    whitened = currents.whitened(gains, noise)
+    residual = whitened.residual(gains, parameters)
+    jacobian = np.concatenate((-currents.corrected(gains, noise, whitened, residual), whitened.linear), axis=1)
+    parts = (np.split(part, len(gains)) for part in (jacobian, residual, whitened.drive @ gains))
+    yield from zip(*parts, strict=True)
 
 
 def motor_jacobian(
@@ -276,10 +308,10 @@ def jackknife_covariance(
     free = slice(count if gains_fixed else 0, size)
     grams, scores = np.zeros((clusters, size, size)), np.zeros((clusters, size))
     for index, (cluster, own) in enumerate(zip(system.clusters, (recorded or system).clusters, strict=True)):
-        for motor, (rows, measured) in enumerate(zip(cluster, own, strict=True)):
-            jacobian, residual = motor_jacobian(rows, motor, gains, parameters, noise)
-            if measured is not rows:
-                residual = motor_jacobian(measured, motor, gains, parameters, noise)[1]
+        equations = motor_jacobians(cluster, system.preload_of(index), gains, parameters, noise)
+        for motor, (jacobian, left, _) in enumerate(equations):
+            same = own[motor] is cluster[motor]
+            residual = left if same else motor_jacobian(own[motor], motor, gains, parameters, noise)[1]
             grams[index] += jacobian.T @ jacobian
             scores[index] += jacobian.T @ residual
     runs = np.array([run for run, _ in system.cluster_runs])

@@ -18,9 +18,10 @@ from ident.data.dataset import differentiate
 from ident.data.demand import with_demand
 from ident.data.run import Run
 from ident.equations.rows import CHUNK_ROWS, Rows, RunRows, rows_of
-from ident.equations.system import System, Triangles, qr_update, triangle
+from ident.equations.system import System
+from ident.equations.triangles import Triangles, qr_update, triangle
 from ident.errors import DataUnfit
-from ident.model.base import BaseParameters, base_parameters
+from ident.model.base import SMALLEST_COLUMN, BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Column, Model
 
@@ -35,8 +36,10 @@ class Cluster:
     mounting: int  #: index into the payloads, −1 without load
     run: int  #: index into the runs
     #: For each motor i the rows, or where they are many their triangle, of [v_i | (T W_st)_i], the columns that the
-    #: motor's equation can hold (``Layout.motor``); with instruments [v_i | (T W_st)_i | (T Z_st)_i].
+    #: motor's equation can hold (``Layout.motor``); with instruments [v_i | (T W_st)_i | (T Z_st)_i]. Of a redundantly
+    #: driven robot always the rows, with the torques per unit of all gains, V_i, in place of v_i.
     factors: tuple[FloatArray, ...]
+    preload: FloatArray  #: N of these rows, shape (rows, m, m − d); empty where no motor works against another
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +81,7 @@ class Reduction:
 
     def _standard(self, index: int) -> FloatArray:
         """W_st of all joints' triangles of a mounting (0: without load), columns spread out."""
-        count, columns = self.model.robot.joint_count, layout(self.model).joint
+        count, columns = self.model.robot.axis_count, layout(self.model).joint
         return np.concatenate(
             [_widened(f, c, count + len(self.model.columns)) for f, c in zip(self.joints[index], columns, strict=True)]
         )[:, count:]
@@ -88,7 +91,10 @@ class Reduction:
         chosen: list[tuple[int, ...]] = []
         for index, payload in enumerate(self.payloads):
             flange = self._standard(index + 1)[:, self.model.flange]
-            unknown = tuple(i for i, name in enumerate(LINK_PARAMETERS) if name not in payload.known)
+            norms = np.linalg.norm(flange, axis=0)
+            # On a platform that never turns, most of the ten are rounding errors beside the mass.
+            shown = norms > SMALLEST_COLUMN * norms.max(initial=0.0)
+            unknown = tuple(i for i, name in enumerate(LINK_PARAMETERS) if name not in payload.known and shown[i])
             names = tuple(LINK_PARAMETERS[i] for i in unknown)
             seen = base_parameters(flange[:, list(unknown)], names).independent if unknown else ()
             chosen.append(tuple(unknown[i] for i in seen))
@@ -96,7 +102,7 @@ class Reduction:
 
     def system(self, base: BaseParameters, payload_columns: tuple[tuple[int, ...], ...]) -> System:
         """Eq. (17) with these base parameters and unknown payload parameters."""
-        plan, count, standard = layout(self.model), self.model.robot.joint_count, len(self.model.columns)
+        plan, count, standard = layout(self.model), self.model.robot.axis_count, len(self.model.columns)
         leading = len(base.independent)
         width = leading + sum(map(len, payload_columns)) + 1
 
@@ -119,24 +125,27 @@ class Reduction:
                 parts.append(np.concatenate((spread[:, :count], -chosen(spread[:, count:], index - 1)), axis=1))
             joints.append(triangle(parts, count + width))
 
+        lead = count if self.model.is_redundant else 1
+
         def part(cluster: Cluster, number: int) -> list[FloatArray]:
             """The columns of each motor's equation in one of the parts of a cluster's rows: W_st, Z_st."""
             return [
                 chosen(
-                    _widened(rows[:, 1 + number * len(c) : 1 + (number + 1) * len(c)], c, standard), cluster.mounting
+                    _widened(rows[:, lead + number * len(c) : lead + (number + 1) * len(c)], c, standard),
+                    cluster.mounting,
                 )
                 for rows, c in zip(cluster.factors, plan.motor, strict=True)
             ]
 
         clusters = tuple(
-            tuple(np.concatenate((rows[:, :1], own), 1) for rows, own in zip(c.factors, part(c, 0), strict=True))
+            tuple(np.concatenate((rows[:, :lead], own), 1) for rows, own in zip(c.factors, part(c, 0), strict=True))
             for c in self.clusters
         )
         instruments = tuple(tuple(part(c, 1)) for c in self.clusters) if self.instrumented else ()
-        motors = tuple(triangle((cluster[motor] for cluster in clusters), 1 + width) for motor in range(count))
+        motors = tuple(triangle((cluster[motor] for cluster in clusters), lead + width) for motor in range(count))
         named = zip(base.names, base.independent, strict=True)
         return System(
-            drive_train=self.model.drive_train,
+            model=self.model,
             base=base,
             columns=tuple(Column(name, self.model.columns[index].unit) for name, index in named),
             payloads=self.payloads,
@@ -147,13 +156,14 @@ class Reduction:
             clusters=clusters,
             cluster_runs=tuple((cluster.run, cluster.mounting) for cluster in self.clusters),
             instruments=instruments,
+            preload=tuple(c.preload for c in self.clusters) if self.model.is_redundant else (),
         )
 
 
 def layout(model: Model) -> Layout:
     """Which columns each joint's and each motor's equation can hold (Model.support through T)."""
     support, train = model.support, model.drive_train
-    current = train.direction.T != 0.0
+    current = np.ones_like(train.direction) if model.is_redundant else train.direction.T != 0.0
     mixed = (np.abs(train.to_motor) > 0.0).astype(np.int64) @ support.astype(np.int64) > 0
     return Layout(
         joint=tuple(np.flatnonzero(np.concatenate((v, w))) for v, w in zip(current, support, strict=True)),
@@ -185,7 +195,8 @@ def reduce_runs(
     Raises:
         DataUnfit: a run is unfit, leaves no usable row, or contradicts another about a mounting.
     """
-    count, plan = model.robot.joint_count, layout(model)
+    count, plan = model.robot.axis_count, layout(model)
+    instruments = instruments and not model.is_redundant
     width = tuple(len(columns) for columns in plan.joint)
     seen_payloads = list(payloads)
     joints = [[np.zeros((c, c)) for c in width] for _ in range(len(seen_payloads) + 1)]
@@ -201,7 +212,7 @@ def reduce_runs(
         if instruments:
             data = with_demand(data, model.drive_train, conditioning)
             known |= data.demanded is not None
-        moves: dict[int, list[list[FloatArray]]] = {}
+        moves: dict[int, list[tuple[list[FloatArray], FloatArray]]] = {}
         built: Iterable[Rows] = rows_of(model, data, conditioning, chunk_rows)
         if keep_rows:
             kept.append(RunRows(data, tuple(built)))
@@ -209,7 +220,10 @@ def reduce_runs(
         for rows in built:
             for joint, used in enumerate(rows.use):
                 own = plan.joint[joint][plan.joint[joint] < count]
-                current = model.drive_train.direction[own, joint, None] * rows.current[own][:, used]
+                if model.is_redundant:
+                    current = rows.drive[joint][:, used]
+                else:
+                    current = model.drive_train.direction[own, joint, None] * rows.current[own][:, used]
                 standard = rows.standard[joint][plan.joint[joint][len(own) :] - count][:, used]
                 columns = np.concatenate((current, standard))
                 joints[mounting + 1][joint] = qr_update(joints[mounting + 1][joint], columns)
@@ -259,25 +273,33 @@ def mounting_index(payload: Payload | None, payloads: list[Payload], run: str) -
     return len(payloads) - 1
 
 
-def _motor_rows(model: Model, rows: Rows, plan: Layout, *, instruments: bool) -> dict[int, list[FloatArray]]:
-    """Rows [v_i | (T W_st)_i] of each motor, with instruments [v_i | (T W_st)_i | (T Z_st)_i], parted by move."""
+def _motor_rows(
+    model: Model, rows: Rows, plan: Layout, *, instruments: bool
+) -> dict[int, tuple[list[FloatArray], FloatArray]]:
+    """Rows [v_i | (T W_st)_i] of each motor, with instruments (T Z_st)_i too, and N, parted by move."""
     to_motor = model.drive_train.to_motor
     by_motor = []
     for motor, held in enumerate(plan.motor):
         joints = np.flatnonzero(to_motor[motor])
         parts_of = (rows.standard, rows.instrument) if instruments else (rows.standard,)
         mixed = [sum(to_motor[motor, joint] * part[joint][held] for joint in joints) for part in parts_of]
-        by_motor.append(np.concatenate((rows.current[motor][None], *map(np.asarray, mixed))))
-    parts: dict[int, list[FloatArray]] = {}
+        own = rows.drive[motor] if model.is_redundant else rows.current[motor][None]
+        by_motor.append(np.concatenate((own, *map(np.asarray, mixed))))
+    parts: dict[int, tuple[list[FloatArray], FloatArray]] = {}
     for move in np.unique(rows.move):
         here = rows.motor_use & (rows.move == move)
         if here.any():
-            parts[int(move)] = [columns[:, used].T for columns, used in zip(by_motor, here, strict=True)]
+            own_rows = [columns[:, used].T for columns, used in zip(by_motor, here, strict=True)]
+            parts[int(move)] = own_rows, rows.preload[:, :, here[0]].transpose(2, 0, 1)
     return parts
 
 
-def _cluster(mounting: int, run: int, pieces: list[list[FloatArray]]) -> Cluster:
-    return Cluster(mounting, run, tuple(triangle(parts, parts[0].shape[1]) for parts in zip(*pieces, strict=True)))
+def _cluster(mounting: int, run: int, pieces: list[tuple[list[FloatArray], FloatArray]]) -> Cluster:
+    preload = np.concatenate([one for _, one in pieces])
+    factors = zip(*(rows for rows, _ in pieces), strict=True)
+    if preload.size:
+        return Cluster(mounting, run, tuple(np.concatenate(parts) for parts in factors), preload)
+    return Cluster(mounting, run, tuple(triangle(parts, parts[0].shape[1]) for parts in factors), preload[:0])
 
 
 def _joined(clusters: list[Cluster]) -> list[Cluster]:
@@ -287,7 +309,7 @@ def _joined(clusters: list[Cluster]) -> list[Cluster]:
     while index < len(clusters):
         pair = clusters[index : index + 2]
         if len(pair) == 2 and pair[0].run == pair[1].run:
-            joined.append(_cluster(pair[0].mounting, pair[0].run, [list(cluster.factors) for cluster in pair]))
+            joined.append(_cluster(pair[0].mounting, pair[0].run, [(list(one.factors), one.preload) for one in pair]))
             index += 2
         else:
             joined.append(pair[0])

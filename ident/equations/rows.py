@@ -13,9 +13,10 @@ import numpy as np
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.conditioning import Conditioning, Decimator, decimator
 from ident.data.dataset import Dataset
-from ident.equations.system import Equations, System, Triangles, triangle_of
+from ident.equations.system import Equations, System
+from ident.equations.triangles import Triangles, triangle_of
 from ident.errors import DataUnfit
-from ident.model.model import Column, DriveTrain, Model
+from ident.model.model import Column, DriveTrain, Model, spread
 from ident.model.robot import Motion
 
 CHUNK_ROWS = 256  #: Decimated rows built at once: the regressor of their samples stays in the cache's reach
@@ -82,6 +83,10 @@ class Rows:
     motor_use: BoolArray  #: rows of each motor that count: all joints it turns with, and itself, moving, shape (n, r)
     time_s: FloatArray  #: of each row, since the start of the run, shape (r,)
     move: IntArray  #: number of each row's move within the run, shape (r,)
+    #: Of a redundantly driven robot: torque at each axis per unit of each motor's gain, preload taken out, shape
+    #: (m, m, r), and N, the torques that move nothing, shape (m, m − d, r). Of others (m, 0, r) both.
+    drive: FloatArray
+    preload: FloatArray
 
 
 def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows: int = CHUNK_ROWS) -> Iterator[Rows]:
@@ -98,6 +103,8 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
     """
     filter_ = row_filter(data, conditioning)
     use, motor_use = row_masks(model.drive_train, data, conditioning)
+    if model.is_redundant:  # preload joins the equations of all motors
+        use[:] = motor_use[:] = use.all(axis=0) & motor_use.all(axis=0)
     if not use.any():
         raise DataUnfit(data.name, "no row is left after the standstill and validity masks; did the robot move?")
     centres = filter_.centres(len(data.time_s))
@@ -105,9 +112,13 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
     first, support = 0, model.support
     asked = None if data.demanded is None else _decimated(data.demanded, filter_)
     for part in chunks(filter_, len(data.time_s), chunk_rows):
-        regressor = model.regressor(data.motion(part))
-        standard = np.zeros((*support.shape, filter_.rows(regressor.shape[2])))
-        standard[support] = filter_(regressor[support])
+        if model.is_redundant:
+            standard, drive, preload = _balanced(model, data, part, filter_)
+        else:
+            regressor = model.regressor(data.motion(part))
+            standard = np.zeros((*support.shape, filter_.rows(regressor.shape[2])))
+            standard[support] = filter_(regressor[support])
+            drive = preload = np.empty((len(support), 0, standard.shape[2]))
         piece = slice(first, first + standard.shape[2])
         first = piece.stop
         yield Rows(
@@ -118,7 +129,26 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
             motor_use=motor_use[:, piece],
             time_s=time_s[piece],
             move=move[piece],
+            drive=drive,
+            preload=preload,
         )
+
+
+def _balanced(
+    model: Model, data: Dataset, part: slice, filter_: Decimator
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rows of a redundantly driven robot: columns of the parameters and of the gains at the axes, and N.
+
+    Both sides of Aᵀ diag(v) g = Gᵀ W χ go through the filter, because A changes from sample to sample; then, with the A
+    of each row, they are written as torques of the axes.
+    """
+    columns, to_motors = model.balance(data.motion(part))
+    currents = data.current_a[part].T
+    slow = filter_(to_motors)
+    standard = spread(filter_(columns), slow)
+    drive = spread(filter_(to_motors * currents), slow)
+    whole, _ = np.linalg.qr(slow.transpose(2, 1, 0), mode="complete")
+    return standard, drive, np.ascontiguousarray(whole[:, :, slow.shape[0] :].transpose(1, 2, 0))
 
 
 def _decimated(demanded: Motion, filter_: Decimator) -> Motion:
@@ -138,7 +168,20 @@ class RunRows:
     pieces: tuple[Rows, ...]  #: its rows, piece by piece
 
 
-OF_ROWS = ("current", "regressor", "effects", "flange", "use", "motor_use", "time_s", "run", "move", "mounting")
+OF_ROWS = (
+    "current",
+    "drive",
+    "preload",
+    "regressor",
+    "effects",
+    "flange",
+    "use",
+    "motor_use",
+    "time_s",
+    "run",
+    "move",
+    "mounting",
+)
 """Fields of an observation that have a row last."""
 
 
@@ -156,6 +199,8 @@ class Observation(Equations):
     run: IntArray  #: index of each row's run, shape (r,)
     move: IntArray  #: number of each row's move, unique over all runs, shape (r,)
     mounting: IntArray  #: index into payloads, −1 without load, shape (r,)
+    drive: FloatArray  #: as of Rows, shape (m, m, r) or (m, 0, r)
+    preload: FloatArray  #: N, shape (m, m − d, r)
     conditioning: Conditioning  #: the filters these rows went through
 
     def of_joint(self, joint: int, rows: BoolArray | slice = slice(None)) -> FloatArray:
@@ -174,8 +219,15 @@ class Observation(Equations):
         return np.asarray(np.einsum("jpr,rp->jr", self.flange[:, :, rows], weights[self.mounting[rows]]))
 
     def motor_columns(self) -> Iterator[FloatArray]:
-        """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor in turn, columns first, shape (p + 2, r)."""
+        """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor in turn, columns first, shape (p + 2, r).
+
+        Of a redundantly driven robot V_i in place of v_i, shape (m + p + 1, r).
+        """
         known = self.known()
+        if self.preload.size:
+            for axis, drive in enumerate(self.drive):
+                yield np.concatenate((drive, self.of_joint(axis), known[axis][None]))
+            return
         for current, row in zip(self.current, self.drive_train.to_motor, strict=True):
             first, *others = np.flatnonzero(row).tolist()  # T is invertible
             columns = np.concatenate((current[None], self.of_joint(first), known[first][None]))
@@ -187,6 +239,8 @@ class Observation(Equations):
 
     def torque(self, gains: FloatArray, rows: BoolArray | slice = slice(None)) -> FloatArray:
         """Y = V g: joint torque from the measured current references (eq. 4 through R) [Nm], shape (n, rows)."""
+        if self.preload.size:
+            return np.asarray(np.einsum("amr,m->ar", self.drive[:, :, rows], gains))
         return self.drive_train.direction.T @ (gains[:, None] * self.current[:, rows])
 
     def only(self, rows: BoolArray | IntArray | slice) -> Observation:
@@ -213,20 +267,22 @@ class Observation(Equations):
         Args:
             demanded: the same rows and columns for the demanded motion: they become the system's instruments.
         """
-        known, direction = self.known(), self.drive_train.direction
+        known, direction, preloaded = self.known(), self.drive_train.direction, self.preload.size > 0
         joints = []
         for joint, used in enumerate(self.use):
-            current = direction[:, joint, None] * self.current[:, used]
+            current = self.drive[joint][:, used] if preloaded else direction[:, joint, None] * self.current[:, used]
             joints.append(
                 triangle_of(np.concatenate((current, -self.of_joint(joint, used), -known[joint, used][None])))
             )
-        clusters, runs = self._by_move(), []
+        clusters, runs, preload = self._by_move(), [], []
         motors = [triangle_of(np.concatenate(rows).T) for rows in zip(*clusters, strict=True)]
         for move in np.unique(self.move[self.motor_use.any(axis=0)]):
             first = int(np.argmax(self.move == move))
             runs.append((int(self.run[first]), int(self.mounting[first])))
+            if preloaded:
+                preload.append(self.preload[:, :, (self.move == move) & self.motor_use[0]].transpose(2, 0, 1))
         return System(
-            drive_train=self.drive_train,
+            model=self.model,
             base=self.base,
             columns=self.columns,
             payloads=self.payloads,
@@ -237,6 +293,7 @@ class Observation(Equations):
             clusters=clusters,
             cluster_runs=tuple(runs),
             instruments=() if demanded is None else demanded._by_move(first_column=1),
+            preload=tuple(preload),
         )
 
 
@@ -259,7 +316,7 @@ def observe(
     mountings = [payload.mounting for payload in like.payloads]
     parts: list[tuple[Rows, FloatArray, FloatArray]] = []
     run, move, mounting = [], [], []
-    first_move, shared = 0, ("current", "use", "motor_use", "time_s")
+    first_move, shared = 0, ("current", "use", "motor_use", "time_s", "drive", "preload")
     names: list[str] = []
     for index, given in enumerate(runs):
         data, pieces = (
@@ -275,11 +332,11 @@ def observe(
             mounting.append(np.full(len(rows.move), mounted, dtype=np.int64))
         first_move = last
     return Observation(
-        drive_train=model.drive_train,
+        model=model,
         columns=like.columns[: len(base)],
         base=like.base,
         regressor=np.concatenate([regressor for _, regressor, _ in parts], axis=2),
-        effects=np.zeros((model.robot.joint_count, 0, sum(map(len, run)))),
+        effects=np.zeros((model.robot.axis_count, 0, sum(map(len, run)))),
         flange=np.concatenate([flange for _, _, flange in parts], axis=2),
         run=np.concatenate(run),
         move=np.concatenate(move),

@@ -175,7 +175,7 @@ def essential(system: System, estimator: Callable[[System], Estimate], ratio: fl
         current = current.holding({worst: 0.0})
         del kept[worst]
         estimate = estimator(current)
-    count, every = system.joint_count, len(system.unknowns)
+    count, every = system.axis_count, len(system.unknowns)
     places = [*kept, *range(len(system.columns), every)]
     parameters = np.zeros(every)
     parameters[places] = estimate.parameters

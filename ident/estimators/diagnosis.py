@@ -24,11 +24,12 @@ from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.equations.reduction import layout
 from ident.equations.rows import rows_of
-from ident.equations.system import System, qr_update, solve
+from ident.equations.system import System
+from ident.equations.triangles import qr_update, solve
 from ident.errors import CurrentReversed, Diagnosis, IdentificationError, UnitsMistaken
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import wls
-from ident.estimators.maximum_likelihood import ml, noise_of
+from ident.estimators.maximum_likelihood import ml
 from ident.estimators.payload_diagnosis import payload_diagnoses
 from ident.model.model import Model
 from ident.plausible import GAIN_RATIO, TORQUE_RATIO, UNIT_RATIO
@@ -181,7 +182,7 @@ def require_signs(system: System, estimate: Estimate, axes: Sequence[str]) -> No
         for column, value, std in zip(one.unknowns, one.parameters, one.parameters_std, strict=True):
             if (of_friction := FRICTION.match(column.name)) is not None:
                 friction[int(of_friction[1]) - 1] += value / std
-        errors = np.maximum(noise_of(system.motors, 1.0 / one.gains, one.parameters, 0), smallest)
+        errors = np.maximum(system.currents.noise(one.gains, one.parameters), smallest)
         return float(np.sum(np.log(errors))), friction
 
     size = np.array([np.linalg.norm(factor[:, 0]) for factor in system.motors.factors])
@@ -309,7 +310,7 @@ def idle_joints(model: Model, size: FloatArray, left: FloatArray) -> BoolArray:
         model: of the fit.
         size, left: of `joint_torques`.
     """
-    kinds = np.array([joint.kind.value for joint in model.robot.joints])
+    kinds = np.array([joint.kind.value for joint in model.robot.axes])
     largest = np.array([size[kinds == kind].max() for kind in kinds])
     return (size < IDLE_TORQUE * largest) & (left < IDLE_ERROR * largest)
 
@@ -430,7 +431,7 @@ def channel_errors(model: Model, runs: Iterable[Run], conditioning: Conditioning
     Raises:
         DataUnfit: as of `ident.equations.reduction.reduce_runs`.
     """
-    count, plan, to_motor = model.robot.joint_count, layout(model), model.drive_train.to_motor
+    count, plan, to_motor = model.robot.axis_count, layout(model), model.drive_train.to_motor
     factors: list[FloatArray | None] = [None] * count
     seen = np.zeros(count)
     for run in runs:

@@ -72,7 +72,7 @@ class Estimate:
 
     def predicted_torque(self, observation: Observation) -> FloatArray:
         """W χ + W_uL χ_uL + W_kL χ_kL [Nm], shape (n, r)."""
-        linear = [self.parameters @ observation.of_joint(joint) for joint in range(observation.joint_count)]
+        linear = [self.parameters @ observation.of_joint(joint) for joint in range(observation.axis_count)]
         return np.stack(linear) + observation.known()
 
     def residual_torque(self, observation: Observation) -> FloatArray:

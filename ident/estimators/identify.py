@@ -19,7 +19,7 @@ from ident.errors import DataUnfit, IdentificationError, ModelContradicted, Mode
 from ident.estimators.diagnosis import idle_joints, joint_torques, require_signs, require_weight
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import ls, tls, wls
-from ident.estimators.maximum_likelihood import iv, ml, noise_of
+from ident.estimators.maximum_likelihood import iv, ml
 from ident.estimators.method import Method
 from ident.model.bodies import Payload
 from ident.model.model import Model
@@ -68,7 +68,7 @@ class Identification:
         for system in (self.system, self.holdout):
             if system is not None:
                 seen = system.motors.rows > 0
-                size = noise_of(system.motors, 1.0 / self.estimate.gains, self.estimate.parameters, 0)
+                size = system.currents.noise(self.estimate.gains, self.estimate.parameters)
                 left[seen] = size[seen]
         return tuple(float(f"{one:.6g}") for one in left) if np.isfinite(left).all() else None
 
@@ -106,7 +106,7 @@ def identify(
     require_kind("conditioning", conditioning, Conditioning, "write Conditioning()")
     method = Method(method)
     if fixed_gains is not None:
-        fixed_gains = as_array("fixed_gains", fixed_gains, (model.robot.joint_count,), "one per motor")
+        fixed_gains = as_array("fixed_gains", fixed_gains, (model.robot.axis_count,), "one per motor")
         if not fixed_gains.all():
             raise ModelError(f"fixed_gains is {fixed_gains.tolist()}; expected no zero: such a motor moves nothing")
     reduction = reduce_runs(model, each_run(runs), conditioning, instruments=method is Method.IV, keep_rows=keep_rows)
@@ -122,7 +122,7 @@ def identify(
         with suppress(IdentificationError):
             jackknifed = estimate if method.is_of_currents else ml(system)
         require_seen_payload(jackknifed, system)
-    axes = [joint.name for joint in model.robot.joints]
+    axes = [joint.name for joint in model.robot.axes]
     if fixed_gains is not None:
         require_weight(system, estimate)
         require_signs(system, estimate, axes)

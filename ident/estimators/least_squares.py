@@ -7,7 +7,8 @@ from enum import Enum
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.equations.system import System, Triangles, require_known_payload, singular_values, solve
+from ident.equations.system import System, require_known_payload
+from ident.equations.triangles import Triangles, singular_values, solve
 from ident.estimators.estimate import Estimate
 from ident.estimators.method import Method
 
@@ -22,7 +23,7 @@ def ls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
     Raises:
         DataUnfit: free gains without a known payload: every gain could be scaled at will.
     """
-    return _solve(system, np.ones(system.joint_count), Method.LS, fixed_gains)
+    return _solve(system, np.ones(system.axis_count), Method.LS, fixed_gains)
 
 
 def wls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
@@ -30,12 +31,12 @@ def wls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
 
     Arguments and errors as for ``ls``.
     """
-    first = _solve(system, np.ones(system.joint_count), Method.LS, fixed_gains)
+    first = _solve(system, np.ones(system.axis_count), Method.LS, fixed_gains)
     return _solve(system, 1.0 / first.axis_noise, Method.WLS, fixed_gains)
 
 
 def _solve(system: System, weight: FloatArray, method: Method, fixed: FloatArray | None) -> Estimate:
-    count, triangles = system.joint_count, system.joints
+    count, triangles = system.axis_count, system.joints
     stacked = triangles.stacked(weight)
     if fixed is None:
         require_known_payload(system)
@@ -86,14 +87,14 @@ def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
     """
     require_known_payload(system)
     triangles = system.joints
-    weight = np.ones(system.joint_count)
+    weight = np.ones(system.axis_count)
     columns = scaling in (Scaling.COLUMNS, Scaling.BOTH)
     if scaling in (Scaling.ROWS, Scaling.BOTH):
         first, _, _ = _smallest(triangles, weight, columns)
         # σ_W^j, the standard deviation of joint j's equations (§3.3, last paragraph).
         weight = 1.0 / triangles.residual_std(first, len(first) - 1)
     vector, covariance, singular = _smallest(triangles, weight, columns)
-    count = system.joint_count
+    count = system.axis_count
     weighted = triangles.weighted_system(vector, len(vector) - 1, gains=True)
     return Estimate(
         method=Method.TLS,

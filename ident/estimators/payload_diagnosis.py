@@ -9,11 +9,9 @@ import numpy as np
 import scipy  # loads its modules when they are first used: a clean fit needs none of them
 
 from ident.arrays import FloatArray
-from ident.equations.linearisation import MIN_MOVES_TO_LEAVE_OUT, left_out_shifts, motor_jacobian
+from ident.equations.linearisation import MIN_MOVES_TO_LEAVE_OUT, left_out_shifts, motor_jacobians
 from ident.equations.system import System
 from ident.errors import Diagnosis, PayloadDiffers
-from ident.estimators.maximum_likelihood import noise_of
-from ident.model.model import link_columns
 
 LEAST_SHARE = 0.15  #: Torque of a payload's difference, relative to the payload's
 UNSEEN_SHARE = 0.3  #: The same in a held-out run, where the errors of all other parameters are in it
@@ -91,14 +89,14 @@ def payload_differences(
     leading = len(system.base.independent)
     if not system.payloads or tuple(column.name for column in system.columns[:leading]) != system.base.names:
         return []  # parameters were taken out, and the flange's columns with them
-    count = system.joint_count
-    of_base = system.base.grouping[:, link_columns(count)[-1]]
-    noise = noise_of(system.motors, 1.0 / gains, parameters, 0)
+    count = system.axis_count
+    of_base = system.base.grouping[:, system.model.flange]
+    noise = system.currents.noise(gains, parameters)
     first, least = (held, LEAST_SHARE) if held is not None else (count + len(parameters), UNSEEN_SHARE)
     blocks = []  # J, e and X of each move
-    for cluster in system.clusters:
-        parts = [motor_jacobian(rows, motor, gains, parameters, noise) for motor, rows in enumerate(cluster)]
-        jacobian, residual = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    for index, cluster in enumerate(system.clusters):
+        parts = motor_jacobians(cluster, system.preload_of(index), gains, parameters, noise)
+        jacobian, residual, _ = (np.concatenate(columns) for columns in zip(*parts, strict=True))
         weight = [rows[:, -1] / (g * std) for rows, g, std in zip(cluster, gains, noise, strict=True)]
         # With given gains, which may all be off, the weight of the payload is an unknown of all runs together.
         others = np.column_stack((jacobian[:, first:], np.concatenate(weight))) if held else jacobian[:, first:]

@@ -9,6 +9,8 @@ from scipy import linalg
 
 from ident.arrays import FloatArray
 
+SMALLEST_COLUMN = 1e-9  #: Norm of a column, relative to the largest, that is rounding error
+
 
 @dataclass(frozen=True, slots=True)
 class BaseParameters:
@@ -28,11 +30,11 @@ def base_parameters(triangle: FloatArray, names: tuple[str, ...], tolerance: flo
     Args:
         triangle: any matrix with the same Gram matrix as the observation matrix, shape (m, c).
         names: of the c standard parameters.
-        tolerance: relative to each column's norm. Before that, columns below 1e-9 of the largest count as zero:
-            normalised, one of them could be chosen, and the condition number would become 1e16.
+        tolerance: relative to each column's norm. Before that, columns below SMALLEST_COLUMN of the largest count as
+            zero: normalised, one of them could be chosen, and the condition number would become 1e16.
     """
     norms = np.linalg.norm(triangle, axis=0)
-    present = norms > 1e-9 * float(norms.max(initial=0.0))
+    present = norms > SMALLEST_COLUMN * float(norms.max(initial=0.0))
     independent: list[int] = []
     basis = np.zeros((triangle.shape[0], 0))
     for column in np.flatnonzero(present):

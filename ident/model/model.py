@@ -1,30 +1,29 @@
-"""The declared model: rigid links, rotors, friction and offsets, each a column (paper eqs. 1 and 25)."""
+"""The declared model: rigid links, rotors, friction and offsets, each a column (paper eqs. 1 and 25).
+
+The torques τ of the m axes need d equations of virtual power, Aᵀ τ = Gᵀ W χ, with W of the tree of all joints and G, A
+of `ident.model.closed_chain`. A serial robot has G = A = I. With as many motors as degrees of freedom A is the identity
+too, and each axis has an equation of its own. With more motors than that, the part of τ in the null space of Aᵀ, the
+internal preload, moves nothing and is in no equation: the columns are then those of the least τ without it,
+
+    τ = B Gᵀ W χ,    B = A (AᵀA)⁻¹,    Aᵀ B = I.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray, as_array, require_kind
 from ident.errors import ModelError
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
-from ident.model.regressor import fill_rigid, rigid_torque
+from ident.model.closed_chain import Assembly, TreeMotion, assemble, follow
+from ident.model.regressor import fill_rigid, mass_matrix, rigid_torque
 from ident.model.robot import JointKind, Motion, Robot
 
 DRIVE_UNITS = {JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"), JointKind.PRISMATIC: ("N", "m/s", "kg")}
 """Units of torque or force along a joint, of its speed, and of a rotor's inertia seen there."""
 JOINT_COLUMNS = 14  #: Standard parameters of a joint: ten of its link (LINK_PARAMETERS), then Ia, fv, fs, off
-
-
-def link_columns(joints: int) -> IntArray:
-    """Columns of the links' parameters among the standard ones, shape (joints, 10)."""
-    return JOINT_COLUMNS * np.arange(joints)[:, None] + np.arange(len(LINK_PARAMETERS))
-
-
-def dry_friction_columns(joints: int) -> IntArray:
-    """Columns of fs among the standard ones, shape (joints,)."""
-    return JOINT_COLUMNS * np.arange(joints) + 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,23 +88,36 @@ class Column:
 class Model:
     """A robot and its drive train, with the standard parameters χ_st in the paper's order.
 
-    A joint has fourteen: ten of its link (LINK_PARAMETERS), then Ia, fv, fs, off. A motor that turns with several
-    joints adds three (eq. 25): Iam, fvm, fsm. Its rotor inertia and viscous friction act on the joints through
-    r rᵀ; the diagonal of that is already in Ia and fv, so Iam and fvm carry the off-diagonal part, as in the paper.
+    A joint has fourteen: ten of its link (LINK_PARAMETERS), then Ia, fv, fs, off; of a joint without a motor the last
+    four are zero columns. A motor that turns with several joints adds three (eq. 25): Iam, fvm, fsm. Its rotor inertia
+    and viscous friction act on the joints through r rᵀ; the diagonal of that is already in Ia and fv, so Iam and fvm
+    carry the off-diagonal part, as in the paper.
     """
 
     robot: Robot
-    drive_train: DriveTrain
+    drive_train: DriveTrain  #: between motors and the joints of the axes
+    assembly: Assembly = field(init=False, compare=False, repr=False)  #: which joints are free, and how the loops close
 
     def __post_init__(self) -> None:
         require_kind("robot", self.robot, Robot, "read it from a URDF: robot_from_urdf(urdf_text)")
         require_kind("drive_train", self.drive_train, DriveTrain, "write DriveTrain(np.diag(gear_ratios))")
-        motors, joints = len(self.drive_train.ratio), self.robot.joint_count
-        if motors != joints:
+        motors, axes = len(self.drive_train.ratio), self.robot.axis_count
+        if motors != axes:
             raise ModelError(
-                f"the drive train has shape {self.drive_train.ratio.shape}, expected {(joints, joints)}: the robot has "
-                f"{joints} joints; give one motor for each"
+                f"the drive train has shape {self.drive_train.ratio.shape}, expected {(axes, axes)}: the robot has "
+                f"{axes} joints; give one motor for each"
             )
+        object.__setattr__(self, "assembly", assemble(self.robot))
+        if self.is_redundant and self.drive_train.coupled:
+            raise ModelError(
+                "the robot has more motors than degrees of freedom, and motors that turn with several joints; expected "
+                "a diagonal drive train there"
+            )
+
+    @property
+    def is_redundant(self) -> bool:
+        """Whether there are more motors than degrees of freedom, so that they can work against each other."""
+        return self.robot.axis_count > self.assembly.mobility
 
     @property
     def columns(self) -> tuple[Column, ...]:
@@ -117,88 +129,197 @@ class Model:
             drive = ("Ia", inertia), ("fv", f"{force}/({rate})"), ("fs", force), ("off", force)
             columns += [Column(f"{name}{number}", unit) for name, unit in (*link, *drive)]
         for motor in self.drive_train.coupled:
-            force, rate, inertia = DRIVE_UNITS[self.robot.joints[self.drive_train.joints[motor]].kind]
+            force, rate, inertia = DRIVE_UNITS[self.robot.axes[self.drive_train.joints[motor]].kind]
             coupling = ("Iam", inertia), ("fvm", f"{force}/({rate})"), ("fsm", force)
             columns += [Column(f"{name}{motor + 1}", unit) for name, unit in coupling]
         return tuple(columns)
 
     @property
+    def link_columns(self) -> IntArray:
+        """Columns of the links' parameters among the standard ones, shape (n, 10)."""
+        return JOINT_COLUMNS * np.arange(self.robot.joint_count)[:, None] + np.arange(len(LINK_PARAMETERS))
+
+    @property
+    def dry_friction_columns(self) -> IntArray:
+        """Column of fs of each axis among the standard ones, shape (m,)."""
+        return JOINT_COLUMNS * np.array(self.robot.axis_joints) + 12
+
+    @property
     def flange(self) -> slice:
-        """The ten columns of the last link; a payload on it has the same."""
-        first = JOINT_COLUMNS * (self.robot.joint_count - 1)
+        """The ten columns of the link that carries the payload; a payload on it has the same."""
+        first = JOINT_COLUMNS * (self.robot.platform % self.robot.joint_count)
         return slice(first, first + 10)
 
     @property
     def support(self) -> BoolArray:
-        """Which standard parameters can load which joint, shape (n, c); all other entries of the regressor are zero."""
-        count = self.robot.joint_count
-        out = np.zeros((count, len(self.columns)), dtype=np.bool_)
+        """Which standard parameters can load which axis, shape (m, c); all other entries of the regressor are zero."""
+        count, axes = self.robot.joint_count, self.robot.axis_count
+        out = np.zeros((axes, len(self.columns)), dtype=np.bool_)
+        for axis, joint in enumerate(self.robot.axis_joints):
+            first = JOINT_COLUMNS * joint
+            out[:, first + 10 : first + JOINT_COLUMNS] |= self.is_redundant
+            out[axis, first + 10 : first + JOINT_COLUMNS] = True
         for link in range(count):
             first = JOINT_COLUMNS * link
-            out[link, first + 10 : first + JOINT_COLUMNS] = True
             joint = link
-            while joint >= 0:  # a link loads its own joint and those before it
+            while joint >= 0 and not self.robot.closures:  # a link loads its own joint and those before it
                 out[joint, first : first + 10] = True
                 joint = self.robot.joints[joint].parent
+            if self.robot.closures:
+                out[:, first : first + 10] = True
         for index, motor in enumerate(self.drive_train.coupled):
             first = JOINT_COLUMNS * count + 3 * index
             out[:, first : first + 3] = (self.drive_train.direction[motor] != 0.0)[:, None]
         return out
 
     def regressor(self, motion: Motion) -> FloatArray:
-        """Joint torque per unit of every standard parameter.
+        """Torque at each axis per unit of every standard parameter, B Gᵀ W.
+
+        Args:
+            motion: of the m axes over k samples.
 
         Returns:
-            shape (n, c, k) [Nm or N per unit], time last.
+            shape (m, c, k) [Nm or N per unit], time last.
 
         Raises:
-            ModelError: the motion is not one of n joints.
+            ModelError: the motion is not one of m axes, or the loops cannot be closed.
         """
-        position, velocity, acceleration = self._joint_first(motion)
+        if not self.robot.closures:
+            return self._tree_regressor(*self._joint_first(motion))
+        columns, to_motors = self.balance(motion)
+        return spread(columns, to_motors) if self.is_redundant else columns
+
+    def balance(self, motion: Motion) -> tuple[FloatArray, FloatArray]:
+        """Columns of the d equations of virtual power, Gᵀ W and Aᵀ, shapes (d, c, k) and (d, m, k).
+
+        Arguments and errors are those of `regressor`.
+        """
+        followed = self.follow(motion)
+        columns = self._tree_regressor(*self._first(followed.joints))
+        projected = np.zeros((self.assembly.mobility, *columns.shape[1:]))
+        per_joint = np.ascontiguousarray(np.transpose(followed.to_joints, (1, 2, 0)))
+        for joint, part in enumerate(columns):  # most links are moved by few joints
+            held = np.flatnonzero(part.any(axis=1))
+            for way, rate in zip(projected, per_joint[joint], strict=True):
+                if rate.any():
+                    way[held] += rate * part[held]
+        return projected, np.ascontiguousarray(np.transpose(followed.to_motors, (2, 1, 0)))
+
+    def follow(self, motion: Motion) -> TreeMotion:
+        """Motion of all joints from that of the axes; see `ident.model.closed_chain.follow`."""
+        self._joint_first(motion)
+        return follow(self.robot, self.assembly, motion)
+
+    def _tree_regressor(self, position: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> FloatArray:
         count, samples = position.shape
         sign = np.sign(velocity)
         out = np.zeros((count, len(self.columns), samples))
         by_link = out[:, : JOINT_COLUMNS * count].reshape(count, count, JOINT_COLUMNS, samples)
         fill_rigid(self.robot, position, velocity, acceleration, by_link[:, :, :10])
-        for joint in range(count):
+        axes = list(self.robot.axis_joints)
+        for joint in axes:
             own = by_link[joint, joint]
             own[10], own[11], own[12], own[13] = acceleration[joint], velocity[joint], sign[joint], 1.0
         direction = self.drive_train.direction
-        motor_speed = direction @ velocity
+        motor_speed = direction @ velocity[axes]
         for index, motor in enumerate(self.drive_train.coupled):
             first = JOINT_COLUMNS * count + 3 * index
             r = direction[motor]
             cross = np.outer(r, r) - np.diag(r**2)
-            out[:, first] = cross @ acceleration
-            out[:, first + 1] = cross @ velocity
-            out[:, first + 2] = r[:, None] * np.sign(motor_speed[motor])
+            out[axes, first] = cross @ acceleration[axes]
+            out[axes, first + 1] = cross @ velocity[axes]
+            out[axes, first + 2] = r[:, None] * np.sign(motor_speed[motor])
         return out
 
     def torques(self, motion: Motion, standard: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Joint torque of links and payload, the same with friction of the joints, and all [Nm or N], each (n, k).
+        """Torque of links and payload at each axis, the same with friction of the axes, and all [Nm or N], each (m, k).
 
         Args:
-            motion: of n joints over k samples.
+            motion: of m axes over k samples.
             standard: χ_st, shape (c,).
         """
         position, velocity, acceleration = self._joint_first(motion)
-        own, motors = np.split(standard, [JOINT_COLUMNS * self.robot.joint_count])
-        own, motors = own.reshape(-1, JOINT_COLUMNS), motors.reshape(-1, 3, 1)
-        load = rigid_torque(self.robot, position, velocity, acceleration, own[:, :10])
+        links, motors = np.split(standard, [JOINT_COLUMNS * self.robot.joint_count])
+        links, motors = links.reshape(-1, JOINT_COLUMNS), motors.reshape(-1, 3, 1)
+        own = links[list(self.robot.axis_joints)]
+        if not self.robot.closures:
+            load = rigid_torque(self.robot, position, velocity, acceleration, links[:, :10])
+        else:
+            followed = self.follow(motion)
+            joints = self._first(followed.joints)
+            load = self.at_axes(followed, rigid_torque(self.robot, joints[0], joints[1], joints[2], links[:, :10]))
         geared = load + own[:, 11, None] * velocity + own[:, 12, None] * np.sign(velocity)
         whole = geared + own[:, 10, None] * acceleration + own[:, 13, None]
         for motor, (inertia, viscous, dry) in zip(self.drive_train.coupled, motors, strict=True):
             r = self.drive_train.direction[motor]
             cross = np.outer(r, r) - np.diag(r**2)
             whole += cross @ (inertia * acceleration + viscous * velocity) + r[:, None] * dry * np.sign(r @ velocity)
+        if self.is_redundant:
+            seen = without_preload(np.transpose(self.follow(motion).to_motors, (2, 1, 0)))
+            load, geared, whole = (np.einsum("amk,mk->ak", seen, part) for part in (load, geared, whole))
         return load, geared, whole
+
+    def inertia(self, position_rad: FloatArray, standard: FloatArray) -> FloatArray:
+        """Mass matrix of links and payload: torque at axis i per unit of acceleration of axis j, shape (m, m, k).
+
+        Args:
+            position_rad: of the axes, shape (k, m).
+            standard: χ_st, shape (c,).
+        """
+        links = standard[self.link_columns]
+        if not self.robot.closures:
+            return mass_matrix(self.robot, np.ascontiguousarray(position_rad.T), links)
+        still = np.zeros_like(position_rad)
+        followed = self.follow(Motion(position_rad, still, still))
+        tree = mass_matrix(self.robot, np.ascontiguousarray(followed.joints.position_rad.T), links)
+        per_x = np.einsum("ijk,kjd->idk", tree, followed.to_joints)
+        per_axis = np.linalg.pinv(followed.to_motors)
+        return self.at_axes(followed, np.einsum("idk,kda->iak", per_x, per_axis))
+
+    def leverage(self, followed: TreeMotion) -> FloatArray:
+        """Torque at each axis per unit of torque on each joint without a motor, shape (n − m, m, k)."""
+        unit = np.eye(self.robot.joint_count)[:, list(self.robot.passive_joints)]
+        torque = np.repeat(unit[:, :, None], len(followed.to_joints), axis=2)
+        return np.ascontiguousarray(np.swapaxes(self.at_axes(followed, torque), 0, 1))
+
+    def at_axes(self, followed: TreeMotion, torque: FloatArray) -> FloatArray:
+        """Torques of all joints as torques of the axes, B Gᵀ τ [Nm or N], shapes (n, …, k) and (m, …, k)."""
+        projected = np.einsum("knd,n...k->d...k", followed.to_joints, torque)
+        if not self.is_redundant:
+            return np.asarray(projected)
+        return spread(projected, np.transpose(followed.to_motors, (2, 1, 0)))
 
     def _joint_first(self, motion: Motion) -> list[FloatArray]:
         states = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
-        count, shapes = self.robot.joint_count, [np.shape(state) for state in states]
+        count, shapes = self.robot.axis_count, [np.shape(state) for state in states]
         if shapes != [(*shapes[0][:1], count)] * 3:
             raise ModelError(
                 f"position, velocity and acceleration have the shapes {', '.join(map(str, shapes))}; expected "
                 f"(n_samples, {count}) each: a row a sample, a column a joint"
             )
+        return self._first(motion)
+
+    @staticmethod
+    def _first(motion: Motion) -> list[FloatArray]:
+        states = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
         return [np.ascontiguousarray(np.transpose(state)) for state in states]
+
+
+def spread(columns: FloatArray, to_motors: FloatArray) -> FloatArray:
+    """The least torques of the axes that do what columns of the d equations ask, B y.
+
+    Args:
+        columns: y, shape (d, …, k).
+        to_motors: Aᵀ, shape (d, m, k).
+
+    Returns:
+        shape (m, …, k).
+    """
+    a = np.transpose(to_motors, (2, 1, 0))
+    back = a @ np.linalg.inv(np.swapaxes(a, 1, 2) @ a)
+    return np.asarray(np.einsum("kmd,d...k->m...k", back, columns, optimize=True))
+
+
+def without_preload(to_motors: FloatArray) -> FloatArray:
+    """B Aᵀ, which takes the preload out of torques of the axes, shapes (d, m, k) and (m, m, k)."""
+    return spread(to_motors, to_motors)

@@ -1,25 +1,13 @@
-"""A robot as its URDF describes it: the joint chain, inertias for the planner and the prior; its motions and poses.
-
-The reader takes from a URDF what identification needs and skips the rest (meshes, transmissions, plugins). Joints are
-ordered and merged as Pinocchio does it, which the tests compare with: depth first, branches in the order of their
-joints' names, fixed joints merged into the moving joint before them.
-"""
+"""A robot: its joints, how its loops close, its motions and poses."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
-from math import atan2, cos, inf, isfinite, sin, sqrt
-from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.errors import ModelError
-from ident.model.bodies import Body
-
-LARGEST_DISTANCE_M = 50.0  #: Between joints that follow each other: more than any gantry has
 
 
 class JointKind(Enum):
@@ -41,316 +29,73 @@ class Joint:
     axis: FloatArray  #: unit vector of the motion in the joint frame, (3,)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """A frame fixed to the link behind a joint (-1: to the base), written in that joint's frame."""
+
+    joint: int
+    rotation: FloatArray  #: (3, 3)
+    translation_m: FloatArray  #: (3,)
+
+
+DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
+"""Along and about the axes of the first frame of a closure."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Closure:
+    """A joint that closes a loop of the tree: two frames on two links that coincide in some directions.
+
+    A ball joint coincides in x, y, z; a hinge about z in x, y, z, rx, ry; in a planar mechanism x, y are enough.
+    """
+
+    name: str
+    first: Place
+    second: Place
+    directions: tuple[str, ...]  #: of DIRECTIONS; in the others the links move freely
+
+
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """A tree of n joints on a fixed base."""
+    """A tree of n joints on a fixed base, in a closed chain with loop closures and joints without a motor."""
 
-    joints: tuple[Joint, ...]  #: in the order of the axes
+    joints: tuple[Joint, ...]  #: depth first from the base
     gravity_m_s2: FloatArray  #: in the base frame, shape (3,); any mounting of the base is a direction of gravity
+    closures: tuple[Closure, ...] = ()  #: none of a serial robot
+    motors: tuple[int, ...] = ()  #: joint that each axis drives, in the order of the axes; empty: every joint is driven
+    #: Positions of all joints at which the closures hold: which of several ways of assembly is meant. Shape (n,).
+    assembly_rad: FloatArray | None = None
+    platform: int = -1  #: joint whose link carries the payload; -1: the last one
 
     @property
     def joint_count(self) -> int:
-        """n."""
+        """n, passive joints included."""
         return len(self.joints)
 
+    @property
+    def axis_joints(self) -> tuple[int, ...]:
+        """Joint of each axis."""
+        return self.motors or tuple(range(len(self.joints)))
 
-@dataclass(frozen=True, slots=True, eq=False)
-class UrdfRobot:
-    """The n moving joints of a URDF."""
+    @property
+    def axes(self) -> tuple[Joint, ...]:
+        """Driven joints, in the order of the axes: all of a serial robot."""
+        return tuple(self.joints[joint] for joint in self.axis_joints)
 
-    joints: tuple[Joint, ...]  #: their geometry, depth first from the base
-    #: What each joint moves, in its frame, links behind fixed joints included; mass zero where none is given.
-    bodies: tuple[Body, ...]
-    effort_limit: FloatArray  #: [Nm or N], shape (n,); inf where none is given
+    @property
+    def passive_joints(self) -> tuple[int, ...]:
+        """Joints without a motor: none of a serial robot."""
+        return tuple(joint for joint in range(len(self.joints)) if joint not in self.axis_joints)
 
+    @property
+    def places(self) -> tuple[Joint, ...]:
+        """Where an effect can act: the driven joints, then those without a motor."""
+        return (*self.axes, *(self.joints[joint] for joint in self.passive_joints))
 
-def robot_from_urdf(urdf: str, gravity_m_s2: tuple[float, float, float] = (0.0, 0.0, -9.81)) -> Robot:
-    """Read the kinematic tree of a URDF.
-
-    Args:
-        urdf: text of the URDF; fixed joints are merged into their parents, inertias are not used.
-        gravity_m_s2: gravity in the base frame.
-
-    Raises:
-        ModelError: the text is no URDF, has no moving joint, or a joint of more than one degree of freedom.
-    """
-    return Robot(read_urdf(urdf).joints, np.asarray(gravity_m_s2, dtype=np.float64))
-
-
-def hold_joints(urdf: str, position_rad: Mapping[str, float]) -> str:
-    """Return a URDF in which joints that are no axes of the arm (a gripper's, a mobile base's) are fixed.
-
-    Args:
-        urdf: text of the URDF.
-        position_rad: position of each held joint [rad; m for a prismatic joint], by name. A joint that mimics a held
-            one follows it. Joints of type floating and planar can only be held at 0.
-
-    Raises:
-        ModelError: the text is no URDF, a name is no movable joint, or a joint cannot be held there.
-    """
-    robot = _root(urdf)
-    movable = {_name(joint): joint for joint in robot.findall("joint") if joint.get("type") != "fixed"}
-    followed = {}
-    for name, joint in movable.items():
-        mimic = joint.find("mimic")
-        leader = None if mimic is None else position_rad.get(mimic.get("joint", ""))
-        if mimic is not None and leader is not None:
-            factor, offset = (_finite(mimic.get(*one)) for one in (("multiplier", "1"), ("offset", "0")))
-            if factor is None or offset is None:
-                raise ModelError(f"<mimic> of {name!r} in the URDF has a multiplier or offset that is no number")
-            followed[name] = factor * leader + offset
-    for name, position in {**followed, **position_rad}.items():
-        if name not in movable:
-            raise ModelError(f"no movable joint {name!r} in the URDF; expected one of {', '.join(movable)}")
-        _fix(movable[name], position)
-    return tostring(robot, encoding="unicode")
-
-
-def _fix(element: Element, position: float) -> None:
-    """Make a joint a fixed one whose origin is its pose at a position."""
-    name, kind = _name(element), element.get("type")
-    rotation, translation = _origin(element, name)
-    if kind not in ("floating", "planar"):
-        joint = _joint(element, _Frame(-1, rotation, translation))
-        placed = poses(Robot((joint,), np.zeros(3)), np.array([[position]]))
-        rotation, translation = placed.rotation[1, 0], placed.origin_m[1, 0]
-    elif position != 0.0:
-        raise ModelError(f"joint {name!r} is of type {kind!r} and held at {position:g}; expected 0")
-    roll = atan2(rotation[2, 1], rotation[2, 2])
-    s, c = sin(roll), cos(roll)  # with this roll the other two are exact for every pitch, 90° included
-    pitch = atan2(-rotation[2, 0], s * rotation[2, 1] + c * rotation[2, 2])
-    yaw = atan2(s * rotation[0, 2] - c * rotation[0, 1], c * rotation[1, 1] - s * rotation[1, 2])
-    for child in [child for child in element if child.tag not in ("parent", "child")]:
-        element.remove(child)
-    element.set("type", "fixed")
-    spelled = {"xyz": translation.tolist(), "rpy": [roll, pitch, yaw]}
-    element.append(Element("origin", {key: " ".join(map(repr, three)) for key, three in spelled.items()}))
-
-
-def read_urdf(urdf: str) -> UrdfRobot:
-    """Read joints, bodies and effort limits of a URDF.
-
-    A link without a readable mass or centre of mass counts as massless, one without a readable inertia as a point mass:
-    they only guide the choice of moves, and a URDF for identification need not have them.
-
-    Raises:
-        ModelError: the text is no URDF, has no moving joint, or a joint of more than one degree of freedom.
-    """
-    links, joints_behind, root = _tree(urdf)
-    joints: list[Joint] = []
-    bodies: list[Body] = []
-    effort_limit: list[float] = []
-    base = _Frame(-1, np.eye(3), np.zeros(3))
-    pending = [(base, element) for element in joints_behind[root]]
-    while pending:
-        before, element = pending.pop()
-        link = _link_at(element, "child")
-        rotation, translation = _origin(element, _name(element))
-        here = _Frame(before.joint, before.rotation @ rotation, before.translation_m + before.rotation @ translation)
-        if element.get("type") != "fixed":
-            joints.append(_joint(element, here))
-            bodies.append(_body(links[link]))
-            effort_limit.append(_effort_limit(element))
-            here = _Frame(len(joints) - 1, np.eye(3), np.zeros(3))
-        elif here.joint >= 0:
-            bodies[here.joint] = _joined(bodies[here.joint], _placed(_body(links[link]), here))
-        pending += [(here, behind) for behind in joints_behind[link]]
-    if not joints:
-        raise ModelError("the URDF has no moving joint; expected at least one revolute or prismatic joint")
-    return UrdfRobot(tuple(joints), tuple(bodies), np.array(effort_limit))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Frame:
-    """A place that moves with a joint (-1: the base), in that joint's frame."""
-
-    joint: int
-    rotation: FloatArray
-    translation_m: FloatArray
-
-
-def _root(urdf: str) -> Element:
-    """Return <robot>, without a namespace."""
-    try:
-        robot = fromstring(urdf)
-    except (ParseError, TypeError) as error:
-        if "<" not in str(urdf):
-            raise ModelError(f"{urdf!r} looks like a file name; expected text: pass Path(...).read_text()") from error
-        raise ModelError(f"the URDF cannot be read: {error}; expected XML") from error
-    space = robot.tag.removesuffix("robot")
-    if robot.tag != space + "robot" or (space and not space.startswith("{")):
-        raise ModelError(f"the URDF cannot be read: its outermost element is <{robot.tag}>; expected <robot>")
-    if robot.get("version", "1.0") not in ("1.0", "1.1"):
-        raise ModelError(f"the URDF is of version {robot.get('version')}; expected 1.0 or 1.1")
-    for element in robot.iter():
-        element.tag = element.tag.removeprefix(space) if isinstance(element.tag, str) else ""
-    return robot
-
-
-def _tree(urdf: str) -> tuple[dict[str, Element], dict[str, list[Element]], str]:
-    """Return the links, the joints behind each (last name first, to be popped), and the link without a parent."""
-    robot = _root(urdf)
-    links = {_name(link): link for link in robot.findall("link")}
-    joints = {_name(joint): joint for joint in robot.findall("joint")}
-    for kind, named in (("link", links), ("joint", joints)):
-        if len(named) != len(robot.findall(kind)):
-            raise ModelError(f"two {kind}s of the URDF have the same name; expected one name each")
-    behind: dict[str, list[Element]] = {name: [] for name in links}
-    children = set()
-    for name in sorted(joints, reverse=True):
-        parent, child = (_link_at(joints[name], end) for end in ("parent", "child"))
-        if parent not in links or child not in links:
-            unknown = child if parent in links else parent
-            raise ModelError(f"joint {name!r} connects link {unknown!r}, which the URDF does not have")
-        if child in children:
-            raise ModelError(f"link {child!r} is the child of two joints; expected a tree")
-        children.add(child)
-        behind[parent].append(joints[name])
-    roots = [name for name in links if name not in children]
-    if len(roots) != 1:
-        raise ModelError(
-            f"the URDF has {len(roots)} links without a parent ({', '.join(roots)}); expected one, the base"
-        )
-    return links, behind, roots[0]
-
-
-def _joint(element: Element, at: _Frame) -> Joint:
-    name, kind = _name(element), element.get("type")
-    if kind not in ("revolute", "continuous", "prismatic"):
-        raise ModelError(f"joint {name!r} is of type {kind!r}; expected revolute, continuous, prismatic or fixed")
-    declared = element.find("axis")
-    axis = np.array([1.0, 0.0, 0.0]) if declared is None else _vector(declared, "xyz", name)
-    length = float(np.linalg.norm(axis))
-    axis = axis / length if length > 0.0 else axis
-    if not np.isclose(float(np.linalg.norm(axis)), 1.0, atol=1e-6):
-        raise ModelError(f"joint {name!r} has the axis {axis.tolist()}; expected a direction of length one")
-    distance = float(np.max(np.abs(at.translation_m)))
-    if not distance <= LARGEST_DISTANCE_M:
-        raise ModelError(
-            f"joint {name!r} lies {distance:.3g} m from the one before it; expected at most {LARGEST_DISTANCE_M:g} m: "
-            "is the URDF in mm?"
-        )
-    return Joint(
-        name=name,
-        kind=JointKind.PRISMATIC if kind == "prismatic" else JointKind.REVOLUTE,
-        parent=at.joint,
-        rotation=at.rotation,
-        translation_m=at.translation_m,
-        axis=axis,
-    )
-
-
-def _effort_limit(element: Element) -> float:
-    """Effort limit of a moving joint; the limit element must be complete, and only a continuous joint may lack it."""
-    limit = element.find("limit")
-    if limit is None:
-        if element.get("type") == "continuous":
-            return inf
-        raise ModelError(f"joint {_name(element)!r} has no <limit>; expected one with effort and velocity")
-    _number(limit, "velocity", _name(element))
-    return _number(limit, "effort", _name(element))
-
-
-def _body(link: Element) -> Body:
-    """Mass, centre and inertia of a link in its own frame."""
-    inertial = link.find("inertial")
-    nothing = Body(0.0, np.zeros(3), np.zeros((3, 3)))
-    if inertial is None:
-        return nothing
-    name = _name(link)
-    try:
-        mass = _number(_part(inertial, "mass", name), "value", name)
-        rotation, centre = _origin(inertial, name)
-    except ModelError:
-        return nothing
-    try:
-        tensor = _part(inertial, "inertia", name)
-        xx, xy, xz, yy, yz, zz = (_number(tensor, entry, name) for entry in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
-    except ModelError:
-        return Body(mass, centre, np.zeros((3, 3)))
-    return Body(mass, centre, rotation @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ rotation.T)
-
-
-def _placed(body: Body, at: _Frame) -> Body:
-    """Write a body in the frame of the joint that moves it."""
-    centre = at.translation_m + at.rotation @ body.centre_m
-    return Body(body.mass_kg, centre, at.rotation @ body.inertia_kg_m2 @ at.rotation.T)
-
-
-def _joined(first: Body, second: Body) -> Body:
-    """Two bodies of one frame as one, about the common centre of mass."""
-    mass = first.mass_kg + second.mass_kg
-    if mass == 0.0:
-        return Body(0.0, np.zeros(3), first.inertia_kg_m2 + second.inertia_kg_m2)
-    centre = (first.mass_kg * first.centre_m + second.mass_kg * second.centre_m) / mass
-    apart = first.centre_m - second.centre_m
-    steiner = first.mass_kg * second.mass_kg / mass * (apart @ apart * np.eye(3) - np.outer(apart, apart))
-    return Body(mass, centre, first.inertia_kg_m2 + second.inertia_kg_m2 + steiner)
-
-
-def _origin(element: Element, name: str) -> tuple[FloatArray, FloatArray]:
-    """Rotation and translation of an <origin>; the angles are about the fixed axes x, y, z, in this order."""
-    origin = element.find("origin")
-    if origin is None:
-        return np.eye(3), np.zeros(3)
-    if "quat_xyzw" in origin.attrib:
-        raise ModelError(f"{name!r} has an origin with quat_xyzw, which URDF 1.0 does not know; expected rpy")
-    half = 0.5 * _vector(origin, "rpy", name)
-    (cx, cy, cz), (sx, sy, sz) = map(cos, half), map(sin, half)
-    x, y, z = sx * cy * cz - cx * sy * sz, cx * sy * cz + sx * cy * sz, cx * cy * sz - sx * sy * cz
-    w = cx * cy * cz + sx * sy * sz
-    length = sqrt(x * x + y * y + z * z + w * w)
-    x, y, z, w = x / length, y / length, z / length, w / length
-    rotation = [
-        [1.0 - (2.0 * y * y + 2.0 * z * z), 2.0 * y * x - 2.0 * z * w, 2.0 * z * x + 2.0 * y * w],
-        [2.0 * y * x + 2.0 * z * w, 1.0 - (2.0 * x * x + 2.0 * z * z), 2.0 * z * y - 2.0 * x * w],
-        [2.0 * z * x - 2.0 * y * w, 2.0 * z * y + 2.0 * x * w, 1.0 - (2.0 * x * x + 2.0 * y * y)],
-    ]
-    return np.array(rotation), _vector(origin, "xyz", name)
-
-
-def _name(element: Element) -> str:
-    name = element.get("name", "")
-    if not name:
-        raise ModelError(f"a {element.tag} of the URDF has no name; expected one for each link and joint")
-    return name
-
-
-def _link_at(joint: Element, end: str) -> str:
-    """Name of the parent or child link of a joint."""
-    return _part(joint, end, _name(joint)).get("link", "")
-
-
-def _part(element: Element, tag: str, name: str) -> Element:
-    found = element.find(tag)
-    if found is None:
-        raise ModelError(f"{element.tag} of {name!r} in the URDF has no <{tag}>; expected one")
-    return found
-
-
-def _vector(element: Element, key: str, name: str) -> FloatArray:
-    """Three numbers of an attribute; zeros where it is left out."""
-    text = element.get(key, "0 0 0")
-    numbers = [_finite(word) for word in text.split()]
-    if len(numbers) != 3 or None in numbers:
-        raise ModelError(f"<{element.tag}> of {name!r} in the URDF has {key}={text!r}; expected three numbers")
-    return np.array(numbers, dtype=np.float64)
-
-
-def _number(element: Element, key: str, name: str) -> float:
-    text = element.get(key, "")
-    number = _finite(text)
-    if number is None:
-        raise ModelError(f"<{element.tag}> of {name!r} in the URDF has {key}={text!r}; expected a number")
-    return number
-
-
-def _finite(text: str) -> float | None:
-    try:
-        number = float(text)
-    except ValueError:
-        return None
-    return number if isfinite(number) and "_" not in text else None
+    @property
+    def axis_count(self) -> int:
+        """m: motors, and what a recording has columns of."""
+        return len(self.axis_joints)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,8 +16,9 @@ from ident.errors import IdentificationError, ModelError
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.model.base import BaseParameters
 from ident.model.bodies import Body, link_parameters, pseudo_inertia
-from ident.model.model import Model, link_columns
-from ident.model.robot import Motion, read_urdf
+from ident.model.model import Model
+from ident.model.robot import Motion
+from ident.model.urdf import read_urdf
 
 MARGIN = 1e-4  #: Every pseudo-inertia is at least this share of its prior's, in every direction (Q ⪰ MARGIN·1)
 _ROOM = 2.0  #: The first programme keeps this multiple of the margin, so that the second has room to search
@@ -325,7 +326,7 @@ class PhysicalParameters:
     @property
     def links(self) -> FloatArray:
         """Inertial parameters of each link in the order of LINK_PARAMETERS, shape (n, 10)."""
-        return self.standard[_link_columns(self.model)]
+        return self.standard[self.model.link_columns]
 
 
 def physical_parameters(
@@ -396,7 +397,7 @@ def physical_parameters(
             identified, np.einsum("jck,c->jk", columns, standard), np.ones(identified.shape, dtype=np.bool_)
         ),
         eigenvalues=np.asarray(
-            np.linalg.eigvalsh(relative_to_prior(programme.factors, standard[_link_columns(model)]))[:, 0],
+            np.linalg.eigvalsh(relative_to_prior(programme.factors, standard[model.link_columns]))[:, 0],
             dtype=np.float64,
         ),
     )
@@ -416,7 +417,7 @@ def _programme(
     other_friction: frozenset[int],
 ) -> Programme:
     index = {column.name: number for number, column in enumerate(model.columns)}
-    link_columns = _link_columns(model)
+    link_columns = model.link_columns
     scalars = np.setdiff1d(np.arange(len(index)), link_columns)
     norms = np.linalg.norm(rows[:, scalars], axis=0)
     coupled = model.drive_train.coupled
@@ -459,7 +460,3 @@ def _turned_together(model: Model) -> tuple[tuple[int, ...], ...]:
         touched = [group for group in groups if group & turned]
         groups = [group for group in groups if not group & turned] + [set().union(*touched)]
     return tuple(tuple(sorted(group)) for group in groups)
-
-
-def _link_columns(model: Model) -> IntArray:
-    return link_columns(model.robot.joint_count)

@@ -33,7 +33,8 @@ from ident.equations.rows import row_filter, row_masks
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, Body, Payload
 from ident.model.model import DriveTrain, Model
-from ident.model.robot import Motion, Robot, read_urdf
+from ident.model.robot import Motion, Robot
+from ident.model.urdf import read_urdf
 
 IntArray = NDArray[np.intp]
 

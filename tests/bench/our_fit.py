@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.model.robot import Motion, robot_from_urdf
+from ident.model.robot import Motion
+from ident.model.urdf import robot_from_urdf
 from tests.bench.torque_fit import PIECE_SAMPLES, fill_rows, fit_torques, standard_rows
 
 FloatArray = NDArray[np.float64]

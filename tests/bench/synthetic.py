@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.model.robot import Motion, Robot, robot_from_urdf
+from ident.model.robot import Motion, Robot
+from ident.model.urdf import robot_from_urdf
 from tests.bench.motion import sinusoids
 from tests.bench.torque_fit import PIECE_SAMPLES, WIDTH, fill_rows, standard_rows
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from ident.model.model import DriveTrain, Model
-from ident.model.robot import Motion, robot_from_urdf
+from ident.model.robot import Motion
+from ident.model.urdf import robot_from_urdf
 from tests.bench.motion import RATE_HZ, sinusoids
 from tests.bench.synthetic import NOISE_NM, measurements
 from tests.bench.torque_fit import fill_rows, fit_torques, names, standard_rows

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from ident.equations.system import qr_update
+from ident.equations.triangles import qr_update
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS
 from ident.model.regressor import fill_rigid

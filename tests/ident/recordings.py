@@ -23,7 +23,7 @@ from ident.estimators.identify import identify
 from ident.estimators.maximum_likelihood import ml
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import DriveTrain, Model
-from ident.model.robot import robot_from_urdf
+from ident.model.urdf import robot_from_urdf
 from tests.ident.arms import THREE_AXES, TX40
 
 FloatArray = NDArray[np.float64]

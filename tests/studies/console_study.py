@@ -4,6 +4,10 @@ Blocks of recordings follow one another, without and with a console whose page i
 jitter of SYNC by the kernel's stamps, and the console's processor time and memory. The rate is the highest of RATES_HZ
 that is lossless without a console: in some recordings before the blocks, and in every block without one. A block
 without a console that loses a cycle starts the study again at the next rate. Written to out/console-study.json.
+
+A machine that stalls longer than a period loses cycles at every rate, whatever runs on it. `--despite-losses` goes on
+at the first rate. Every gap of SYNC is written with its time, to be compared with what a sleeper of the highest
+priority saw on the host (`python -m tests.studies.stalls`).
 """
 
 from __future__ import annotations
@@ -25,12 +29,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.cli.app import main as drivegain
 from daq.log.reader import read_log
 from tests.vcan.cells import record_once, simulated, write_cell, write_simulation
 from tests.vcan.run import OUT
 
+IntArray = NDArray[np.int64]
 RATES_HZ = (500, 400, 250, 200, 125, 100, 80, 50, 40, 25)
 TICKS = os.sysconf("SC_CLK_TCK")
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
@@ -76,7 +82,7 @@ def recording(cell: Path, plan: Path, log: Path) -> dict[str, Any]:
     log.with_name(log.name + ".part").unlink(missing_ok=True)
     document = record_once(cell, plan, log)
     if not log.exists():
-        return {"ended_early": 1, "lost": 0, "missing": 0, "samples": 0, "jitter_us": []}
+        return {"ended_early": 1, "lost": 0, "missing": 0, "samples": 0, "jitter_us": [], "gaps": []}
     found = read_log(log)
     interval_ns = np.diff(found.samples.time_ns)
     jitter_us = 1e-3 * np.abs(interval_ns - 1e9 / found.head.run.rate_hz)
@@ -86,7 +92,15 @@ def recording(cell: Path, plan: Path, log: Path) -> dict[str, Any]:
         "missing": sum(document["missing"]),
         "samples": document["samples"],
         "jitter_us": jitter_us.tolist(),
+        "gaps": gaps_of(found.samples.time_ns, found.head.run.rate_hz),
     }
+
+
+def gaps_of(time_ns: IntArray, rate_hz: float) -> list[tuple[float, float]]:
+    """Time [s since 1970] and length [ms] of every interval that is half a period too long."""
+    interval_ms = 1e-6 * np.diff(time_ns)
+    late = np.flatnonzero(interval_ms > 1.5e3 / rate_hz)
+    return [(round(1e-9 * float(time_ns[i]), 3), round(float(interval_ms[i]), 1)) for i in late]
 
 
 def block(cell: Path, plan: Path, log: Path, seconds: float, process: subprocess.Popen[str] | None) -> dict[str, Any]:
@@ -97,8 +111,10 @@ def block(cell: Path, plan: Path, log: Path, seconds: float, process: subprocess
         parts.append(recording(cell, plan, log))
     lasted_s = time.monotonic() - began_s
     jitter = np.concatenate([part.pop("jitter_us") for part in parts])
-    summed = {key: sum(part[key] for part in parts) for key in parts[0]}
+    gaps = [gap for part in parts for gap in part.pop("gaps", ())]
+    summed = {key: sum(part[key] for part in parts) for key in ("ended_early", "lost", "missing", "samples")}
     found = {"open": process is not None, "recordings": len(parts), "seconds": round(lasted_s, 1), **summed}
+    found["gaps"] = gaps
     if jitter.size:
         found |= {f"jitter_us_p{share:g}": round(float(np.percentile(jitter, share)), 1) for share in (50, 99, 99.9)}
     if process is not None:
@@ -129,7 +145,7 @@ def blocks_at(folder: Path, rate_hz: int, options: argparse.Namespace) -> list[d
     with simulated(simulation):
         for _ in range(options.tries):
             tried = recording(cell, plan, log)
-            if not is_lossless(tried):
+            if not is_lossless(tried) and not options.despite_losses:
                 _show({"rate_hz": rate_hz, "lossless": False, **tried, "jitter_us": None})
                 return None
         for number in range(round(options.minutes / options.block)):
@@ -137,7 +153,7 @@ def blocks_at(folder: Path, rate_hz: int, options: argparse.Namespace) -> list[d
             with console(cell) if is_open else nullcontext() as process:
                 blocks.append(block(cell, plan, log, 60.0 * options.block, process))
             _show({"rate_hz": rate_hz, **blocks[-1]})
-            if not is_open and not is_lossless(blocks[-1]):
+            if not (is_open or is_lossless(blocks[-1]) or options.despite_losses):
                 return None
     return blocks
 
@@ -155,6 +171,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=60.0, help="of the plan")
     parser.add_argument("--tries", type=int, default=3, help="recordings before the blocks")
     parser.add_argument("--rates", type=int, nargs="+", default=list(RATES_HZ), metavar="HZ", help="the highest first")
+    parser.add_argument("--despite-losses", action="store_true", help="go on at the first rate")
     options = parser.parse_args(arguments)
     out = Path(os.environ.get(OUT, "out")) / "console-study.json"
     out.parent.mkdir(exist_ok=True)

@@ -63,6 +63,21 @@ def test_the_part_of_a_cell_file_can_be_pasted() -> None:
     }
 
 
+def test_a_mechanism_that_does_not_close_is_refused_with_its_file(
+    checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = checkout / "configs/simulation"
+    (tmp_path / "five-bar-plant.urdf").write_bytes((folder / "five-bar-plant.urdf").read_bytes())
+    text = (
+        (folder / "five-bar.yaml").read_text(encoding="utf-8").replace("directions: [x, y]", "directions: [x, y, rz]")
+    )
+    (tmp_path / "five-bar.yaml").write_text(text, encoding="utf-8")
+    assert main(["simulate", str(tmp_path / "five-bar.yaml"), "--interface", "virtual"]) == 6
+    said = capsys.readouterr().err
+    assert "five-bar.yaml" in said
+    assert "tip stays open" in said
+
+
 @pytest.mark.parametrize("verb", [["simulate", "demo"], ["demo", "--out", "made"]])
 @pytest.mark.parametrize("package", ["numba", "pinocchio"])
 def test_without_its_packages_the_extra_is_named(

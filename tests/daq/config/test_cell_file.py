@@ -19,7 +19,7 @@ from daq.errors import ConfigurationError, ConfigurationInconsistent, Configurat
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.split_bus import SplitAddress
 from drivers.profiles.profile import Amplitude, ObjectEntry, TapPoint
-from ident.model.robot import read_urdf
+from ident.model.urdf import read_urdf
 from tests.two_buses import LEFT, RIGHT, on_two_buses
 
 

@@ -53,6 +53,57 @@ def test_a_wrong_file_is_refused(
         load_simulation(path)
 
 
+def test_a_closed_chain_is_read(checkout: Path) -> None:
+    spec = load_simulation(checkout / "configs/simulation/orthoglide.yaml", "spindle")
+    assert spec.motors == ("slide-x", "slide-y", "slide-z")
+    assert spec.closures[3].directions == ("x", "y", "z", "rx", "ry")
+    assert spec.platform == "plate-centre"
+    assert spec.passive["swing-x"].viscous_nm_s_rad == 0.01
+    assert len(spec.assembly_rad) == 16
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "kind", "message"),
+    [
+        ("second: rod-2-tip", "second: rod-3-tip", ConfigurationInconsistent, r"closures\[0\].second.*rod-3-tip"),
+        ("second: rod-2-tip", "second: rod-1-tip", ConfigurationInconsistent, "two links"),
+        ("directions: [x, y]", "directions: [x, x]", ConfigurationInconsistent, "each direction once"),
+        ("directions: [x, y]", "directions: []", SchemaMismatch, r"closures\[0\].directions"),
+        ("directions: [x, y]", "directions: [x, w]", SchemaMismatch, r"closures\[0\].directions"),
+        ("motors: [crank-1, crank-2]", "motors: [crank-1]", ConfigurationInconsistent, "2 different joints"),
+        ("motors: [crank-1, crank-2]", "motors: [crank-1, hip]", ConfigurationInconsistent, "crank-1, hip"),
+        ("platform: plate", "platform: tray", ConfigurationInconsistent, "a link of the URDF"),
+        ("elbow-1: 0,", "", ConfigurationInconsistent, "no elbow-1"),
+        ("  elbow-2: {viscous", "  crank-2: {viscous", ConfigurationInconsistent, "a joint with a motor"),
+        ("  elbow-2: {viscous", "  knee: {viscous", ConfigurationInconsistent, "knee"),
+        ("effects: []", "effects: [{name: stribeck}]", SchemaMismatch, "one of them"),
+        ("effects: []", "assembly_mm: {crank-1: 0}\neffects: []", ConfigurationInconsistent, "prismatic"),
+    ],
+)
+def test_a_wrong_closed_chain_is_refused(
+    checkout: Path, tmp_path: Path, old: str, new: str, kind: type[Exception], message: str
+) -> None:
+    folder = checkout / "configs/simulation"
+    text = (folder / "five-bar.yaml").read_text(encoding="utf-8")
+    assert old in text
+    path = tmp_path / "spoiled.yaml"
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    (tmp_path / "five-bar-plant.urdf").write_bytes((folder / "five-bar-plant.urdf").read_bytes())
+    with pytest.raises(kind, match=message):
+        load_simulation(path)
+
+
+def test_a_serial_robot_has_no_key_of_a_closed_chain(checkout: Path, tmp_path: Path) -> None:
+    folder = checkout / "configs/simulation"
+    path = tmp_path / "gantry.yaml"
+    (tmp_path / "gantry-plant.urdf").write_bytes((folder / "gantry-plant.urdf").read_bytes())
+    path.write_text(
+        (folder / "gantry.yaml").read_text(encoding="utf-8") + "motors: [X, Y, Z, A, B]\n", encoding="utf-8"
+    )
+    with pytest.raises(ConfigurationInconsistent, match="without closures"):
+        load_simulation(path)
+
+
 def test_only_simulate_and_demo_import_the_truth(checkout: Path) -> None:
     importers = set()
     for room in ("daq", "ident", "drivers"):

@@ -27,7 +27,7 @@ from ident.estimators.estimate import RelativeError
 from ident.model.base import base_parameters
 from ident.model.bodies import Body
 from ident.model.model import DriveTrain, Model
-from ident.model.robot import robot_from_urdf
+from ident.model.urdf import robot_from_urdf
 from ident.physical.physical import random_motion, urdf_links
 from tests.ident.arms import GANTRY
 

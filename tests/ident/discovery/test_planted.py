@@ -317,16 +317,14 @@ def test_motors_in_another_order_change_no_verdict(arm: Arm) -> None:
     """A spring on joint 2 must pass its gates on whichever motor gives the torque."""
     order = np.array([2, 0, 1, 3, 5, 4])
     start = _with(arm, CASES[0])
-    train = DriveTrain(RATIO[order])
+    model = Model(arm.truth.model.robot, DriveTrain(RATIO[order]))
     training = replace(
         start.training,
-        drive_train=train,
+        model=model,
         current=start.training.current[order],
         motor_use=start.training.motor_use[order],
     )
-    turned = replace(
-        start, model=Model(arm.truth.model.robot, train), training=training, estimate=ml(training.system())
-    )
+    turned = replace(start, model=model, training=training, estimate=ml(training.system()))
     families = (_family("spring"), _family("stribeck"), _family("load-friction"))
     findings = rank_effects(search_problem_of(turned), np.random.default_rng(0), GATES, families)
     assert (findings[0].effect.name, findings[0].axis, findings[0].passed) == ("spring", 1, True)

@@ -20,7 +20,7 @@ from ident.effects.signals import Abscissa, Signals
 from ident.effects.transmission import Elasticity
 from ident.effects.unnamed import INTERVALS, Periodic, Smooth
 from ident.model.model import DriveTrain
-from ident.model.robot import robot_from_urdf
+from ident.model.urdf import robot_from_urdf
 from tests.ident.arms import GANTRY, THREE_AXES
 
 FloatArray = NDArray[np.float64]

@@ -15,7 +15,8 @@ from ident.discovery.evidence import Evidence, gather
 from ident.equations import reduction as reduction_module
 from ident.equations.reduction import Reduction, layout, reduce_runs
 from ident.equations.rows import OF_ROWS
-from ident.equations.system import System, triangle
+from ident.equations.system import System
+from ident.equations.triangles import triangle
 from ident.estimators.estimate import Estimate
 from ident.estimators.identify import identify
 from ident.estimators.maximum_likelihood import ml

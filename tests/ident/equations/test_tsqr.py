@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ident.equations.system import BLOCK_ROWS, qr_update
+from ident.equations.triangles import BLOCK_ROWS, qr_update
 from tests.bench.torque_fit import qr_merge
 
 FloatArray = NDArray[np.float64]

@@ -9,25 +9,31 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.discovery.evidence import Evidence
-from ident.equations.system import System, Triangles, triangle
+from ident.equations.system import System
+from ident.equations.triangles import Triangles, triangle
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import Scaling, ls, tls, wls
 from ident.model.base import BaseParameters
 from ident.model.bodies import Payload
-from ident.model.model import Column, DriveTrain
+from ident.model.model import Column, DriveTrain, Model
+from ident.model.robot import Joint, JointKind, Robot
 
 FloatArray = NDArray[np.float64]
 
 SOLUTION = np.array([3.0, -2.0, 0.7, 0.2, -0.5, 1.1, 1.0])
 """Two gains, three parameters of the robot, one of the payload, and eq. (17)'s one."""
 ROWS = 400
+TWO_AXES = Model(
+    Robot((Joint("J", JointKind.REVOLUTE, -1, np.eye(3), np.zeros(3), np.array([0.0, 0.0, 1.0])),) * 2, np.zeros(3)),
+    DriveTrain(np.eye(2)),
+)
 
 
 def _system(matrix: FloatArray) -> System:
     """W_tot of two joints, the first half of the rows the first one's."""
     halves = np.split(matrix, 2)
     return System(
-        drive_train=DriveTrain(np.eye(2)),
+        model=TWO_AXES,
         base=BaseParameters((0, 1, 2), np.eye(3), ("a", "b", "c")),
         columns=tuple(Column(name, "1") for name in "abc"),
         payloads=(Payload("disc", "x", {"m": 1.0}),),

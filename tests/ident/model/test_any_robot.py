@@ -19,7 +19,8 @@ from ident.estimators.identify import identify
 from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import DriveTrain, Model
-from ident.model.robot import JointKind, robot_from_urdf
+from ident.model.robot import JointKind
+from ident.model.urdf import robot_from_urdf
 from tests.ident.arms import CONFIGS
 from tests.ident.recordings import positions
 

@@ -11,7 +11,6 @@ from ident.equations.reduction import reduce_runs
 from ident.equations.rows import observe
 from ident.model.base import base_parameters
 from ident.model.bodies import LINK_PARAMETERS
-from ident.model.model import dry_friction_columns, link_columns
 from tests.ident.recordings import CONDITIONING, Truth
 
 
@@ -31,9 +30,11 @@ def test_the_tx40_has_61(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
 def test_columns_of_the_links_and_of_dry_friction_are_those_of_their_names(truth: Truth) -> None:
     names = np.array([column.name for column in truth.model.columns])
     numbers = range(1, 7)
-    assert names[link_columns(6)].tolist() == [[f"{name}{number}" for name in LINK_PARAMETERS] for number in numbers]
-    assert names[dry_friction_columns(6)].tolist() == [f"fs{number}" for number in numbers]
-    assert np.arange(len(names))[truth.model.flange].tolist() == link_columns(6)[-1].tolist()
+    assert names[truth.model.link_columns].tolist() == [
+        [f"{name}{number}" for name in LINK_PARAMETERS] for number in numbers
+    ]
+    assert names[truth.model.dry_friction_columns].tolist() == [f"fs{number}" for number in numbers]
+    assert np.arange(len(names))[truth.model.flange].tolist() == truth.model.link_columns[-1].tolist()
 
 
 def test_a_tiny_column_is_zero_and_not_a_parameter() -> None:

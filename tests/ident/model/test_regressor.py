@@ -9,7 +9,8 @@ import pytest
 from ident.arrays import FloatArray
 from ident.model import regressor
 from ident.model.regressor import fill_rigid, mass_matrix
-from ident.model.robot import Robot, robot_from_urdf
+from ident.model.robot import Robot
+from ident.model.urdf import robot_from_urdf
 from tests.bench.torque_fit import moved_links
 from tests.ident.arms import ARMS, GRAVITIES, Arm
 

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ident.errors import ModelError
-from ident.model.robot import JointKind, UrdfRobot, hold_joints, read_urdf, robot_from_urdf
+from ident.model.robot import JointKind
+from ident.model.urdf import UrdfRobot, hold_joints, read_urdf, robot_from_urdf
 from tests.ident.arms import CONFIGS, GANTRY, SEVEN_AXES, THREE_AXES
 
 FloatArray = NDArray[np.float64]

@@ -15,7 +15,8 @@ from ident.errors import ModelError
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import body_of, link_parameters, pseudo_inertia
 from ident.model.model import DriveTrain, Model
-from ident.model.robot import Motion, robot_from_urdf
+from ident.model.robot import Motion
+from ident.model.urdf import robot_from_urdf
 from ident.physical.physical import (
     DEFAULT_MASS_KG,
     MARGIN,

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ident.model.robot import poses, robot_from_urdf
+from ident.model.robot import poses
+from ident.model.urdf import robot_from_urdf
 from ident.planning.clearance import BASE, RESOLUTION_M, Box, Capsule, Checker, Scene
 from tests.ident.arms import ARMS, GANTRY, SEVEN_AXES, TX40, Arm
 

@@ -16,7 +16,8 @@ from ident.data.run import Run
 from ident.estimators.identify import identify
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
-from ident.model.robot import Motion, robot_from_urdf
+from ident.model.robot import Motion
+from ident.model.urdf import robot_from_urdf
 from ident.planning.excitation import (
     Design,
     Excitation,

@@ -1,0 +1,114 @@
+"""Closed chains in a cell file: `closures`, and what `robot` says of motors, platform and assembly."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from math import radians
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from daq.config.yaml_file import Fault, Name, StrictModel
+from ident.errors import ModelError
+from ident.model.closed_chain import assemble
+from ident.model.robot import JointKind, Robot
+from ident.model.urdf import LinkPair, read_urdf, robot_from_urdf
+
+Direction = Literal["x", "y", "z", "rx", "ry", "rz"]
+
+
+class ClosureModel(StrictModel):
+    """Two links of the URDF whose frames coincide: the joint that closes a loop."""
+
+    name: Name
+    first: Name
+    second: Name
+    directions: Annotated[
+        tuple[Direction, ...],
+        Field(min_length=1, max_length=6, description="Along and about the axes of the first link's frame."),
+    ]
+
+
+class ChainModel(StrictModel):
+    """What a robot with closures says beside its URDF."""
+
+    motors: Annotated[
+        tuple[Name, ...], Field(description="Joint of each axis of a closed chain, in the order of the axes.")
+    ] = ()
+    platform: Annotated[Name | None, Field(description="Link that carries the payload.")] = None
+    mobility: Annotated[int | None, Field(ge=1, le=32, description="Degrees of freedom of a closed chain.")] = None
+    assembly_deg: Annotated[
+        Mapping[str, float], Field(description="Positions of the revolute joints at which the closures nearly hold.")
+    ] = Field(default_factory=dict)
+    assembly_mm: Annotated[Mapping[str, float], Field(description="The same of the prismatic joints.")] = Field(
+        default_factory=dict
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class ClosedChain:
+    """How the loops of a URDF's tree close."""
+
+    closures: tuple[LinkPair, ...]
+    motors: tuple[str, ...]  #: joint of each axis, in the order of the axes
+    platform: str | None  #: link that carries the payload; that of the last joint when None
+    assembly_rad: dict[str, float]  #: roughly, positions of all joints at which the closures hold [rad or m]
+
+
+def chain_of(robot: ChainModel, closures: tuple[ClosureModel, ...]) -> ClosedChain | None:
+    """Return the closed chain of a cell file, None of a serial robot."""
+    if not closures:
+        return None
+    revolute = {name: radians(position) for name, position in robot.assembly_deg.items()}
+    prismatic = {name: 1e-3 * position for name, position in robot.assembly_mm.items()}
+    pairs = (LinkPair(one.name, one.first, one.second, one.directions) for one in closures)
+    return ClosedChain(tuple(pairs), robot.motors, robot.platform, revolute | prismatic)
+
+
+def robot_with(chain: ClosedChain | None, urdf: str, gravity_m_s2: tuple[float, float, float]) -> Robot:
+    """Read a cell's robot.
+
+    Raises:
+        ModelError: see `ident.model.urdf.robot_from_urdf`.
+    """
+    if chain is None:
+        return robot_from_urdf(urdf, gravity_m_s2)
+    return robot_from_urdf(
+        urdf,
+        gravity_m_s2,
+        closures=chain.closures,
+        motors=chain.motors,
+        assembly_rad=chain.assembly_rad,
+        platform=chain.platform,
+    )
+
+
+def chain_faults(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: str) -> Iterator[Fault]:
+    """Find a closed chain that is described by halves, does not close, or is not moved by its motors.
+
+    Raises:
+        ModelError: the URDF cannot be read.
+    """
+    given = [key for key in ChainModel.model_fields if getattr(robot, key)]
+    if not closures:
+        for key in given:
+            yield Fault(("robot", key), "no `closures` beside it", "nothing: only a closed chain has it")
+        return
+    for key, what in (
+        ("motors", "the joint of each axis"),
+        ("mobility", "the maker's degrees of freedom"),
+    ):
+        if key not in given:
+            yield Fault(("robot", key), "nothing, beside `closures`", what)
+    kinds = {joint.name: joint.kind for joint in read_urdf(urdf).joints}
+    for key, kind in (("assembly_deg", JointKind.REVOLUTE), ("assembly_mm", JointKind.PRISMATIC)):
+        for name in getattr(robot, key):
+            if kinds.get(name, kind) is not kind:
+                found = f"joint {name}, which is {kinds[name].value}"
+                yield Fault(("robot", key, name), found, f"a {kind.value} joint")
+    if {"motors", "mobility"} <= set(given):
+        try:
+            assemble(robot_with(chain_of(robot, closures), urdf, (0.0, 0.0, -9.81)), robot.mobility)
+        except ModelError as error:
+            yield Fault(("closures",), str(error), "a mechanism that closes, and that its motors move")

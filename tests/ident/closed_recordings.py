@@ -1,0 +1,89 @@
+"""Recordings of closed chains that obey the declared model exactly: what an estimator must give back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.data.conditioning import Conditioning
+from ident.data.dataset import differentiate
+from ident.data.run import Run
+from ident.model.bodies import Payload
+from ident.model.model import Model
+from tests.ident.mechanisms import FIVE_BAR, PLANAR, Mechanism, leg_angles
+from tests.ident.recordings import positions
+
+FloatArray = NDArray[np.float64]
+RATE_HZ = 250.0
+MOUNTED = Payload("body", "a", {"m": 2.0})
+
+
+@dataclass(frozen=True)
+class Made:
+    """Runs without and with the payload, and what they were made of."""
+
+    model: Model
+    conditioning: Conditioning
+    runs: tuple[Run, Run]
+    standard: FloatArray
+
+
+def _body(rng: np.random.Generator, mass: float) -> FloatArray:
+    centre = rng.uniform(-0.05, 0.05, 3)
+    inertia = mass * (np.eye(3) * (0.06**2 + centre @ centre) - np.outer(centre, centre))
+    return np.concatenate((inertia[np.triu_indices(3)], mass * centre, [mass]))
+
+
+def axis_positions(mechanism: Mechanism, rng: np.random.Generator, seconds: float) -> FloatArray:
+    """Positions of the motors that the closures allow, around the assembly pose, shape (k, m)."""
+    robot = mechanism.robot
+    home = mechanism.model.assembly.position_rad[list(robot.axis_joints)]
+    if mechanism is not PLANAR:
+        reach = np.full(robot.axis_count, 0.6 if mechanism is FIVE_BAR else 0.08)
+        return home + positions(rng, seconds, RATE_HZ, reach)
+    pose = positions(rng, seconds, RATE_HZ, np.array([0.08, 0.08, 0.4]))
+    motors = np.stack([leg_angles(pose, leg)[0] for leg in range(4)], axis=1)
+    return np.asarray(motors + 2.0 * np.pi * np.round((home - motors[0]) / (2.0 * np.pi)))
+
+
+def preload_of(model: Model, to_motors: FloatArray, time_s: FloatArray, size_nm: float) -> FloatArray:
+    """Torques of the motors that work against each other, shape (k, m): zero of a robot that is not redundant."""
+    samples, count, free = to_motors.shape
+    out = np.zeros((samples, count))
+    whole, _ = np.linalg.qr(to_motors, mode="complete")
+    for number in range(count - free):
+        way = whole[:, :, free + number]
+        way = way * np.sign(np.einsum("km,m->k", way, way[0]))[:, None]
+        out += size_nm * (0.5 + np.sin((1.7 + number) * time_s))[:, None] * way
+    assert model.is_redundant == (count > free)
+    return out
+
+
+def recorded(
+    mechanism: Mechanism, seed: int = 4, *, seconds: float = 22.0, noise_a: float = 0.0, preload_nm: float = 0.3
+) -> Made:
+    """A run without load and one with 2 kg on the platform."""
+    model, rng = mechanism.model, np.random.default_rng(0)
+    standard = np.zeros(len(model.columns))
+    for columns in model.link_columns:
+        standard[columns] = _body(rng, rng.uniform(0.3, 1.5))
+    for joint in model.robot.axis_joints:
+        standard[14 * joint + 10 : 14 * joint + 14] = 0.02, 0.3, 0.4, 0.05
+    payload = _body(rng, 2.0)
+    conditioning = Conditioning(standstill_rad_s=(0.02,) * model.robot.axis_count)
+    rng, runs = np.random.default_rng(seed), []
+    for mounted in (None, MOUNTED):
+        q = axis_positions(mechanism, rng, seconds)
+        run = Run("loaded" if mounted else "bare", np.arange(len(q)) / RATE_HZ, q, np.zeros_like(q), mounted)
+        data = differentiate(run, model.drive_train, conditioning)
+        whole = standard.copy()
+        if mounted is not None:
+            whole[model.flange] += payload
+        torque = np.einsum("mck,c->km", model.regressor(data.motion()), whole)
+        torque = torque + preload_of(model, model.follow(data.motion()).to_motors, data.time_s, preload_nm)
+        current = noise_a * rng.standard_normal(q.shape)
+        current[1:-1] += torque / mechanism.gains
+        runs.append(replace(run, current_a=current))
+    return Made(model, conditioning, (runs[0], runs[1]), standard)

@@ -1,0 +1,135 @@
+"""Gains and parameters of closed chains: exact recordings, noise, internal preload."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from ident.data.dataset import differentiate
+from ident.equations.currents import PreloadedCurrents, without_preload
+from ident.equations.linearisation import linearise
+from ident.equations.rows import observe
+from ident.errors import DataUnfit
+from ident.estimators.identify import Identification, identify
+from ident.estimators.maximum_likelihood import iv
+from ident.estimators.method import Method
+from tests.ident.closed_recordings import Made, recorded
+from tests.ident.mechanisms import FIVE_BAR, MECHANISMS, PLANAR, Mechanism
+
+SEEDS = range(10, 16)
+NOISE_A = 0.03
+
+
+@cache
+def _made(name: str) -> Made:
+    return recorded(next(one for one in MECHANISMS if one.name == name))
+
+
+@cache
+def _fitted(name: str) -> Identification:
+    made = _made(name)
+    return identify(made.model, made.runs, made.conditioning, keep_rows=True)
+
+
+@pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
+@pytest.mark.parametrize("method", [Method.ML, Method.WLS, Method.LS])
+def test_exact_recordings_give_the_gains_back(mechanism: Mechanism, method: Method) -> None:
+    made = _made(mechanism.name)
+    found = identify(made.model, made.runs, made.conditioning, method=method)
+    assert found.estimate.gains == pytest.approx(mechanism.gains, rel=1e-6)
+    assert found.training_error.total < 1e-6
+
+
+@pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
+def test_parameters_are_those_of_the_base_grouping(mechanism: Mechanism) -> None:
+    found = _fitted(mechanism.name)
+    expected = found.system.base.grouping @ _made(mechanism.name).standard
+    own = found.estimate.parameters[: len(expected)]
+    assert own == pytest.approx(expected, rel=1e-5, abs=1e-6)
+
+
+def test_five_bar_has_the_base_parameters_of_the_paper_and_pencil() -> None:
+    """A plane needs 3 of each link (Izz, mx, my); one of a closed loop's mx is regrouped; 3 of each drive."""
+    names = _fitted(FIVE_BAR.name).system.base.names
+    assert len(names) == 4 * 3 - 1 + 2 * 3
+    assert sum(name.startswith(("Izz", "mx", "my")) for name in names) == 11
+
+
+def test_noise_does_not_bend_the_gains_of_a_preloaded_drive() -> None:
+    """Least squares loses a share of every gain to the noise of its own columns; corrected currents do not."""
+    errors, deviations, noises = [], [], []
+    for seed in SEEDS:
+        made = recorded(PLANAR, seed, seconds=15.0, noise_a=NOISE_A)
+        found = identify(made.model, made.runs, made.conditioning).estimate
+        errors.append(found.gains / PLANAR.gains - 1.0)
+        deviations.append(found.gains_std / np.abs(PLANAR.gains))
+        noises.append(found.axis_noise)
+    mean, expected = np.mean(errors, axis=0), np.mean(deviations, axis=0)
+    assert np.all(np.abs(mean) < 3.5 * expected / np.sqrt(len(SEEDS)))
+    assert 0.5 < np.sqrt(np.mean(np.square(errors))) / np.sqrt(np.mean(np.square(deviations))) < 1.5
+    # White noise behind the decimation: each motor shows the same share of it.
+    assert np.mean(noises, axis=0) == pytest.approx(np.full(4, np.mean(noises)), rel=0.06)
+
+
+def test_what_the_preload_hides_is_taken_out_exactly() -> None:
+    rng = np.random.default_rng(1)
+    preload, _ = np.linalg.qr(rng.normal(size=(30, 4, 1)))
+    gains, noise = np.array([2.0, -1.5, 1.8, 2.2]), np.array([0.02, 0.05, 0.01, 0.03])
+    transform = without_preload(preload, gains, noise)
+    assert np.max(np.abs(transform @ preload)) < 1e-10
+    # ‖T y‖² is yᵀA (AᵀD²A)⁻¹ Aᵀy, with A the complement of N.
+    complement = np.linalg.qr(preload, mode="complete")[0][:, :, 1:]
+    scaled = complement * (gains * noise)[None, :, None]
+    y = rng.normal(size=(30, 4, 1))
+    seen = np.swapaxes(complement, 1, 2) @ y
+    expected = np.swapaxes(seen, 1, 2) @ np.linalg.solve(np.swapaxes(scaled, 1, 2) @ scaled, seen)
+    assert np.sum((transform @ y) ** 2, axis=(1, 2)) == pytest.approx(expected[:, 0, 0], rel=1e-9)
+
+
+def test_the_gain_columns_are_derivatives() -> None:
+    """Of the least over all preloads, e(g)ᵀe(g), at given σ."""
+    made = recorded(PLANAR, noise_a=NOISE_A)
+    currents = identify(made.model, made.runs, made.conditioning).system.currents
+    assert isinstance(currents, PreloadedCurrents)
+    noise, gains = np.array([0.01, 0.02, 0.012, 0.015]), PLANAR.gains * np.array([1.01, 0.98, 1.0, 1.02])
+    parameters = currents.whitened(gains, noise).parameters(gains)
+    whitened = currents.whitened(gains, noise)
+    residual = whitened.residual(gains, parameters)
+    slope = 2.0 * currents.corrected(gains, noise, whitened, residual).T @ residual
+    for motor in range(4):
+        step = 1e-6 * np.eye(4)[motor]
+        ahead, behind = (2.0 * currents.cost(gains + sign * step, parameters, noise) for sign in (1, -1))
+        assert slope[motor] == pytest.approx((ahead - behind) / 2e-6, rel=1e-4, abs=1e-3)
+
+
+@pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
+def test_rows_and_triangles_are_the_same_equations(mechanism: Mechanism) -> None:
+    found, made = _fitted(mechanism.name), _made(mechanism.name)
+    assert found.gathered is not None
+    datasets, rows = found.gathered
+    again = observe(made.model, [differentiate(run, made.model.drive_train, made.conditioning) for run in made.runs],
+                    made.conditioning, found.system)  # fmt: skip
+    assert again.regressor == pytest.approx(rows.regressor)
+    system = rows.system()
+    estimate = found.estimate
+    assert estimate.relative_error(system).total < 1e-6
+    ones = np.ones(mechanism.model.robot.axis_count)
+    assert system.currents.cost(estimate.gains * 1.1, estimate.parameters, ones) == pytest.approx(
+        found.system.currents.cost(estimate.gains * 1.1, estimate.parameters, ones), rel=1e-6
+    )
+    problem = linearise(rows, estimate.gains, estimate.parameters, ones, gains_fixed=False)
+    torque = rows.regressor[:, :2]
+    seen = problem.whitened(torque, made.model.drive_train.to_motor)
+    first = found.system.axis_count
+    direct = np.zeros((problem.jacobian.width, len(problem.residual)))
+    for motor, (part, held) in enumerate(zip(problem.jacobian.parts, problem.jacobian.seen, strict=True)):
+        direct[held, problem.rows_of(motor)] = part
+    assert seen == pytest.approx((direct[first : first + 2] / problem.scale[first : first + 2, None]).T, abs=1e-9)
+    assert len(datasets) == 2
+
+
+def test_instruments_need_an_equation_a_motor() -> None:
+    with pytest.raises(DataUnfit, match="more motors than degrees of freedom"):
+        iv(_fitted(PLANAR.name).system)

@@ -1,0 +1,265 @@
+"""Closed chains: how passive joints follow, against differences, Pinocchio, and equations derived by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from ident.errors import ModelError
+from ident.model.closed_chain import assemble, closure_equations, follow
+from ident.model.model import DriveTrain, Model
+from ident.model.robot import DIRECTIONS, Closure, Motion, Place, Robot, poses
+from ident.model.urdf import LinkPair, read_urdf, robot_from_urdf
+from tests.ident.arms import SEVEN_AXES
+from tests.ident.mechanisms import (
+    BASE_M,
+    CRANK_M,
+    FIVE_BAR,
+    HALF_M,
+    LEGS,
+    MECHANISMS,
+    PLANAR,
+    ROD_M,
+    SLIDE_M,
+    THREE_LEGS,
+    Mechanism,
+    leg_angles,
+)
+
+FloatArray = NDArray[np.float64]
+STEP_S = 1e-3
+
+
+def _turn(rng: np.random.Generator) -> FloatArray:
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    return np.asarray(q * np.sign(np.linalg.det(q)))
+
+
+def _axes_motion(mechanism: Mechanism, samples: int = 400, size: float = 1.0) -> Motion:
+    """A smooth motion of the motors that the closures allow, with its exact derivatives."""
+    t = np.arange(samples) * STEP_S
+    phase = np.arange(3)[:, None]
+    wave = 2.0 * np.pi * (0.6 + 0.35 * phase)
+    x, v, a = (
+        size * np.sin(wave * t + phase),
+        size * wave * np.cos(wave * t + phase),
+        -size * wave**2 * np.sin(wave * t + phase),
+    )
+    robot = mechanism.robot
+    assembly = assemble(robot)
+    home = assembly.position_rad[list(robot.axis_joints)]
+    if mechanism is not PLANAR:
+        reach = 0.4 if mechanism is FIVE_BAR else 0.06
+        part = slice(len(home))
+        return Motion(*(np.asarray(start + reach * one[part].T) for start, one in ((home, x), (0.0, v), (0.0, a))))
+    pose, rate, change = (np.asarray((np.array([[0.05], [0.05], [0.3]]) * part).T) for part in (x, v, a))
+    h = 1e-4
+    steps = [pose + k * h * rate + 0.5 * (k * h) ** 2 * change for k in (-2, -1, 0, 1, 2)]
+    at = [np.stack([leg_angles(one, leg)[0] for leg in range(4)], axis=1) for one in steps]
+    turns = 2.0 * np.pi * np.round((home - at[2][0]) / (2.0 * np.pi))
+    velocity = (at[0] - 8.0 * at[1] + 8.0 * at[3] - at[4]) / (12.0 * h)
+    acceleration = (-at[0] + 16.0 * at[1] - 30.0 * at[2] + 16.0 * at[3] - at[4]) / (12.0 * h**2)
+    return Motion(at[2] + turns, velocity, acceleration)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10_000), directions=st.lists(st.sampled_from(DIRECTIONS), min_size=1, max_size=6, unique=True)
+)
+def test_derivatives_of_any_closure(seed: int, directions: list[str]) -> None:
+    rng = np.random.default_rng(seed)
+    tree = robot_from_urdf(SEVEN_AXES.urdf)
+    joints = tuple(replace(joint, parent=index // 2 - 1) for index, joint in enumerate(tree.joints))
+    ends = [Place(joint, _turn(rng), rng.uniform(-0.3, 0.3, 3)) for joint in (6, 5)]
+    robot = Robot(joints, tree.gravity_m_s2, (Closure("any", ends[0], ends[1], tuple(directions)),), (0,))
+    q, v = rng.uniform(-1, 1, (2, 1, 7))
+    h = 1e-6
+    _, jacobian, bias = closure_equations(robot, q, v)
+    (ahead, ahead_j, _), (behind, behind_j, _) = (closure_equations(robot, q + sign * h * v) for sign in (1, -1))
+    assert jacobian[0] @ v[0] == pytest.approx((ahead - behind)[0] / (2 * h), abs=1e-7)
+    assert bias[0] == pytest.approx((ahead_j - behind_j)[0] @ v[0] / (2 * h), abs=1e-6)
+
+
+@pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
+def test_joints_follow_with_their_derivatives(mechanism: Mechanism) -> None:
+    robot, motion = mechanism.robot, _axes_motion(mechanism)
+    assembly = assemble(robot, mechanism.mobility)
+    found = follow(robot, assembly, motion)
+    q, v, a = found.joints.position_rad, found.joints.velocity_rad_s, found.joints.acceleration_rad_s2
+    assert np.max(np.abs(closure_equations(robot, q)[0])) < 1e-11
+    motors = list(robot.axis_joints)
+    assert np.max(np.abs(q[:, motors] - motion.position_rad)) < 1e-11
+    _, jacobian, bias = closure_equations(robot, q, v)
+    assert np.max(np.abs(np.einsum("kcn,kn->kc", jacobian, v))) < 1e-10
+    assert np.max(np.abs(np.einsum("kcn,kn->kc", jacobian, a) + bias)) < 1e-9
+    differences = (q[2:] - q[:-2]) / (2 * STEP_S)
+    assert np.max(np.abs(differences - v[1:-1])) < 2e-5 * np.max(np.abs(a)) + 1e-4
+    assert np.max(np.abs(np.einsum("kcn,knd->kcd", jacobian, found.to_joints))) < 1e-12
+    assert found.to_motors == pytest.approx(found.to_joints[:, motors])
+
+
+def test_a_pose_does_not_depend_on_what_was_asked_before() -> None:
+    motion = _axes_motion(FIVE_BAR, 300)
+    robot = FIVE_BAR.robot
+    assembly = assemble(robot)
+    whole = follow(robot, assembly, motion).joints.position_rad
+    part = Motion(
+        *(array[77:201] for array in (motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2))
+    )
+    assert np.max(np.abs(follow(robot, assembly, part).joints.position_rad - whole[77:201])) < 1e-11
+
+
+def test_five_bar_against_the_circles_that_its_rods_describe() -> None:
+    found = follow(FIVE_BAR.robot, assemble(FIVE_BAR.robot), _axes_motion(FIVE_BAR)).joints.position_rad
+    index = {joint.name: number for number, joint in enumerate(FIVE_BAR.robot.joints)}
+    left, right = found[:, index["left-crank"]], found[:, index["right-crank"]]
+    ends = [
+        np.stack([side * 0.5 * BASE_M + CRANK_M * np.cos(q), CRANK_M * np.sin(q)], axis=1)
+        for side, q in ((-1, left), (1, right))
+    ]
+    middle, apart = 0.5 * (ends[0] + ends[1]), ends[1] - ends[0]
+    half = 0.5 * np.linalg.norm(apart, axis=1)
+    across = np.stack([-apart[:, 1], apart[:, 0]], axis=1) / (2.0 * half)[:, None]
+    tip = middle + np.sqrt(ROD_M**2 - half**2)[:, None] * across
+    angle = found[:, index["left-rod"]] + left
+    assert ends[0] + ROD_M * np.stack([np.cos(angle), np.sin(angle)], axis=1) == pytest.approx(tip, abs=1e-12)
+
+
+def test_three_legs_carry_a_platform_that_only_translates() -> None:
+    robot = THREE_LEGS.robot
+    motion = _axes_motion(THREE_LEGS)
+    placed = poses(robot, follow(robot, assemble(robot), motion).joints.position_rad)
+    hand = next(number for number, joint in enumerate(robot.joints) if joint.name == "hand-0") + 1
+    assert placed.rotation[hand] == pytest.approx(np.broadcast_to(placed.rotation[hand, 0], (400, 3, 3)), abs=1e-11)
+    # Each rod keeps its length: from its slide to the platform.
+    for leg in range(3):
+        at = motion.position_rad[:, leg, None] * np.eye(3)[leg] - SLIDE_M * np.eye(3)[leg]
+        assert np.linalg.norm(placed.origin_m[hand] - at, axis=1) == pytest.approx(SLIDE_M, abs=1e-11)
+
+
+def _torque_of_tree(mechanism: Mechanism, joints: Motion) -> FloatArray:
+    """Pinocchio's inverse dynamics of the tree without closures, shape (k, n)."""
+    model = pin.buildModelFromXML(mechanism.urdf)
+    model.gravity.linear = np.array(mechanism.gravity_m_s2)
+    data = model.createData()
+    states = zip(joints.position_rad, joints.velocity_rad_s, joints.acceleration_rad_s2, strict=True)
+    return np.stack([pin.rnea(model, data, q, v, a) for q, v, a in states])
+
+
+def _standard(mechanism: Mechanism, model: Model) -> FloatArray:
+    """The URDF's inertias as standard parameters, without friction."""
+    standard = np.zeros(len(model.columns))
+    for columns, body in zip(model.link_columns, read_urdf(mechanism.urdf).bodies, strict=True):
+        standard[columns] = body.parameters
+    return standard
+
+
+@pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
+def test_virtual_power_of_the_motors_is_that_of_all_joints(mechanism: Mechanism) -> None:
+    model, motion = mechanism.model, _axes_motion(mechanism, 60)
+    torque = np.einsum("mck,c->mk", model.regressor(motion), _standard(mechanism, model))
+    followed = model.follow(motion)
+    tree = _torque_of_tree(mechanism, followed.joints)
+    motors = np.einsum("kmd,mk->kd", followed.to_motors, torque)
+    joints = np.einsum("knd,kn->kd", followed.to_joints, tree)
+    assert np.max(np.abs(motors - joints)) < 1e-9 * np.max(np.abs(joints))
+
+
+@pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
+def test_pinocchio_returns_the_acceleration(mechanism: Mechanism) -> None:
+    """The torques of the regressor, put into constrained forward dynamics: equations of motion with multipliers."""
+    model, motion = mechanism.model, _axes_motion(mechanism, 40)
+    torque = np.einsum("mck,c->km", model.regressor(motion), _standard(mechanism, model))
+    followed = model.follow(motion)
+    joints = followed.joints
+    tree = pin.buildModelFromXML(mechanism.urdf)
+    tree.gravity.linear = np.array(mechanism.gravity_m_s2)
+    data = tree.createData()
+    motors = list(model.robot.axis_joints)
+    _, jacobian, bias = closure_equations(model.robot, joints.position_rad, joints.velocity_rad_s)
+    for k in range(40):
+        q, v = joints.position_rad[k], joints.velocity_rad_s[k]
+        mass = pin.crba(tree, data, q)
+        mass = np.triu(mass) + np.triu(mass, 1).T
+        applied = np.zeros(tree.nv)
+        applied[motors] = torque[k]
+        j = jacobian[k]
+        system = np.block([[mass, j.T], [j, np.zeros((len(j), len(j)))]])
+        right = np.concatenate((applied - pin.nonLinearEffects(tree, data, q, v), -bias[k]))
+        found = np.linalg.lstsq(system, right, rcond=1e-12)[0][: tree.nv]
+        assert found == pytest.approx(joints.acceleration_rad_s2[k], rel=1e-8, abs=1e-7)
+
+
+@pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
+def test_short_cuts_agree_with_the_regressor(mechanism: Mechanism) -> None:
+    model, motion = mechanism.model, _axes_motion(mechanism, 30)
+    standard = _standard(mechanism, model)
+    load, _, whole = model.torques(motion, standard)
+    torque = np.einsum("mck,c->mk", model.regressor(motion), standard)
+    assert load == pytest.approx(torque, rel=1e-9, abs=1e-9)
+    assert whole == pytest.approx(torque, rel=1e-9, abs=1e-9)
+    faster = Motion(motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2 + 1.0)
+    if model.is_redundant:  # all motors at will would tear the platform apart
+        return
+    change = np.einsum("mck,c->mk", model.regressor(faster), standard) - torque
+    assert model.inertia(motion.position_rad, standard).sum(axis=1) == pytest.approx(change, rel=1e-8)
+
+
+def test_a_robot_without_closures_is_the_special_case() -> None:
+    robot = robot_from_urdf(SEVEN_AXES.urdf)
+    assembly = assemble(robot)
+    q = np.random.default_rng(0).uniform(-1, 1, (5, 7))
+    found = follow(robot, assembly, Motion(q, q, q))
+    assert assembly.mobility == 7
+    assert (found.to_joints == np.eye(7)).all()
+    assert (found.to_motors == np.eye(7)).all()
+    assert Model(robot, DriveTrain(np.eye(7))).is_redundant is False
+
+
+def _wrong(mechanism: Mechanism, **changes: object) -> Robot:
+    return replace(mechanism, **changes).robot  # type: ignore[arg-type]
+
+
+def test_bad_descriptions_are_refused_by_name() -> None:
+    with pytest.raises(ModelError, match=r"closure 'tip' cannot close at the assembly pose: x .* mm"):
+        assemble(_wrong(FIVE_BAR, assembly_rad={"left-crank": 3.1, "right-crank": 0.0}))
+    with pytest.raises(ModelError, match="leave 2 degrees of freedom at the assembly pose; expected 3"):
+        assemble(FIVE_BAR.robot, 3)
+    with pytest.raises(ModelError, match="left-crank do not move all 2 degrees of freedom"):
+        assemble(_wrong(FIVE_BAR, motors=("left-crank",)))
+    # Both rods in one line: the tip can move across it while the cranks stay.
+    low = float(np.arccos((2.0 * ROD_M - BASE_M) / (2.0 * CRANK_M)))
+    high = np.pi - low
+    stretched = {"left-crank": high, "left-rod": -high, "right-crank": low, "right-rod": high}
+    with pytest.raises(ModelError, match="the robot is singular at the assembly pose"):
+        assemble(_wrong(FIVE_BAR, assembly_rad=stretched))
+    with pytest.raises(ModelError, match="names link 'nowhere'"):
+        _wrong(FIVE_BAR, closures=(LinkPair("tip", "nowhere", "right-tip", ("x",)),))
+    with pytest.raises(ModelError, match="the list of motors names joint 'left'"):
+        _wrong(FIVE_BAR, motors=("left", "right-crank"))
+    with pytest.raises(ModelError, match="directions q; expected some of x, y, z, rx, ry, rz"):
+        _wrong(FIVE_BAR, closures=(LinkPair("tip", "left-tip", "right-tip", ("q",)),))
+
+
+def test_a_position_out_of_reach_is_named() -> None:
+    motion = Motion(*(np.array([[3.1, 0.0]]) for _ in range(3)))
+    with pytest.raises(ModelError, match=r"the loops cannot be closed at left-crank .*, right-crank "):
+        follow(FIVE_BAR.robot, assemble(FIVE_BAR.robot), motion)
+
+
+def test_the_planar_platform_is_where_its_legs_hold_it() -> None:
+    pose = np.array([[0.03, -0.02, 0.2]])
+    motors = np.stack([leg_angles(pose, leg)[0] for leg in range(4)], axis=1)
+    home = assemble(PLANAR.robot).position_rad[list(PLANAR.robot.axis_joints)]
+    motors += 2.0 * np.pi * np.round((home - motors) / (2.0 * np.pi))
+    found = follow(PLANAR.robot, assemble(PLANAR.robot), Motion(motors, 0 * motors, 0 * motors)).joints.position_rad
+    turned = {joint.name: value for joint, value in zip(PLANAR.robot.joints, found[0], strict=True)}
+    assert turned["motor-0"] + turned["elbow-0"] + turned["platform"] == pytest.approx(0.2)
+    x, y, _ = LEGS[0]
+    assert np.hypot(0.03 - HALF_M * np.cos(0.2) - x, -0.02 - HALF_M * np.sin(0.2) - y) > 0
