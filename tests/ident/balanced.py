@@ -13,7 +13,7 @@ from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.model.bodies import Payload
 from ident.model.model import DriveTrain, Model
-from ident.model.robot import robot_from_urdf
+from ident.model.urdf import robot_from_urdf
 from ident.planning.excitation import nominal_links
 from tests.ident.arms import CONFIGS
 from tests.ident.recordings import positions

@@ -22,7 +22,8 @@ from daq.log.metadata import AxisReadback, Readback
 from daq.report.plots import plot_torques
 from daq.simulation.simulation_file import load_simulation
 from ident.model.model import DriveTrain
-from ident.model.robot import JointKind, robot_from_urdf
+from ident.model.robot import JointKind
+from ident.model.urdf import robot_from_urdf
 from tests.conftest import CHECKOUT
 
 GANTRY = load_cell(CHECKOUT / "configs/cells/gantry.yaml")
