@@ -7,7 +7,7 @@ the dictionary's grid explains a part of, and compete together with the grid, wh
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from ident.discovery.refinement import is_possible, refine_together
 from ident.discovery.search import Gates
 from ident.effects.effect import Effect
 from ident.effects.position import Counterbalance
+
+STARTS = 4  #: Directions from which the geometry is fitted
 
 
 def propose_balancers(
@@ -57,11 +59,9 @@ def propose_balancers(
     return proposed
 
 
-def _apart(members: Sequence[Effect]) -> Iterator[Effect]:
-    """The first member, and the first that points the other way.
-
-    Turned by half a revolution the second harmonic is the same, and the simplex does not find the way.
-    """
-    away = (one for one in members if np.cos(one.settings["phase_rad"] - members[0].settings["phase_rad"]) < 0.0)
-    yield from members[:1]
-    yield from list(away)[:1]
+def _apart(members: Sequence[Effect]) -> tuple[Effect, ...]:
+    """The best members of so many directions of the lever: the simplex does not find the way from one to another."""
+    best: dict[float, Effect] = {}
+    for member in members:
+        best.setdefault(member.settings["phase_rad"], member)
+    return tuple(best.values())[:STARTS]

@@ -157,7 +157,8 @@ def prepare_search(
     rows: list[Signals] = []
     for run, data in zip(runs, datasets, strict=True):
         at_rate = {array.name: getattr(run, array.name) for array in fields(run) if array.name != "rate_hz"}
-        known = {name: array for name, array in at_rate.items() if array is not None and name != "inertia_kg_m2"}
+        sampled = {name: array for name, array in at_rate.items() if array is not None and array.shape[-1]}
+        known = {name: array for name, array in sampled.items() if name != "inertia_kg_m2"}
         arrays = {name: decimate_rows(data, observation.conditioning, array) for name, array in known.items()}
         time_s, none = arrays["time_s"], run.inertia_kg_m2[..., :0]
         rate_hz = float((len(time_s) - 1) / (time_s[-1] - time_s[0]))

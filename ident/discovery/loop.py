@@ -180,7 +180,7 @@ def with_declared(
         NotConverged, RankDeficient: see `ident.identify`.
     """
     gates, cache, evidence, steps = Gates(), ColumnCache(), start, list[Step]()
-    names = axes or [joint.name for joint in start.model.robot.joints]
+    names = axes or [joint.name for joint in start.model.robot.places]
     for placed in declared:
         name = placed.name_among(names)
         progress(f"fitting the declared {name}")

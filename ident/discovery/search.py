@@ -41,6 +41,7 @@ from ident.effects.unnamed import FOLDED, INTERVALS, Periodic, Smooth
 
 EffectKey = tuple[str, int, tuple[float, ...]]
 
+FEWEST_MOVES = 3.0  #: Effective number of moves below which their random signs test nothing
 AS_GOOD = 0.99  #: Share of the best one's fall on held-out moves that counts as equal
 CLEARLY = 0.95
 """Confidence of a paired comparison over folds (Student's t; folds share training data, so it is a rough one)."""
@@ -285,12 +286,17 @@ def _sigma(trial: Trial) -> FloatArray:
 
 
 def _max_t(trials: tuple[Trial, ...], rng: np.random.Generator, draws: int) -> FloatArray:
-    """Probability of each candidate's Wald statistic under random signs of the moves, for the largest of all."""
+    """Probability of each candidate's Wald statistic under random signs of the moves, for the largest of all.
+
+    A candidate that rests on one or two moves, as a hinge at the end of an axis' range, has no scatter to compare with:
+    its statistic is large in half of the draws, and would hide every other candidate. It is never surprising.
+    """
     clusters, widths = len(trials[0].scatter), np.array([len(trial.score) for trial in trials])
+    shown = np.array([moves_behind(trial) >= FEWEST_MOVES for trial in trials])
     signs = rng.choice((-1.0, 1.0), size=(draws, clusters))
     observed, surprise = np.empty(len(trials)), np.zeros(draws)
-    for freedom in np.unique(widths).tolist():
-        numbers = np.flatnonzero(widths == freedom)
+    for freedom in np.unique(widths[shown]).tolist():
+        numbers = np.flatnonzero(shown & (widths == freedom))
         alike = [trials[number] for number in numbers]
         score, scatter = (np.stack(parts) for parts in zip(*((one.score, one.scatter) for one in alike), strict=True))
         # The candidate is in the fit here: else its own torque would count as noise, and the strongest would hide best.
@@ -303,7 +309,14 @@ def _max_t(trials: tuple[Trial, ...], rng: np.random.Generator, draws: int) -> F
         # On the scale of −log p, so that candidates with one and with two coefficients compete alike.
         observed[numbers] = _surprise(wald, freedom)
         surprise = np.maximum(surprise, _surprise(drawn, freedom))
-    return np.asarray((1.0 + np.sum(surprise[None] >= observed[:, None], axis=1)) / (draws + 1.0))
+    probability = (1.0 + np.sum(surprise[None] >= observed[:, None], axis=1)) / (draws + 1.0)
+    return np.where(shown, probability, 1.0)
+
+
+def moves_behind(trial: Trial) -> float:
+    """Effective number of moves that a candidate's columns rest on, (Σ G_m)²/Σ G_m², the least of its coefficients."""
+    own = np.diagonal(trial.gram, axis1=1, axis2=2)
+    return float(np.min(own.sum(axis=0) ** 2 / np.sum(own**2, axis=0)))
 
 
 def _surprise(wald: FloatArray, freedom: int) -> FloatArray:

@@ -113,7 +113,7 @@ def _turns(cell: Cell, _: Any) -> Iterator[RenderableType]:
         error_after_percent=112.34,
         passed=True,
     )
-    step = SimpleNamespace(findings=(finding,) * 6, set_aside=(), accepted=None)
+    step = SimpleNamespace(findings=(finding,) * 6, set_aside=(), accepted=None, declared=False)
     fitted: Any = SimpleNamespace(steps=(step,), cell=cell)
     return residual.turns_view(fitted)
 

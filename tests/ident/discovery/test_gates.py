@@ -28,11 +28,19 @@ from ident.discovery.gates import (
     without_effects_of,
 )
 from ident.discovery.loop import SetAside, find_effects
-from ident.discovery.search import Finding, Gates, effect_key, rank_effects
+from ident.discovery.search import (
+    FEWEST_MOVES,
+    Finding,
+    Gates,
+    effect_key,
+    moves_behind,
+    rank_effects,
+    rank_families,
+)
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.friction import NonlinearViscous, Stribeck, TemperatureFriction, WarmUp
-from ident.effects.position import Spring
+from ident.effects.position import Hinge, Spring
 from ident.effects.signals import Abscissa, Signals
 from ident.effects.unnamed import Smooth
 from ident.estimators.identify import identify
@@ -97,6 +105,21 @@ def test_a_time_constant_is_no_longer_than_the_data(search_problem: SearchProble
     assert not WarmUp(400.0, 1).fits_in(later, 0)
     tried = rank_effects(search_problem, np.random.default_rng(0), GATES, ((WarmUp(900.0, 0),), (Spring(),)))
     assert {finding.effect.name for finding in tried} == {"spring"}
+
+
+def test_a_candidate_that_rests_on_one_move_is_never_surprising_and_hides_no_other(
+    search_problem: SearchProblem,
+) -> None:
+    position = np.concatenate([run.position_rad[1] for run in search_problem.rows])
+    counted = position[search_problem.observation.use[1]]
+    farthest = (Hinge(float(counted.max()) - 0.02, 1),)
+    (family,) = search_problem.test((farthest,), 1)
+    assert moves_behind(family.members[0][1]) < FEWEST_MOVES
+    trials = [search_problem.test(((Spring(),),), 1)[0], family]
+    ranked = rank_families(search_problem, trials, np.random.default_rng(0), GATES)
+    judged = {found.effect.name: found.probability for found in ranked}
+    only = rank_families(search_problem, trials[:1], np.random.default_rng(0), GATES)
+    assert judged == {"spring": only[0].probability, "hinge": 1.0}
 
 
 def test_friction_against_temperature_is_tried_where_every_run_has_one_that_changes(

@@ -195,7 +195,7 @@ SMALL_CASES = (
     Planted("inertial-coupling", 0, lambda t: _inertial(t, 2), (0.25,)),
     Planted("hinge", 1, lambda t: np.where(t.position > 0.5, 12.0 * (t.position - 0.5), 0.0), (12.0,)),
     Planted("gravity-compensator", 1, lambda t: 5.0 * np.cos(2.0 * t.position - np.arctan2(3.0, 4.0)), (4.0, 3.0)),
-    Planted("counterbalance", 1, lambda t: _lengthening(t.position - np.pi / 3.0, 1.0, 0.5, 16.0), (8.0, 0.0)),
+    Planted("counterbalance", 1, lambda t: _lengthening(t.position - np.pi / 3.0, 1.0, 0.5, 16.0), (8.0,)),
 )  # fmt: skip
 """On the arm of three axes, which needs a third of the time."""
 
