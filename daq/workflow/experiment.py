@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import cycle, pairwise
 
@@ -246,20 +246,17 @@ def _allowed(
     """Positions of a closed chain that can be reached one after the other, shape (count, m)."""
     found = [checker.home]
     while len(found) <= count:
-        found.append(next(towards(checker, found[-1], rng.uniform(lower, upper))))
+        found.append(towards(checker, found[-1], rng.uniform(lower, upper)))
     return np.array(found[1:])
 
 
 SHARES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
 
 
-def towards(checker: Checker, start: FloatArray, target: FloatArray) -> Iterator[FloatArray]:
-    """Positions from which a closed chain can go to a target, the farthest first; at last the start itself."""
-    for share in SHARES:
-        end = checker.fitting(start + share * (target - start))
-        if checker.obstruction(start, end) is None:
-            yield end
-    yield start
+def towards(checker: Checker, start: FloatArray, target: FloatArray) -> FloatArray:
+    """The farthest position that a closed chain can go to on the way to a target; the start where there is none."""
+    found = checker.farthest(start, start + np.array(SHARES)[:, None] * (target - start))
+    return start if found is None else found
 
 
 @dataclass(frozen=True, slots=True)

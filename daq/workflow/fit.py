@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.config.cell import Cell, model_of
+from daq.config.cell import Cell, model_of, robot_of
 from daq.environment import software
 from daq.errors import ConfigurationError, EffectsRefuted, LogRepeated, LogsDiffer, UsageError
 from daq.log.conversion import load_run
@@ -285,7 +285,9 @@ def with_diagnoses(fitted: Fit) -> Fit:
     cell = fitted.cell
     nameplate = np.array([axis.nameplate_gain for axis in cell.axes])
     kept = (one for one in fitted.diagnoses if one.name == "channels-exchanged")
-    found = diagnose(fitted.final, cell.axis_names, nameplate, read_urdf(cell.urdf).effort_limit[list(robot_of(cell).axis_joints)])
+    found = diagnose(
+        fitted.final, cell.axis_names, nameplate, read_urdf(cell.urdf).effort_limit[list(robot_of(cell).axis_joints)]
+    )
     return replace(fitted, diagnoses=(*kept, *found))
 
 

@@ -233,7 +233,7 @@ class Search:
         for _ in range(MAX_TRIES):
             move, checker = self._random_move(), self._experiment.scene.checker
             if checker.robot.closures:
-                near = next(towards(checker, checker.home, np.array(move.target_rad)))
+                near = towards(checker, checker.home, np.array(move.target_rad))
                 move = replace(move, target_rad=self._written(near))
             if checker.margins(np.array(move.target_rad)[None])[0] > 0.0:
                 return move
@@ -244,7 +244,7 @@ class Search:
             move = self._random_move()
             checker, target = self._experiment.scene.checker, np.array(move.target_rad)
             if checker.robot.closures:  # a way to a far target often leaves the workspace
-                target = next(towards(checker, start, target))
+                target = towards(checker, start, target)
                 move = replace(move, target_rad=self._written(target))
             if not np.array_equal(target, start) and checker.obstruction(start, np.array(move.target_rad)) is None:
                 return move

@@ -157,7 +157,7 @@ class Checker:
             start, end: positions of the axes [rad or m], shape (m,).
         """
         if self.robot.closures:
-            return self._obstruction_of_chain(start, end)
+            return self._ways(start[None], end[None])[0]
         # A bound on the path of any point of one body relative to the other, for each row of `_margins` [m].
         rows = [*self._pairs, *((index, len(self.scene.capsules)) for index in self._confined)]
         travel = np.array([self._relative_travel(first, second, start, end) for first, second in rows])
@@ -181,25 +181,36 @@ class Checker:
             middles = np.concatenate((open_ - half, open_ + half))
         return None
 
-    def _obstruction_of_chain(self, start: FloatArray, end: FloatArray) -> Obstruction | None:
-        """Look at poses so close to each other that nothing happens between them."""
-        way = np.arange(0.0, 1.0 + 0.5 * STEP_SHARE, STEP_SHARE)
-        position = start + (end - start) * way[:, None]
-        found = self._reached(position)
-        if not found.usable.all():
-            at = tuple(position[int(np.argmin(found.usable))].tolist())
-            return Obstruction("the closures", "a pose that they allow", 0.0, at)
+    def farthest(self, start: FloatArray, ends: FloatArray) -> FloatArray | None:
+        """Choose the first of some ends, shape (e, m), that a closed chain can go to; None where it can go to none."""
+        ends = self.fitting(ends)
+        told = self._ways(np.broadcast_to(start, ends.shape), ends)
+        return next((end for end, obstruction in zip(ends, told, strict=True) if obstruction is None), None)
+
+    def _ways(self, starts: FloatArray, ends: FloatArray) -> list[Obstruction | None]:
+        """Look at poses of straight ways so close to each other that nothing happens between them."""
+        share = np.linspace(0.0, 1.0, round(1.0 / STEP_SHARE) + 1)[:, None]
+        position = starts[:, None] + (ends - starts)[:, None] * share
+        shape = position.shape[:2]
+        found = self._reached(position.reshape(-1, position.shape[2]))
+        usable = found.usable.reshape(shape)
         margins = self._margins(found.joints, self._everywhere)
-        if not len(margins):
-            return None
         # A body moves at most as far between two poses as the fastest of its ends.
-        placed = self._placed(found.joints)
-        travel = np.linalg.norm(np.diff(placed, axis=1), axis=2).max(initial=0.0)
-        row, sample = np.unravel_index(int(np.argmin(margins)), margins.shape)
-        if margins[row, sample] >= 0.5 * travel:
-            return None
-        first, second = self._names_of(int(row))
-        return Obstruction(first, second, float(margins[row, sample]), tuple(position[sample].tolist()))
+        placed = self._placed(found.joints).reshape(-1, *shape, 3, 2)
+        travel = np.linalg.norm(np.diff(placed, axis=2), axis=3).max(axis=(0, 2, 3), initial=0.0)
+        told: list[Obstruction | None] = []
+        for way, moved in enumerate(travel.tolist()):
+            own = margins.reshape(-1, *shape)[:, way]
+            if not usable[way].all():
+                at = tuple(position[way, int(np.argmin(usable[way]))].tolist())
+                told.append(Obstruction("the closures", "a pose that they allow", 0.0, at))
+            elif not own.size or own.min() >= 0.5 * moved:
+                told.append(None)
+            else:
+                row, sample = np.unravel_index(int(np.argmin(own)), own.shape)
+                first, second = self._names_of(int(row))
+                told.append(Obstruction(first, second, float(own[row, sample]), tuple(position[way, sample].tolist())))
+        return told
 
     def _names_of(self, row: int) -> tuple[str, str]:
         if row < len(self._pairs):
