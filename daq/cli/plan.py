@@ -9,7 +9,7 @@ import typer
 
 from daq.cli.verb import CellArgument, JsonOption, Verb, print_json, say_next
 from daq.errors import UsageError
-from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_STD_PERCENT
+from daq.workflow.choices import EXCHANGES, LARGEST_STD_PERCENT
 
 
 def plan_verb(
@@ -22,7 +22,9 @@ def plan_verb(
     speed: Annotated[
         float, typer.Option(help="Share of the limits that the fastest move uses.", min=0.05, max=1.0)
     ] = 1.0,
-    condition: Annotated[float, typer.Option(help="Largest condition number.", min=1.0)] = LARGEST_CONDITION,
+    condition: Annotated[
+        float | None, typer.Option(help="Largest condition number; 3500, of a closed chain 1e5.", min=1.0)
+    ] = None,
     preview: Annotated[Path | None, typer.Option(help="Page to write (HTML): the arm moves through the plan.")] = None,
     sigma: Annotated[float, typer.Option(help="Largest σ predicted for a gain [%].", min=0.01)] = LARGEST_STD_PERCENT,
     json: JsonOption = False,

@@ -6,6 +6,8 @@ from enum import Enum
 
 LARGEST_CONDITION = 3500.0
 """Condition of the weighted observation matrix; the paper's trajectories have 1930 to 2817 (Table 5)."""
+LARGEST_CONDITION_OF_CHAIN = 1e5
+"""The same of a closed chain: links that hardly turn have parameters that hardly show, and spoil no gain."""
 LARGEST_STD_PERCENT = 10.0  #: Predicted standard deviation of the worst gain; a plan above it is not worth executing
 EXCHANGES = 3000  #: Changes of the random moves that the planner tries
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from daq.config.cell import Cell, JointUnit
 from daq.errors import UsageError
-from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_STD_PERCENT
+from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_CONDITION_OF_CHAIN, LARGEST_STD_PERCENT
 from daq.workflow.experiment import (
     POSITION_MARGIN,
     Experiment,
@@ -290,7 +290,7 @@ def plan(
     duration_s: float = 40.0,
     exchanges: int = EXCHANGES,
     speed: float = 1.0,
-    largest_condition: float = LARGEST_CONDITION,
+    largest_condition: float | None = None,
     largest_std_percent: float = LARGEST_STD_PERCENT,
     experiment: Experiment | None = None,
     progress: Callable[[int, float], None] = lambda _done, _worst: None,
@@ -307,7 +307,7 @@ def plan(
         duration_s: of the run [s].
         exchanges: tries; every one of them is made. With 0 the random moves are the plan.
         speed: share of the limits that the fastest moves may use.
-        largest_condition: a plan worse than this is refused.
+        largest_condition: a plan worse than this is refused; that of the kind of robot when None.
         largest_std_percent: a plan that predicts more than this for a gain is refused.
         experiment: that the plan is for, None for the one with the cell's first payload.
         progress: receives the number of tries and the deviation predicted for the worst gain so far [%].
@@ -317,6 +317,8 @@ def plan(
         ConfigurationInconsistent: the cell declares no payload.
     """
     experiment = experiment or experiment_of(cell)
+    if largest_condition is None:
+        largest_condition = LARGEST_CONDITION if cell.chain is None else LARGEST_CONDITION_OF_CHAIN
     search = Search(experiment, np.random.default_rng(seed), duration_s, speed, largest_condition)
     draft = search.improve(search.random_moves(), exchanges, lambda done, found: progress(done, float(np.max(found))))
     information = np.sum(experiment.informations(draft.paths), axis=0)
