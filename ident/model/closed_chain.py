@@ -18,10 +18,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
-from scipy.interpolate import CubicSpline
 
-from ident.arrays import BoolArray, FloatArray
+from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.errors import ModelError
 from ident.model.robot import Closure, JointKind, Motion, Place, Poses, Robot, poses
 
@@ -87,7 +85,7 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
     size_m = _size(robot, start)
     position = _closed_near(robot, start, size_m)
     jacobian = _loops(robot, position[None], size_m).jacobian[0]
-    free = linalg.null_space(jacobian, rcond=SMALLEST_RANK)
+    free = _null_space(jacobian)
     found = free.shape[1]
     if mobility is not None and found != mobility:
         raise ModelError(
@@ -211,7 +209,7 @@ def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
     while len(coarse) < samples:
         stride = max(1, stride // 8)
         finer = np.unique(np.append(np.arange(0, samples, stride), samples - 1))
-        near = CubicSpline(coarse, found)(finer) if len(coarse) > 1 else np.repeat(found, len(finer), axis=0)
+        near = _between(coarse, found, finer) if len(coarse) > 1 else np.repeat(found, len(finer), axis=0)
         coarse = finer
         found, gap, condition = _newton(robot, assembly, near, axes_rad[finer])
     return Reach(found, gap, np.max(np.abs(found[:, motors] - axes_rad), axis=1), condition)
@@ -247,6 +245,18 @@ def _newton(
             break
     condition = np.linalg.norm(r, axis=(1, 2)) * np.linalg.norm(_solve_each(r, np.eye(len(rest))), axis=(1, 2))
     return position, gap, condition
+
+
+def _between(coarse: IntArray, found: FloatArray, finer: IntArray) -> FloatArray:
+    """Positions between known samples, shape (len(finer), n): cubic polynomials with the slopes of differences."""
+    slope = np.gradient(found, coarse, axis=0)
+    before = np.clip(np.searchsorted(coarse, finer, side="right") - 1, 0, len(coarse) - 2)
+    length = (coarse[before + 1] - coarse[before])[:, None]
+    s = (finer - coarse[before])[:, None] / length
+    first, second = found[before], found[before + 1]
+    bend = first - second
+    a, b = slope[before] * length + bend, -slope[before + 1] * length - bend
+    return np.asarray((1 - s) * first + s * second + s * (1 - s) * ((1 - s) * a + s * b))
 
 
 def _solve_each(triangle: FloatArray, right: FloatArray) -> FloatArray:
@@ -291,8 +301,20 @@ def _gap(direction: str, length_m: float, angle_rad: float) -> str:
 
 def _independent(free: FloatArray) -> tuple[int, ...]:
     """Joints that move most independently of each other, by pivoted QR of the free motions, shape (n, d)."""
-    _, pivots = linalg.qr(free.T, mode="r", pivoting=True)
-    return tuple(sorted(int(joint) for joint in pivots[: free.shape[1]]))
+    left, chosen = free.copy(), list[int]()
+    for _ in range(free.shape[1]):
+        joint = int(np.argmax(np.linalg.norm(left, axis=1)))
+        way = left[joint] / np.linalg.norm(left[joint])
+        left -= np.outer(left @ way, way)
+        chosen.append(joint)
+    return tuple(sorted(chosen))
+
+
+def _null_space(jacobian: FloatArray) -> FloatArray:
+    """Motions of the joints that the closures leave free, shape (n, d)."""
+    _, values, ways = np.linalg.svd(jacobian)
+    rank = int(np.sum(values > SMALLEST_RANK * values.max(initial=0.0)))
+    return np.asarray(ways[rank:].T)
 
 
 def _generic_rank(robot: Robot, position: FloatArray, free: FloatArray, size_m: float) -> int:
@@ -304,7 +326,7 @@ def _generic_rank(robot: Robot, position: FloatArray, free: FloatArray, size_m: 
         for _ in range(MAX_ITERATIONS):
             loops = _loops(robot, beside[None], size_m)
             beside -= np.linalg.lstsq(loops.jacobian[0], loops.residual[0], rcond=1e-8)[0]
-        moved = linalg.null_space(_loops(robot, beside[None], size_m).jacobian[0], rcond=SMALLEST_RANK)
+        moved = _null_space(_loops(robot, beside[None], size_m).jacobian[0])
         best = max(best, int(np.linalg.matrix_rank(moved[list(robot.axis_joints)], tol=1e-6)))
     return best
 
