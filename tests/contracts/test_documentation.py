@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import subprocess
+import sys
 from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daq.config.cell import robot_of
+from daq.config.cell_file import load_cell
 
 ROOT = Path(__file__).parents[2]
 LARGEST_WORDS = 30_000
@@ -64,3 +74,34 @@ def test_pictures_are_small_and_load_nothing() -> None:
         if picture.suffix == ".svg":
             addresses = re.findall(r"https?://[^\"')\s]+", picture.read_text(encoding="utf-8"))
             assert set(addresses) <= {"http://www.w3.org/2000/svg"}, picture
+
+
+@pytest.fixture(scope="module")
+def drawings() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("drawings", ROOT / "docs" / "drawings.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("name", ["five-bar", "orthoglide", "dualv"])
+def test_drawn_mechanisms_are_those_of_the_cells(drawings: Any, name: str) -> None:
+    shown, robot = drawings.mechanism(name), robot_of(load_cell(ROOT / "configs" / "cells" / f"{name}.yaml"))
+    assert len(shown.motors) == robot.axis_count
+    assert len(shown.passive) == len(robot.passive_joints)
+    assert len(shown.closures) == len(robot.closures)
+    # Loops close in the drawing, and the platform is drawn on the link that carries the payload.
+    assert all(np.allclose(first, second, atol=1e-9) for first, second in shown.closures)
+    body = np.array(shown.bodies[shown.carrier])
+    assert (shown.platform > body.min(axis=0) - 1e-9).all() and (shown.platform < body.max(axis=0) + 1e-9).all()
+
+
+def test_the_picture_of_the_mechanisms_is_up_to_date(drawings: Any) -> None:
+    drawn, kept = drawings.mechanisms(), (ROOT / "docs" / "pictures" / "mechanisms.svg").read_text(encoding="utf-8")
+    number = r"-?\d+\.\d"
+    assert re.sub(number, "#", drawn) == re.sub(number, "#", kept), "run `make screenshots`"
+    # The last digit of a coordinate is the processor's.
+    found, expected = (np.array(re.findall(number, text), dtype=np.float64) for text in (drawn, kept))
+    np.testing.assert_allclose(found, expected, atol=0.11)
