@@ -13,8 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daq.config.cell import robot_of
+from daq.config.cell import model_of, robot_of
 from daq.config.cell_file import load_cell
+from ident.equations.triangles import triangle_of
+from ident.model.base import base_parameters
+from ident.model.closed_chain import reach
+from ident.model.robot import Motion
 
 ROOT = Path(__file__).parents[2]
 LARGEST_WORDS = 30_000
@@ -105,3 +109,32 @@ def test_the_picture_of_the_mechanisms_is_up_to_date(drawings: Any) -> None:
     # The last digit of a coordinate is the processor's.
     found, expected = (np.array(re.findall(number, text), dtype=np.float64) for text in (drawn, kept))
     np.testing.assert_allclose(found, expected, atol=0.11)
+
+
+CHAINS = {
+    "five-bar": ("five-bar", "Izz mx my m"),
+    "Orthoglide": ("orthoglide", "m"),
+    "DualV-like": ("dualv", "Izz mx my m"),
+}
+"""Row of the table in the method's page: cell, and the parameters of a payload that show."""
+
+
+@pytest.mark.parametrize("row", CHAINS)
+def test_what_is_identifiable_on_a_closed_chain_is_as_documented(row: str) -> None:
+    name, shown = CHAINS[row]
+    cell = load_cell(ROOT / "configs" / "cells" / f"{name}.yaml")
+    model, draw = model_of(cell), np.random.default_rng(1)
+    robot, (lower, upper) = model.robot, np.array([axis.limits.position for axis in cell.axes]).T
+    found = reach(robot, model.assembly, 0.6 * draw.uniform(lower, upper, (400, len(lower))))
+    position = found.position_rad[found.closed][:, list(robot.axis_joints)]
+    speed, acceleration = draw.standard_normal((2, *position.shape))
+    columns = np.concatenate(list(model.regressor(Motion(position, speed, 8.0 * acceleration))), axis=1).T
+    base = base_parameters(triangle_of(columns.T), tuple(column.name for column in model.columns))
+    counts = (
+        f"{robot.joint_count}, {robot.axis_count}, {model.assembly.mobility} | {columns.shape[1]} → {len(base.names)}"
+    )
+    assert f"| {row} | {counts} |" in (ROOT / "docs" / "explanation" / "method.md").read_text(encoding="utf-8")
+    payload = np.linalg.norm(columns[:, model.flange], axis=0)
+    names = (column.name.rstrip("0123456789") for column in model.columns[model.flange])
+    seen = [name for name, size in zip(names, payload, strict=True) if size > 1e-9 * payload.max()]
+    assert " ".join(seen) == shown
