@@ -308,23 +308,23 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     low, high = lower + margin, upper - margin
     sampled = np.random.default_rng(0).uniform(low, high, (EXTRA_POSTURES, len(low)))
     if checker.robot.closures:
-        sampled = _allowed(checker, np.random.default_rng(0), low, high, EXTRA_POSTURES // 5)
+        sampled = _allowed(checker, np.random.default_rng(0), low, high, EXTRA_POSTURES // 15)
     clear = sampled[checker.margins(sampled) > 0.0]
     found: list[ExtraMoves] = []
+    chain = bool(checker.robot.closures)
 
     def swing(words: str, postures: FloatArray, moved: list[int], speed: float = 1.0) -> None:
         """There and back in the first few postures in which that is clear."""
         paths: list[Trapezoid] = []
         for posture in postures:
-            for stroke in STROKES:
-                inwards = 0.5 * (1.0 - stroke) * (high - low)
-                start, end = posture.copy(), posture.copy()
-                start[moved], end[moved] = (low + inwards)[moved], (high - inwards)[moved]
-                start, end = checker.fitting(start), checker.fitting(end)
-                if checker.obstruction(start, end) is None:
-                    there = synchronised(start, end, velocity * speed, acceleration)
-                    paths += [there, Trapezoid(end, start, there.duration_s, there.ramp_s)]
-                    break
+            ends = (
+                _swing_of_chain(checker, posture, moved, low, high)
+                if chain
+                else _swing(checker, posture, moved, low, high)
+            )
+            if ends is not None:
+                there = synchronised(*ends, velocity * speed, acceleration)
+                paths += [there, Trapezoid(there.end, there.start, there.duration_s, there.ramp_s)]
             if len(paths) >= 6:
                 break
         chosen: list[Trapezoid] = []
@@ -355,3 +355,28 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
             swing(f"fast moves of {name} and {names[other]} together", clear, [axis, other])
     swing("fast moves of all axes", clear, list(range(len(names))))
     return tuple(found)
+
+
+def _swing(
+    checker: Checker, posture: FloatArray, moved: list[int], low: FloatArray, high: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """Both ends of the longest clear swing of some axes about the middle of their range; None where there is none."""
+    for stroke in STROKES:
+        inwards = 0.5 * (1.0 - stroke) * (high - low)
+        start, end = posture.copy(), posture.copy()
+        start[moved], end[moved] = (low + inwards)[moved], (high - inwards)[moved]
+        if checker.obstruction(start, end) is None:
+            return start, end
+    return None
+
+
+def _swing_of_chain(
+    checker: Checker, posture: FloatArray, moved: list[int], low: FloatArray, high: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """The same where the other axes follow, as far as the closures allow; None where that is nowhere."""
+    ends: list[FloatArray] = []
+    for limit in (low, high):
+        target = posture.copy()
+        target[moved] = limit[moved]
+        ends.append(towards(checker, ends[-1] if ends else posture, target))
+    return None if np.allclose(ends[0], ends[1]) else (ends[0], ends[1])

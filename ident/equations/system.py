@@ -200,7 +200,8 @@ def require_distinct(system: System, *, gains: bool) -> None:
         )
     if gains:
         for motor, factor in enumerate(system.motors.factors):
-            if system.motors.rows[motor] and not np.any(factor[:, 0]):
+            own = motor if system.leading > 1 else 0
+            if system.motors.rows[motor] and not np.any(factor[:, own]):
                 name = f"gain {motor + 1}"
                 raise RankDeficient(
                     f"the current of motor {motor + 1} is zero throughout: is its channel connected?", (name,)

@@ -28,6 +28,7 @@ class Made:
     conditioning: Conditioning
     runs: tuple[Run, Run]
     standard: FloatArray
+    payload: FloatArray
 
 
 def _body(rng: np.random.Generator, mass: float) -> FloatArray:
@@ -86,4 +87,4 @@ def recorded(
         current = noise_a * rng.standard_normal(q.shape)
         current[1:-1] += torque / mechanism.gains
         runs.append(replace(run, current_a=current))
-    return Made(model, conditioning, (runs[0], runs[1]), standard)
+    return Made(model, conditioning, (runs[0], runs[1]), standard, payload)

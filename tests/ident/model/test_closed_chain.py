@@ -34,6 +34,7 @@ from tests.ident.mechanisms import (
 
 FloatArray = NDArray[np.float64]
 STEP_S = 1e-3
+TOLERANCE = 1e-9
 
 
 def _turn(rng: np.random.Generator) -> FloatArray:
@@ -172,28 +173,34 @@ def test_virtual_power_of_the_motors_is_that_of_all_joints(mechanism: Mechanism)
 
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
-def test_pinocchio_returns_the_acceleration(mechanism: Mechanism) -> None:
-    """The torques of the regressor, put into constrained forward dynamics: equations of motion with multipliers."""
+def test_constrained_forward_dynamics_returns_the_acceleration(mechanism: Mechanism) -> None:
+    """The torques of the regressor, put into Pinocchio's forward dynamics with constraints of its own."""
     model, motion = mechanism.model, _axes_motion(mechanism, 40)
     torque = np.einsum("mck,c->km", model.regressor(motion), _standard(mechanism, model))
-    followed = model.follow(motion)
-    joints = followed.joints
+    joints = model.follow(motion).joints
     tree = pin.buildModelFromXML(mechanism.urdf)
     tree.gravity.linear = np.array(mechanism.gravity_m_s2)
     data = tree.createData()
-    motors = list(model.robot.axis_joints)
-    _, jacobian, bias = closure_equations(model.robot, joints.position_rad, joints.velocity_rad_s)
+    constraints, datas = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
+    for closure in mechanism.closures:
+        # In a plane, the third translation holds by itself.
+        kind = pin.ContactType.CONTACT_6D if len(closure.directions) == 6 else pin.ContactType.CONTACT_3D
+        ends = [tree.frames[tree.getFrameId(link, pin.FrameType.BODY)] for link in (closure.first, closure.second)]
+        places = [part for end in ends for part in (end.parentJoint, end.placement)]
+        constraints.append(pin.RigidConstraintModel(kind, tree, *places, pin.ReferenceFrame.LOCAL))
+    for constraint in constraints:
+        datas.append(constraint.createData())
+    pin.initConstraintDynamics(tree, data, constraints, datas)
+    settings = pin.ProximalSettings(1e-13, 1e-10, 200)
+    names = [joint.name for joint in model.robot.axes]
     for k in range(40):
         q, v = joints.position_rad[k], joints.velocity_rad_s[k]
-        mass = pin.crba(tree, data, q)
-        mass = np.triu(mass) + np.triu(mass, 1).T
         applied = np.zeros(tree.nv)
-        applied[motors] = torque[k]
-        j = jacobian[k]
-        system = np.block([[mass, j.T], [j, np.zeros((len(j), len(j)))]])
-        right = np.concatenate((applied - pin.nonLinearEffects(tree, data, q, v), -bias[k]))
-        found = np.linalg.lstsq(system, right, rcond=1e-12)[0][: tree.nv]
-        assert found == pytest.approx(joints.acceleration_rad_s2[k], rel=1e-8, abs=1e-7)
+        for name, one in zip(names, torque[k], strict=True):
+            applied[tree.joints[tree.getJointId(name)].idx_v] = one
+        found = pin.constraintDynamics(tree, data, q, v, applied, constraints, datas, settings)
+        expected = joints.acceleration_rad_s2[k]
+        assert np.max(np.abs(found - expected)) < TOLERANCE * np.max(np.abs(expected))
 
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
