@@ -45,6 +45,7 @@ def main() -> int:
     PICTURES.mkdir(exist_ok=True)
     (PICTURES / "house.svg").write_text(drawings.house(), encoding="utf-8")
     (PICTURES / "one-sample.svg").write_text(drawings.one_sample(), encoding="utf-8")
+    (PICTURES / "mechanisms.svg").write_text(drawings.mechanisms(), encoding="utf-8")
     _webp(demo / "gains.png", "gains", width=1000)
     _webp(ROOT / "out" / "console" / "desktop.png", "console", width=1000)
     with tempfile.TemporaryDirectory() as name:

@@ -2,9 +2,23 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import subprocess
+import sys
 from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daq.config.cell import model_of, robot_of
+from daq.config.cell_file import load_cell
+from ident.equations.triangles import triangle_of
+from ident.model.base import base_parameters
+from ident.model.closed_chain import reach
+from ident.model.robot import Motion
 
 ROOT = Path(__file__).parents[2]
 LARGEST_WORDS = 30_000
@@ -64,3 +78,63 @@ def test_pictures_are_small_and_load_nothing() -> None:
         if picture.suffix == ".svg":
             addresses = re.findall(r"https?://[^\"')\s]+", picture.read_text(encoding="utf-8"))
             assert set(addresses) <= {"http://www.w3.org/2000/svg"}, picture
+
+
+@pytest.fixture(scope="module")
+def drawings() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("drawings", ROOT / "docs" / "drawings.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("name", ["five-bar", "orthoglide", "dualv"])
+def test_drawn_mechanisms_are_those_of_the_cells(drawings: Any, name: str) -> None:
+    shown, robot = drawings.mechanism(name), robot_of(load_cell(ROOT / "configs" / "cells" / f"{name}.yaml"))
+    assert len(shown.motors) == robot.axis_count
+    assert len(shown.passive) == len(robot.passive_joints)
+    assert len(shown.closures) == len(robot.closures)
+    # Loops close in the drawing, and the platform is drawn on the link that carries the payload.
+    assert all(np.allclose(first, second, atol=1e-9) for first, second in shown.closures)
+    body = np.array(shown.bodies[shown.carrier])
+    assert (shown.platform > body.min(axis=0) - 1e-9).all() and (shown.platform < body.max(axis=0) + 1e-9).all()
+
+
+def test_the_picture_of_the_mechanisms_is_up_to_date(drawings: Any) -> None:
+    drawn, kept = drawings.mechanisms(), (ROOT / "docs" / "pictures" / "mechanisms.svg").read_text(encoding="utf-8")
+    number = r"-?\d+\.\d"
+    assert re.sub(number, "#", drawn) == re.sub(number, "#", kept), "run `make screenshots`"
+    # The last digit of a coordinate is the processor's.
+    found, expected = (np.array(re.findall(number, text), dtype=np.float64) for text in (drawn, kept))
+    np.testing.assert_allclose(found, expected, atol=0.11)
+
+
+CHAINS = {
+    "five-bar": ("five-bar", "Izz mx my m"),
+    "Orthoglide": ("orthoglide", "m"),
+    "DualV-like": ("dualv", "Izz mx my m"),
+}
+"""Row of the table in the method's page: cell, and the parameters of a payload that show."""
+
+
+@pytest.mark.parametrize("row", CHAINS)
+def test_what_is_identifiable_on_a_closed_chain_is_as_documented(row: str) -> None:
+    name, shown = CHAINS[row]
+    cell = load_cell(ROOT / "configs" / "cells" / f"{name}.yaml")
+    model, draw = model_of(cell), np.random.default_rng(1)
+    robot, (lower, upper) = model.robot, np.array([axis.limits.position for axis in cell.axes]).T
+    found = reach(robot, model.assembly, 0.6 * draw.uniform(lower, upper, (400, len(lower))))
+    position = found.position_rad[found.closed][:, list(robot.axis_joints)]
+    speed, acceleration = draw.standard_normal((2, *position.shape))
+    columns = np.concatenate(list(model.regressor(Motion(position, speed, 8.0 * acceleration))), axis=1).T
+    base = base_parameters(triangle_of(columns.T), tuple(column.name for column in model.columns))
+    counts = (
+        f"{robot.joint_count}, {robot.axis_count}, {model.assembly.mobility} | {columns.shape[1]} → {len(base.names)}"
+    )
+    assert f"| {row} | {counts} |" in (ROOT / "docs" / "explanation" / "method.md").read_text(encoding="utf-8")
+    payload = np.linalg.norm(columns[:, model.flange], axis=0)
+    names = (column.name.rstrip("0123456789") for column in model.columns[model.flange])
+    seen = [name for name, size in zip(names, payload, strict=True) if size > 1e-9 * payload.max()]
+    assert " ".join(seen) == shown
