@@ -54,6 +54,7 @@ EITHER_SIGN = {
     "asymmetric-viscous",
     "position-friction",
     "spring",
+    "passive-spring",
     "hinge",
     "gravity-compensator",
     "cogging",
