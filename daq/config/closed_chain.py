@@ -31,7 +31,7 @@ class ClosureModel(StrictModel):
 
 
 class ChainModel(StrictModel):
-    """What a robot with closures says beside its URDF."""
+    """Keys of a robot with closures, beside its URDF."""
 
     motors: Annotated[
         tuple[Name, ...], Field(description="Joint of each axis of a closed chain, in the order of the axes.")

@@ -34,7 +34,7 @@ _OPERATORS = frozenset({Gate.SIGNATURE, Gate.BASE})
 
 
 class Verdict(Enum):
-    """What may happen with the gains of a calibration."""
+    """Verdict on the gains of a calibration: what may happen with them."""
 
     READY = "ready"  #: every check passed, and a gain differs by more than noise
     UNCHANGED = "unchanged"  #: every check passed, and no gain does
@@ -151,7 +151,7 @@ class Certificate:
 
     @property
     def place(self) -> str:
-        """What the gains are compared with."""
+        """Name of the gains that these are compared with."""
         return "nameplate" if self.comparison.edit is None else "controller"
 
     @property

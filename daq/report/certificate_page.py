@@ -74,7 +74,7 @@ def certificate_page(certificate: Certificate, consequence: str = "", details: S
 
 
 def _next(certificate: Certificate, look: str) -> Iterator[str]:
-    """What to do now, below the verdict."""
+    """The next step, below the verdict."""
     comparison = certificate.comparison
     if comparison.unread:
         yield paragraph(comparison.unread, f"next {look}")
@@ -219,7 +219,7 @@ def _write(certificate: Certificate) -> str:
 
 
 def _since(certificate: Certificate) -> Iterator[str]:
-    """What differs from an earlier calibration."""
+    """Differences from an earlier calibration."""
     earlier, calibration = certificate.earlier, certificate.calibration
     if earlier is None:
         return

@@ -90,7 +90,7 @@ class Currents(ABC):
 
     @abstractmethod
     def cost(self, gains: FloatArray, parameters: FloatArray, noise: FloatArray) -> float:
-        """What an estimate makes least: −log L up to constants."""
+        """Cost that an estimate makes least: −log L up to constants."""
 
     def settled(self, gains: FloatArray, free: int) -> tuple[FloatArray, FloatArray]:
         """χ and σ of each current [A] for given gains, shapes (p,) and (m,): a fixed point of a few rounds."""

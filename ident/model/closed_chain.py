@@ -24,7 +24,7 @@ from ident.errors import ModelError
 from ident.model.robot import Closure, JointKind, Motion, Place, Poses, Robot, poses
 
 LARGEST_CONDITION = 500.0
-"""Of J_d, the closures' derivatives to the joints that follow. Mechanisms stay below 30 in their workspace."""
+"""Largest condition of J_d, the derivatives to the joints that follow; mechanisms stay below 30 in their workspace."""
 CLOSED = 1e-12  #: |φ| at which Newton's iteration ends, in units of the robot's size or radians
 SMALLEST_RANK = 1e-7  #: Singular value of J, relative to the largest, that counts as zero
 LARGEST_GAP = 0.3  #: |φ| at the declared assembly pose, in units of the robot's size or radians
@@ -41,7 +41,7 @@ _INDEX = {"x": 0, "y": 1, "z": 2}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assembly:
-    """What the closures leave of a robot's joints, found at its assembly pose."""
+    """Joints of a robot that its closures leave free, and those that follow, found at its assembly pose."""
 
     position_rad: FloatArray  #: of all joints, closed exactly, shape (n,)
     independent: tuple[int, ...]  #: joints that are x, d of them

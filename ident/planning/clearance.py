@@ -67,7 +67,7 @@ class Obstruction:
 
 
 LARGEST_CONDITION = 60.0
-"""Of the closures in a planned pose, by the Frobenius norm: nearer to a singularity, forces in the loops grow."""
+"""Largest condition of the closures in a planned pose (Frobenius): nearer to a singularity, forces in loops grow."""
 LARGEST_MISFIT = 0.01
 """Motors of a redundant drive may differ by this on the way between two poses that fit [rad or m]: they work against
 each other there, which is what tells their gains apart, and no more than their position loops can bear."""
@@ -184,8 +184,8 @@ class Checker:
     def farthest(self, start: FloatArray, ends: FloatArray) -> FloatArray | None:
         """Choose the first of some ends, shape (e, m), that a closed chain can go to; None where it can go to none."""
         ends = self.fitting(ends)
-        told = self._ways(np.broadcast_to(start, ends.shape), ends)
-        return next((end for end, obstruction in zip(ends, told, strict=True) if obstruction is None), None)
+        found = self._ways(np.broadcast_to(start, ends.shape), ends)
+        return next((end for end, obstruction in zip(ends, found, strict=True) if obstruction is None), None)
 
     def _ways(self, starts: FloatArray, ends: FloatArray) -> list[Obstruction | None]:
         """Look at poses of straight ways so close to each other that nothing happens between them."""
@@ -198,19 +198,21 @@ class Checker:
         # A body moves at most as far between two poses as the fastest of its ends.
         placed = self._placed(found.joints).reshape(-1, *shape, 3, 2)
         travel = np.linalg.norm(np.diff(placed, axis=2), axis=3).max(axis=(0, 2, 3), initial=0.0)
-        told: list[Obstruction | None] = []
+        answers: list[Obstruction | None] = []
         for way, moved in enumerate(travel.tolist()):
             own = margins.reshape(-1, *shape)[:, way]
             if not usable[way].all():
                 at = tuple(position[way, int(np.argmin(usable[way]))].tolist())
-                told.append(Obstruction("the closures", "a pose that they allow", 0.0, at))
+                answers.append(Obstruction("the closures", "a pose that they allow", 0.0, at))
             elif not own.size or own.min() >= 0.5 * moved:
-                told.append(None)
+                answers.append(None)
             else:
                 row, sample = np.unravel_index(int(np.argmin(own)), own.shape)
                 first, second = self._names_of(int(row))
-                told.append(Obstruction(first, second, float(own[row, sample]), tuple(position[way, sample].tolist())))
-        return told
+                answers.append(
+                    Obstruction(first, second, float(own[row, sample]), tuple(position[way, sample].tolist()))
+                )
+        return answers
 
     def _names_of(self, row: int) -> tuple[str, str]:
         if row < len(self._pairs):

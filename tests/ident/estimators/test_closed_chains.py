@@ -89,7 +89,7 @@ def test_what_the_preload_hides_is_taken_out_exactly() -> None:
 
 
 def test_the_gain_columns_are_derivatives() -> None:
-    """Of the least over all preloads, e(g)ᵀe(g), at given σ."""
+    """The least e(g)ᵀe(g) over all preloads, at given σ, falls as they say."""
     made = recorded(PLANAR, noise_a=NOISE_A)
     currents = identify(made.model, made.runs, made.conditioning).system.currents
     assert isinstance(currents, PreloadedCurrents)
