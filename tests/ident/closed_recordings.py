@@ -63,7 +63,7 @@ def preload_of(model: Model, to_motors: FloatArray, time_s: FloatArray, size_nm:
 
 
 def recorded(
-    mechanism: Mechanism, seed: int = 4, *, seconds: float = 22.0, noise_a: float = 0.0, preload_nm: float = 0.3
+    mechanism: Mechanism, seed: int = 4, *, seconds: float = 15.0, noise_a: float = 0.0, preload_nm: float = 0.3
 ) -> Made:
     """A run without load and one with 2 kg on the platform."""
     model, rng = mechanism.model, np.random.default_rng(0)

@@ -68,6 +68,9 @@ ROBOTS = (
     StudiedRobot("KR270", "kr270", "kr270", 60.0, 3, "tool"),
     StudiedRobot("seven-axis", "seven-axis", "seven-axis", 40.0, 2, "bar"),
     StudiedRobot("gantry", "gantry", "gantry", 60.0, 2, "box"),
+    StudiedRobot("five-bar", "five-bar", "five-bar", 40.0, 2, "block"),
+    StudiedRobot("Orthoglide", "orthoglide", "orthoglide", 40.0, 3, "spindle"),
+    StudiedRobot("DualV", "dualv", "dualv", 40.0, 2, "plate"),
 )
 """To study another robot, ship its cell and simulation, with two bodies, and add a row."""
 
