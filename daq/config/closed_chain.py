@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from math import radians
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field
 
 from daq.config.yaml_file import Fault, Name, StrictModel
 from ident.errors import ModelError
 from ident.model.closed_chain import assemble
-from ident.model.robot import JointKind, Robot
+from ident.model.robot import Joint, JointKind, Place, Robot
 from ident.model.urdf import LinkPair, read_urdf, robot_from_urdf
 
 Direction = Literal["x", "y", "z", "rx", "ry", "rz"]
@@ -54,16 +55,35 @@ class ClosedChain:
     motors: tuple[str, ...]  #: joint of each axis, in the order of the axes
     platform: str | None  #: link that carries the payload; that of the last joint when None
     assembly_rad: dict[str, float]  #: roughly, positions of all joints at which the closures hold [rad or m]
+    passive_joints: tuple[Joint, ...]  #: joints without a motor, in the order of the URDF's tree
 
 
-def chain_of(robot: ChainModel, closures: tuple[ClosureModel, ...]) -> ClosedChain | None:
-    """Return the closed chain of a cell file, None of a serial robot."""
+def chain_of(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: str) -> ClosedChain | None:
+    """Return the closed chain of a cell file, None of a serial robot.
+
+    Raises:
+        ModelError: the URDF cannot be read.
+    """
     if not closures:
         return None
     revolute = {name: radians(position) for name, position in robot.assembly_deg.items()}
     prismatic = {name: 1e-3 * position for name, position in robot.assembly_mm.items()}
     pairs = (LinkPair(one.name, one.first, one.second, one.directions) for one in closures)
-    return ClosedChain(tuple(pairs), robot.motors, robot.platform, revolute | prismatic)
+    passive = tuple(joint for joint in read_urdf(urdf).joints if joint.name not in robot.motors)
+    return ClosedChain(tuple(pairs), robot.motors, robot.platform, revolute | prismatic, passive)
+
+
+def platform_frame(robot: ChainModel, urdf: str) -> Place:
+    """Return the frame in which payloads are drawn, in that of the joint that carries them: the platform's link.
+
+    Without a `platform` both are the same.
+
+    Raises:
+        ModelError: the URDF cannot be read.
+    """
+    if robot.platform is None:
+        return Place(-1, np.eye(3), np.zeros(3))
+    return read_urdf(urdf).places[robot.platform]
 
 
 def robot_with(chain: ClosedChain | None, urdf: str, gravity_m_s2: tuple[float, float, float]) -> Robot:
@@ -109,6 +129,6 @@ def chain_faults(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: st
                 yield Fault(("robot", key, name), found, f"a {kind.value} joint")
     if {"motors", "mobility"} <= set(given):
         try:
-            assemble(robot_with(chain_of(robot, closures), urdf, (0.0, 0.0, -9.81)), robot.mobility)
+            assemble(robot_with(chain_of(robot, closures, urdf), urdf, (0.0, 0.0, -9.81)), robot.mobility)
         except ModelError as error:
             yield Fault(("closures",), str(error), "a mechanism that closes, and that its motors move")
