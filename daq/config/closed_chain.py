@@ -83,7 +83,7 @@ def platform_frame(robot: ChainModel, urdf: str) -> Place:
     """
     if robot.platform is None:
         return Place(-1, np.eye(3), np.zeros(3))
-    return read_urdf(urdf).places[robot.platform]
+    return read_urdf(urdf).links[robot.platform]
 
 
 def robot_with(chain: ClosedChain | None, urdf: str, gravity_m_s2: tuple[float, float, float]) -> Robot:
