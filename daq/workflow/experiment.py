@@ -291,6 +291,7 @@ SECONDS = 5.0  #: Duration of the extra moves of each kind, so that the kinds ca
 EXTRA_POSTURES = 300
 POSITION_MARGIN = 0.03  #: Share of a joint's range that targets keep from its limits
 SLOW = 0.2  #: Share of the speed limit at which gravity excites more than inertia
+CHAIN_POSTURES = 12  #: Tried of a closed chain at most, where a way costs a hundred poses
 STROKES = (1.0, 0.7, 0.4)  #: Shares of the range that are tried until the way is clear
 
 
@@ -315,16 +316,16 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     def swing(words: str, postures: FloatArray, moved: list[int], speed: float = 1.0) -> None:
         """There and back in the first few postures in which that is clear."""
         paths: list[Trapezoid] = []
-        for posture in postures:
-            for stroke in STROKES:
-                inwards = 0.5 * (1.0 - stroke) * (high - low)
-                start, end = posture.copy(), posture.copy()
-                start[moved], end[moved] = (low + inwards)[moved], (high - inwards)[moved]
-                start, end = checker.fitting(start), checker.fitting(end)
-                if checker.obstruction(start, end) is None:
-                    there = synchronised(start, end, velocity * speed, acceleration)
-                    paths += [there, Trapezoid(end, start, there.duration_s, there.ramp_s)]
-                    break
+        for posture in postures[: CHAIN_POSTURES if checker.robot.closures else None]:
+            starts, ends = np.tile(posture, (len(STROKES), 1)), np.tile(posture, (len(STROKES), 1))
+            inwards = 0.5 * (1.0 - np.array(STROKES)[:, None]) * (high - low)
+            starts[:, moved], ends[:, moved] = (low + inwards)[:, moved], (high - inwards)[:, moved]
+            starts, ends = checker.fitting(starts), checker.fitting(ends)
+            clear_one = checker.first_clear(starts, ends)
+            if clear_one is not None:
+                start, end = starts[clear_one], ends[clear_one]
+                there = synchronised(start, end, velocity * speed, acceleration)
+                paths += [there, Trapezoid(end, start, there.duration_s, there.ramp_s)]
             if len(paths) >= 6:
                 break
         chosen: list[Trapezoid] = []

@@ -11,6 +11,7 @@ least h times that; else it is halved. So nothing is jumped over, whatever the s
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -180,6 +181,14 @@ class Checker:
             open_ = middles[unsure.any(axis=0)]
             middles = np.concatenate((open_ - half, open_ + half))
         return None
+
+    def first_clear(self, starts: FloatArray, ends: FloatArray) -> int | None:
+        """Index of the first of some ways, from starts to ends of shape (e, m), that is clear; None where none is."""
+        if self.robot.closures:
+            told: Iterable[Obstruction | None] = self._ways(starts, ends)
+        else:
+            told = (self.obstruction(*way) for way in zip(starts, ends, strict=True))
+        return next((index for index, obstruction in enumerate(told) if obstruction is None), None)
 
     def farthest(self, start: FloatArray, ends: FloatArray) -> FloatArray | None:
         """Choose the first of some ends, shape (e, m), that a closed chain can go to; None where it can go to none."""
