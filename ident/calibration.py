@@ -61,11 +61,12 @@ class AcceptedEffect:
     """An effect that the declared model lacked and that held-out data asked for."""
 
     name: str  #: family, as in ident/effects/
-    axis: str  #: name of the axis, or of all together
+    axis: str  #: name of the axis, of a joint without a motor, or of all axes together
     settings: dict[str, float]  #: the searched (non-linear) parameters by name, units in the names
     coefficients: tuple[Parameter, ...]  #: the linear parameters, identified
     #: Error without the effect on data that the fit did not use [%]: of the axis's joint torque on held-out runs (in
-    #: total for an effect on all motors); without such runs, of the most affected motor's current on left-out moves.
+    #: total for an effect on all motors, or on a joint without one); without such runs, of the most affected motor's
+    #: current on left-out moves.
     error_before_percent: float
     error_after_percent: float  #: the same with the effect
     ambiguity: tuple[str, ...] = ()  #: families whose held-out score does not differ from this one's
@@ -120,6 +121,12 @@ class Calibration:
     #: Root mean square of what is left of each motor's current on the held-out run, filtered as in the fit [A, or the
     #: unit of the gains' current]; of the fit for a motor that did not move there. None in earlier versions.
     current_residual: tuple[float, ...] | None = None
+    passive_joints: tuple[str, ...] = ()  #: joints of a closed chain without a motor, on which effects can act, too
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """Names of the axes, then of the joints without a motor, as in `Robot.places`."""
+        return (*(gain.axis for gain in self.gains), *self.passive_joints)
 
     @property
     def covariance(self) -> FloatArray | None:
@@ -185,12 +192,14 @@ def calibration_of(
         for column, value, std in zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
     )
     gains = zip(axes, estimate.gains, estimate.gains_std, units, nameplate, strict=True)
+    passive = found.model.robot.passive_names
+    places = (*axes, *passive)
     return Calibration(
         cell=robot,
         method=estimate.method.value,
         gains=tuple(Gain(axis, float(g), float(std), unit, float(entered)) for axis, g, std, unit, entered in gains),
         parameters=parameters,
-        effects=() if last is None else tuple(_accepted(start, steps, one, axes, parameters) for one in last.effects),
+        effects=() if last is None else tuple(_accepted(start, steps, one, places, parameters) for one in last.effects),
         relative_error_percent=found.training_error,
         holdout_error_percent=found.holdout_error,
         condition=estimate.condition,
@@ -206,6 +215,7 @@ def calibration_of(
         session_began_s=None if last is None else session_began_s(last.fit_runs),
         covariance_factor=factor_of(estimate.covariance),
         current_residual=found.current_residual,
+        passive_joints=passive,
     )
 
 
@@ -225,7 +235,11 @@ def factor_of(covariance: FloatArray) -> tuple[tuple[float, ...], ...] | None:
 
 
 def _accepted(
-    start: Identification, steps: Sequence[Step], placed: PlacedEffect, axes: Sequence[str], found: Sequence[Parameter]
+    start: Identification,
+    steps: Sequence[Step],
+    placed: PlacedEffect,
+    places: Sequence[str],
+    found: Sequence[Parameter],
 ) -> AcceptedEffect:
     # The last turn that added it: an effect may have been dropped and added again.
     for number, step in reversed(list(enumerate(steps))):
@@ -235,9 +249,9 @@ def _accepted(
             break
     else:
         raise LookupError(f"{placed} is in the model, and no turn of the loop added it")
-    axis = placed.axis_name(axes)
+    axis = placed.axis_name(places)
     held_out = (before or start).holdout_error, step.after.holdout_error
-    errors = [math.nan if e is None else e.axes[placed.axis] if axis in axes else e.total for e in held_out]
+    errors = [math.nan if e is None else e.at(placed.axis) if axis in places else e.total for e in held_out]
     if not all(map(math.isfinite, errors)):
         # Without a run that was held out, the moves that were left out in turn must do.
         errors = [finding.error_before_percent, finding.error_after_percent]
@@ -249,5 +263,5 @@ def _accepted(
         coefficients=tuple(parameter for parameter in found if parameter.name in names),
         error_before_percent=errors[0],
         error_after_percent=errors[1],
-        ambiguity=tuple(rival.name_among(axes) for rival in finding.ambiguity),
+        ambiguity=tuple(rival.name_among(places) for rival in finding.ambiguity),
     )

@@ -35,10 +35,10 @@ from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
-from ident.equations.rows import row_filter, row_masks
+from ident.equations.rows import row_filter
 from ident.errors import DataUnfit
 from ident.model.model import Model
-from ident.prediction import measured_torque, predict_torque
+from ident.prediction import measured_torque, predict_torque, predicted_rows
 
 DRIVERS = ("constant", "torque", "speed", "acceleration")  #: Of the residual's scale
 PREDICTED_SHARE = 0.95  #: Share of quiet rows inside the band
@@ -168,11 +168,11 @@ def prediction_band(
 def _residual(calibration: Calibration, model: Model, run: Run, conditioning: Conditioning) -> _Residual:
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
-    use, _ = row_masks(model.drive_train, data, conditioning)
+    use, _ = predicted_rows(model, data, conditioning)
     if not use.any():
         raise DataUnfit(data.name, "no row is left after the standstill and validity masks; did the robot move?")
     predicted = predict_torque(calibration, model, data).T
-    measured = measured_torque(calibration, model, data.current_a).T
+    measured = measured_torque(calibration, model, data.current_a, data.motion()).T
     torque, needed, speed, acceleration = (
         filter_(one) for one in (measured - predicted, predicted, data.velocity_rad_s.T, data.acceleration_rad_s2.T)
     )

@@ -6,15 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.arrays import FloatArray
+from ident.arrays import BoolArray, FloatArray
 from ident.calibration import AcceptedEffect, Calibration, Parameter
+from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import EFFECTS, UNNAMED
 from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, Side, at_joints, check_settings, columns_at
 from ident.effects.signals import declared_signals, payload_parameters
+from ident.equations.rows import row_masks
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload
-from ident.model.model import Model
+from ident.model.model import Model, seen_torques
+from ident.model.robot import Motion
 
 SAME_MASS = 0.01  #: Share by which two weighings of one body may differ
 
@@ -41,7 +44,7 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
     run = declared_signals(model, data, standard, gains, calibration.session_began_s)
     torque = model.drive_train.direction.T @ run.motor_torque_nm
     for accepted in calibration.effects:
-        placed, coefficients = placed_effect(accepted, calibration, model)
+        placed, coefficients = placed_effect(accepted, calibration)
         columns = columns_at(placed.effect, run, placed.axis)
         at_all = at_joints(placed.effect, placed.axis, columns, model.drive_train)
         torque += np.einsum("p,npk->nk", coefficients, at_all)
@@ -60,13 +63,48 @@ def predict_current(calibration: Calibration, model: Model, data: Dataset) -> Fl
     return np.asarray(torque @ model.drive_train.to_motor.T / _gains(calibration, model))
 
 
-def measured_torque(calibration: Calibration, model: Model, current_a: FloatArray) -> FloatArray:
+def measured_torque(
+    calibration: Calibration, model: Model, current_a: FloatArray, motion: Motion | None = None
+) -> FloatArray:
     """Convert current references [A] to joint torque [Nm], Y = V g (eq. 4 through R), shape (n_samples, n_axes) each.
 
+    Args:
+        calibration: with the gains.
+        model: the declared model of the same robot.
+        current_a: of the motors.
+        motion: of the axes. With it, torques of a redundant drive are without internal preload, like those that
+            `predict_torque` returns; other robots have none.
+
     Raises:
-        ModelError: the calibration has another number of gains.
+        ModelError: the calibration has another number of gains, or the loops cannot be closed.
     """
-    return np.asarray((_gains(calibration, model) * np.asarray(current_a)) @ model.drive_train.direction)
+    torque = np.asarray((_gains(calibration, model) * np.asarray(current_a)) @ model.drive_train.direction)
+    if motion is None or not model.is_redundant:
+        return torque
+    seen = seen_torques(np.transpose(model.follow(motion).to_motors, (2, 1, 0)))
+    return np.asarray(np.einsum("amk,km->ka", seen, torque))
+
+
+def measured_current(calibration: Calibration, model: Model, current_a: FloatArray, motion: Motion) -> FloatArray:
+    """Return the part of current references that `predict_current` predicts: all, but for internal preload.
+
+    Arguments and errors are those of `measured_torque`.
+    """
+    if not model.is_redundant:
+        return np.asarray(current_a)
+    torque = measured_torque(calibration, model, current_a, motion)
+    return np.asarray(torque @ model.drive_train.to_motor.T / _gains(calibration, model))
+
+
+def predicted_rows(model: Model, data: Dataset, conditioning: Conditioning) -> tuple[BoolArray, BoolArray]:
+    """Rows of each joint and of each motor whose prediction counts; see `ident.equations.rows.row_masks`.
+
+    Motors of a redundant drive share their loads, so that stiction of one is in the torque of all.
+    """
+    use, motor_use = row_masks(model.drive_train, data, conditioning)
+    if model.is_redundant:
+        use[:] = motor_use[:] = use.all(axis=0) & motor_use.all(axis=0)
+    return use, motor_use
 
 
 def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
@@ -124,36 +162,31 @@ def as_calibrated(calibration: Calibration, payload: Payload | None, run: str) -
     return replace(payload, known={name: value for name, value in payload.known.items() if name not in own})
 
 
-def placed_effect(
-    accepted: AcceptedEffect, calibration: Calibration, model: Model | None = None
-) -> tuple[PlacedEffect, FloatArray]:
-    """The effect that a calibration names, on its axis, and its coefficients, shape (p,).
+def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[PlacedEffect, FloatArray]:
+    """The effect that a calibration names, on its axis or joint without a motor, and its coefficients, shape (p,).
 
     Args:
         accepted: of the calibration.
-        calibration: whose axes these are.
-        model: names the joints without a motor, on which an effect of a closed chain may act.
+        calibration: whose axes and joints these are.
 
     Raises:
         EffectRefused: no such effect, setting, axis or coefficient exists.
     """
-    axes = tuple(gain.axis for gain in calibration.gains)
-    if model is not None:
-        axes += tuple(joint.name for joint in model.robot.places[len(axes) :])
+    places = calibration.places
     families = {known.name: known for known in (*(family[0] for family in EFFECTS), *UNNAMED)}
     if accepted.name not in families:
         raise EffectRefused(f"there is no effect {accepted.name!r}; there are {', '.join(sorted(families))}")
     known = families[accepted.name]
     everywhere = known.side is Side.ALL_MOTORS and accepted.axis == ALL_AXES
-    if not everywhere and accepted.axis not in axes:
-        raise EffectRefused(f"effect {accepted.name!r} acts on axis {accepted.axis!r}; there are {', '.join(axes)}")
-    axis = 0 if everywhere else axes.index(accepted.axis)
+    if not everywhere and accepted.axis not in places:
+        raise EffectRefused(f"effect {accepted.name!r} acts on axis {accepted.axis!r}; there are {', '.join(places)}")
+    axis = 0 if everywhere else places.index(accepted.axis)
     added = {name: 0.0 for name in known.settings if name in ADDED and name not in accepted.settings}
     accepted = replace(accepted, settings={**accepted.settings, **added})
     if set(accepted.settings) != set(known.settings):
         found, exist = (", ".join(sorted(settings)) or "none" for settings in (accepted.settings, known.settings))
         raise EffectRefused(f"effect {accepted.name!r} is given the settings {found}; it has {exist}")
-    check_settings(known, accepted.settings, axis, len(axes))
+    check_settings(known, accepted.settings, axis, len(calibration.gains))
     # A file knows one kind of number; an order must be whole.
     given = {name: type(known.settings[name])(value) for name, value in accepted.settings.items()}
     if given != accepted.settings:

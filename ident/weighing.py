@@ -203,7 +203,7 @@ def weigh_rows(calibration: Calibration, given: RowsToWeigh) -> WeighedBody:
     """Weigh the body with rows that are at hand; errors are those of `weigh`."""
     model, standard = given.model, standard_parameters(calibration, given.model)
     gains = np.array([gain.value for gain in calibration.gains])
-    effects = [placed_effect(accepted, calibration, model) for accepted in calibration.effects]
+    effects = [placed_effect(accepted, calibration) for accepted in calibration.effects]
     known = np.concatenate((standard, np.zeros(10), *(coefficients for _, coefficients in effects)))
     ten = np.arange(len(standard), len(standard) + 10)
     depends = not all(placed.effect.abscissa.is_kinematic for placed, _ in effects)

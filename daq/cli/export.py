@@ -134,6 +134,13 @@ def export_urdf_verb(
     parse_markup(content, str(given))  # before any other reader sees it
     if urdf is None:
         declared = _declared(known, given)
+        if declared.chain is not None:
+            raise UsageError(
+                f"cell {declared.name!r}",
+                found="a closed chain",
+                expected="a serial robot: bodies are sought for a tree of driven joints alone",
+                remedy="use the calibration's own `parameters`, which `drivegain validate` predicts with",
+            )
         model, limits, same = model_of(declared), cell_limits(declared), declared.digest == known.configuration_sha256
         content = declared.urdf.encode()  # held joints are fixed in it
     else:

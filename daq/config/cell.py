@@ -22,7 +22,7 @@ from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.model.bodies import Payload
 from ident.model.model import DriveTrain, Model
-from ident.model.robot import JointKind, Robot
+from ident.model.robot import Joint, JointKind, Robot
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +140,7 @@ class DeclaredEffect:
     """An effect beyond rigid links and friction that the robot is known to have, such as a counterbalance."""
 
     name: str  #: family, as a calibration names it
-    axis: int  #: index of the axis that it acts on
+    axis: int  #: index among `Cell.place_names` of the axis, or joint without a motor, that it acts on
     #: Its settings by name, where they are known; a fit of the effect begins with them. Empty: the fit finds them.
     settings: dict[str, float]
 
@@ -202,6 +202,20 @@ class Cell:
     def axis_names(self) -> tuple[str, ...]:
         """Names in the order of the axes."""
         return tuple(axis.name for axis in self.axes)
+
+    @property
+    def place_names(self) -> tuple[str, ...]:
+        """Where an effect can act: the axes, then the joints of a closed chain without a motor (`Robot.places`)."""
+        return (*self.axis_names, *(joint.name for joint in self._passive))
+
+    @property
+    def place_units(self) -> tuple[JointUnit, ...]:
+        """Unit of each of `place_names`."""
+        return (*(axis.unit for axis in self.axes), *(joint_unit(joint.kind) for joint in self._passive))
+
+    @property
+    def _passive(self) -> tuple[Joint, ...]:
+        return () if self.chain is None else self.chain.passive_joints
 
 
 def robot_of(cell: Cell) -> Robot:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from daq.config.cell import MILLIMETRE, Axis, Cell, DeclaredEffect, Limits, Weig
 from daq.config.cell_schema import AxisModel, CellModel, ConditioningModel, EffectModel, PayloadModel, ratio_of
 from daq.config.checks import check
 from daq.config.clearance import clearance_of
-from daq.config.closed_chain import chain_of
+from daq.config.closed_chain import chain_of, platform_frame
 from daq.config.drive import drive_from_text
 from daq.config.hold import held_urdf
 from daq.config.yaml_file import parse_yaml, read_bytes, read_model
@@ -23,6 +23,7 @@ from daq.errors import ConfigurationMissing
 from drivers.profiles.profile import DriveProfile, Identity, TapPoint
 from ident.data.conditioning import Conditioning
 from ident.model.bodies import LINK_PARAMETERS
+from ident.model.robot import Place
 
 CELL = "cell.yaml"
 URDF = "robot.urdf"
@@ -75,6 +76,9 @@ def cell_from_bundle(
     urdf = held_urdf(document, model, urdf)
     check(document, model, urdf, profiles, logged=file is None)
     controller = None if model.controller is None else model.controller.file
+    chain = chain_of(model.robot, model.closures, urdf)
+    places = [axis.name for axis in model.axes] + [joint.name for joint in (chain.passive_joints if chain else ())]
+    mounted = platform_frame(model.robot, urdf)
     used = (CELL, URDF, *(f"{DRIVES}{drive}.yaml" for drive in model.drives))
     return Cell(
         name=model.name,
@@ -84,12 +88,12 @@ def cell_from_bundle(
         buses=model.buses,
         sync=model.sync,
         axes=tuple(_axis(axis, model.bus_of(axis), profiles) for axis in model.axes),
-        payloads=tuple(_payload(payload) for payload in model.payloads),
+        payloads=tuple(_payload(payload, mounted) for payload in model.payloads),
         conditioning=_conditioning(model.conditioning),
         controller=model.controller,
-        chain=chain_of(model.robot, model.closures),
+        chain=chain,
         clearance=clearance_of(model.workspace, model.clearance, [axis.name for axis in model.axes]),
-        effects=tuple(_effect(effect, model) for effect in model.effects),
+        effects=tuple(_effect(effect, places) for effect in model.effects),
         folder=None if file is None else file.parent,
         digest=digest({name: files[name] for name in used}),
         recording_digest=digest({name: _canonical(name, files[name], names.get(name, name)) for name in used}),
@@ -215,15 +219,31 @@ def _conditioning(model: ConditioningModel) -> Conditioning:
     return Conditioning(**rest, standstill_rad_s=tuple(speeds))
 
 
-def _effect(effect: EffectModel, model: CellModel) -> DeclaredEffect:
-    return DeclaredEffect(effect.name, [axis.name for axis in model.axes].index(effect.axis), dict(effect.settings))
+def _effect(effect: EffectModel, places: Sequence[str]) -> DeclaredEffect:
+    return DeclaredEffect(effect.name, places.index(effect.axis), dict(effect.settings))
 
 
-def _payload(model: PayloadModel) -> WeighedPayload:
+def _payload(model: PayloadModel, mounted: Place) -> WeighedPayload:
     known = {} if model.known is None else model.known.model_dump(exclude_none=True)
     if model.centre_m is not None:
-        known = drawn_parameters(model.mass_kg, model.centre_m, model.inertia_kg_m2)
+        centre_m, inertia = _in_joint_frame(mounted, model.centre_m, model.inertia_kg_m2)
+        known = drawn_parameters(model.mass_kg, centre_m, inertia)
     return WeighedPayload(model.name, model.mounting, model.mass_kg, model.mass_tolerance_kg, known)
+
+
+def _in_joint_frame(
+    mounted: Place, centre_m: tuple[float, ...], about_centre_kg_m2: tuple[float, ...] | None
+) -> tuple[tuple[float, ...], tuple[float, ...] | None]:
+    """Write centre of mass and inertia about it, both in a link's frame, in the frame of the joint that moves it."""
+    turned = mounted.rotation
+    centre = mounted.translation_m + turned @ np.array(centre_m)
+    if about_centre_kg_m2 is None:
+        return tuple(centre.tolist()), None
+    upper = np.triu_indices(3)
+    inertia = np.zeros((3, 3))
+    inertia[upper] = about_centre_kg_m2
+    inertia = turned @ (inertia + np.triu(inertia, 1).T) @ turned.T
+    return tuple(centre.tolist()), tuple(inertia[upper].tolist())
 
 
 def drawn_parameters(

@@ -154,8 +154,8 @@ class KnownModel(StrictModel):
 class PayloadModel(StrictModel):
     """A weighed body, and the parameters of its drawing.
 
-    The centre of mass is in the last joint's frame; the inertia xx, xy, xz, yy, yz, zz is about the centre of mass, in
-    the directions of that frame, as a URDF has it (xy = −∫xy dm).
+    The centre of mass is in the last joint's frame, on a closed chain in that of the platform's link; the inertia xx,
+    xy, xz, yy, yz, zz is about the centre of mass, in the directions of that frame, as a URDF has it (xy = −∫xy dm).
     """
 
     name: Name
@@ -179,7 +179,7 @@ class EffectModel(StrictModel):
     """An effect that the robot is known to have, and its settings where they are known."""
 
     name: Name
-    axis: Name
+    axis: Annotated[Name, Field(description="Name of the axis, or of a closed chain's joint without a motor.")]
     settings: dict[str, float] = Field(default_factory=dict)
 
 

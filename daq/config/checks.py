@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import hypot
 from xml.etree import ElementTree
@@ -14,7 +14,7 @@ from daq.config.bus import LARGEST_MEAN, bus_load, shortest_period_us, split_ans
 from daq.config.cell import DEGREE, KERNEL, MILLIMETRE, RECORDER, Bus, PacingMode, joint_unit
 from daq.config.cell_schema import AxisModel, CellModel, PayloadModel, gain_joints, ratio_of
 from daq.config.clearance import clearance_faults
-from daq.config.closed_chain import chain_faults, chain_of, robot_with
+from daq.config.closed_chain import chain_faults, chain_of, platform_frame, robot_with
 from daq.config.controller import controller_faults
 from daq.config.policy import max_change_faults
 from daq.config.signers import signer_faults
@@ -22,7 +22,7 @@ from daq.config.yaml_file import Document, Fault, Location, describe
 from daq.errors import ConfigurationInconsistent
 from drivers.profiles.profile import DriveProfile
 from ident.errors import ModelError
-from ident.model.robot import Joint, JointKind
+from ident.model.robot import Joint, JointKind, Robot
 from ident.plausible import (
     FARTHEST_DEG,
     FARTHEST_MM,
@@ -53,7 +53,8 @@ def check(
     Raises:
         ConfigurationInconsistent: with every contradiction and its line.
     """
-    joints, faults = _robot(model, urdf)
+    robot, faults = _robot(model, urdf)
+    joints = () if robot is None else robot.axes
     names = [axis.name for axis in model.axes]
     faults += [
         *_ratio_faults(model),
@@ -61,19 +62,21 @@ def check(
         *_producer_faults(model),
         *_axis_faults(model, joints),
         *_list_faults(model),
-        *_effect_faults(model),
+        *_effect_faults(model, () if robot is None else robot.passive_names),
         *signer_faults(model.policy.apply.signers),
         *clearance_faults(model.workspace, model.clearance, names),
         *max_change_faults(model.policy.apply, names),
     ]
     if not logged:
         faults += [*_mass_faults(model), *_si_faults(model, urdf)]
+    if robot is not None:
+        faults += _frame_faults(model, urdf)
     if faults:
         raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the cell file")
 
 
-def _robot(model: CellModel, urdf: str) -> tuple[tuple[Joint, ...], list[Fault]]:
-    """Return the joints of the URDF, none if it cannot be read, and the faults of the robot as a whole."""
+def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
+    """Return the robot, None if it cannot be read or its loops do not close, and the faults of it as a whole."""
     faults = []
     gravity = hypot(*model.robot.gravity_m_s2)
     if not GRAVITY_M_S2[0] < gravity < GRAVITY_M_S2[1]:
@@ -82,12 +85,13 @@ def _robot(model: CellModel, urdf: str) -> tuple[tuple[Joint, ...], list[Fault]]
     try:
         of_chain = [*chain_faults(model.robot, model.closures, urdf)]
         if of_chain:
-            return (), [*faults, *of_chain]
-        chain = chain_of(model.robot, model.closures)
-        joints = robot_with(chain, urdf, model.robot.gravity_m_s2).axes
+            return None, [*faults, *of_chain]
+        chain = chain_of(model.robot, model.closures, urdf)
+        robot = robot_with(chain, urdf, model.robot.gravity_m_s2)
     except ModelError as error:
         expected = "a URDF of an arm; `hold: {JOINT: POSITION}` fixes a joint that is no axis"
-        return (), [*faults, Fault(("robot", "urdf"), str(error), expected)]
+        return None, [*faults, Fault(("robot", "urdf"), str(error), expected)]
+    joints = robot.axes
     if chain is not None and len(joints) != len(model.axes):
         found, motors = f"{len(model.axes)} axes", ", ".join(model.robot.motors)
         faults.append(Fault(("axes",), found, f"one for each joint in `robot.motors` ({motors})"))
@@ -99,7 +103,12 @@ def _robot(model: CellModel, urdf: str) -> tuple[tuple[Joint, ...], list[Fault]]
             held = ", ".join(f"{name}: 0.0" for name in others[len(model.axes) - len(joints) :])
             expected += f"; joints that are no axes are held at a position [deg; m if prismatic]: `hold: {{{held}}}`"
         faults.append(Fault(("axes",), f"{len(model.axes)} axes", expected))
-    return joints, faults
+    axes = [axis.name for axis in model.axes]
+    for name in robot.passive_names:
+        if name in axes:
+            path, found = ("axes", axes.index(name), "name"), f"{name}, the name of a joint without a motor"
+            faults.append(Fault(path, found, "another name: an effect may act on that joint"))
+    return robot, faults
 
 
 def _ratio_faults(model: CellModel) -> Iterator[Fault]:
@@ -141,14 +150,27 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
         yield from _inertia_faults(payload, index)
 
 
-def _effect_faults(model: CellModel) -> Iterator[Fault]:
-    names = [axis.name for axis in model.axes]
+def _effect_faults(model: CellModel, passive: Collection[str]) -> Iterator[Fault]:
+    names = [*(axis.name for axis in model.axes), *passive]
     placed = [(effect.name, effect.axis) for effect in model.effects]
     for index, effect in enumerate(model.effects):
-        if effect.axis not in names:
+        if effect.axis not in names and not (model.closures and not passive):
             yield Fault(("effects", index, "axis"), repr(effect.axis), f"one of {', '.join(names)}")
         elif placed.index((effect.name, effect.axis)) < index:
             yield Fault(("effects", index), f"{effect.name} on {effect.axis} twice", "each effect once on an axis")
+
+
+def _frame_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
+    """Find single parameters of a payload in the frame of a platform's link, where only all of them can be turned."""
+    mounted = platform_frame(model.robot, urdf)
+    if np.allclose(mounted.rotation, np.eye(3)) and not mounted.translation_m.any():
+        return
+    for index, payload in enumerate(model.payloads):
+        if payload.known is not None:
+            found = f"single parameters, and the link {model.robot.platform} is not at the origin of its joint"
+            yield Fault(
+                ("payloads", index, "known"), found, "`centre_m` and `inertia_kg_m2`, in the frame of that link"
+            )
 
 
 def _mass_faults(model: CellModel) -> Iterator[Fault]:

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from math import radians
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field
 
 from daq.config.yaml_file import Fault, Name, StrictModel
 from ident.errors import ModelError
 from ident.model.closed_chain import assemble
-from ident.model.robot import JointKind, Robot
-from ident.model.urdf import LinkPair, read_urdf, robot_from_urdf
+from ident.model.robot import Joint, JointKind, Place, Robot
+from ident.model.urdf import LinkPair, UrdfRobot, read_urdf, robot_from_urdf
 
 Direction = Literal["x", "y", "z", "rx", "ry", "rz"]
 
@@ -54,16 +55,35 @@ class ClosedChain:
     motors: tuple[str, ...]  #: joint of each axis, in the order of the axes
     platform: str | None  #: link that carries the payload; that of the last joint when None
     assembly_rad: dict[str, float]  #: roughly, positions of all joints at which the closures hold [rad or m]
+    passive_joints: tuple[Joint, ...]  #: joints without a motor, in the order of the URDF's tree
 
 
-def chain_of(robot: ChainModel, closures: tuple[ClosureModel, ...]) -> ClosedChain | None:
-    """Return the closed chain of a cell file, None of a serial robot."""
+def chain_of(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: str) -> ClosedChain | None:
+    """Return the closed chain of a cell file, None of a serial robot.
+
+    Raises:
+        ModelError: the URDF cannot be read.
+    """
     if not closures:
         return None
     revolute = {name: radians(position) for name, position in robot.assembly_deg.items()}
     prismatic = {name: 1e-3 * position for name, position in robot.assembly_mm.items()}
     pairs = (LinkPair(one.name, one.first, one.second, one.directions) for one in closures)
-    return ClosedChain(tuple(pairs), robot.motors, robot.platform, revolute | prismatic)
+    passive = tuple(joint for joint in read_urdf(urdf).joints if joint.name not in robot.motors)
+    return ClosedChain(tuple(pairs), robot.motors, robot.platform, revolute | prismatic, passive)
+
+
+def platform_frame(robot: ChainModel, urdf: str) -> Place:
+    """Return the frame in which payloads are drawn, in that of the joint that carries them: the platform's link.
+
+    Without a `platform` both are the same.
+
+    Raises:
+        ModelError: the URDF cannot be read.
+    """
+    if robot.platform is None:
+        return Place(-1, np.eye(3), np.zeros(3))
+    return read_urdf(urdf).links[robot.platform]
 
 
 def robot_with(chain: ClosedChain | None, urdf: str, gravity_m_s2: tuple[float, float, float]) -> Robot:
@@ -101,14 +121,41 @@ def chain_faults(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: st
     ):
         if key not in given:
             yield Fault(("robot", key), "nothing, beside `closures`", what)
-    kinds = {joint.name: joint.kind for joint in read_urdf(urdf).joints}
+    tree = read_urdf(urdf)
+    unknown = [*_unknown_names(robot, closures, tree)]
+    yield from unknown
+    kinds = {joint.name: joint.kind for joint in tree.joints}
     for key, kind in (("assembly_deg", JointKind.REVOLUTE), ("assembly_mm", JointKind.PRISMATIC)):
         for name in getattr(robot, key):
             if kinds.get(name, kind) is not kind:
                 found = f"joint {name}, which is {kinds[name].value}"
                 yield Fault(("robot", key, name), found, f"a {kind.value} joint")
-    if {"motors", "mobility"} <= set(given):
+    if {"motors", "mobility"} <= set(given) and not unknown:
         try:
-            assemble(robot_with(chain_of(robot, closures), urdf, (0.0, 0.0, -9.81)), robot.mobility)
+            assemble(robot_with(chain_of(robot, closures, urdf), urdf, (0.0, 0.0, -9.81)), robot.mobility)
         except ModelError as error:
-            yield Fault(("closures",), str(error), "a mechanism that closes, and that its motors move")
+            found, _, expected = str(error).partition("; expected ")
+            yield Fault(("closures",), found, expected or "a mechanism that closes, and that its motors move")
+
+
+def _unknown_names(robot: ChainModel, closures: tuple[ClosureModel, ...], tree: UrdfRobot) -> Iterator[Fault]:
+    """Find names of joints and links that the URDF lacks."""
+    joints = [joint.name for joint in tree.joints]
+    a_joint, a_link = (
+        f"a joint of the URDF that moves: {', '.join(joints)}",
+        f"a link of the URDF: {', '.join(tree.links)}",
+    )
+    for index, name in enumerate(robot.motors):
+        if name not in joints:
+            yield Fault(("robot", "motors", index), f"{name!r}", a_joint)
+    for key in ("assembly_deg", "assembly_mm"):
+        for name in getattr(robot, key):
+            if name not in joints:
+                yield Fault(("robot", key, name), "no such joint", a_joint)
+    if robot.platform is not None and robot.platform not in tree.links:
+        yield Fault(("robot", "platform"), f"{robot.platform!r}", a_link)
+    for index, one in enumerate(closures):
+        for end in ("first", "second"):
+            name = getattr(one, end)
+            if name not in tree.links:
+                yield Fault(("closures", index, end), f"{name!r}", a_link)

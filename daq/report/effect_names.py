@@ -40,6 +40,8 @@ WORDS = {
     "hinge": "a cable or hose that pulls from some position on",
     "gravity-compensator": "a gravity compensator, or another torque that repeats with the joint",
     "counterbalance": "a balancer between two links",
+    "passive-friction": "friction in a joint without a motor",
+    "passive-spring": "a spring in a joint without a motor",
 }
 """Words by family; an effect that is not listed is called by its name."""
 
@@ -106,11 +108,10 @@ def variable_label(effect: Effect, axes: tuple[str, ...], force: str) -> str:
 def accepted_text(accepted: AcceptedEffect, calibration: Calibration) -> str:
     """Describe an effect of a calibration, to follow "J3 has"."""
     placed = _placed(accepted, calibration)
-    axes = tuple(gain.axis for gain in calibration.gains)
     return (
         WORDS.get(accepted.name, f"the effect {accepted.name!r}")
         if placed is None
-        else effect_text(placed.effect, axes)
+        else effect_text(placed.effect, calibration.places)
     )
 
 
@@ -157,9 +158,9 @@ def curve_of(accepted: AcceptedEffect, calibration: Calibration) -> Curve | None
         rows = [index[name] for name in words]
         half_nm = _SIGMAS * np.sqrt(np.einsum("pk,pq,qk->k", shapes, covariance[np.ix_(rows, rows)], shapes))
     folded = isinstance(effect, Smooth) and effect.variable in FOLDED
-    axes = tuple(gain.axis for gain in calibration.gains)
-    force = calibration.gains[placed.axis].unit.partition("/")[0]
-    name, _, unit = variable_label(effect, axes, force).partition(" [")
+    # Along a prismatic joint without a motor, too, a coefficient's unit begins with that of its force.
+    force = accepted.coefficients[0].unit.partition("/")[0]
+    name, _, unit = variable_label(effect, calibration.places, force).partition(" [")
     name += ", magnitude" if folded else ""
     values = np.array([one.value for one in _in_order(accepted, placed)])
     return Curve(x, values @ shapes, half_nm, f"{name} [{unit}", force, bool(effect.signed))

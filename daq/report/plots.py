@@ -42,8 +42,8 @@ def draw_fit(fitted: Fit, calibration: Calibration, truth: dict[str, float] | No
     replace_file(out / "gains.png", plot_gains(calibration.gains, truth, title="Joint drive gains"))
     for step in fitted.steps:
         for placed in (placed for placed in step.after.effects if placed not in before.effects):
-            axis = fitted.cell.axis_names[placed.axis]
-            title = f"{axis}: {effect_text(placed.effect, fitted.cell.axis_names)}"
+            axis = fitted.cell.place_names[placed.axis]
+            title = f"{axis}: {effect_text(placed.effect, fitted.cell.place_names)}"
             drawn = sheet(draw_effect(before, step.after, placed, fitted.cell), title)
             replace_file(out / f"residual-{axis}-{placed.effect.name}.svg", drawn)
         before = step.after
@@ -100,8 +100,23 @@ def plot_torques(
     return tuple(drawn)
 
 
+def drawn_axis(before: Evidence, after: Evidence, placed: PlacedEffect) -> int:
+    """Return the axis of an effect; of one on a joint without a motor, the axis whose residual falls most with it."""
+    if placed.axis < after.model.robot.axis_count:
+        return placed.axis
+    without, with_it = (
+        np.sum(one.estimate.residual_torque(one.training) ** 2, axis=1, where=one.training.use)
+        for one in (before, after)
+    )
+    moved = without > 0.0
+    return int(np.argmax(np.where(moved, without - with_it, 0.0) / np.where(moved, without, 1.0)))
+
+
 def draw_effect(before: Evidence, after: Evidence, placed: PlacedEffect, cell: Cell) -> tuple[str, ...]:
-    """Draw the residual of an axis before and after an effect was added, on the first held-out run, or of the fit."""
+    """Draw the residual of an axis before and after an effect was added, on the first held-out run, or of the fit.
+
+    It is that of `drawn_axis`, against the variable and the velocity of the joint that the effect acts on.
+    """
     index = len(after.fit_runs) if after.held_out else 0
     rows_before = before.holdout if before.holdout is not None else before.training
     rows_after = after.holdout if after.holdout is not None else after.training
@@ -110,21 +125,21 @@ def draw_effect(before: Evidence, after: Evidence, placed: PlacedEffect, cell: C
     along = seen.variable(placed.effect.abscissa, placed.axis, other_axis(placed.effect))
     variable, velocity = (
         decimate_rows(data, rows_after.conditioning, column[None])[0]
-        for column in (along, data.velocity_rad_s[:, placed.axis])
+        for column in (along, seen.velocity_rad_s[placed.axis])
     )
-    use = rows_after.use[placed.axis, chosen]
+    drawn = drawn_axis(before, after, placed)
+    use = rows_after.use[drawn, chosen]
     residuals = (
-        np.where(use, model.estimate.residual_torque(rows)[placed.axis, chosen], np.nan)
+        np.where(use, model.estimate.residual_torque(rows)[drawn, chosen], np.nan)
         for model, rows in ((before, rows_before), (after, rows_after))
     )
-    axis = cell.axes[placed.axis]
     return plot_residual(
         rows_after.time_s[chosen],
         *residuals,
         variable=variable,
-        variable_label=variable_label(placed.effect, cell.axis_names, axis.unit.force),
+        variable_label=variable_label(placed.effect, cell.place_names, cell.place_units[placed.axis].force),
         velocity_rad_s=velocity,
-        force=axis.unit.force,
+        force=cell.axes[drawn].unit.force,
     )
 
 

@@ -74,14 +74,14 @@ def turns_view(fitted: Fit) -> Iterator[RenderableType]:
     for declared in (step.accepted for step in fitted.steps if step.declared):
         if declared is not None:
             placed = PlacedEffect(declared.effect, declared.axis)
-            yield f"Declared in the cell file: {placed.name_among(fitted.cell.axis_names)}.\n"
+            yield f"Declared in the cell file: {placed.name_among(fitted.cell.place_names)}.\n"
     for number, step in enumerate((step for step in fitted.steps if not step.declared), start=1):
         headings = ("effect", "axis", "p", "folds", "explains", "left-out error", "gates")
         table = plain_table(headings, title=f"Turn {number}: best candidates on left-out moves")
         for finding in step.findings[:_SHOWN]:
             table.add_row(
                 finding.effect.name,
-                fitted.cell.axes[finding.axis].name,
+                fitted.cell.place_names[finding.axis],
                 f"{finding.probability:.3f}",
                 f"{100 * finding.folds_better:.0f} %",
                 f"{100 * finding.explained:.1f} %",
@@ -91,12 +91,12 @@ def turns_view(fitted: Fit) -> Iterator[RenderableType]:
         yield table
         for aside in step.set_aside:
             placed = PlacedEffect(aside.finding.effect, aside.finding.axis)
-            yield f"Not added: {placed.name_among(fitted.cell.axis_names)}: {aside.reason(fitted.cell.axis_names)}."
+            yield f"Not added: {placed.name_among(fitted.cell.place_names)}: {aside.reason(fitted.cell.place_names)}."
         if step.accepted is None:
             yield "No candidate passes every gate; nothing is added.\n"
         else:
             placed = PlacedEffect(step.accepted.effect, step.accepted.axis)
-            yield f"Added: {placed.name_among(fitted.cell.axis_names)}.\n"
+            yield f"Added: {placed.name_among(fitted.cell.place_names)}.\n"
 
 
 def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
@@ -172,7 +172,7 @@ def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:
 
 def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
     """Sentences on findings that did not join the model, where the last model still lacks them."""
-    axes, last = fitted.cell.axis_names, fitted.steps[-1]
+    axes, last = fitted.cell.place_names, fitted.steps[-1]
     for aside in step.set_aside:
         finding = aside.finding
         axis = PlacedEffect(finding.effect, finding.axis).axis_name(axes)
@@ -291,10 +291,10 @@ def error_change_text(before_percent: float, after_percent: float) -> str:
 def _effect_sentence(
     fitted: Fit, account: Account, turn: BeforeAfter, placed: PlacedEffect, share_of_excess: float | None
 ) -> str:
-    axes = fitted.cell.axis_names
+    axes = fitted.cell.place_names
     name = axes[placed.axis]
     (before, _), (after, where) = _strictest_error(turn.before), _strictest_error(turn.after)
-    floor = _floor(account).axes[placed.axis]
+    floor = _floor(account).at(placed.axis)
     floor_text = f"noise floor {floor:.1f} %" if math.isfinite(floor) else "noise floor not known"
     excess = ""
     if is_unnamed(placed.effect) and share_of_excess is not None:
@@ -303,9 +303,10 @@ def _effect_sentence(
         before_all, after_all = (_strictest_error(errors)[0].total for errors in (turn.before, turn.after))
         change = error_change_text(before_all, after_all)
         return f"The recording has {effect_text(placed.effect, axes)}: the error {where} {change}."
+    whose = f" of {name}" if placed.axis < len(fitted.cell.axes) else " of all axes"
     return (
-        f"{name} has {effect_text(placed.effect, axes)}{excess}: the error of {name} {where} "
-        f"{error_change_text(before.axes[placed.axis], after.axes[placed.axis])} ({floor_text})."
+        f"{name} has {effect_text(placed.effect, axes)}{excess}: the error{whose} {where} "
+        f"{error_change_text(before.at(placed.axis), after.at(placed.axis))} ({floor_text})."
     )
 
 
@@ -381,7 +382,7 @@ def residual_document(fitted: Fit, account: Account, calibration: Calibration) -
 
 
 def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> dict[str, Any]:
-    axes = fitted.cell.axis_names
+    axes = fitted.cell.place_names
     added, removed = ((), ()) if turn is None else (turn.added, turn.removed)
     return {
         "accepted": None if step.accepted is None else _finding(step.accepted, axes),

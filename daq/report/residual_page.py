@@ -14,7 +14,7 @@ from daq.report.effect_names import effect_text, variable_text
 from daq.report.fit import coefficients, identifiability_notes, start_of
 from daq.report.gains import with_deviation
 from daq.report.html import MARK, figure, folded, listed, pair, paragraph, table
-from daq.report.plots import draw_effect, draw_torques, plot_ranking
+from daq.report.plots import draw_effect, draw_torques, drawn_axis, plot_ranking
 from daq.report.residual import WHEN, error_rows, gains_sentence, residual_document, summary
 from daq.report.svg import Interval, intervals
 from daq.report.text import json_text, percent_text
@@ -90,8 +90,11 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration, compa
 
 
 def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed: PlacedEffect) -> str:
-    axes = fitted.cell.axis_names
+    axes = fitted.cell.place_names
     axis, final = axes[placed.axis], fitted.steps[-1].after
+    has_motor = placed.axis < len(fitted.cell.axes)
+    shown_axis = axes[drawn_axis(before, step.after, placed)]
+    of_joint = "" if has_motor else f" of {axis}"
     kept = placed in final.effects
     rivals = () if step.accepted is None else step.accepted.ambiguity
     ambiguous = "; ".join(f"{axes[one.axis]}: {effect_text(one.effect, axes)}" for one in rivals)
@@ -108,7 +111,7 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
         ("held out", turn.before.holdout, turn.after.holdout),
     )
     errors = [
-        (name, percent_text(first.axes[placed.axis]), percent_text(second.axes[placed.axis]))
+        (name, percent_text(first.at(placed.axis)), percent_text(second.at(placed.axis)))
         for name, first, second in pairs
         if first is not None and second is not None
     ]
@@ -119,11 +122,11 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
         f"{axis}: {effect_text(placed.effect, axes)}",
         paragraph(" ".join(sentences)),
         table("Identified coefficients", ("coefficient", "value ± σ", "unit"), sizes) if sizes else "",
-        table(f"Relative error of {axis} [%]", ("", *WHEN), errors),
+        table(f"Relative error of {axis if has_motor else 'all axes'} [%]", ("", *WHEN), errors),
         pair(map(figure, draw_effect(before, step.after, placed, fitted.cell))),
         paragraph(
-            f"Residual of {axis} over time and against {variable_text(placed.effect, axes)}, without and with the "
-            "effect. A mean away from zero is torque that the model still lacks. Gaps: samples left out."
+            f"Residual of {shown_axis} over time and against {variable_text(placed.effect, axes)}{of_joint}, without "
+            "and with the effect. A mean away from zero is torque that the model still lacks. Gaps: samples left out."
         ),
     )
 
@@ -160,7 +163,7 @@ def _gains(fitted: Fit, account: Account) -> str:
 
 
 def _turn(fitted: Fit, number: int, step: Step) -> str:
-    axes, added = fitted.cell.axis_names, step.accepted
+    axes, added = fitted.cell.place_names, step.accepted
     shown = (*step.findings[:_SHOWN], *(finding for finding in step.structures[:_SHOWN] if finding.passed))
     outcome = "Nothing passed every check and nothing was added."
     if added is not None:

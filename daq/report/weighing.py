@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
-from daq.config.cell import Cell
+from daq.config.cell import Cell, robot_of
 from daq.files import replace_file
 from daq.report.fit import error_document
 from daq.report.gains import with_deviation
@@ -20,6 +20,7 @@ from daq.workflow.fit import DOUBTFUL_PERCENT
 from daq.workflow.weigh import Weighed
 from ident.contact import ExternalTorque
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, pseudo_inertia
+from ident.model.urdf import read_urdf
 
 LISTED = 20  #: Contacts shown in a terminal; `--json` has all
 NOISE_ROWS = 4.0
@@ -37,7 +38,7 @@ def weighed_view(found: Weighed) -> Iterator[RenderableType]:
     for name, value, std in zip(LINK_PARAMETERS[:6], inertia, inertia_std, strict=True):
         table.add_row(f"{name} about the centre", with_deviation(value, std), "kg m²")
     yield table
-    yield "In the frame of the last joint."
+    yield f"In the frame of {carrier_text(found.cell)}."
     if found.declared_kg is not None:
         yield f"The logs declare {found.declared_kg:g} kg: {100.0 * (body.mass_kg / found.declared_kg - 1.0):+.2f} %."
     within = "moves, gains, robot and effects" if body.complete else "moves and gains"
@@ -68,6 +69,18 @@ def _doubts(found: Weighed) -> Iterator[str]:
         yield "No body shows: the mass is within two σ of nothing."
     elif not np.isnan(body.values).any() and np.linalg.eigvalsh(pseudo_inertia(body.values))[0] < 0.0:
         yield "No solid body has exactly this inertia; use it within its σ."
+
+
+def carrier_text(cell: Cell) -> str:
+    """Name the joint whose frame the parameters of a payload are in, and where the platform's link is in it."""
+    if cell.chain is None:
+        return "the last joint"
+    robot = robot_of(cell)
+    name = f"the joint {robot.joints[robot.carrier].name}"
+    if cell.chain.platform is None:
+        return name
+    x, y, z = 1000.0 * read_urdf(cell.urdf).links[cell.chain.platform].translation_m
+    return f"{name}, in which the link {cell.chain.platform} is at ({x:.4g}, {y:.4g}, {z:.4g}) mm"
 
 
 def weighed_document(found: Weighed) -> dict[str, Any]:

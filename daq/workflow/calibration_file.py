@@ -93,6 +93,7 @@ class CalibrationBody(StrictModel):
     covariance_factor: tuple[tuple[float, ...], ...] | None = None
     diagnoses: tuple[Diagnosis, ...] = ()
     current_residual: tuple[float, ...] | None = None
+    passive_joints: tuple[str, ...] = ()
 
 
 class CalibrationDocument(CalibrationBody):

@@ -30,7 +30,7 @@ def declared_effects(cell: Cell) -> tuple[PlacedEffect, ...]:
     families = {family[0].name: family[0] for family in EFFECTS}
     robot, placed = model_of(cell).robot, []
     for declared in cell.effects:
-        subject = f"effects of cell {cell.name!r}: {declared.name} on {cell.axis_names[declared.axis]}"
+        subject = f"effects of cell {cell.name!r}: {declared.name} on {cell.place_names[declared.axis]}"
         if declared.name not in families:
             raise _wrong(subject, "no such effect", f"one of {', '.join(families)}")
         known = families[declared.name]
@@ -61,7 +61,7 @@ def refuse_effects(cell: Cell, option: str) -> None:
         UsageError: the cell declares effects.
     """
     if cell.effects:
-        names = ", ".join(f"{effect.name} on {cell.axis_names[effect.axis]}" for effect in cell.effects)
+        names = ", ".join(f"{effect.name} on {cell.place_names[effect.axis]}" for effect in cell.effects)
         raise UsageError(
             option,
             found=f"a cell that declares effects: {names}",
@@ -86,7 +86,8 @@ def with_effects_of_cell(
     if estimate.method is not Method.ML:
         after = with_declared_again(after, estimate)
         steps = (*steps[:-1], replace(steps[-1], after=after))
-    require_plausible(after.estimate, after.estimate.relative_error(after.identification.system), axes)
+    error = after.estimate.relative_error(after.identification.system)
+    require_plausible(after.estimate, error, axes[: len(estimate.gains)])
     return steps
 
 

@@ -227,7 +227,7 @@ def fit(
             keep_rows=keep_rows or bool(effects),
             judge=not effects,
         )
-        steps = with_effects_of_cell(result, effects, declared.axis_names) if effects else ()
+        steps = with_effects_of_cell(result, effects, declared.place_names) if effects else ()
         last = steps[-1].after.identification if steps else result
         if not gains_fixed:
             check_signs(last.estimate, nameplate)
@@ -371,7 +371,7 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
         by_ml = before.estimate
         evidence = with_declared_again(evidence, by_ml) if known else replace(evidence, estimate=by_ml)
     rng = np.random.default_rng(seed)
-    steps = find_effects(evidence, rng, progress=progress, axes=start.cell.axis_names)
+    steps = find_effects(evidence, rng, progress=progress, axes=start.cell.place_names)
     closed = replace(start, identification=before, steps=(*known, *steps))
     return closed if closed.estimate is start.estimate else with_diagnoses(closed)
 
@@ -399,7 +399,7 @@ def check_holdout(fitted: Fit) -> None:
     cold = [one.name for one in unseen if one.temperature_c is None]
     needed = cold and any(placed.effect.name == TemperatureFriction.name for placed in after.effects)
     raise EffectsRefuted(
-        ", ".join(placed.name_among(fitted.cell.axis_names) for placed in after.effects),
+        ", ".join(placed.name_among(fitted.cell.place_names) for placed in after.effects),
         found=f"an error of held-out runs of {last:.2f} %, {first:.2f} % without"
         + (f"; {', '.join(cold)} has no temperature, on which an effect depends" if needed else ""),
         expected=f"no rise by more than its noise over their {change.moves} moves",

@@ -28,11 +28,10 @@ from ident.arrays import FloatArray, IntArray
 from ident.calibration import Calibration
 from ident.data.conditioning import central_differences, decimator, low_pass
 from ident.data.dataset import moving_samples, planned
-from ident.equations.rows import row_masks
 from ident.errors import IdentificationError
 from ident.model.bodies import Payload
 from ident.model.robot import Motion
-from ident.prediction import as_calibrated, predict_current
+from ident.prediction import as_calibrated, measured_current, predict_current, predicted_rows
 
 EDGE_S = 0.15  #: Of a window, where the low-pass is not yet what it is over a whole run (to 2·10⁻⁵ at 40 Hz)
 STEP_S = 0.2  #: Samples that are predicted at once: each prediction costs 2 ms, and most of it is not for the samples
@@ -168,14 +167,15 @@ class Predictor:
         raw = np.ascontiguousarray(self._position.T)
         smooth = low_pass(raw, rate_hz, settings.position_cutoff_hz, settings.position_order)
         position, velocity, acceleration = central_differences(smooth, rate_hz)
-        data = planned(Motion(position.T, velocity.T, acceleration.T), rate_hz, self._payload)
+        motion = Motion(position.T, velocity.T, acceleration.T)
+        data = planned(motion, rate_hz, self._payload)
         predicted = self._filter(predict_current(self._calibration, self._model, data).T)
-        measured = self._filter(self._current[1:-1].T)
+        measured = self._filter(measured_current(self._calibration, self._model, self._current[1:-1], motion).T)
         centres = self._filter.centres(position.shape[1])
         whole = (centres >= self._margin) & (centres < position.shape[1] - self._margin)
         moving, motor_moving = moving_samples(velocity, self._still, self._model.drive_train)
         data = replace(data, moving=moving.T, motor_moving=motor_moving.T)
-        still = ~row_masks(self._model.drive_train, data, settings)[1][:, whole]
+        still = ~predicted_rows(self._model, data, settings)[1][:, whole]
         predicted, measured = predicted[:, whole], measured[:, whole]
         predicted = np.where(still, np.nan, predicted)
         return Rows(self._cycle + 1 + centres[whole], predicted.T, (measured - predicted).T, self._band)

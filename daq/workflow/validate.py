@@ -26,7 +26,7 @@ from ident.data.run import Run
 from ident.effects.friction import TemperatureFriction
 from ident.effects.signals import REFERENCE_C
 from ident.equations.reduction import Reduction, reduce_runs
-from ident.equations.rows import row_filter, row_masks
+from ident.equations.rows import row_filter
 from ident.errors import DataUnfit, Diagnosis, IdentificationError
 from ident.estimators.diagnosis import (
     axis_error_diagnoses,
@@ -45,6 +45,7 @@ from ident.prediction import (
     measured_torque,
     mounted_parameters,
     predict_torque,
+    predicted_rows,
     standard_parameters,
 )
 from ident.weighing import RowsToWeigh, rows_to_weigh, weigh_rows
@@ -178,7 +179,7 @@ def predicted(
     roles = {source.role for source in calibration.sources if source.sha256 == run.digest}
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
-    use, _ = row_masks(model.drive_train, data, conditioning)
+    use, _ = predicted_rows(model, data, conditioning)
     if not use.any():
         raise DataUnfit(data.name, "no row is left after the standstill and validity masks; did the robot move?")
     return Validation(
@@ -189,7 +190,7 @@ def predicted(
         same_configuration=configuration_sha256 == calibration.configuration_sha256,
         partial=run.partial,
         time_s=data.time_s[filter_.centres(len(data.time_s))] - data.time_s[0],
-        measured_nm=filter_(measured_torque(calibration, model, data.current_a).T),
+        measured_nm=filter_(measured_torque(calibration, model, data.current_a, data.motion()).T),
         predicted_nm=filter_(predict_torque(calibration, model, data).T),
         use=use,
     )

@@ -51,7 +51,7 @@ EXCHANGE = 0.4
 all pairs of channels of two real robots and of five simulated arms the smallest is 0.6."""
 LEVEL = 0.05  #: Largest rise of the same, where it decides nothing and the sign of the friction must
 SMALL_ERROR = 0.02  #: Relative error of a motor below which its current needs no other explanation
-FRICTION = re.compile(r"f[vs]m?([0-9]+)\b")  #: Names of the friction of a joint or of its coupled motor
+FRICTION = re.compile(r"f[vs](m?)([0-9]+)\b")  #: Names of the friction of a joint or of its coupled motor
 FRICTION_SIGMAS = 15.0  #: In the σ of independent rows, which is some three times too small
 WEIGHT_SIGMAS = 30.0  #: Likewise, for the weight of a payload
 
@@ -140,13 +140,21 @@ def require_weight(system: System, estimate: Estimate) -> None:
 
 def weight_ratio(system: System, estimate: Estimate) -> tuple[float, float]:
     """Size of W_kL χ_kL that the currents ask for with given gains, and WEIGHT_SIGMAS of its σ."""
+    if system.model.is_redundant:  # no motor has an equation of its own
+        whitened = system.currents.whitened(estimate.gains, np.ones(len(estimate.gains)))
+        torque, right = np.column_stack((whitened.linear, whitened.known)), whitened.drive @ estimate.gains
+        return _last(torque, right, int(system.motors.rows.sum()))
     # Weighted by the size of each current: the residuals of a fit with a wrong weight say nothing about noise.
     factors = [factor / max(float(np.linalg.norm(factor[:, 0])), 1e-300) for factor in system.motors.factors]
     rows = np.concatenate(factors)
     scale = np.concatenate([np.full(len(f), 1.0 / g) for f, g in zip(factors, estimate.gains, strict=True)])
-    torque = rows[:, 1:] * scale[:, None]
-    solution, inverse = solve(torque, rows[:, 0])
-    left = float(np.sum((rows[:, 0] - torque @ solution) ** 2)) / int(system.motors.rows.sum())
+    return _last(rows[:, 1:] * scale[:, None], rows[:, 0], int(system.motors.rows.sum()))
+
+
+def _last(columns: FloatArray, right: FloatArray, rows: int) -> tuple[float, float]:
+    """Size of the last unknown by least squares, and WEIGHT_SIGMAS of its σ."""
+    solution, inverse = solve(columns, right)
+    left = float(np.sum((right - columns @ solution) ** 2)) / rows
     return abs(float(solution[-1])), WEIGHT_SIGMAS * float(np.sqrt(left * inverse[-1, -1]))
 
 
@@ -181,11 +189,14 @@ def require_signs(system: System, estimate: Estimate, axes: Sequence[str]) -> No
         friction = np.zeros(len(axes))
         for column, value, std in zip(one.unknowns, one.parameters, one.parameters_std, strict=True):
             if (of_friction := FRICTION.match(column.name)) is not None:
-                friction[int(of_friction[1]) - 1] += value / std
+                number = int(of_friction[2]) - 1
+                friction[number if of_friction[1] else joints.index(number)] += value / std
         errors = np.maximum(system.currents.noise(one.gains, one.parameters), smallest)
         return float(np.sum(np.log(errors))), friction
 
-    size = np.array([np.linalg.norm(factor[:, 0]) for factor in system.motors.factors])
+    joints, redundant = system.model.robot.axis_joints, system.model.is_redundant
+    own = range(len(axes)) if redundant else [0] * len(axes)  # where a motor's rows have its current
+    size = np.array([np.linalg.norm(f[:, column]) for f, column in zip(system.motors.factors, own, strict=True)])
     smallest = SMALL_ERROR * size / np.sqrt(np.maximum(system.motors.rows, 1))
     smallest[smallest == 0.0] = 1.0  # a motor without current
     signs = np.ones(len(axes))
@@ -403,6 +414,8 @@ def exchanged_channels(
     Raises:
         DataUnfit: as of `ident.equations.reduction.reduce_runs`.
     """
+    if model.is_redundant:  # internal preload is in every current: no motor has an equation without those of the others
+        return None
     errors = channel_errors(model, runs, conditioning)
     if not np.all((errors > 0.0) & np.isfinite(errors)):
         return None

@@ -23,6 +23,10 @@ class RelativeError:
     axes: tuple[float, ...]
     total: float
 
+    def at(self, place: int) -> float:
+        """Of an axis; of a joint without a motor, which come after the axes, that of all axes, which carry it."""
+        return self.axes[place] if place < len(self.axes) else self.total
+
 
 def relative_error(measured_nm: FloatArray, predicted_nm: FloatArray, use: BoolArray) -> RelativeError:
     """‖ρ_j‖/‖Y_j‖ of each joint and of all together [%] (paper Table 6); NaN for a joint without a row that counts.

@@ -9,6 +9,7 @@ import numpy as np
 import scipy  # loads its modules when they are first used: a clean fit needs none of them
 
 from ident.arrays import FloatArray
+from ident.equations.currents import PreloadedCurrents
 from ident.equations.linearisation import MIN_MOVES_TO_LEAVE_OUT, left_out_shifts, motor_jacobians
 from ident.equations.system import System
 from ident.errors import Diagnosis, PayloadDiffers
@@ -97,7 +98,11 @@ def payload_differences(
     for index, cluster in enumerate(system.clusters):
         parts = motor_jacobians(cluster, system.preload_of(index), gains, parameters, noise)
         jacobian, residual, _ = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-        weight = [rows[:, -1] / (g * std) for rows, g, std in zip(cluster, gains, noise, strict=True)]
+        if system.model.is_redundant:
+            currents = PreloadedCurrents.of_rows(list(cluster), system.preload_of(index))
+            weight = [currents.whitened(gains, noise).known]
+        else:
+            weight = [rows[:, -1] / (g * std) for rows, g, std in zip(cluster, gains, noise, strict=True)]
         # With given gains, which may all be off, the weight of the payload is an unknown of all runs together.
         others = np.column_stack((jacobian[:, first:], np.concatenate(weight))) if held else jacobian[:, first:]
         blocks.append((others, residual, jacobian[:, count : count + leading] @ of_base))

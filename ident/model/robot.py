@@ -98,6 +98,11 @@ class Robot:
         return (*self.axes, *(self.joints[joint] for joint in self.passive_joints))
 
     @property
+    def passive_names(self) -> tuple[str, ...]:
+        """Names of the joints without a motor."""
+        return tuple(self.joints[joint].name for joint in self.passive_joints)
+
+    @property
     def axis_count(self) -> int:
         """m: motors, and what a recording has columns of."""
         return len(self.axis_joints)

@@ -251,7 +251,9 @@ def _fingerprint(cell: Cell, spec: CellSpec, moves: Plan, run: StudyRun) -> str:
     """
     declared = None if run.payload is None else declared_payload(run.payload)
     truth = (spec.urdf, spec.gravity_m_s2, spec.ratio.tolist(), spec.axes, spec.start_rad.tolist(), spec.payload)
-    simulation = (*truth, spec.effects, spec.sync_period_us, spec.substeps, spec.seed)
+    assembly, passive = sorted(spec.assembly_rad.items()), sorted(spec.passive.items())
+    chain = (spec.closures, spec.motors, spec.platform, assembly, passive) if spec.closures else ()
+    simulation = (*truth, *chain, spec.effects, spec.sync_period_us, spec.substeps, spec.seed)
     probe = simulate_run(cell, spec, replace(moves, moves=moves.moves[:1]), run.name, declared)
     samples = (probe.position_counts.tobytes(), probe.current_raw.tobytes(), probe.move.tobytes())
     return digest(software(), VERSION, cell.digest, simulation, moves.moves, declared, samples)

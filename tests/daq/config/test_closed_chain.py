@@ -1,0 +1,207 @@
+"""Closed chains in a cell file: bad descriptions are refused by name, and joints without a motor have names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from daq.config.cell import DEGREE, Cell, DeclaredEffect, robot_of
+from daq.config.cell_file import load_cell
+from daq.errors import ConfigurationInconsistent
+from daq.workflow.declared_effects import declared_effects
+from ident.model.bodies import LINK_PARAMETERS
+from ident.model.urdf import read_urdf
+from tests.conftest import CHECKOUT
+
+MOTORS, JOINTS = "motors: [crank-1, crank-2]", "crank-1, elbow-1, crank-2, elbow-2"
+ASSEMBLY = "crank-1: 0, elbow-1: 0, crank-2: 0, elbow-2: 0"
+CLOSURE = "  - {name: tip, first: rod-1-tip, second: rod-2-tip, directions: [x, y]}\n"
+#: The cranks meet each other, and the rods lie on each other: they turn about the elbows freely.
+SINGULAR = "crank-1: 81.87, elbow-1: -128.436, crank-2: -81.87, elbow-2: 128.436"
+
+
+def _cell(folder: Path, *changes: tuple[str, str], name: str = "five-bar") -> Cell:
+    text = (CHECKOUT / f"configs/cells/{name}.yaml").read_text(encoding="utf-8")
+    text = text.replace("../", f"{CHECKOUT}/configs/")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    (folder / "cell.yaml").write_text(text, encoding="utf-8")
+    return load_cell(folder / "cell.yaml")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        pytest.param(
+            ASSEMBLY,
+            "crank-1: 90, elbow-1: 90, crank-2: 0, elbow-2: 0",
+            "11: closures: found closure 'tip' cannot close at the assembly pose: x 643 mm, y 243 mm apart where it is "
+            "declared; expected a pose of all joints at which the frames of every closure nearly coincide "
+            "(assembly_deg, assembly_mm)",
+            id="cannot close",
+        ),
+        pytest.param(
+            "mobility: 2",
+            "mobility: 3",
+            "11: closures: found the closures leave 2 degrees of freedom at the assembly pose; expected 3 as declared: "
+            "is a closure missing, or does one hold a direction that must be free (`directions`)?",
+            id="mobility",
+        ),
+        pytest.param(
+            MOTORS,
+            "motors: [crank-1]",
+            "11: closures: found the motors crank-1 do not move all 2 degrees of freedom that the closures leave; name "
+            "a joint that each motor drives, one for each degree of freedom at least (`motors`); expected a mechanism "
+            "that closes, and that its motors move",
+            id="too few motors",
+        ),
+        pytest.param(
+            MOTORS,
+            "motors: [crank-1, crank-1]",
+            "11: closures: found two motors drive the same joint; expected a joint of its own for each (`motors`)",
+            id="one joint twice",
+        ),
+        pytest.param(
+            MOTORS,
+            "motors: [crank-1, crank-9]",
+            f"6: robot.motors[1]: found 'crank-9'; expected a joint of the URDF that moves: {JOINTS}",
+            id="unknown motor",
+        ),
+        pytest.param(
+            "second: rod-2-tip",
+            "second: rod-2-tap",
+            "12: closures[0].second: found 'rod-2-tap'; expected a link of the URDF: base, crank-link-1, rod-1, plate, "
+            "rod-1-tip, crank-link-2, rod-2, rod-2-tip",
+            id="unknown link",
+        ),
+        pytest.param(
+            "platform: plate",
+            "platform: base",
+            "11: closures: found the platform 'base' does not move; expected the link that carries the payload",
+            id="fixed platform",
+        ),
+        pytest.param(
+            "elbow-2: 0}",
+            "elbow-3: 0}",
+            f"10: robot.assembly_deg.elbow-3: found no such joint; expected a joint of the URDF that moves: {JOINTS}",
+            id="unknown joint of the assembly pose",
+        ),
+        pytest.param(
+            f"  {MOTORS}\n",
+            "",
+            "3: robot.motors: found nothing, beside `closures`; expected the joint of each axis",
+            id="closures without motors",
+        ),
+        pytest.param(
+            "  mobility: 2\n",
+            "",
+            "3: robot.mobility: found nothing, beside `closures`; expected the maker's degrees of freedom",
+            id="closures without mobility",
+        ),
+        pytest.param(
+            "- name: crank-2\n",
+            "- name: elbow-1\n",
+            "33: axes[1].name: found elbow-1, the name of a joint without a motor; expected another name: an effect "
+            "may act on that joint",
+            id="axis named as a joint without a motor",
+        ),
+        pytest.param(
+            "mass_tolerance_kg: 0.005\n",
+            "mass_tolerance_kg: 0.005\n    known: {mx: 0.1}\n",
+            "45: payloads[0].known: found single parameters, and the link plate is not at the origin of its joint; "
+            "expected `centre_m` and `inertia_kg_m2`, in the frame of that link",
+            id="single parameters in the frame of a platform",
+        ),
+    ],
+)
+def test_a_bad_description_is_refused_by_name(tmp_path: Path, old: str, new: str, message: str) -> None:
+    with pytest.raises(ConfigurationInconsistent) as refusal:
+        _cell(tmp_path, (old, new))
+    assert str(refusal.value) == f"{tmp_path}/cell.yaml:{message}; correct the cell file"
+
+
+def test_a_singular_start_is_refused(tmp_path: Path) -> None:
+    message = r"11: closures: found the assembly pose is close to a singularity: condition \d[\d.e+]+ of the closures; "
+    with pytest.raises(
+        ConfigurationInconsistent, match=message + "expected below 500: give a pose inside the workspace"
+    ):
+        _cell(tmp_path, (ASSEMBLY, SINGULAR))
+
+
+def test_degrees_of_a_prismatic_joint_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationInconsistent) as refusal:
+        _cell(
+            tmp_path,
+            ("  assembly_mm: {slide-x: 0, slide-y: 0, slide-z: 0}\n", ""),
+            ("assembly_deg: {\n", "assembly_deg: {\n    slide-x: 0,\n"),
+            name="orthoglide",
+        )
+    assert "robot.assembly_deg.slide-x: found joint slide-x, which is prismatic; expected a revolute joint" in str(
+        refusal.value
+    )
+
+
+def test_a_serial_robot_has_no_key_of_a_closed_chain(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationInconsistent, match=r"6: robot\.motors: found no `closures` beside it") as refusal:
+        _cell(tmp_path, (CLOSURE, ""), ("closures:", "closures: []"))
+    assert "found 4 faults" in str(refusal.value)
+
+
+def test_places_of_a_cell_are_those_of_its_robot() -> None:
+    for name in ("five-bar", "dualv", "orthoglide", "demo"):
+        cell = load_cell(CHECKOUT / f"configs/cells/{name}.yaml")
+        robot = robot_of(cell)
+        assert cell.place_names[len(cell.axes) :] == robot.passive_names
+        assert len(cell.place_units) == len(robot.places)
+    assert load_cell(CHECKOUT / "configs/cells/five-bar.yaml").place_units[3] is DEGREE
+
+
+def test_an_effect_is_declared_on_a_joint_without_a_motor(tmp_path: Path) -> None:
+    declared = "effects:\n  - {name: passive-friction, axis: elbow-2}\nconditioning:"
+    cell = _cell(tmp_path, ("conditioning:", declared))
+    assert cell.effects == (DeclaredEffect("passive-friction", 3, {}),)
+    (placed,) = declared_effects(cell)
+    assert placed.name_among(cell.place_names) == "passive-friction on elbow-2"
+    wrong = declared.replace("elbow-2", "elbow-3")
+    with pytest.raises(
+        ConfigurationInconsistent, match="'elbow-3'; expected one of crank-1, crank-2, elbow-1, elbow-2"
+    ):
+        _cell(tmp_path, ("conditioning:", wrong))
+    on_axis = _cell(tmp_path, ("conditioning:", declared.replace("elbow-2", "crank-2")))
+    with pytest.raises(ConfigurationInconsistent, match="passive-friction on crank-2: found an effect that this axis"):
+        declared_effects(on_axis)
+
+
+def test_a_payload_is_drawn_in_the_frame_of_the_platform(tmp_path: Path) -> None:
+    # The URDF's own joining of a body on a fixed joint must give the same as the cell file's conversion.
+    centre, inertia = (-0.02, 0.03, 0.05), (0.012, 0.001, -0.002, 0.014, 0.003, 0.017)
+    turned = '<origin xyz="0.45 0 0" rpy="0.3 -0.2 0.5"/>'
+    urdf = (CHECKOUT / "configs/robots/five-bar.urdf").read_text(encoding="utf-8")
+    head, tail = urdf.split('<joint name="plate-mount" type="fixed">')
+    tail = tail.replace('<origin xyz="0.45 0 0" rpy="0 0 0"/>', turned, 1)
+    head_of_link, rest = tail.split('<link name="plate">')
+    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    drawn = " ".join(f'{name}="{value}"' for name, value in zip(names, inertia, strict=True))
+    body = (
+        f'<inertial><origin xyz="{centre[0]} {centre[1]} {centre[2]}"/><mass value="5.1"/>'
+        f"<inertia {drawn}/></inertial></link>"
+    )
+    start = f'{head}<joint name="plate-mount" type="fixed">{head_of_link}<link name="plate">'
+    rest = rest.partition("</link>")[2]
+    bare = read_urdf(f"{start}</link>{rest}").bodies[1]
+    loaded = read_urdf(f"{start}{body}{rest}").bodies[1]
+    (tmp_path / "robot.urdf").write_text(f"{start}</link>{rest}", encoding="utf-8")
+    listed = f"    centre_m: {list(centre)}\n    inertia_kg_m2: {list(inertia)}\n"
+    cell = _cell(
+        tmp_path,
+        (f"{CHECKOUT}/configs/robots/five-bar.urdf", "robot.urdf"),
+        ("    mass_tolerance_kg: 0.005\n", f"    mass_tolerance_kg: 0.005\n{listed}"),
+    )
+    known = cell.payloads[0].drawn.known
+    expected = loaded.parameters - bare.parameters
+    assert_allclose([known[name] for name in LINK_PARAMETERS], expected, rtol=1e-9, atol=1e-12)
+    assert not np.allclose([known["mx"], known["my"], known["mz"]], 5.1 * np.array(centre))
