@@ -14,7 +14,7 @@ from daq.config.cell import MILLIMETRE, Axis, Cell, DeclaredEffect, Limits, Weig
 from daq.config.cell_schema import AxisModel, CellModel, ConditioningModel, EffectModel, PayloadModel, ratio_of
 from daq.config.checks import check
 from daq.config.clearance import clearance_of
-from daq.config.closed_chain import chain_of, platform_frame
+from daq.config.closed_chain import ClosedChain, chain_of, platform_frame
 from daq.config.drive import drive_from_text
 from daq.config.hold import held_urdf
 from daq.config.yaml_file import parse_yaml, read_bytes, read_model
@@ -24,6 +24,7 @@ from drivers.profiles.profile import DriveProfile, Identity, TapPoint
 from ident.data.conditioning import Conditioning
 from ident.model.bodies import LINK_PARAMETERS
 from ident.model.robot import Place
+from ident.model.urdf import read_urdf
 
 CELL = "cell.yaml"
 URDF = "robot.urdf"
@@ -92,7 +93,7 @@ def cell_from_bundle(
         conditioning=_conditioning(model.conditioning),
         controller=model.controller,
         chain=chain,
-        clearance=clearance_of(model.workspace, model.clearance, [axis.name for axis in model.axes]),
+        clearance=clearance_of(model.workspace, model.clearance, _joints(model, chain, urdf)),
         effects=tuple(_effect(effect, places) for effect in model.effects),
         folder=None if file is None else file.parent,
         digest=digest({name: files[name] for name in used}),
@@ -217,6 +218,16 @@ def _conditioning(model: ConditioningModel) -> Conditioning:
         for about, along in zip(radians, millimetres, strict=True)
     )
     return Conditioning(**rest, standstill_rad_s=tuple(speeds))
+
+
+def _joints(model: CellModel, chain: ClosedChain | None, urdf: str) -> dict[str, int]:
+    """Return the index of the joint behind each axis, and behind each joint of a closed chain without a motor."""
+    names = [axis.name for axis in model.axes]
+    if chain is None:
+        return {name: index for index, name in enumerate(names)}
+    index = {joint.name: number for number, joint in enumerate(read_urdf(urdf).joints)}
+    passive = {joint.name: index[joint.name] for joint in chain.passive_joints}
+    return passive | {name: index[motor] for name, motor in zip(names, chain.motors, strict=True)}
 
 
 def _effect(effect: EffectModel, places: Sequence[str]) -> DeclaredEffect:

@@ -64,7 +64,7 @@ def check(
         *_list_faults(model),
         *_effect_faults(model, () if robot is None else robot.passive_names),
         *signer_faults(model.policy.apply.signers),
-        *clearance_faults(model.workspace, model.clearance, names),
+        *clearance_faults(model.workspace, model.clearance, [*names, *(() if robot is None else robot.passive_names)]),
         *max_change_faults(model.policy.apply, names),
     ]
     if not logged:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -63,13 +63,18 @@ class ClearanceSection:
 
 
 def clearance_of(
-    workspace: WorkspaceSection | None, clearance: ClearanceSection | None, axis_names: Sequence[str]
+    workspace: WorkspaceSection | None, clearance: ClearanceSection | None, joints: Mapping[str, int]
 ) -> Clearance | None:
-    """Convert the sections of the cell file; None if it has neither."""
+    """Convert the sections of the cell file; None if it has neither.
+
+    Args:
+        workspace, clearance: of the cell file.
+        joints: index of the joint that each axis drives by the name of the axis, and of each joint without a motor.
+    """
     if workspace is None and clearance is None:
         return None
     declared = clearance or ClearanceSection()
-    links = {BASE_LINK: BASE, **{name: index for index, name in enumerate(axis_names)}}
+    links = {BASE_LINK: BASE, **joints}
     return Clearance(
         workspace=None if workspace is None else Box("workspace", workspace.lower_m, workspace.upper_m),
         minimum_m=declared.minimum_m,
@@ -79,7 +84,7 @@ def clearance_of(
 
 
 def clearance_faults(
-    workspace: WorkspaceSection | None, clearance: ClearanceSection | None, axis_names: Sequence[str]
+    workspace: WorkspaceSection | None, clearance: ClearanceSection | None, names: Sequence[str]
 ) -> Iterator[Fault]:
     """Find boxes with exchanged corners, and capsules on links that the cell does not have."""
     if workspace is not None:
@@ -89,8 +94,8 @@ def clearance_faults(
     for index, obstacle in enumerate(clearance.obstacles):
         yield from _box_faults(("clearance", "obstacles", index), obstacle)
     for index, capsule in enumerate(clearance.capsules):
-        if capsule.link not in (BASE_LINK, *axis_names):
-            expected = f"{BASE_LINK}, or the axis that moves it: {', '.join(axis_names)}"
+        if capsule.link not in (BASE_LINK, *names):
+            expected = f"{BASE_LINK}, or the axis that moves it: {', '.join(names)}"
             yield Fault(("clearance", "capsules", index, "link"), capsule.link, expected)
 
 

@@ -11,7 +11,6 @@ least h times that; else it is halved. So nothing is jumped over, whatever the s
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np

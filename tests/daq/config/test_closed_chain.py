@@ -205,3 +205,15 @@ def test_a_payload_is_drawn_in_the_frame_of_the_platform(tmp_path: Path) -> None
     expected = loaded.parameters - bare.parameters
     assert_allclose([known[name] for name in LINK_PARAMETERS], expected, rtol=1e-9, atol=1e-12)
     assert not np.allclose([known["mx"], known["my"], known["mz"]], 5.1 * np.array(centre))
+
+
+def test_a_capsule_hangs_on_the_joint_that_its_axis_drives(tmp_path: Path) -> None:
+    """The second crank of the five-bar is its third joint; a rod has no axis, and its joint's name."""
+    capsules = "".join(
+        f"    - {{name: {name}, link: {link}, from_m: [0, 0, 0], to_m: [0.1, 0, 0], radius_m: 0.02}}\n"
+        for name, link in (("crank", "crank-2"), ("rod", "elbow-1"))
+    )
+    cell = _cell(tmp_path, ("drive_train:\n", f"clearance:\n  capsules:\n{capsules}drive_train:\n"))
+    assert cell.clearance is not None
+    joints = [joint.name for joint in robot_of(cell).joints]
+    assert [joints[capsule.link] for capsule in cell.clearance.capsules] == ["crank-2", "elbow-1"]
