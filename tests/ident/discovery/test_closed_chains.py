@@ -82,7 +82,7 @@ def test_an_effect_is_named_on_its_joint(mechanism: Mechanism, joint: str, torqu
     named = joint if joint in made.model.robot.passive_names else axes[places.index(joint)]
     assert (accepted.name, accepted.axis) == (family, named)
     assert placed_effect(accepted, calibration)[0] == steps[-1].after.effects[0]
-    without = replace(calibration, effects=())
+    without = calibration_of(identified, axes, mechanism.gains)
     assert _error(calibration, made, runs[0]) < 0.8 * _error(without, made, runs[0])
 
 
