@@ -7,14 +7,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
+from ident.calibration import Calibration, calibration_of
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.discovery.evidence import gather
 from ident.discovery.loop import find_effects
+from ident.equations.rows import row_filter
+from ident.errors import CurrentReversed
+from ident.estimators.diagnosis import diagnose, exchanged_channels
+from ident.estimators.estimate import relative_error
 from ident.estimators.identify import identify
 from ident.model.closed_chain import TreeMotion
+from ident.prediction import measured_current, measured_torque, placed_effect, predict_torque, predicted_rows
 from tests.ident.closed_recordings import Made, recorded
 from tests.ident.mechanisms import FIVE_BAR, PLANAR, THREE_LEGS, Mechanism
 
@@ -62,13 +69,71 @@ def _planted(mechanism: Mechanism, joint: str, torque: Torque, size: float) -> t
 def test_an_effect_is_named_on_its_joint(mechanism: Mechanism, joint: str, torque: Torque, family: str) -> None:
     size = {"five-bar": 1.0, "planar": 0.06, "three-legs": 30.0}[mechanism.name]
     made, runs = _planted(mechanism, joint, torque, size)
-    start = gather(identify(made.model, runs, made.conditioning, keep_rows=True))
-    steps = find_effects(start, np.random.default_rng(0))
+    identified = identify(made.model, runs, made.conditioning, keep_rows=True)
+    steps = find_effects(gather(identified), np.random.default_rng(0))
     places = [one.name for one in made.model.robot.places]
     found = [(placed.effect.name, places[placed.axis]) for placed in steps[-1].after.effects]
     assert found == [(family, joint)]
     gains = steps[-1].after.estimate
     assert np.all(np.abs(gains.gains / mechanism.gains - 1.0) < 4.0 * gains.gains_std / np.abs(gains.gains))
+    axes = [f"J{number}" for number in range(1, len(mechanism.gains) + 1)]
+    calibration = calibration_of(identified, axes, mechanism.gains, steps=steps)
+    (accepted,) = calibration.effects
+    named = joint if joint in made.model.robot.passive_names else axes[places.index(joint)]
+    assert (accepted.name, accepted.axis) == (family, named)
+    assert placed_effect(accepted, calibration)[0] == steps[-1].after.effects[0]
+    without = calibration_of(identified, axes, mechanism.gains)
+    assert _error(calibration, made, runs[0]) < 0.8 * _error(without, made, runs[0])
+
+
+def _error(calibration: Calibration, made: Made, run: Run) -> float:
+    """Share of the torque of all axes that a calibration leaves."""
+    data = differentiate(run, made.model.drive_train, made.conditioning)
+    use = predicted_rows(made.model, data, made.conditioning)[0]
+    filter_ = row_filter(data, made.conditioning)
+    measured = filter_(measured_torque(calibration, made.model, data.current_a, data.motion()).T)
+    return relative_error(measured, filter_(predict_torque(calibration, made.model, data).T), use).total
+
+
+def test_internal_preload_is_in_no_comparison() -> None:
+    made = recorded(PLANAR, 7, seconds=12.0, noise_a=0.01)
+    identified = identify(made.model, made.runs, made.conditioning)
+    calibration = calibration_of(identified, ["J1", "J2", "J3", "J4"][: len(PLANAR.gains)], PLANAR.gains)
+    calibration = replace(
+        calibration,
+        gains=tuple(replace(g, value=float(v)) for g, v in zip(calibration.gains, PLANAR.gains, strict=True)),
+    )
+    data = differentiate(made.runs[0], made.model.drive_train, made.conditioning)
+    whole, _ = np.linalg.qr(made.model.follow(data.motion()).to_motors, mode="complete")
+    preload = whole[:, :, made.model.assembly.mobility :].sum(axis=2)
+    preloaded = data.current_a + 0.5 * preload / PLANAR.gains
+    arguments = calibration, made.model
+    seen = measured_torque(*arguments, data.current_a, data.motion())
+    assert_allclose(measured_torque(*arguments, preloaded, data.motion()), seen, rtol=0.0, atol=1e-10)
+    assert not np.allclose(
+        measured_torque(*arguments, preloaded), measured_torque(*arguments, data.current_a), atol=0.1
+    )
+    shown = measured_current(*arguments, preloaded, data.motion())
+    assert_allclose(shown * PLANAR.gains, seen, rtol=0.0, atol=1e-10)
+    assert _error(calibration, made, replace(made.runs[0], current_a=_at_samples(made.runs[0], preloaded))) < 5.0
+
+
+def _at_samples(run: Run, inner: FloatArray) -> FloatArray:
+    """Currents of a run from those of its differentiated samples, which lack the first and the last one."""
+    return np.concatenate((run.current_a[:1], inner, run.current_a[-1:]))
+
+
+@pytest.mark.parametrize("mechanism", [FIVE_BAR, PLANAR], ids=lambda one: one.name)
+def test_no_diagnosis_fails_on_a_closed_chain(mechanism: Mechanism) -> None:
+    made = recorded(mechanism, 7, seconds=12.0, noise_a=0.01)
+    axes, limit = [joint.name for joint in made.model.robot.axes], np.full(len(mechanism.gains), 1e3)
+    for gains in (None, mechanism.gains):
+        identified = identify(made.model, made.runs, made.conditioning, fixed_gains=gains)
+        assert diagnose(identified, axes, mechanism.gains, limit) == ()
+    assert exchanged_channels(made.model, made.runs, made.conditioning, axes) is None
+    turned = mechanism.gains * np.where(np.arange(len(mechanism.gains)) == 1, -1.0, 1.0)
+    with pytest.raises(CurrentReversed, match=axes[1]):
+        identify(made.model, made.runs, made.conditioning, fixed_gains=turned)
 
 
 def test_a_clean_closed_chain_has_no_effect() -> None:
