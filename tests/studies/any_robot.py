@@ -68,7 +68,7 @@ ROBOTS = (
     StudiedRobot("KR270", "kr270", "kr270", 60.0, 3, "tool"),
     StudiedRobot("seven-axis", "seven-axis", "seven-axis", 40.0, 2, "bar"),
     StudiedRobot("gantry", "gantry", "gantry", 60.0, 2, "box"),
-    StudiedRobot("five-bar", "five-bar", "five-bar", 40.0, 2, "block"),
+    StudiedRobot("five-bar", "five-bar", "five-bar", 60.0, 3, "block"),
     StudiedRobot("Orthoglide", "orthoglide", "orthoglide", 40.0, 3, "spindle"),
     StudiedRobot("DualV", "dualv", "dualv", 40.0, 2, "plate"),
 )
