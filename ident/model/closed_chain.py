@@ -31,7 +31,7 @@ LARGEST_GAP = 0.3  #: |φ| at the declared assembly pose, in units of the robot'
 LONGEST_STRIDE = 64
 """At most every so manyth sample is reached from the assembly pose; the others start from their neighbours."""
 STRIDE_RAD = 0.25  #: Largest motion between two such samples [rad, or m divided by the robot's size]
-STEP_RAD = 0.25  #: Longest step on that way [rad, or m divided by the robot's size]
+STEP_RAD = 0.15  #: Longest step on that way [rad, or m divided by the robot's size]
 LONGEST_STEP_RAD = 1.5  #: Longer steps of Newton lead to another pose, or nowhere
 MAX_ITERATIONS = 30
 

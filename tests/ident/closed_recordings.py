@@ -42,7 +42,7 @@ def axis_positions(mechanism: Mechanism, rng: np.random.Generator, seconds: floa
     robot = mechanism.robot
     home = mechanism.model.assembly.position_rad[list(robot.axis_joints)]
     if mechanism is not PLANAR:
-        reach = np.full(robot.axis_count, 0.6 if mechanism is FIVE_BAR else 0.08)
+        reach = np.full(robot.axis_count, 0.6 if mechanism is FIVE_BAR else 0.06)
         return home + positions(rng, seconds, RATE_HZ, reach)
     pose = positions(rng, seconds, RATE_HZ, np.array([0.08, 0.08, 0.4]))
     motors = np.stack([leg_angles(pose, leg)[0] for leg in range(4)], axis=1)

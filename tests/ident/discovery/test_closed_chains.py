@@ -67,7 +67,7 @@ def _planted(mechanism: Mechanism, joint: str, torque: Torque, size: float) -> t
 
 @pytest.mark.parametrize(("mechanism", "joint", "torque", "family"), CASES, ids=lambda one: getattr(one, "name", None))
 def test_an_effect_is_named_on_its_joint(mechanism: Mechanism, joint: str, torque: Torque, family: str) -> None:
-    size = {"five-bar": 1.0, "planar": 0.06, "three-legs": 30.0}[mechanism.name]
+    size = {"five-bar": 1.0, "planar": 0.06, "three-legs": 150.0}[mechanism.name]
     made, runs = _planted(mechanism, joint, torque, size)
     identified = identify(made.model, runs, made.conditioning, keep_rows=True)
     steps = find_effects(gather(identified), np.random.default_rng(0))

@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ident.errors import ModelError
-from ident.model.closed_chain import assemble, closure_equations, follow
+from ident.model.closed_chain import assemble, closure_equations, follow, reach
 from ident.model.model import DriveTrain, Model
 from ident.model.robot import DIRECTIONS, Closure, Motion, Place, Robot, poses
 from ident.model.urdf import LinkPair, read_urdf, robot_from_urdf
 from tests.ident.arms import SEVEN_AXES
+from tests.ident.closed_recordings import axis_positions
 from tests.ident.mechanisms import (
     BASE_M,
     CRANK_M,
@@ -270,3 +271,15 @@ def test_the_planar_platform_is_where_its_legs_hold_it() -> None:
     assert turned["motor-0"] + turned["elbow-0"] + turned["platform"] == pytest.approx(0.2)
     x, y, _ = LEGS[0]
     assert np.hypot(0.03 - HALF_M * np.cos(0.2) - x, -0.02 - HALF_M * np.sin(0.2) - y) > 0
+
+
+@pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
+def test_every_pose_of_a_recording_is_reached_from_the_assembly_pose(mechanism: Mechanism) -> None:
+    """Also when they are asked one by one, far from each other, as a planner does."""
+    robot, assembly = mechanism.robot, assemble(mechanism.robot)
+    motion = axis_positions(mechanism, np.random.default_rng(7), 40.0)
+    smooth = reach(robot, assembly, motion)
+    apart = reach(robot, assembly, motion[::97])
+    assert smooth.closed.all()
+    assert apart.closed.all()
+    assert np.max(np.abs(apart.position_rad - smooth.position_rad[::97])) < 1e-8
