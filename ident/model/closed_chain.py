@@ -129,7 +129,8 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
             fits them best.
 
     Raises:
-        ModelError: the loops cannot be closed at a position.
+        ModelError: the loops cannot be closed at a position, or it is close to a singularity, where small errors of
+            position are large forces.
     """
     motors, x, rest = list(robot.axis_joints), list(assembly.independent), list(assembly.dependent)
     measured = np.asarray(axes.position_rad, dtype=np.float64)
@@ -151,7 +152,13 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
     bias[:, rest] = -np.linalg.solve(r, np.einsum("kcr,kc->kr", q, turning)[..., None])[..., 0]
     acceleration_x = _least_squares(to_motors, np.asarray(axes.acceleration_rad_s2) - bias[:, motors])
     acceleration = np.einsum("knd,kd->kn", to_joints, acceleration_x) + bias
-    condition = np.linalg.norm(r, axis=(1, 2)) * np.linalg.norm(np.linalg.inv(r), axis=(1, 2))
+    condition = np.linalg.norm(r, axis=(1, 2)) * np.linalg.norm(_solve_each(r, np.eye(len(rest))), axis=(1, 2))
+    worst = int(np.argmax(condition))
+    if condition[worst] > LARGEST_CONDITION:
+        raise ModelError(
+            f"the motion comes close to a singularity at {_at(robot, measured[worst])}: condition "
+            f"{condition[worst]:.3g} of the closures; expected below {LARGEST_CONDITION:g}: record moves away from it"
+        )
     return TreeMotion(Motion(position, velocity, acceleration), to_joints, to_motors, condition)
 
 
@@ -181,12 +188,16 @@ def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatAr
     found = reach(robot, assembly, axes_rad)
     if not found.closed.all():
         worst = int(np.argmax(found.gap))
-        at = ", ".join(f"{joint.name} {value:.4g}" for joint, value in zip(robot.axes, axes_rad[worst], strict=True))
         raise ModelError(
-            f"the loops cannot be closed at {at} (rad or m): {found.gap[worst]:.2g} of the robot's size is left open; "
-            "expected positions inside the workspace: are signs, zeros and units of the axes right?"
+            f"the loops cannot be closed at {_at(robot, axes_rad[worst])}: {found.gap[worst]:.2g} of the robot's size "
+            "is left open; expected positions inside the workspace: are signs, zeros and units of the axes right?"
         )
     return found.position_rad
+
+
+def _at(robot: Robot, axes_rad: FloatArray) -> str:
+    named = zip(robot.axes, axes_rad, strict=True)
+    return ", ".join(f"{joint.name} {value:.4g}" for joint, value in named) + " (rad or m)"
 
 
 def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:

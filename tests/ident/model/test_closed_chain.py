@@ -261,6 +261,15 @@ def test_a_position_out_of_reach_is_named() -> None:
         follow(FIVE_BAR.robot, assemble(FIVE_BAR.robot), motion)
 
 
+def test_a_motion_through_a_singularity_is_refused_with_the_pose() -> None:
+    low = float(np.arccos((2.0 * ROD_M - BASE_M) / (2.0 * CRANK_M))) + 1e-7
+    home = assemble(FIVE_BAR.robot).position_rad[list(FIVE_BAR.robot.axis_joints)]
+    way = np.linspace(0.0, 1.0, 200)[:, None]
+    motion = home + way * (np.array([np.pi - low, low]) - home)
+    with pytest.raises(ModelError, match=r"close to a singularity at left-crank 2.73, right-crank 0.41"):
+        follow(FIVE_BAR.robot, assemble(FIVE_BAR.robot), Motion(motion, 0.0 * motion, 0.0 * motion))
+
+
 def test_the_planar_platform_is_where_its_legs_hold_it() -> None:
     pose = np.array([[0.03, -0.02, 0.2]])
     motors = np.stack([leg_angles(pose, leg)[0] for leg in range(4)], axis=1)
