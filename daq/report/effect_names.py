@@ -158,8 +158,10 @@ def curve_of(accepted: AcceptedEffect, calibration: Calibration) -> Curve | None
         rows = [index[name] for name in words]
         half_nm = _SIGMAS * np.sqrt(np.einsum("pk,pq,qk->k", shapes, covariance[np.ix_(rows, rows)], shapes))
     folded = isinstance(effect, Smooth) and effect.variable in FOLDED
-    # Along a prismatic joint without a motor, too, a coefficient's unit begins with that of its force.
-    force = accepted.coefficients[0].unit.partition("/")[0]
+    # Of a joint without a motor, which has no gain, a coefficient's unit begins with that of its force.
+    units = [gain.unit for gain in calibration.gains]
+    unit = units[placed.axis] if placed.axis < len(units) else accepted.coefficients[0].unit
+    force = unit.partition("/")[0]
     name, _, unit = variable_label(effect, calibration.places, force).partition(" [")
     name += ", magnitude" if folded else ""
     values = np.array([one.value for one in _in_order(accepted, placed)])

@@ -113,8 +113,11 @@ def rank_effects(
         own = (proposed or {}).get(axis, ())
         names = {family[0].name for family in own}
         shared = (family for family in families if family[0].name not in names)
-        shared = (family for family in shared if is_placeable(family[0], axis, search_problem.model.robot))
-        fitting = (tuple(one for one in family if one.fits_in(search_problem.runs, axis)) for family in (*shared, *own))
+        placeable = (
+            tuple(one for one in family if is_placeable(one, axis, search_problem.model.robot))
+            for family in (*shared, *own)
+        )
+        fitting = (tuple(one for one in family if one.fits_in(search_problem.runs, axis)) for family in placeable)
         tested += search_problem.test((family for family in fitting if family), axis)
     return rank_families(search_problem, tested, rng, gates or Gates(), known)
 

@@ -150,7 +150,7 @@ def _weighed(cell: Cell, _: Any) -> Iterator[RenderableType]:
         std=np.full(10, 0.00000123),
         identifiable=np.ones(10, dtype=bool),
     )
-    found: Any = SimpleNamespace(body=body, declared_kg=12.3, bare=(), help=())
+    found: Any = SimpleNamespace(cell=cell, body=body, declared_kg=12.3, bare=(), help=())
     return weighing.weighed_view(found)
 
 

@@ -285,7 +285,9 @@ def _family(name: str) -> tuple[Effect, ...]:
 
 
 def test_every_family_is_planted() -> None:
-    assert {case.family for case in (*CASES, *SMALL_CASES)} == {family[0].name for family in EFFECTS}
+    """Those of joints without a motor in test_closed_chains.py."""
+    on_axes = {family[0].name for family in EFFECTS if family[0].with_motor is not False}
+    assert {case.family for case in (*CASES, *SMALL_CASES)} == on_axes
 
 
 @pytest.mark.parametrize("planted", CASES, ids=lambda planted: planted.family)
