@@ -107,8 +107,8 @@ class Effect(ABC):
         return False
 
     @property
-    def with_motor(self) -> bool | None:
-        """Whether it acts on driven joints alone (True), on joints without a motor alone (False), or on both (None)."""
+    def with_motor(self) -> bool:
+        """Whether it acts on driven joints; else on joints without a motor."""
         return True
 
     @property
@@ -262,8 +262,7 @@ def at_joints(effect: Effect, axis: int, columns: FloatArray, drive_train: Drive
 
 def is_placeable(effect: Effect, axis: int, robot: Robot) -> bool:
     """Whether an effect can act on an axis; an effect of two joints is placed on the one with the lower number."""
-    driven = axis < robot.axis_count
-    if effect.with_motor is not None and effect.with_motor != driven:
+    if effect.with_motor != (axis < robot.axis_count):
         return False
     if effect.needs_revolute and robot.places[axis].kind is JointKind.PRISMATIC:
         return False

@@ -24,7 +24,7 @@ class RelativeError:
     total: float
 
     def at(self, place: int) -> float:
-        """Of an axis; of a joint without a motor, which come after the axes, that of all axes, which carry it."""
+        """Error of an axis [%]; for a joint without a motor (numbers above the axes'), that of all axes together."""
         return self.axes[place] if place < len(self.axes) else self.total
 
 

@@ -36,7 +36,7 @@ from tests.studies.fingerprint import digest, finish, is_finished
 OUT = Path("out/robot-study")
 SEEDS = (1, 2, 3, 4)
 SECOND_PLAN, SECOND_NOISE = 9, 99
-"""Of a seed's plans and noises, those of the first recording with the second body; the others count down."""
+"""Number of the plan and of the noise of a seed's first recording with the second body; later ones count down."""
 WITHIN = 1.96  #: σ of a 95 % interval
 
 

@@ -286,7 +286,7 @@ def _family(name: str) -> tuple[Effect, ...]:
 
 def test_every_family_is_planted() -> None:
     """Those of joints without a motor in test_closed_chains.py."""
-    on_axes = {family[0].name for family in EFFECTS if family[0].with_motor is not False}
+    on_axes = {family[0].name for family in EFFECTS if family[0].with_motor}
     assert {case.family for case in (*CASES, *SMALL_CASES)} == on_axes
 
 

@@ -253,7 +253,7 @@ def _duplicates(families: tuple[tuple[Effect, ...], ...]) -> list[tuple[str, str
     """Pairs of effects of which one's columns span the other's on the robot's joints: they cannot be distinguished."""
     train, first_run, rest = DriveTrain(np.diag(np.linspace(30.0, 50.0, JOINTS))), random_signals(5), random_signals(6)
     runs = (first_run, replace(rest, session_s=300.0 + rest.time_s))
-    spans: list[tuple[str, FloatArray, bool | None]] = []
+    spans: list[tuple[str, FloatArray, bool]] = []
     for effect in (effect for family in families for effect in family):
         torque = np.concatenate([at_joints(effect, 0, effect.columns(run, 0), train) for run in runs], axis=-1)
         columns = np.moveaxis(torque, 1, 0).reshape(torque.shape[1], -1)
@@ -261,7 +261,7 @@ def _duplicates(families: tuple[tuple[Effect, ...], ...]) -> list[tuple[str, str
         spans.append((f"{effect.name} ({settings})", np.linalg.svd(columns, full_matrices=False)[2], effect.with_motor))
     pairs = []
     for (one, first, driven), (other, second, other_driven) in combinations(spans, 2):
-        if {driven, other_driven} == {True, False}:  # never on the same joint
+        if driven != other_driven:  # never on the same joint
             continue
         smallest = np.linalg.svd(first @ second.T, compute_uv=False)[-1]
         if smallest > 1.0 - 1e-9:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -22,8 +23,6 @@ from tests.ident.mechanisms import (
     BASE_M,
     CRANK_M,
     FIVE_BAR,
-    HALF_M,
-    LEGS,
     MECHANISMS,
     PLANAR,
     ROD_M,
@@ -230,8 +229,8 @@ def test_a_robot_without_closures_is_the_special_case() -> None:
     assert Model(robot, DriveTrain(np.eye(7))).is_redundant is False
 
 
-def _wrong(mechanism: Mechanism, **changes: object) -> Robot:
-    return replace(mechanism, **changes).robot  # type: ignore[arg-type]
+def _wrong(mechanism: Mechanism, **changes: Any) -> Robot:
+    return replace(mechanism, **changes).robot
 
 
 def test_bad_descriptions_are_refused_by_name() -> None:
@@ -278,8 +277,6 @@ def test_the_planar_platform_is_where_its_legs_hold_it() -> None:
     found = follow(PLANAR.robot, assemble(PLANAR.robot), Motion(motors, 0 * motors, 0 * motors)).joints.position_rad
     turned = {joint.name: value for joint, value in zip(PLANAR.robot.joints, found[0], strict=True)}
     assert turned["motor-0"] + turned["elbow-0"] + turned["platform"] == pytest.approx(0.2)
-    x, y, _ = LEGS[0]
-    assert np.hypot(0.03 - HALF_M * np.cos(0.2) - x, -0.02 - HALF_M * np.sin(0.2) - y) > 0
 
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
