@@ -43,15 +43,15 @@ class Kind(IntEnum):
 
     READY = 0
     FRAME = 1
-    LOSSES = 2  #: Only the counts, where no frame followed that could carry them
+    LOSSES = 2  #: Only the counts and the time, where no frame followed that could carry them
     END = 3  #: The last record; its identifier is the error number
 
 
 RECORD = struct.Struct("=qqQQQIBB??8s")
 """One frame, or a note of the capture process.
 
-Time at which the kernel received the frame, by the wall clock [ns since 1970] and by the monotonic clock [ns]; frames
-lost so far in the socket's buffer, before it, and in the backlog; identifier and flags of struct can_frame; `Kind`;
+Time at which the kernel received the frame, by the wall clock [ns since 1970] and by the monotonic clock [ns]; a note
+has instead 0 and the monotonic time at which nothing was left to receive. Frames lost so far in the socket's buffer, before it, and in the backlog; identifier and flags of struct can_frame; `Kind`;
 bytes of data; whether it was sent by this very socket, and by any program of this machine; eight bytes.
 """
 
@@ -126,6 +126,7 @@ class Capture:
         self._backlog_dropped = self._interface_dropped = 0
         self._counters = tuple(f"/sys/class/net/{interface}/statistics/{name}" for name in INTERFACE_COUNTERS)
         self._interface_before = self._read_interface()
+        self._empty_ns = 0
         self._reported_drops = (0, 0, 0)
         self._frame = bytearray(FRAME.size)
 
@@ -149,7 +150,8 @@ class Capture:
                     poller.unregister(self._bus)
                     ended = True
             elif not ready:
-                self._now_ns = time.monotonic_ns()
+                self._empty_ns = self._now_ns = time.monotonic_ns()
+                self._note(Kind.LOSSES)  # the parent distinguishes a silent bus from a capture process that was stopped
                 # A frame reports the drops before it, and there may be none: ask the socket itself.
                 with suppress(OSError):  # before Linux 4.12 the next frame reports it
                     counters = self._bus.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size)
@@ -209,7 +211,7 @@ class Capture:
     def _note(self, kind: Kind, number: int = 0) -> None:
         """Append a note to the backlog, even when that is full: notes are few."""
         self._reported_drops = self._counts
-        self._backlog += RECORD.pack(0, 0, *self._reported_drops, number, kind, 0, False, False, bytes(8))
+        self._backlog += RECORD.pack(0, self._empty_ns, *self._reported_drops, number, kind, 0, False, False, bytes(8))
 
     @property
     def _counts(self) -> tuple[int, int, int]:

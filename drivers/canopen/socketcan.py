@@ -74,6 +74,15 @@ def losses_of(bus: can.BusABC) -> Losses:
     return found if isinstance(found, Losses) else NO_LOSSES
 
 
+def read_until_ns(bus: can.BusABC) -> int | None:
+    """Return the monotonic time up to which every frame of a bus has been received; None where frames have no stamps.
+
+    On a bus with stamps our own SYNC comes back, in its place among the other frames.
+    """
+    found = getattr(bus, "read_until_ns", None)
+    return found if isinstance(found, int) else None
+
+
 def remarks_of(bus: can.BusABC) -> tuple[str, ...]:
     """Return remarks for the operator on how a bus was opened."""
     return tuple(getattr(bus, "remarks", ()))
@@ -138,6 +147,7 @@ class SocketcanBus(BurstBus):
     ) -> None:
         self.channel_info = f"socketcan {channel}"
         self.losses = NO_LOSSES  #: Of the frames received so far
+        self.read_until_ns = 0  #: Monotonic time up to which every frame has been received
         self.remarks = remarks
         self._channel = channel
         self._received = deque()
@@ -231,6 +241,7 @@ class SocketcanBus(BurstBus):
         whole = len(chunk) - len(chunk) % RECORD.size
         rest, received, ready, end = deque((chunk[whole:],)), self._received.copy(), self._ready, self._end
         lost: list[int] = list(self.losses)
+        monotonic_ns = self.read_until_ns
         for record in RECORD.iter_unpack(memoryview(chunk)[:whole]):
             kernel_ns, monotonic_ns, *lost, can_id, kind, length, own, local, data = record
             if kind == Kind.FRAME:
@@ -241,9 +252,10 @@ class SocketcanBus(BurstBus):
                 ready = True
             elif kind == Kind.END:
                 end = _reason(can_id)
-        losses = Losses(*lost)
+        losses, until_ns = Losses(*lost), max(monotonic_ns, self.read_until_ns)
         # No call from here on: the state changes whole, or not at all.
         self._chunks, self._received, self._ready, self._end, self.losses = rest, received, ready, end, losses
+        self.read_until_ns = until_ns
 
     def _message(
         self, kernel_ns: int, monotonic_ns: int, can_id: int, data: bytes, own: bool, local: bool

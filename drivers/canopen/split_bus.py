@@ -3,7 +3,8 @@
 A frame that carries a node id goes to the bus of that node: SDO, PDO and EMCY by the lower seven bits of their COB-ID
 (CiA 301, predefined connection set), NMT by its second byte. Frames without a node go to all buses: SYNC, NMT to all,
 and the heartbeat of the recorder. Received frames come in the order of their time stamps, which all interfaces take
-from clocks of this computer: monotonic where all have such stamps, else wall time.
+from clocks of this computer: monotonic where all have such stamps, else wall time. Where all have such stamps, our own
+SYNC comes when it has been received from every bus: all frames that arrived on their bus before it have come by then.
 
 A bus that fails is reported once, as a BusError with its name. The others go on, so that their axes can be stopped and
 restored; the nodes of the failed bus are silent from then on.
@@ -20,7 +21,7 @@ from itertools import groupby
 import can
 
 from drivers.canopen.bus import BusAddress, open_bus, send_burst
-from drivers.canopen.socketcan import CapturedMessage, Losses, losses_of, remarks_of
+from drivers.canopen.socketcan import CapturedMessage, Losses, losses_of, read_until_ns, remarks_of
 from drivers.errors import BusError, NodeMisplaced, node_label
 
 ALTERNATION_S = 0.0005  #: Time to wait at one bus while another may receive, where one of them has no file descriptor
@@ -115,6 +116,7 @@ class SplitBus(can.BusABC):
         self._misplaced: set[tuple[int, int]] = set()
         self._last = self._run = self._turn = 0
         self._handles = tuple(_fileno(end) for end in self._ends)
+        self._stamped = all(read_until_ns(end) is not None for end in self._ends)
         super().__init__(channel=str(address))
 
     @property
@@ -126,6 +128,13 @@ class SplitBus(can.BusABC):
     def losses(self) -> Losses:
         """Losses of all buses together."""
         return Losses(*map(sum, zip(*map(losses_of, self._ends), strict=True)))
+
+    @property
+    def read_until_ns(self) -> int | None:
+        """Monotonic time up to which every frame of every bus has been received; None where one has no stamps."""
+        times = [read_until_ns(end) for index, end in enumerate(self._ends) if index not in self._failed]
+        known = [time_ns for time_ns in times if time_ns is not None]
+        return min(known) if known and len(known) == len(times) else None
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -195,8 +204,15 @@ class SplitBus(can.BusABC):
         return message
 
     def _oldest(self) -> int | None:
-        """Return the bus of the oldest waiting frame; None where there is none."""
+        """Return the bus of the oldest waiting frame; None where there is none, or only our SYNC of some buses."""
         waiting = [(message, index) for index, message in enumerate(self._waiting) if message is not None]
+        if self._stamped:
+            received = [(message, index) for message, index in waiting if message.is_rx]
+            if waiting and not received and len(waiting) == len(self._ends) - len(self._failed):
+                first = waiting[0][1]
+                self._waiting = [head if index == first else None for index, head in enumerate(self._waiting)]
+                return first
+            waiting = received
         # The wall clock can be set between two frames, and a float of its seconds has steps of 200 ns.
         heads: list[tuple[float, int]] = [
             (m.monotonic_ns, index) for m, index in waiting if isinstance(m, CapturedMessage)
@@ -227,7 +243,7 @@ class SplitBus(can.BusABC):
 
     def _wait(self, left_s: float | None) -> None:
         """Wait until a frame comes on one of the buses, or the time is over."""
-        live = [index for index in range(len(self._ends)) if index not in self._failed]
+        live = [n for n, head in enumerate(self._waiting) if head is None and n not in self._failed]
         handles = [handle for index in live if (handle := self._handles[index]) is not None]
         if len(handles) == len(live):
             select.select(handles, (), (), left_s)
@@ -240,6 +256,8 @@ class SplitBus(can.BusABC):
     def _failure(self, index: int, error: Exception) -> BusError:
         """Leave this bus out from now on."""
         self._failed.add(index)
+        if (head := self._waiting[index]) is not None and not head.is_rx:
+            self._waiting[index] = None
         reason = error.reason if isinstance(error, BusError) else str(error) or type(error).__name__
         failure = BusError(self._names[index], reason)
         failure.__cause__ = error

@@ -1,7 +1,8 @@
 """The answers of the axes to SYNC: the values in each TPDO, and the SYNC to which it belongs.
 
-A TPDO carries no cycle number. An answer that comes after the next SYNC can be distinguished from that SYNC's own
-answer only by waiting for both. After a missing frame this is done for one cycle, before the frame counts as lost.
+An answer belongs to the SYNC before it on the bus. But a TPDO carries no cycle number: after a missing answer, the next
+one may be that answer, late. Only if two come is it known which is which. If one comes, it is doubtful: its sample says
+that it is missing too, and counts as such. The answers after that are no longer in doubt.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ class StreamStatistics:
 
     cycles: int = 0  #: SYNCs sent, or followed
     frames: int = 0  #: answers used
-    missing: int = 0  #: answers that did not come in their cycle
-    late: int = 0  #: answers that came in a later cycle, where that could be known
+    missing: int = 0  #: answers that did not come in their cycle, and doubtful ones
+    late: int = 0  #: answers that came in the next cycle, and doubtful ones
     duplicate: int = 0  #: second answers of an axis to one SYNC
     surplus: int = 0  #: PDOs of an axis of the cell that are not mapped
     wrong_length: int = 0  #: answers whose length differs from the mapping; they count as missing too
@@ -58,20 +59,28 @@ def slots_of(axes: Sequence[Axis]) -> dict[int, Slot]:
 
 
 class Answers:
-    """Assigns answers to cycles and counts them."""
+    """Assigns answers to cycles and counts them.
 
-    def __init__(self, axes: Sequence[Axis]) -> None:
+    Args:
+        axes: of the cell.
+        certain: no answer is late, because each cycle waited long enough for it; none is doubtful then.
+    """
+
+    def __init__(self, axes: Sequence[Axis], certain: bool = False) -> None:
+        self._certain = certain
         self.slots = slots_of(axes)  #: By COB-ID
         self.values = [0] * (3 * len(axes))  #: Last value of each column
         self.counts: Counter[str] = Counter()  #: By their names in StreamStatistics
         self._all = (1 << len(self.slots)) - 1
-        self._owed_slots = 0  # slots whose answer to an earlier SYNC may still come
+        self._owed_slots = 0  # slots whose answer to the SYNC before may still come
         self._still_owed = self._answered_slots = 0
+        self._before: dict[int, list[int]] = {}  # values before a doubtful answer, by the bit of its slot
         self._last_data: dict[int, bytearray] = {}
 
     def begin(self) -> None:
         """Begin a cycle."""
         self._still_owed, self._answered_slots = self._owed_slots, 0
+        self._before.clear()
 
     @property
     def complete(self) -> bool:
@@ -89,12 +98,15 @@ class Answers:
             if self._still_owed & slot.bit:
                 # The first one was the late answer to an earlier SYNC, this one belongs to the current SYNC.
                 self._still_owed &= ~slot.bit
+                self._before.pop(slot.bit, None)
                 self.counts["late"] += 1
             else:
                 self.counts["duplicate"] += 1
                 if self._last_data.get(identifier) == data:
                     return
                 # The second answer differs: the first may have been a repetition of the cycle before.
+        elif self._still_owed & slot.bit and not self._certain:
+            self._before[slot.bit] = [self.values[column] for column in slot.columns]
         self._answered_slots |= slot.bit
         self._last_data[identifier] = data
         for column, value in zip(slot.columns, slot.layout.unpack(data), strict=True):
@@ -110,13 +122,19 @@ class Answers:
 
     def end(self) -> int:
         """End a cycle; returns the axes without a complete answer, bit i for axis i."""
-        # If only one answer came while two were owed, the older frame is lost; the answer counts for this cycle.
         self._owed_slots = self._all & ~self._answered_slots
-        self.counts["frames"] += self._answered_slots.bit_count()
+        if not (self._owed_slots or self._before):
+            self.counts["frames"] += self._answered_slots.bit_count()
+            return 0
         absent = 0
-        if self._owed_slots:
-            for slot in self.slots.values():
-                if self._owed_slots & slot.bit:
-                    absent |= 1 << slot.axis
-                    self.counts["missing"] += 1
+        for slot in self.slots.values():
+            if slot.bit in self._before:
+                for column, value in zip(slot.columns, self._before[slot.bit], strict=True):
+                    self.values[column] = value
+                self.counts["late"] += 1
+            elif not self._owed_slots & slot.bit:
+                self.counts["frames"] += 1
+                continue
+            absent |= 1 << slot.axis
+            self.counts["missing"] += 1
         return absent

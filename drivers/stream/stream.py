@@ -1,11 +1,15 @@
 """The SYNC-grouped stream: one SYNC, sent or followed, the answers of all axes, one Sample.
 
-The stream is the only reader of the bus while it runs. Which answer belongs to which SYNC is decided in answers.py, the
-pacing is described in sync.py.
+The stream is the only reader of the bus while it runs. Where frames have the kernel's stamps, our own SYNC comes back
+among them, and a cycle lasts from one SYNC to the next in the order of the frames, however late they are read: SYNC is
+sent on schedule while the stream waits for frames. Where they have none, a cycle ends by the clock, after everything
+that has arrived was read. Which answer belongs to which SYNC is decided in answers.py, the pacing is described in
+sync.py.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 
 import can
@@ -13,7 +17,7 @@ import can
 from drivers.canopen.bus import bus_errors
 from drivers.canopen.link import SYNC_COB_ID
 from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.socketcan import CapturedMessage, Losses, losses_of, remarks_of
+from drivers.canopen.socketcan import CapturedMessage, Losses, losses_of, read_until_ns, remarks_of
 from drivers.errors import BusError, DriveFault, NodeMisplaced, SampleLost, node_label
 from drivers.motion.watch import Watch
 from drivers.stream.answers import Answers, Slot, StreamStatistics
@@ -24,6 +28,7 @@ SHORTENED, STRAGGLING = 16, 4
 """Divisors of a lockstep time-out: if no axis answered the last SYNC, and once another axis has answered this one."""
 
 LARGEST_LAG_NS = 1_000_000_000  #: Largest delay of the reader behind the bus; older data cannot protect moving axes
+PATIENCE_S = 0.02  #: Time between two looks whether the capture process has received what came before a deadline
 FRAMES_PER_S = 50_000
 """Frames per second of time-out to read past the deadline before a producer is dead; two full buses carry fewer."""
 
@@ -80,11 +85,14 @@ class SyncStream:
         #: Returns frames that may wait, for a cycle that has no others to send; receives the last SYNC's time [ns].
         self.spare: Callable[[int], Sequence[can.Message]] = nothing_to_send
         self._link = network.link
-        self._answers = Answers(network.axes)
+        self._answers = Answers(network.axes, certain=isinstance(pacing, LockstepSync))
         self._sync = can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False)
         self._last_wrong_length: dict[int, int] = {}  # cycle, by COB-ID
         self._answered_ns = self._next_sync_ns = self._first_sync_ns = self._last_sync_ns = 0
         self._early_sync: can.Message | None = None
+        # Each SYNC that was sent and has not come back: its time by the clock [ns], and the periods left out before it.
+        # None where SYNC does not come back.
+        self._sent: deque[tuple[int, int]] | None = None
         self._rate = SyncRate(pacing.period_ns)
         self._behind = self._waited = self._cycle_over = False
         self._base = self._counted = self._losses = Losses()
@@ -129,7 +137,13 @@ class SyncStream:
                 if self._cycles == 0:
                     self._begin()
                 pacing = self.pacing
-                self._collect(self._follow_sync(pacing) if isinstance(pacing, FollowedSync) else self._send_sync())
+                if isinstance(pacing, FollowedSync):
+                    deadline_ns = self._follow_sync(pacing)
+                elif self._sent is not None:
+                    deadline_ns = self._open_own_cycle()
+                else:
+                    deadline_ns = self._send_sync()
+                self._collect(deadline_ns)
         except (BusError, NodeMisplaced) as error:
             self.emit(CellEvent(self.time_ns, None, EventKind.BUS_LOST, 0, str(error)))
             raise
@@ -138,6 +152,8 @@ class SyncStream:
     def _begin(self) -> None:
         """Discard the frames from before the first SYNC; losses before it do not count."""
         bus, begun_ns = self._link.bus, self.pacing.clock()
+        if isinstance(self.pacing, TimedSync) and read_until_ns(bus) is not None:
+            self._sent = deque()
         for message in self._waiting():
             fresh = isinstance(message, CapturedMessage) and message.monotonic_ns > begun_ns
             if fresh and isinstance(self.pacing, FollowedSync) and _is_sync(message):
@@ -169,13 +185,21 @@ class SyncStream:
 
     def _until_sync(self, pacing: FollowedSync, end_ns: int) -> can.Message | None:
         """Return the next frame that arrived before a deadline, even if it is read late; None without any."""
+        bus = self._link.bus
         self._link.beat()
-        while (left_ns := end_ns - pacing.clock()) > 0:
-            message = self._link.bus.recv(left_ns * 1e-9)
-            if message is not None:
+        while (left_ns := end_ns - (now_ns := pacing.clock())) > 0:
+            if (message := bus.recv(left_ns * 1e-9)) is not None:
                 return message
         self._reads_past_deadline += 1
-        return self._link.bus.recv(0.0) if self._reads_past_deadline <= FRAMES_PER_S * pacing.timeout_s else None
+        if self._reads_past_deadline > FRAMES_PER_S * pacing.timeout_s:
+            return None
+        message = bus.recv(0.0)
+        # A capture process that was stopped has not received all of it yet.
+        while message is None and now_ns < end_ns + LARGEST_LAG_NS and (read_until_ns(bus) or end_ns) < end_ns:
+            self._link.beat()
+            message = bus.recv(PATIENCE_S)
+            now_ns = pacing.clock()
+        return message
 
     def _follow_sync(self, pacing: FollowedSync) -> int:
         """Send waiting frames, and read until the next SYNC; returns the deadline of the SYNC after it."""
@@ -226,6 +250,48 @@ class SyncStream:
         self._next_sync_ns = pacing.clock()
         return self._send_sync()
 
+    def _open_own_cycle(self) -> int:
+        """Read until our next SYNC comes back, which is sent when it is due; returns the time of the one after it."""
+        if self._cycles == 0:
+            self._next_sync_ns = self._answered_ns = self.pacing.clock()
+        sync, self._early_sync = self._early_sync, None
+        while sync is None:
+            message = self._read_and_send()
+            if message is None:
+                return self._send_sync()
+            if _is_sync(message) and not message.is_rx:
+                sync = message
+            else:
+                self._between_cycles(message)
+        now_ns = self.pacing.clock()
+        at_ns = sync.monotonic_ns if isinstance(sync, CapturedMessage) else now_ns
+        self._too_late(now_ns - at_ns)
+        self._skipped += self._sent.popleft()[1] if self._sent else 0
+        if self._cycles == 0:
+            self._first_sync_ns = at_ns
+        self.time_ns = self.pacing.start_ns + at_ns - self._first_sync_ns
+        self._cycles += 1
+        return self._next_sync_ns
+
+    def _read_and_send(self) -> can.Message | None:
+        """Return the next frame, and send SYNC when it is due; None once SYNC does not come back."""
+        sent = self._sent
+        while sent is not None:
+            self._link.beat()
+            now_ns = self.pacing.clock()
+            if now_ns >= self._next_sync_ns:
+                late = (now_ns - self._next_sync_ns) // self.pacing.period_ns
+                self._too_late(late * self.pacing.period_ns)
+                self._next_sync_ns += (late + 1) * self.pacing.period_ns
+                self._link.send((*self._take_outgoing(), self._sync))
+                sent.append((now_ns, late))
+            if sent and self._too_late(now_ns - sent[0][0]):
+                self._skipped += sum(late for _, late in sent) + len(sent)
+                self._sent = sent = None  # from now on, cycles end by the clock
+            elif (message := self._link.bus.recv((self._next_sync_ns - now_ns) * 1e-9)) is not None:
+                return message
+        return None
+
     def _send_sync(self) -> int:
         """Send waiting frames and the SYNC; returns the deadline of its answers by the clock."""
         pacing, bus = self.pacing, self._link.bus
@@ -270,18 +336,18 @@ class SyncStream:
                 self._early_sync = message
                 return None
             return message
+        if self._sent is not None:
+            message = self._read_and_send()
+            if message is not None and _is_sync(message) and not message.is_rx:
+                self._early_sync = message
+                return None
+            return message
         while (left_ns := deadline_ns - clock()) > 0:
             message = recv(left_ns * 1e-9)
-            if message is None:
-                continue
-            if message.is_rx or not isinstance(message, CapturedMessage):
+            if message is not None and message.is_rx:
                 return message
-            if isinstance(self.pacing, TimedSync):  # the kernel's time of our SYNC; lockstep keeps its made-up time
-                self._too_late(clock() - message.monotonic_ns)
-                if self._cycles == 1:
-                    self._first_sync_ns = message.monotonic_ns
-                self.time_ns = self.pacing.start_ns + message.monotonic_ns - self._first_sync_ns
-        return None
+        # What has arrived belongs to this cycle: the next SYNC is not sent yet.
+        return None if -left_ns > LARGEST_LAG_NS else recv(0.0)
 
     def _collect(self, deadline_ns: int) -> None:
         """Receive until all answers are there, or the cycle is over."""

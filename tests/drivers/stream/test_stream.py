@@ -299,7 +299,7 @@ def test_a_timed_cycle_does_not_wait_beyond_its_period(timed: Prepared) -> None:
     stream, bus, _ = timed
     drop(bus, 0x181, range(1, 3))
     samples = [next(stream) for _ in range(5)]
-    assert [sample.missing for sample in samples] == [0, 1, 1, 0, 0]
+    assert [sample.missing for sample in samples] == [0, 1, 1, 1, 0]  # the answer after it may be a late one
     assert [sample.time_ns - samples[0].time_ns for sample in samples] == [PERIOD_NS * k for k in range(5)]
 
 
@@ -433,10 +433,11 @@ def test_a_missing_answer_ends_with_the_next_sync(followed: Followed) -> None:
     bus.tamper = lambda message: (message,)
     producer.pulse()
     producer.pulse()
+    producer.pulse()
     samples = [next(stream) for _ in range(3)]
-    assert [sample.missing for sample in samples] == [2, 0, 0]
-    assert [sample.position_counts for sample in samples] == [(1, 0), (2, 2), (3, 3)]
-    assert stream.statistics == StreamStatistics(cycles=4, frames=7, missing=1)
+    assert [sample.missing for sample in samples] == [2, 2, 0]  # the answer after it may be a late one
+    assert [sample.position_counts for sample in samples] == [(1, 0), (2, 0), (3, 3)]
+    assert stream.statistics == StreamStatistics(cycles=4, frames=6, missing=2, late=1)
 
 
 def test_what_is_to_be_sent_goes_out_at_once(followed: Followed) -> None:
@@ -486,7 +487,7 @@ def test_a_producer_that_dies_before_an_answer_came_is_noticed_in_one_bound(foll
     bus.tamper = lambda message: (message,)
     begun_ns = bus.clock.now_ns
     assert stream.advance().missing == 2
-    assert stream.advance().missing == 0
+    assert stream.advance().missing == 2  # by a SYNC of ours; the answer may be a late one
     assert bus.clock.now_ns - begun_ns <= 17_000_000
     assert EventKind.SYNC_LOST in [event.kind for event in events]
 
@@ -611,7 +612,9 @@ def test_the_kernels_sync_never_comes_from_the_wire(followed: Followed) -> None:
 
 @settings(deadline=None)
 @given(st.sets(st.tuples(st.integers(0, 29), st.sampled_from((0x181, 0x182))), max_size=12))
-def test_every_answer_dropped_from_a_followed_cycle_is_exactly_one_bit(dropped: set[tuple[int, int]]) -> None:
+def test_an_answer_dropped_from_a_followed_cycle_is_a_bit_and_the_next_is_doubtful(
+    dropped: set[tuple[int, int]],
+) -> None:
     for stream, bus, producer, _ in followed_stream():
         stream.max_missing_cycles = 40
         next(stream)
@@ -620,13 +623,15 @@ def test_every_answer_dropped_from_a_followed_cycle_is_exactly_one_bit(dropped: 
             producer.pulse()
         samples = [next(stream) for _ in range(30)]
         for number, sample in enumerate(samples):
-            expected = sum(axis for axis, cob in ((1, 0x181), (2, 0x182)) if (number, cob) in dropped)
+            expected = sum(
+                axis for axis, cob in ((1, 0x181), (2, 0x182)) if {(number, cob), (number - 1, cob)} & dropped
+            )
             assert sample.missing == expected
             for axis in range(2):
                 if not sample.missing >> axis & 1:
                     assert sample.position_counts[axis] == number + 1
-        assert stream.statistics.missing == len(dropped)
-        assert stream.statistics.late == 0
+        assert stream.statistics.missing == sum(sample.missing.bit_count() for sample in samples)
+        assert stream.statistics.missing - stream.statistics.late == len(dropped)
 
 
 @settings(deadline=None)
@@ -667,6 +672,7 @@ def test_what_is_to_be_known_of_the_bus_is_reported_at_the_start(lockstep: Prepa
 def test_a_timed_sync_has_the_kernels_time(timed: Prepared) -> None:
     """Our own SYNC comes back with it, before its answers."""
     stream, bus, _ = timed
+    bus.read_until_ns = 0  # type: ignore[attr-defined]
     send = bus.send
 
     def echo(msg: can.Message, timeout: float | None = None) -> None:

@@ -1,0 +1,199 @@
+"""Samples do not depend on when frames are read: made-up frames with stamps, on a made-up clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+
+import can
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.canopen.bus import BusAddress
+from drivers.canopen.socketcan import CapturedMessage
+from drivers.canopen.split_bus import BusPart, SplitAddress, SplitBus
+from drivers.errors import BusError, DriverError
+from drivers.stream.answers import StreamStatistics
+from drivers.stream.sample import Sample
+from drivers.stream.stream import SyncStream
+from drivers.stream.sync import FollowedSync, TimedSync
+from tests.drivers.scripted import PERIOD_NS, FakeClock, cell
+
+CYCLES = 12
+NEVER = 10**12
+SECOND_NS = 1_000_000_000
+
+
+@dataclass
+class Timeline(can.BusABC):
+    """A bus whose frames have their times, with a capture process that is stopped now and then.
+
+    Attributes:
+        clock: passes only while somebody waits.
+        delays_ns: of the answers of each axis to each SYNC; later than a period, they come after the next SYNC.
+        stops_ns: begin and end of the times, since the first SYNC, in which the capture process is stopped.
+        producer: SYNC comes by itself.
+        nodes: that are on this bus.
+    """
+
+    clock: FakeClock
+    delays_ns: Sequence[Sequence[int]]
+    stops_ns: Sequence[tuple[int, int]] = ()
+    producer: bool = False
+    nodes: Sequence[int] = (1, 2)
+    begun_ns: int = 0
+    syncs: int = 0
+    sent_ns: list[int] = field(default_factory=list)
+    _frames: list[tuple[int, int, CapturedMessage]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.begun_ns = self.clock.now_ns + (PERIOD_NS if self.producer else 0)
+        super().__init__(channel="timeline")
+
+    @property
+    def read_until_ns(self) -> int:
+        now_ns = self.clock.now_ns - self.begun_ns
+        return self.begun_ns + min([now_ns, *(begin for begin, end in self.stops_ns if begin <= now_ns < end)])
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        if msg.arbitration_id == 0x80:
+            if not self.syncs:
+                self.begun_ns = self.clock.now_ns
+            self._sync(self.clock.now_ns, is_rx=False)
+
+    def _sync(self, at_ns: int, *, is_rx: bool) -> None:
+        self._put(at_ns, 0x80, b"", is_rx=is_rx)
+        self.sent_ns.append(at_ns)
+        for node in self.nodes:
+            delay_ns = self.delays_ns[node - 1][self.syncs] if self.syncs < CYCLES else 1
+            data = self.syncs.to_bytes(4, "little") + b"\0\0\x50\x02"
+            if delay_ns < NEVER:
+                self._put(at_ns + 1 + delay_ns, 0x180 + node, data)
+        self.syncs += 1
+
+    def _put(self, at_ns: int, identifier: int, data: bytes, *, is_rx: bool = True) -> None:
+        message = CapturedMessage(arbitration_id=identifier, is_extended_id=False, data=data, is_rx=is_rx)
+        message.kernel_ns, message.monotonic_ns, message.local = at_ns, at_ns, True
+        heappush(self._frames, (at_ns, len(self.sent_ns) * 10 + identifier % 0x80, message))
+
+    def _readable_ns(self, at_ns: int) -> int:
+        return max([at_ns, *(self.begun_ns + end for begin, end in self.stops_ns if begin <= at_ns - self.begun_ns)])
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        end_ns = self.clock.now_ns + (max(1, round(timeout * 1e9)) if timeout else 0)
+        while self.producer and self.begun_ns + self.syncs * PERIOD_NS <= end_ns:
+            self._sync(self.begun_ns + self.syncs * PERIOD_NS, is_rx=True)
+        if self._frames and (readable_ns := self._readable_ns(self._frames[0][0])) <= end_ns:
+            self.clock.now_ns = max(self.clock.now_ns, readable_ns)
+            return heappop(self._frames)[2]
+        self.clock.now_ns = end_ns
+        return None
+
+
+def run(
+    delays_ns: Sequence[Sequence[int]], stops_ns: Sequence[tuple[int, int]], *, producer: bool, buses: int = 1
+) -> tuple[list[Sample], StreamStatistics, list[DriverError]]:
+    """Samples, statistics and faults of the bus of a stream; on two buses the capture process of the first stops."""
+    network, scripted = cell()
+    clock, faults = scripted.clock, list[DriverError]()
+    ends = [
+        Timeline(clock, delays_ns, () if number else stops_ns, producer, (1, 2) if buses == 1 else (number + 1,))
+        for number in range(buses)
+    ]
+    bus: can.BusABC = ends[0]
+    if buses == 2:
+        parts = [BusPart(f"{n}", BusAddress("virtual", f"{n}"), frozenset((n + 1,))) for n in range(2)]
+        bus = SplitBus(SplitAddress(tuple(parts)), ends, lambda: clock.now_ns * 1e-9)
+    network.link._bus = bus
+    network.link.sync_producer = "J1" if producer else None
+    pacing = FollowedSync(PERIOD_NS, "J1", timeout_s=0.1, clock=clock) if producer else TimedSync(PERIOD_NS, 0, clock)
+    stream = SyncStream(network, pacing)
+    samples = [stream.advance() for _ in range(CYCLES)]
+    found = stream.statistics
+    while True:
+        try:
+            stream.check()
+        except DriverError as fault:
+            faults.append(fault)
+        else:
+            break
+    bus.shutdown()
+    return samples, found, faults
+
+
+delays = st.one_of(st.integers(0, PERIOD_NS - 2000), st.integers(0, PERIOD_NS - 2000), st.just(NEVER))
+late_too = st.one_of(delays, st.integers(PERIOD_NS, 2 * PERIOD_NS - 2000))
+stops = st.lists(
+    st.tuples(st.integers(0, CYCLES * PERIOD_NS), st.sampled_from((1, 3, 10))), max_size=3
+).map(lambda found: [(begin, begin + 1_000_000 * ms) for begin, ms in sorted(found)])  # fmt: skip
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.lists(st.lists(late_too, min_size=CYCLES, max_size=CYCLES), min_size=2, max_size=2), stops, st.booleans())
+def test_a_capture_process_that_is_stopped_changes_no_sample(
+    delays_ns: list[list[int]], stops_ns: list[tuple[int, int]], producer: bool
+) -> None:
+    plain, counts, _ = run(delays_ns, (), producer=producer)
+    stopped, counts_stopped, faults = run(delays_ns, stops_ns, producer=producer)
+    assert stopped == plain
+    assert counts_stopped == counts
+    assert [fault for fault in faults if isinstance(fault, BusError)] == []
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.lists(st.lists(late_too, min_size=CYCLES, max_size=CYCLES), min_size=2, max_size=2), stops, st.booleans())
+def test_no_sample_without_its_bit_holds_another_cycles_answer(
+    delays_ns: list[list[int]], stops_ns: list[tuple[int, int]], producer: bool
+) -> None:
+    # No queue of answers: a late one is followed by one in time.
+    for axis in delays_ns:
+        for number, delay_ns in enumerate(axis[1:], start=1):
+            if PERIOD_NS <= axis[number - 1] < NEVER and delay_ns >= PERIOD_NS:
+                axis[number] = 0
+            if PERIOD_NS <= axis[number - 1] < NEVER and axis[number] + PERIOD_NS <= axis[number - 1]:
+                axis[number] = axis[number - 1] - PERIOD_NS + 1000
+    samples, _, _ = run(delays_ns, stops_ns, producer=producer)
+    for axis in range(2):
+        for sample in samples:
+            if not sample.missing >> axis & 1:
+                assert sample.position_counts[axis] == sample.cycle
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.lists(st.lists(delays, min_size=CYCLES, max_size=CYCLES), min_size=2, max_size=2), stops)
+def test_each_bus_of_two_has_its_own_order(delays_ns: list[list[int]], stops_ns: list[tuple[int, int]]) -> None:
+    plain, counts, _ = run(delays_ns, (), producer=False)
+    stopped, counts_stopped, _ = run(delays_ns, stops_ns, producer=False, buses=2)
+    assert [(s.cycle, s.position_counts, s.missing) for s in stopped] == [
+        (s.cycle, s.position_counts, s.missing) for s in plain
+    ]
+    assert counts_stopped == counts
+
+
+@pytest.mark.parametrize("producer", [True, False])
+@pytest.mark.parametrize("stop_ms", [30, 100, 300])
+def test_a_stop_of_many_periods_loses_nothing(stop_ms: int, producer: bool) -> None:
+    stop = (5 * PERIOD_NS + 1000, 5 * PERIOD_NS + 1_000_000 * stop_ms)
+    samples, counts, faults = run([[300_000] * CYCLES] * 2, [stop], producer=producer)
+    assert [sample.missing for sample in samples] == [0] * CYCLES
+    assert counts == StreamStatistics(cycles=CYCLES, frames=2 * CYCLES)
+    assert [fault for fault in faults if isinstance(fault, BusError)] == []
+
+
+@pytest.mark.parametrize("producer", [True, False])
+def test_a_capture_process_that_stays_stopped_is_a_fault(producer: bool) -> None:
+    _, _, faults = run([[0] * CYCLES] * 2, [(5 * PERIOD_NS, 3 * SECOND_NS)], producer=producer)
+    assert any(isinstance(fault, BusError) for fault in faults)
+
+
+def test_sync_goes_out_on_schedule_while_frames_are_waited_for() -> None:
+    network, scripted = cell()
+    network.link._bus = bus = Timeline(scripted.clock, [[0] * CYCLES] * 2, [(3 * PERIOD_NS, 7 * PERIOD_NS)])
+    stream = SyncStream(network, TimedSync(PERIOD_NS, 0, scripted.clock))
+    for _ in range(CYCLES):
+        stream.advance()
+    bus.shutdown()
+    steps = {after - before for before, after in zip(bus.sent_ns, bus.sent_ns[1:], strict=False)}
+    assert steps == {PERIOD_NS}
