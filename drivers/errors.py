@@ -25,6 +25,7 @@ from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 WHILE = "while "  #: Prefix of the notes that report what a stop, or the closing of a network, could not confirm
+POWERED = "not confirmed without power: "  #: Prefix of the note that names the axes which had power and may still have
 
 
 class NamedNode(Protocol):

@@ -22,7 +22,7 @@ from ident import errors as identification
 
 NOTES = ("kept", "hint")
 """Labels of the notes that are shown; a verb adds them to an error with ``error.add_note("hint: …")``."""
-NOT_STOPPED = "NOT ALL ARE CONFIRMED STOPPED: use the emergency stop"
+NOT_STOPPED = "{} NOT CONFIRMED WITHOUT POWER: use the emergency stop"
 
 _VCAN = "`sudo modprobe vcan`, `sudo ip link add dev vcan0 type vcan`, `sudo ip link set vcan0 up`"
 _SIMULATE = "at a desk `drivegain simulate demo` in a second terminal is a cell"
@@ -147,7 +147,8 @@ class Failure:
     do: str
     exit_code: int
     notes: dict[str, str] = field(default_factory=dict)  #: by label: kept, hint
-    unconfirmed: tuple[str, ...] = ()  #: parts of a stop of the axes that could not be confirmed
+    unconfirmed: tuple[str, ...] = ()  #: parts of the stop and of the restoring that could not be confirmed
+    powered: str = ""  #: axes that had power and are not confirmed without it
 
     @classmethod
     def of(cls, error: Exception) -> Failure:
@@ -160,11 +161,14 @@ class Failure:
             int(exit_code(type(error)) or ExitCode.UNEXPECTED),
             labelled,
             tuple(note for note in notes if note.startswith((f"{driver.WHILE}stopping", f"{driver.WHILE}closing"))),
+            may_have_power(error),
         )
 
     def document(self) -> dict[str, Any]:
         """Return the object of `--json`."""
-        stop = {"axes": NOT_STOPPED, "unconfirmed": list(self.unconfirmed)} if self.unconfirmed else {}
+        stop: dict[str, Any] = {"axes": NOT_STOPPED.format(self.powered)} if self.powered else {}
+        if self.unconfirmed:
+            stop["unconfirmed"] = list(self.unconfirmed)
         parts = {"error": self.error, "found": self.found, "expected": self.expected, "do": self.do}
         return {**parts, "exit_code": self.exit_code, "kind": self.kind, **self.notes, **stop}
 
@@ -176,8 +180,14 @@ class Failure:
                 yield label, text, "bold"
         yield from ((label, text, "bold") for label, text in self.notes.items())
         yield from (("note", text, "bold") for text in self.unconfirmed)
-        if self.unconfirmed:
-            yield "AXES", NOT_STOPPED, "bold red"
+        if self.powered:
+            yield "AXES", NOT_STOPPED.format(self.powered), "bold red"
+
+
+def may_have_power(error: BaseException | None) -> str:
+    """Name the axes that had power and are not confirmed without it; empty where there are none."""
+    notes = getattr(error, "__notes__", ())
+    return ", ".join(note.removeprefix(driver.POWERED) for note in notes if note.startswith(driver.POWERED))
 
 
 def _parts(error: Exception) -> tuple[str, str, str, str]:

@@ -12,7 +12,7 @@ import typer
 
 from daq.cli.verb import CellArgument, JsonOption, Verb, print_json, say_next
 from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError
-from drivers.errors import DriverError, SampleLost
+from drivers.errors import POWERED, DriverError, SampleLost
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
@@ -191,8 +191,10 @@ def _interrupted(interrupt: KeyboardInterrupt, made: Path | None, out: Path) -> 
         first = first.__context__
     notes = [] if first is None else [f"it came while they were stopped after {type(first).__name__}: {first}"]
     notes += [note for error in (first, interrupt) for note in getattr(error, "__notes__", ())]
-    problems = "; ".join(notes)
-    axes = f"NOT ALL AXES ARE CONFIRMED STOPPED, press the emergency stop ({problems})" if problems else "axes stopped"
+    problems = "; ".join(note for note in notes if not note.startswith(POWERED))
+    powered = ", ".join(note.removeprefix(POWERED) for note in notes if note.startswith(POWERED))
+    axes = f"{powered} NOT CONFIRMED WITHOUT POWER, use the emergency stop" if powered else "axes stopped"
+    axes += f" ({problems})" if problems else ""
     if made is None:
         return f"interrupted: {axes}; nothing was recorded"
     if made == out:

@@ -231,6 +231,7 @@ def delay_signals() -> Iterator[None]:
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GRACE_S = 10.0  #: Longer than a stop of all axes takes
+ONE_KEY_S = 0.3  #: Signals that are closer together count as one
 
 
 @contextmanager
@@ -243,27 +244,33 @@ def interruptible(
     (&) with SIGINT ignored, and only a handler of our own makes them interruptible. The first signal starts the stop of
     the axes, which a second one must not cut short; later signals count again, so that a hanging stop can be left. The
     yielded context manager protects a stop that a fault has started in the same way; a signal that arrives meanwhile is
-    dropped, because it asks for what is happening already. Outside the main thread, where Python handles no signals,
-    nothing changes.
+    dropped, because it asks for what is happening already. The context yields a function that returns whether a second
+    signal came, after which the settings of the axes need not be restored any more. Outside the main thread, where
+    Python handles no signals, nothing changes.
     """
     if threading.current_thread() is not threading.main_thread():
         yield nullcontext
         return
 
-    blocked_until_s = float("-inf")
+    blocked_until_s = last_s = float("-inf")
+    signals_seen = 0
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
-        nonlocal blocked_until_s
-        if clock() >= blocked_until_s:
-            blocked_until_s = clock() + GRACE_S
+        nonlocal blocked_until_s, last_s, signals_seen
+        now_s = clock()
+        # A terminal and a shell may both pass one key on.
+        signals_seen += now_s - last_s >= ONE_KEY_S
+        last_s = now_s
+        if now_s >= blocked_until_s:
+            blocked_until_s = now_s + GRACE_S
             raise KeyboardInterrupt
 
     @contextmanager
-    def block_signals() -> Iterator[None]:
+    def block_signals() -> Iterator[Callable[[], bool]]:
         nonlocal blocked_until_s
         earlier_s, blocked_until_s = blocked_until_s, max(blocked_until_s, clock() + GRACE_S)
         try:
-            yield
+            yield lambda: signals_seen > 1
         finally:
             blocked_until_s = earlier_s
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
@@ -61,9 +61,9 @@ def recalibrate(
             with time_bound(section.max_duration_min) as in_time:
 
                 @contextmanager
-                def block_both() -> Iterator[None]:
-                    with block_signals(), in_time():
-                        yield
+                def block_both() -> Iterator[Callable[[], bool] | None]:
+                    with block_signals() as asked_again, in_time():
+                        yield asked_again
 
                 session = _run(replace(context, block_signals=block_both), session)
         except BaseException as error:

@@ -49,7 +49,7 @@ class ErrorReport(StrictModel):
     kind: str = Field(description="class of the error")
     kept: str = Field("", description="files that were written before")
     hint: str = ""
-    axes: str = Field("", description="present where a stop of the axes is not confirmed")
+    axes: str = Field("", description="axes that had power and are not confirmed without it")
     unconfirmed: list[str] = Field([], description="what could not be confirmed")
 
 

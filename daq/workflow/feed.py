@@ -32,7 +32,7 @@ from pydantic import TypeAdapter
 
 from daq.log.conversion import SiScaling
 from daq.log.metadata import RunStatistics
-from drivers.errors import WHILE
+from drivers.errors import POWERED, WHILE
 from drivers.stream.sample import CellEvent, Sample
 
 BATCH_S = 0.02  #: Time of the samples in one packet
@@ -429,13 +429,20 @@ class Feed:
             connection.close()
 
 
+SHOWN = (f"{WHILE}stopping", POWERED)  #: Notes of an error that a console shows
+
+
 def end_of(error: BaseException | None) -> dict[str, Any]:
     """Describe how a program ended: whether all axes are known to be stopped, and the error in words."""
     chain: list[BaseException] = []
     while error is not None and error not in chain:
         chain.append(error)
         error = error.__context__
-    notes = [note for one in chain for note in getattr(one, "__notes__", ()) if note.startswith(f"{WHILE}stopping")]
+    notes = [note for one in chain for note in getattr(one, "__notes__", ()) if note.startswith(SHOWN)]
     reason = "" if not chain else str(chain[0]) or ("stopped" if isinstance(chain[0], KeyboardInterrupt) else "")
     text = reason or ("" if not chain else type(chain[0]).__name__)
-    return {"ok": not chain, "axes_stopped": not notes, "text": "; ".join((text, *notes) if text else notes)}
+    return {
+        "ok": not chain,
+        "axes_stopped": not any(note.startswith(POWERED) for note in notes),
+        "text": "; ".join((text, *notes) if text else notes),
+    }

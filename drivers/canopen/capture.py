@@ -51,8 +51,9 @@ RECORD = struct.Struct("=qqQQQIBB??8s")
 """One frame, or a note of the capture process.
 
 Time at which the kernel received the frame, by the wall clock [ns since 1970] and by the monotonic clock [ns]; a note
-has instead 0 and the monotonic time at which nothing was left to receive. Frames lost so far in the socket's buffer, before it, and in the backlog; identifier and flags of struct can_frame; `Kind`;
-bytes of data; whether it was sent by this very socket, and by any program of this machine; eight bytes.
+has 0, and the monotonic time at which nothing was left to receive. Frames lost so far in the socket's buffer, before
+it, and in the backlog; identifier and flags of struct can_frame; `Kind`; bytes of data; whether it was sent by this
+very socket, and by any program of this machine; eight bytes.
 """
 
 

@@ -25,7 +25,7 @@ SYNC_COB_ID = 0x080
 _NMT_COB_ID = 0x000
 _EMCY, HEARTBEAT = 0x080, 0x700
 _RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))  #: Set-points of a drive (CiA 301, predefined connection set)
-PUMP_S = 1.0  #: Longest time spent on frames that have already arrived, however fast more arrive
+PUMP_S = 0.1  #: Longest time spent on frames that have already arrived, however fast more arrive
 # linux/can/error.h: classes of an error frame, and the controller's state in its second byte.
 _CONTROLLER, _RESTARTED = 0x004, 0x100
 _OVERFLOW, _WARNING, _PASSIVE, _ACTIVE = 0x03, 0x0C, 0x30, 0x40
@@ -56,6 +56,11 @@ class SdoListener(Protocol):
 
     def receive(self, data: bytearray) -> None:
         """Take an answer; most are for others."""
+
+
+def never() -> bool:
+    """Return False: see `Link.given_up`."""
+    return False
 
 
 def nmt_name(state: int | None) -> str:
@@ -101,6 +106,10 @@ class Link:
         self.foreign: dict[int, int] = {}
         self.own_id: int | None = None  #: Node id of our heartbeat, None before one was chosen
         self.names: Mapping[int, str] = {}  #: Of our axes by node id
+        #: Time by the clock at which everything that waits must end [ns]; None while the network is not closed.
+        self.deadline_ns: int | None = None
+        #: Whether the operator wants what is left to be given up.
+        self.given_up: Callable[[], bool] = never
         #: Device that sends SYNC on our behalf (drivers/stream/sync.py); None while only we send it.
         self.sync_producer: str | None = None
         self._beat: can.Message | None = None
@@ -144,6 +153,12 @@ class Link:
                 self.dispatch(message)
                 message = self.bus.recv(0.0) if self.clock() < end_ns else None
 
+    def allowed_s(self, seconds: float) -> float:
+        """Return how long a step may wait that takes so many seconds: less, or not at all, while the network closes."""
+        if self.deadline_ns is None:
+            return seconds
+        return 0.0 if self.given_up() else min(seconds, max(0.0, (self.deadline_ns - self.clock()) * 1e-9))
+
     def pass_time(self) -> None:
         """Send one SYNC and handle frames for 1 ms: a cell in lockstep advances by SYNC alone."""
         self.send((can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False),))
@@ -151,7 +166,7 @@ class Link:
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
         """Handle frames for a time, or until a condition holds; returns whether it does."""
-        deadline = self.clock() + round(seconds * 1e9)
+        deadline = self.clock() + round(self.allowed_s(seconds) * 1e9)
         while not (done := until()) and (left_ns := deadline - self.clock()) > 0:
             self.pump(left_ns * 1e-9)
         return done

@@ -13,13 +13,24 @@ from typing import Self
 import can
 
 from drivers.canopen.bus import BusAddress
-from drivers.canopen.link import HEARTBEAT, Link, NmtCommand, NmtState, command_name
+from drivers.canopen.link import HEARTBEAT, Link, NmtCommand, NmtState, command_name, never
 from drivers.canopen.pdo import CONTROLWORD, HEARTBEAT_MS, STATUSWORD
 from drivers.canopen.scan import FoundNode, answering, free_ids, read_identity, scan_link
 from drivers.canopen.sdo import Clock, SdoPolicy
 from drivers.canopen.setup import AxisSetup, Guard, producer_of, read_consumers
 from drivers.canopen.split_bus import CellAddress, open_cell_bus
-from drivers.errors import WHILE, BusBusy, DriverError, NodeMissing, SetupRefused, StateRefused
+from drivers.errors import (
+    POWERED,
+    WHILE,
+    BusBusy,
+    BusError,
+    DriverError,
+    NodeMissing,
+    ObjectAccessError,
+    SetupRefused,
+    StateRefused,
+    node_label,
+)
 from drivers.profiles.cia402 import FAULT_RESET_SEQUENCE, POWERLESS, Goal, State, decode, next_command
 from drivers.profiles.profile import Axis, Identity
 from drivers.profiles.scale import ScaleReading, read_scale
@@ -44,10 +55,16 @@ class Bounds:
     #: For devices with the node ids that the recorder may take. With `listen_s` before it, longer than `guard_ms` of a
     #: cell whose SYNC has a usual period: a slower heartbeat could not replace the recorder's.
     free_s: float = 0.35
+    #: For everything from the stop of the axes to the last restored setting. The stop comes first; whatever is not
+    #: restored by then is named.
+    closing_s: float = 10.0
 
 
-SignalBlocker = Callable[[], AbstractContextManager[None]]
-"""Returns a context in which no signal interrupts stopping and restoring the axes."""
+SignalBlocker = Callable[[], AbstractContextManager[Callable[[], bool] | None]]
+"""Returns a context in which no signal interrupts stopping and restoring the axes.
+
+It yields None, or a function that returns whether the operator has asked a second time: restoring is then given up.
+"""
 DEFAULT_BOUNDS = Bounds()
 DEFAULT_POLICY = SdoPolicy()
 
@@ -110,6 +127,7 @@ class CanopenNetwork:
         self.node_ids = tuple(axis.node_id for axis in axes)
         self.link.names = {axis.node_id: axis.name for axis in axes}
         # The highest id is the least likely to be a drive's; `prepare` checks that it is free.
+        self.powered: set[int] = set()  #: Nodes that have had power, and are not confirmed without it since
         self.recorder_id = next((n for n in range(127, 0, -1) if n not in self.node_ids), 0)
         self._setups: dict[int, AxisSetup] = {}
         self._readback: dict[str, object] = {}
@@ -123,20 +141,47 @@ class CanopenNetwork:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         try:
-            with self.block_signals():
-                problems = self._restore() if self._setups else []
+            with self.block_signals() as asked_again:
+                problems = self._restore(asked_again or never) if self._setups else []
         except BaseException as cut:
             cut.add_note(f"{WHILE}closing the network: it was cut short, and not every axis has its settings back")
+            self._note_powered(cut)
             raise
         finally:
             self.link.close()
         if error is not None:
             for problem in problems:
                 error.add_note(f"{WHILE}closing the network: {problem}")
+            self._note_powered(error)
         elif problems:
             for problem in problems[1:]:
                 problems[0].add_note(str(problem))
+            self._note_powered(problems[0])
             raise problems[0]
+
+    def _note_powered(self, error: BaseException) -> None:
+        """Name on an error the axes that may still have power."""
+        if self.powered:
+            names = ", ".join(
+                node_label(node_id, self.link.names) for node_id in self.node_ids if node_id in self.powered
+            )
+            error.add_note(POWERED + names)
+
+    def see(self, axis: Axis, state: State) -> None:
+        """Remember whether an axis has power."""
+        if state in POWERLESS:
+            self.powered.discard(axis.node_id)
+        else:
+            self.powered.add(axis.node_id)
+
+    def begin_closing(self) -> None:
+        """Let everything from here on end within `Bounds.closing_s`; the first call counts."""
+        if self.link.deadline_ns is None:
+            self.link.deadline_ns = self.link.clock() + round(self.bounds.closing_s * 1e9)
+
+    def end_closing(self) -> None:
+        """Go on without that time limit: the axes are stopped, and the network is used further."""
+        self.link.deadline_ns = None
 
     def scan(self, node_ids: Sequence[int] = range(1, 128), wait_s: float = 0.5) -> tuple[FoundNode, ...]:
         """Find the nodes on the bus; changes nothing."""
@@ -356,6 +401,7 @@ class CanopenNetwork:
             access = self.link.objects(axis.node_id)
             with suppress(DriverError):
                 state = decode(access.read(STATUSWORD))
+                self.see(axis, state)
                 if state not in POWERLESS:
                     access.write(CONTROLWORD, next_command(state, Goal.QUICK_STOP))
 
@@ -369,8 +415,11 @@ class CanopenNetwork:
         access = self.link.objects(axis.node_id)
         deadline = self.link.clock() + round(self.bounds.disable_s * 1e9)
         goal = Goal.QUICK_STOP
-        while decode(statusword := access.read(STATUSWORD)) not in POWERLESS:
-            state = decode(statusword)
+        while True:
+            state = decode(statusword := access.read(STATUSWORD))
+            self.see(axis, state)
+            if state in POWERLESS:
+                return
             if self.link.clock() >= deadline:
                 if goal is Goal.SWITCH_ON_DISABLED:
                     raise StateRefused(axis, str(State.SWITCH_ON_DISABLED), str(state), statusword)
@@ -379,8 +428,13 @@ class CanopenNetwork:
             access.write(CONTROLWORD, next_command(state, goal))
             self.link.pass_time()
 
-    def _restore(self) -> list[DriverError]:
-        """Disable, PRE-OPERATIONAL, restore; every step is tried, whatever failed before. Returns the failures."""
+    def _restore(self, asked_again: Callable[[], bool]) -> list[DriverError]:
+        """Disable, PRE-OPERATIONAL, restore, all within one time limit; returns the failures.
+
+        Every axis is tried, whatever failed before. A second request of the operator ends the restoring alone: axes
+        that may have power are disabled first.
+        """
+        self.begin_closing()
         problems: list[DriverError] = []
         axes = [axis for axis in self.axes if axis.node_id in self._setups]
         for attempt in ("first", "last"):
@@ -396,7 +450,7 @@ class CanopenNetwork:
                     self._setups.clear()
                     return problems
         if silent is not None:
-            silent.add_note("its standstill is not confirmed, and its settings were not restored")
+            silent.add_note("its settings were not restored")
             problems.append(silent)
             axes = [axis for axis in axes if axis.node_id not in silent.node_ids]
         self.begin_stop(axes)
@@ -404,12 +458,34 @@ class CanopenNetwork:
         since_ns = self.link.clock()
         pre_operational = NmtCommand.ENTER_PRE_OPERATIONAL
         self._try(problems, [partial(self.link.command_nmt, axis.node_id, pre_operational) for axis in axes])
-        for axis in axes:
-            left_s = self.bounds.nmt_s - (self.link.clock() - since_ns) * 1e-9
-            confirm = partial(self.link.confirm_nmt, axis.node_id, NmtState.PRE_OPERATIONAL, since_ns, max(left_s, 0.0))
-            self._try(problems, [confirm, *self._setups[axis.node_id].restoring()])
+        self.link.given_up = asked_again
+        left = {axis.name: self._restore_axis(axis, since_ns, problems) for axis in axes}
+        if any(left.values()):
+            cause = "asked a second time" if asked_again() else "some did not answer, or the time limit was over"
+            names = "; ".join(f"{name}: {', '.join(steps)}" for name, steps in left.items() if steps)
+            remedy = "switch these drives off and on before they are used"
+            problems.append(BusError(str(self.link.address), f"settings not restored ({cause}): {names}; {remedy}"))
         self._setups.clear()
         return problems
+
+    def _restore_axis(self, axis: Axis, since_ns: int, problems: list[DriverError]) -> tuple[str, ...]:
+        """Restore the settings of an axis; returns the names of those for which it did not answer any more."""
+        left_s = self.bounds.nmt_s - (self.link.clock() - since_ns) * 1e-9
+        confirm = partial(self.link.confirm_nmt, axis.node_id, NmtState.PRE_OPERATIONAL, since_ns, max(left_s, 0.0))
+        steps = list(self._setups[axis.node_id].restoring())
+        if self.link.allowed_s(1.0) > 0.0:
+            self._try(problems, [confirm])
+        for number, (_, step) in enumerate(steps):
+            if self.link.allowed_s(1.0) <= 0.0:
+                return tuple(name for name, _ in steps[number:])
+            try:
+                step()
+            except DriverError as problem:
+                if isinstance(problem, ObjectAccessError) and problem.abort_code is None:
+                    problems += [] if self.link.allowed_s(1.0) <= 0.0 else [problem]
+                    return tuple(name for name, _ in steps[number:])
+                problems.append(problem)
+        return ()
 
     def _try(self, problems: list[DriverError], steps: Sequence[Callable[[], object]]) -> None:
         for step in steps:

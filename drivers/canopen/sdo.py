@@ -122,6 +122,9 @@ class ObjectAccess:
     def _attempt(self, name: str, transfer: Callable[[], T]) -> T:
         reason = ""
         for _ in range(self._policy.attempts):
+            if self._client.closing_is_over:
+                reason = reason or "the time for closing the network was over"
+                break
             try:
                 return transfer()
             except SdoAbortedError as error:
@@ -129,7 +132,9 @@ class ObjectAccess:
                 raise ObjectAccessError(self, name, f"aborted, {error}", error.code) from error
             except SdoCommunicationError as error:
                 reason = str(error)
-        raise ObjectAccessError(self, name, f"{reason}, asked {self._policy.attempts} times")
+        else:
+            reason = f"{reason}, asked {self._policy.attempts} times"
+        raise ObjectAccessError(self, name, reason)
 
 
 class _Bus(Protocol):
@@ -140,6 +145,8 @@ class _Bus(Protocol):
     def send(self, messages: Sequence[can.Message]) -> None: ...
 
     def pump(self, timeout_s: float) -> None: ...
+
+    def allowed_s(self, seconds: float) -> float: ...
 
 
 class SynchronousSdoClient(SdoClient):
@@ -153,6 +160,11 @@ class SynchronousSdoClient(SdoClient):
         SdoClient.__init__(self, SDO_REQUEST + node_id, SDO_ANSWER + node_id, ObjectDictionary())
         self._bus = bus
         self._policy = policy
+
+    @property
+    def closing_is_over(self) -> bool:
+        """Whether the network closes, and there is no time left for another request."""
+        return self._bus.allowed_s(self._policy.timeout_s) <= 0.0
 
     def receive(self, data: bytearray) -> None:
         """Accept an answer that was read from the bus; CiA 301: an SDO always has eight bytes."""
@@ -169,7 +181,7 @@ class SynchronousSdoClient(SdoClient):
 
     def read_response(self) -> bytes:
         """Wait for the next answer of the node; SdoCommunicationError where none comes in time."""
-        deadline = self._bus.clock() + round(self._policy.timeout_s * 1e9)
+        deadline = self._bus.clock() + round(self._bus.allowed_s(self._policy.timeout_s) * 1e9)
         while self.responses.empty():
             left_s = (deadline - self._bus.clock()) * 1e-9
             if left_s <= 0:

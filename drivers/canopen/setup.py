@@ -192,15 +192,15 @@ class AxisSetup:
                 raise StateRefused(self._axis, "profile position mode (1)", found, access.read(STATUSWORD))
             self._link.pass_time()
 
-    def restoring(self) -> Iterator[Callable[[], object]]:
-        """Yield the steps that restore all settings; the heartbeat last."""
+    def restoring(self) -> Iterator[tuple[str, Callable[[], object]]]:
+        """Yield the steps that restore all settings, and their names; the heartbeat last."""
         for record in self._pdos_before.values():
-            yield partial(write_record, self._access, record)
+            yield record.name, partial(write_record, self._access, record)
         if self._mode is not None:
-            yield partial(self._access.write, MODE_OF_OPERATION, self._mode)
-        yield self.guard.disarm
+            yield "6060h", partial(self._access.write, MODE_OF_OPERATION, self._mode)
+        yield "1016h", self.guard.disarm
         if self._heartbeat_ms is not None:
-            yield partial(self._access.write, HEARTBEAT_TIME, self._heartbeat_ms)
+            yield "1017h", partial(self._access.write, HEARTBEAT_TIME, self._heartbeat_ms)
 
     def describe(self, identity: Identity, scale: ScaleReading, silence_ms: int) -> dict[str, object]:
         """Return what the drive reported during the setup, for the log."""

@@ -26,7 +26,7 @@ from drivers.canopen.capture import FRAME, RECORD, Kind
 
 RECEIVE_BUFFER_BYTES = 4 << 20  #: The kernel's default of 208 KiB holds 43 ms of a full bus; a busy machine needs more
 START_S = 20.0  #: Time for the capture process to start; a loaded machine is slow to start an interpreter
-END_S = 5.0
+END_S = 1.0
 SEND_S = 0.1  #: Longest time of a full transmit queue: at 10 kbit/s a frame takes 13 ms
 RETRY_S = 0.0002
 SO_RCVBUFFORCE, SO_TIMESTAMPNS = 33, 35  # asm-generic/socket.h; the first is allowed to CAP_NET_ADMIN

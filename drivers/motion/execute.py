@@ -97,6 +97,7 @@ def execute(
         yield from execution.stop()
         if not execution.problems:  # amplifiers without confirmed standstill go on watching us
             network.unguard()
+            network.end_closing()
     except BaseException as error:
         # Also a closed generator and an interrupt, during the stop above as well: it then runs without yielding.
         with network.block_signals():
@@ -152,6 +153,7 @@ class _Execution:
         for axis in self._axes:
             if self._state(axis) in (State.FAULT, State.FAULT_REACTION_ACTIVE):
                 raise self._refusal(axis)
+        self._network.powered.update(self._network.node_ids)
         for cycle in range(self._cycles(self._bounds.enable_s)):
             waiting = [axis for axis in self._axes if self._state(axis) is not State.OPERATION_ENABLED]
             if not waiting:
@@ -252,6 +254,7 @@ class _Execution:
         self._stream.spare = nothing_to_send
         self.emit(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
         self.problems = []
+        self._network.begin_closing()
         unconfirmed = tuple(self._axes)
         try:
             unconfirmed = yield from self._stop_by_pdo()
@@ -304,6 +307,7 @@ class _Execution:
             silent = silent + 1 if self._sample.missing else 0
             missing = self._sample.missing
             powered = [axis for axis in self._axes if missing >> axis & 1 or self._state(axis) not in POWERLESS]
+            self._network.powered -= {self._nodes[axis].node_id for axis in self._axes if axis not in powered}
             lockstep_silent = self._stream.silent and isinstance(self._stream.pacing, LockstepSync)
             if not powered or silent > (0 if lockstep_silent else self._stream.max_missing_cycles):
                 break

@@ -183,6 +183,8 @@ class DriveProducer(AbstractContextManager["DriveProducer"]):
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         try:
+            if error is not None:
+                self._network.begin_closing()
             self.stop()
         except DriverError as problem:
             if error is None:

@@ -220,7 +220,7 @@ def test_the_recorder_says_so_and_the_axes_stop_by_themselves(
     ended = record(tmp_path, strike)
     assert ended.code == ExitCode.DEVICE_FAULT, ended.output
     assert words in ended.output
-    assert "NOT ALL ARE CONFIRMED STOPPED" in ended.output  # they could not be reached
+    assert "NOT CONFIRMED WITHOUT POWER" in ended.output  # they could not be reached
     assert [event.text for event in ended.log.events if event.kind is EventKind.BUS_LOST and words in event.text]
     kinds = [event.kind for event in ended.log.events]
     assert EventKind.STOP_UNCONFIRMED in kinds

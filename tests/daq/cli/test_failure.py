@@ -97,7 +97,9 @@ def test_a_program_gets_one_object_a_line(capsys: pytest.CaptureFixture[str]) ->
     }
     stop = DriveFault(3, "fault")
     stop.add_note("while stopping: J3 (node 3) does not answer")
-    assert "emergency stop" in Failure.of(stop).document()["axes"]
+    assert "axes" not in Failure.of(stop).document()
+    stop.add_note("not confirmed without power: J3 (node 3)")
+    assert Failure.of(stop).document()["axes"] == "J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop"
 
 
 def test_an_error_of_a_verb_is_an_object_under_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

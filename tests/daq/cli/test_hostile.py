@@ -141,6 +141,9 @@ def test_a_stop_that_was_not_confirmed_is_shouted(capsys: pytest.CaptureFixture[
     error = DriveFault(3, "fault")
     error.add_note("while stopping: node 3: object 6041h:00: no answer")
     show_failure(Failure.of(error), json_wanted=False)
+    assert "emergency stop" not in capsys.readouterr().err  # it was stopped, and confirmed by other means
+    error.add_note("not confirmed without power: node 3")
+    show_failure(Failure.of(error), json_wanted=False)
     output = capsys.readouterr().err
     assert "node 3: object 6041h:00: no answer" in output
     assert "emergency stop" in output

@@ -77,16 +77,32 @@ def test_what_must_not_be_disturbed_is_not_for_as_long_as_a_stop_takes() -> None
                 signal.raise_signal(signal.SIGINT)  # a hanging stop can be left
 
 
+def test_a_second_signal_gives_up_restoring_and_one_key_is_one_signal() -> None:
+    now_s = 100.0
+    with interruptible(lambda: now_s) as block_signals:
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        with block_signals() as asked_again:
+            assert asked_again is not None
+            signal.raise_signal(signal.SIGTERM)  # by the shell, of the same key
+            assert not asked_again()
+            now_s += 1.0
+            signal.raise_signal(signal.SIGINT)
+            assert asked_again()
+
+
 def test_what_is_not_known_to_rest_is_not_said_to() -> None:
     out = Path("run.mcap")
     assert "axes stopped" in _interrupted(KeyboardInterrupt(), None, out)
     fault = DriveFault(3, "EMCY 7305h")
     fault.add_note("while stopping: node 2 does not answer")
+    assert "emergency" not in _interrupted(fault, None, out)  # type: ignore[arg-type]
     cut = KeyboardInterrupt()
+    cut.add_note("not confirmed without power: J2 (node 2)")
     cut.__context__ = ValueError("in between")
     cut.__context__.__context__ = fault
     said = _interrupted(cut, None, out)
-    assert "NOT ALL AXES ARE CONFIRMED STOPPED" in said
+    assert "J2 (node 2) NOT CONFIRMED WITHOUT POWER, use the emergency stop" in said
     assert "EMCY 7305h" in said
     assert "node 2 does not answer" in said
     harmless = KeyboardInterrupt()

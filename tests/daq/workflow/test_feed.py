@@ -175,9 +175,11 @@ def test_a_second_program_on_a_cell_publishes_nothing_and_goes_on(cell_file: Pat
 def test_what_a_stop_could_not_confirm_is_in_its_end() -> None:
     error = RuntimeError("node 3")
     error.add_note("while stopping: node 2 does not answer")
+    assert end_of(error)["axes_stopped"]
+    error.add_note("not confirmed without power: node 2")
     assert end_of(error) == {
         "ok": False,
         "axes_stopped": False,
-        "text": "node 3; while stopping: node 2 does not answer",
+        "text": "node 3; while stopping: node 2 does not answer; not confirmed without power: node 2",
     }
     assert end_of(None) == {"ok": True, "axes_stopped": True, "text": ""}

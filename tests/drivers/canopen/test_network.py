@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import can
 import pytest
@@ -13,7 +14,9 @@ from drivers.canopen.link import NmtState
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
 from drivers.errors import (
+    POWERED,
     BusError,
+    DriverError,
     MotionRefused,
     NodeMissing,
     ObjectAccessError,
@@ -322,3 +325,48 @@ def test_giving_back_is_undisturbed_and_says_when_it_was_cut_short() -> None:
     with pytest.raises(KeyboardInterrupt) as interrupt, network:
         network.prepare()
     assert ["cut short" in note for note in interrupt.value.__notes__] == [True]
+
+
+def deaf_from_now_on(bus: ScriptedBus, node_id: int) -> None:
+    """A node that answers no SDO request any more, beside a flood of frames of no importance."""
+    receive = bus.recv
+
+    def recv(timeout: float | None = None) -> can.Message | None:
+        bus.clock.now_ns += 90_000  # 11 000 frames/s
+        return receive(timeout) or can.Message(arbitration_id=0x7FF, is_extended_id=False)
+
+    bus.tamper = lambda m: () if m.arbitration_id == 0x580 + node_id else (m,)
+    bus.recv = recv  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_closing_has_one_time_limit_and_names_what_it_left(asked: bool) -> None:
+    network, bus = cell(3)
+    network.bounds = replace(network.bounds, closing_s=0.2)
+
+    @contextmanager
+    def block_signals() -> Iterator[Callable[[], bool]]:
+        yield lambda: asked
+
+    network.block_signals = block_signals
+    with pytest.raises(DriverError) as left, network:
+        network.prepare()
+        deaf_from_now_on(bus, 2)
+        begun_ns = bus.clock.now_ns
+    assert bus.clock.now_ns - begun_ns < 300_000_000
+    said = "; ".join((str(left.value), *left.value.__notes__))
+    assert "J2 (node 2) did not answer" in said
+    if asked:
+        assert "settings not restored (asked a second time): J1: TPDO1" in said
+        assert "6060h, 1016h, 1017h; switch these drives off and on" in said
+    assert "not confirmed without power" not in said  # none of them ever had it
+
+
+def test_an_axis_that_had_power_and_fell_silent_is_named_alone() -> None:
+    network, bus = cell(3)
+    with pytest.raises(ValueError, match="cause") as error, network:
+        network.prepare()
+        network.powered.update(network.node_ids)
+        bus.tamper = lambda m: () if m.arbitration_id == 0x582 else (m,)
+        raise ValueError("cause")
+    assert [note for note in error.value.__notes__ if note.startswith(POWERED)] == [f"{POWERED}J2 (node 2)"]

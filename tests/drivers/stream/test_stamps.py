@@ -148,12 +148,11 @@ def test_no_sample_without_its_bit_holds_another_cycles_answer(
     delays_ns: list[list[int]], stops_ns: list[tuple[int, int]], producer: bool
 ) -> None:
     # No queue of answers: a late one is followed by one in time.
-    for axis in delays_ns:
-        for number, delay_ns in enumerate(axis[1:], start=1):
-            if PERIOD_NS <= axis[number - 1] < NEVER and delay_ns >= PERIOD_NS:
-                axis[number] = 0
-            if PERIOD_NS <= axis[number - 1] < NEVER and axis[number] + PERIOD_NS <= axis[number - 1]:
-                axis[number] = axis[number - 1] - PERIOD_NS + 1000
+    for of_axis in delays_ns:
+        for number, delay_ns in enumerate(of_axis[1:], start=1):
+            before_ns = of_axis[number - 1]
+            if PERIOD_NS <= before_ns < NEVER and (delay_ns >= PERIOD_NS or delay_ns + PERIOD_NS <= before_ns):
+                of_axis[number] = before_ns - PERIOD_NS + 1000
     samples, _, _ = run(delays_ns, stops_ns, producer=producer)
     for axis in range(2):
         for sample in samples:

@@ -612,7 +612,7 @@ def test_the_kernels_sync_never_comes_from_the_wire(followed: Followed) -> None:
 
 @settings(deadline=None)
 @given(st.sets(st.tuples(st.integers(0, 29), st.sampled_from((0x181, 0x182))), max_size=12))
-def test_an_answer_dropped_from_a_followed_cycle_is_a_bit_and_the_next_is_doubtful(
+def test_after_an_answer_dropped_from_a_followed_cycle_the_next_is_doubtful(
     dropped: set[tuple[int, int]],
 ) -> None:
     for stream, bus, producer, _ in followed_stream():
