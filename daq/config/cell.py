@@ -74,7 +74,10 @@ class Bus(UnnamedBus):
 
 
 RECORDER, KERNEL = "recorder", "kernel"
-"""SYNC producers other than an axis: the recording program, or this machine's kernel (SocketCAN's BCM)."""
+"""SYNC producers other than an axis: the recording program, or this machine's kernel (SocketCAN's BCM).
+
+On one SocketCAN bus that can do it, the kernel sends SYNC for the recording program too.
+"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,8 +34,9 @@ from daq.workflow.safeguards import (
     largest_log_bytes,
 )
 from daq.writeback.formats.document import read_bytes
+from drivers.canopen.bus import BusAddress
 from drivers.canopen.network import CanopenNetwork, SignalBlocker
-from drivers.errors import MotionRefused
+from drivers.errors import BusError, MotionRefused
 from drivers.motion.execute import execute
 from drivers.motion.move import AxisLimits, MotionPermission, Move, check_moves, synchronised_move
 from drivers.stream.answers import StreamStatistics
@@ -150,7 +151,7 @@ def record(
     if granted_by is None:
         raise MotionRefused("recording moves the robot and motion is disabled: pass --enable-motion")
     check_entered_mass(cell, payload, entered_kg)
-    with defer_full_gc(), network_of(cell, block_signals) as network, _sync_producer(cell, network) as producer:
+    with defer_full_gc(), network_of(cell, block_signals) as network, _sync_producer(cell, network) as wanted:
         network.prepare()
         polling = Polling(network, beside_stream=polling_fits(cell))
         scales = network.scales()
@@ -164,8 +165,7 @@ def record(
         rate_hz, files = 1e6 / _sync(cell).period_us, bundle(cell_file)
         # Read the positions first, so that a refusal comes before a file exists. This takes a stream of its own: the
         # checks below last many periods, and the schedule of the recording does not wait.
-        if producer is not None:
-            producer.start()
+        producer, remarks = _started(cell, wanted)
         start_counts = _positions(network, _pacing(cell, clocks.wall_ns(), clocks, producer))
         permission = MotionPermission(granted_by, motor_limits(cell, scale))
         moves = _checked_moves(cell, plan, scale, start_counts, permission)
@@ -214,7 +214,7 @@ def record(
         kept.feed.finish()
         if short is not None:
             raise short
-        return Recorded(out, log.statistics, stream.statistics, (*warnings, *polling.remarks))
+        return Recorded(out, log.statistics, stream.statistics, (*warnings, *remarks, *polling.remarks))
 
 
 def controller_digest(cell: Cell) -> str | None:
@@ -396,19 +396,39 @@ def _sync(cell: Cell) -> declared.Sync:
 
 
 def _sync_producer(cell: Cell, network: CanopenNetwork) -> AbstractContextManager[SyncProducer | None]:
-    """Return the SYNC producer; None if this program sends SYNC."""
-    sync = cell.sync
-    if sync is None or sync.producer == declared.RECORDER:
+    """Return the SYNC producer; None if this program sends SYNC.
+
+    On one SocketCAN bus the kernel sends it for this program, which a busy computer delays.
+    """
+    sync, address = cell.sync, network.link.address
+    if sync is None:
         return nullcontext()
-    if sync.producer == declared.KERNEL:
+    timed = sync.pacing is declared.PacingMode.TIMED
+    socketcan = isinstance(address, BusAddress) and address.interface == "socketcan"
+    if sync.producer == declared.KERNEL or (sync.producer == declared.RECORDER and timed and socketcan):
         return KernelProducer(network, sync.period_us)
+    if sync.producer == declared.RECORDER:
+        return nullcontext()
     return DriveProducer(network, cell.axis_names.index(sync.producer), sync.period_us)
+
+
+def _started(cell: Cell, producer: SyncProducer | None) -> tuple[SyncProducer | None, tuple[str, ...]]:
+    """Start the SYNC producer; returns it, or None with a remark if this program has to send SYNC after all."""
+    try:
+        if producer is not None:
+            producer.start()
+    except BusError as error:
+        if _sync(cell).producer != declared.RECORDER:
+            raise
+        return None, (f"SYNC is sent by this program, and late when the computer is busy: {error.reason}",)
+    return producer, ()
 
 
 def _pacing(cell: Cell, start_ns: int, clocks: Clocks, producer: SyncProducer | None) -> Pacing:
     sync = _sync(cell)
     period_ns, clock = sync.period_us * 1000, clocks.monotonic_ns
     if producer is not None:
+        producer.start()  # again: it may have ended while nothing was recorded
         seen = producer.seen if isinstance(producer, KernelProducer) else None  # a drive keeps its period by itself
         silence_s = max(SYNC_SILENCE_S, SYNC_SILENCE_PERIODS * period_ns * 1e-9)
         return FollowedSync(period_ns, producer.name, seen is not None, silence_s, seen, start_ns, clock)

@@ -21,6 +21,7 @@ from typing import cast
 
 import can
 from can.interfaces.virtual import VirtualBus
+from can.typechecking import CanFilter
 
 from drivers.canopen.socketcan import BurstBus, open_socketcan
 from drivers.errors import BusError
@@ -28,6 +29,11 @@ from drivers.errors import BusError
 CONNECT_TIMEOUT_S = 5.0
 SEND_S = 2.0  #: Longest time in which a server may accept nothing; a frame sent in part cannot be recalled
 _RECEIVE_BYTES = 1 << 16
+# Frames for devices (CiA 301): NMT, SYNC, RPDOs, SDO requests, heartbeats.
+_TO_DEVICES: list[CanFilter] = [
+    CanFilter(can_id=cob_id, can_mask=0x780 if cob_id > 0x080 else 0x7FF, extended=False)
+    for cob_id in (0x000, 0x080, 0x200, 0x300, 0x400, 0x500, 0x600, 0x700)
+]
 LONGEST_BYTES = 4096
 """Longest unfinished message; a frame has some 50. A server that never ends a message speaks another protocol."""
 _LONGEST_IDENTIFIER, _LONGEST_DATA = 8, 16  #: Hexadecimal digits
@@ -107,6 +113,7 @@ def open_bus(address: BusAddress, *, answering: bool = False) -> can.BusABC:
                 bitrate=address.bitrate_bit_s,
                 receive_own_messages=False,
                 ignore_config=True,
+                can_filters=_TO_DEVICES if answering else None,
             )
         except (ValueError, TypeError, ImportError, NotImplementedError) as error:
             raise BusError(str(address), str(error)) from error

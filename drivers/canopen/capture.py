@@ -30,6 +30,7 @@ LOOK_NS = 200_000_000  #: Time between two checks of the interface's own counter
 INTERFACE_COUNTERS = ("rx_dropped", "rx_over_errors", "rx_missed_errors")
 """Frames that were lost before any socket: in the kernel's queue behind the driver, and in the controller."""
 FRAME = struct.Struct("=IB3x8s")  #: struct can_frame
+SYNC = 0x080
 _TIMESPEC, _U32, _MEMINFO = struct.Struct("@ll"), struct.Struct("=I"), struct.Struct("=9I")
 _DROPS = 8  # SK_MEMINFO_DROPS
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_U32.size)
@@ -193,6 +194,8 @@ class Capture:
                 elif level == socket.SOL_SOCKET and kind == SO_RXQ_OVFL:
                     self._drops.see(_U32.unpack(data)[0])
             can_id, length, payload = FRAME.unpack(self._frame)
+            if flags & MSG_OWN and can_id != SYNC:
+                continue  # of our own frames only SYNC is of interest: its actual time
             burst.append((can_id, length, payload, stamp_ns, flags))
         before_ns, wall_ns, self._now_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
         now_ns = (before_ns + self._now_ns) // 2

@@ -17,13 +17,14 @@ import can
 from drivers.canopen.bus import bus_errors, send_burst
 from drivers.canopen.emcy import describe
 from drivers.canopen.sdo import SDO_ANSWER, SDO_REQUEST, Clock, ObjectAccess, SdoPolicy, SynchronousSdoClient
+from drivers.canopen.socketcan import receive_only
 from drivers.canopen.split_bus import BUS_OFF, BUS_OFF_REASON, CellAddress, open_cell_bus
 from drivers.errors import BusError, StateRefused, node_label
 from drivers.stream.sample import CellEvent, EventKind
 
 SYNC_COB_ID = 0x080
-_NMT_COB_ID = 0x000
-_EMCY, HEARTBEAT = 0x080, 0x700
+NMT_COB_ID = 0x000
+EMCY, HEARTBEAT = 0x080, 0x700
 _RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))  #: Set-points of a drive (CiA 301, predefined connection set)
 PUMP_S = 0.1  #: Longest time spent on frames that have already arrived, however fast more arrive
 # linux/can/error.h: classes of an error frame, and the controller's state in its second byte.
@@ -74,7 +75,7 @@ def command_name(identifier: int, names: Mapping[int, str]) -> str:
     """Describe a frame that only the recorder should send; `names` of the axes are by node id."""
     if identifier == SYNC_COB_ID:
         return "a SYNC (080h)"
-    if identifier == _NMT_COB_ID:
+    if identifier == NMT_COB_ID:
         return "an NMT command (000h)"
     if identifier < SDO_REQUEST:
         return f"a set-point of {node_label(identifier & 0x7F, names)} ({identifier:03X}h)"
@@ -124,6 +125,13 @@ class Link:
     def open(self) -> None:
         """Open the bus."""
         self._bus = self._opener(self.address)
+
+    def narrow(self) -> None:
+        """Receive from now on only what concerns our axes, or is a command: a flood of others costs nothing."""
+        services = (EMCY, *range(0x180, SDO_REQUEST, 0x80))
+        wanted = [(service + node_id, 0x7FF) for service in services for node_id in self.names]
+        whole = [(SDO_REQUEST, 0x780), (HEARTBEAT, 0x780)]
+        receive_only(self.bus, [(NMT_COB_ID, 0x7FF), (SYNC_COB_ID, 0x7FF), *wanted, *whole])
 
     def close(self) -> None:
         """Close the bus if it is open."""
@@ -200,7 +208,7 @@ class Link:
         if message.is_extended_id or message.is_remote_frame:
             return False
         ours = (service in _RPDOS and node_id in self.names) or (service == HEARTBEAT and node_id == self.own_id)
-        if message.arbitration_id in (_NMT_COB_ID, SYNC_COB_ID) or (service == SDO_REQUEST and node_id) or ours:
+        if message.arbitration_id in (NMT_COB_ID, SYNC_COB_ID) or (service == SDO_REQUEST and node_id) or ours:
             if message.arbitration_id != SYNC_COB_ID or self.sync_producer is None:
                 self.note_foreign(message.arbitration_id)
             return True
@@ -213,7 +221,7 @@ class Link:
             self.nmt[node_id], self.heard_ns[node_id] = state, self.clock()
             if previous != state:
                 self._events.append((node_id, EventKind.NMT, state, f"NMT {nmt_name(previous)} -> {nmt_name(state)}"))
-        elif service == _EMCY and len(message.data) == 8:
+        elif service == EMCY and len(message.data) == 8:
             code, register, data = struct.unpack("<HB5s", message.data)
             # CiA 301: codes 00xxh report the end of an error.
             kind = EventKind.EMCY if code & 0xFF00 else EventKind.EMCY_RESET

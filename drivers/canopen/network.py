@@ -243,6 +243,7 @@ class CanopenNetwork:
         for axis, identity, scale in zip(self.axes, identities, self.scales(), strict=True):
             self._readback[axis.name] = self._setups[axis.node_id].describe(identity, scale, self.guard_ms)
         self._command_all(NmtCommand.START, NmtState.OPERATIONAL)
+        self.link.narrow()
 
     def _take_recorder_id(self, watched: Sequence[int]) -> None:
         """Choose the highest node id that no device uses, and that no amplifier waits for by its entries of 1016h."""

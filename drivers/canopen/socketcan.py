@@ -9,11 +9,14 @@ import errno
 import os
 import select
 import socket
+import struct
 import subprocess
 import sys
 import time
 from abc import abstractmethod
 from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from operator import sub
 from pathlib import Path
@@ -36,6 +39,7 @@ ERROR_CLASSES = 0x4 | 0x40 | 0x100
 requested: a bus without a second node sends thousands a second."""
 _EXTENDED, _REMOTE, _ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
 _PAIR_BYTES = 1 << 18
+_FILTER = struct.Struct("=II")  #: struct can_filter
 
 
 class Losses(NamedTuple):
@@ -72,6 +76,13 @@ def losses_of(bus: can.BusABC) -> Losses:
     """Return the frames of a bus that this machine lost; zeros where a bus does not count them."""
     found = getattr(bus, "losses", NO_LOSSES)
     return found if isinstance(found, Losses) else NO_LOSSES
+
+
+def receive_only(bus: can.BusABC, wanted: Sequence[tuple[int, int]]) -> None:
+    """Let the kernel discard what a bus does not need, where it can: see `SocketcanBus.receive_only`."""
+    narrow: Callable[[Sequence[tuple[int, int]]], None] | None = getattr(bus, "receive_only", None)
+    if narrow is not None:
+        narrow(wanted)
 
 
 def read_until_ns(bus: can.BusABC) -> int | None:
@@ -205,6 +216,15 @@ class SocketcanBus(BurstBus):
             else:
                 return
 
+    def receive_only(self, wanted: Sequence[tuple[int, int]]) -> None:
+        """Let the kernel discard base frames other than these, given as identifier and mask, however many come.
+
+        Error frames are still received.
+        """
+        filters = b"".join(_FILTER.pack(number, mask | _EXTENDED | _REMOTE) for number, mask in wanted)
+        with suppress(OSError):  # a socket that is no CAN_RAW has no filters: it receives all
+            self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
+
     def _fill(self, timeout_s: float | None) -> None:
         """Take records from the capture process, waiting for the first of them."""
         if self._end is not None:
@@ -245,9 +265,7 @@ class SocketcanBus(BurstBus):
         for record in RECORD.iter_unpack(memoryview(chunk)[:whole]):
             kernel_ns, monotonic_ns, *lost, can_id, kind, length, own, local, data = record
             if kind == Kind.FRAME:
-                # Of our own frames only SYNC is of interest: its actual time.
-                if not own or can_id == 0x080:
-                    received.append(self._message(kernel_ns, monotonic_ns, can_id, data[:length], own, local))
+                received.append(self._message(kernel_ns, monotonic_ns, can_id, data[:length], own, local))
             elif kind == Kind.READY:
                 ready = True
             elif kind == Kind.END:

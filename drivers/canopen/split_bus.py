@@ -21,7 +21,7 @@ from itertools import groupby
 import can
 
 from drivers.canopen.bus import BusAddress, open_bus, send_burst
-from drivers.canopen.socketcan import CapturedMessage, Losses, losses_of, read_until_ns, remarks_of
+from drivers.canopen.socketcan import CapturedMessage, Losses, losses_of, read_until_ns, receive_only, remarks_of
 from drivers.errors import BusError, NodeMisplaced, node_label
 
 ALTERNATION_S = 0.0005  #: Time to wait at one bus while another may receive, where one of them has no file descriptor
@@ -141,6 +141,11 @@ class SplitBus(can.BusABC):
         """Remarks for the operator on how each bus was opened."""
         named = zip(self._names, map(remarks_of, self._ends), strict=True)
         return tuple(f"{name}: {remark}" for name, remarks in named for remark in remarks)
+
+    def receive_only(self, wanted: Sequence[tuple[int, int]]) -> None:
+        """Let the kernel discard other frames of every bus."""
+        for end in self._ends:
+            receive_only(end, wanted)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """As `send_burst`, with one frame."""

@@ -2,7 +2,8 @@
 
 An answer belongs to the SYNC before it on the bus. But a TPDO carries no cycle number: after a missing answer, the next
 one may be that answer, late. Only if two come is it known which is which. If one comes, it is doubtful: its sample says
-that it is missing too, and counts as such. The answers after that are no longer in doubt.
+that it is missing too, and counts as such. In the cycle after that, two are waited for once more. If all later answers
+were one cycle late, a cycle with two would end that, and these count as a duplicate, which no fit accepts.
 """
 
 from __future__ import annotations
@@ -72,7 +73,8 @@ class Answers:
         self.values = [0] * (3 * len(axes))  #: Last value of each column
         self.counts: Counter[str] = Counter()  #: By their names in StreamStatistics
         self._all = (1 << len(self.slots)) - 1
-        self._owed_slots = 0  # slots whose answer to the SYNC before may still come
+        self._owed_slots = 0  # slots whose answer to a SYNC before may still come
+        self._missed_slots = 0  # those that did not answer the SYNC before at all
         self._still_owed = self._answered_slots = 0
         self._before: dict[int, list[int]] = {}  # values before a doubtful answer, by the bit of its slot
         self._last_data: dict[int, bytearray] = {}
@@ -105,7 +107,7 @@ class Answers:
                 if self._last_data.get(identifier) == data:
                     return
                 # The second answer differs: the first may have been a repetition of the cycle before.
-        elif self._still_owed & slot.bit and not self._certain:
+        elif self._still_owed & self._missed_slots & slot.bit and not self._certain:
             self._before[slot.bit] = [self.values[column] for column in slot.columns]
         self._answered_slots |= slot.bit
         self._last_data[identifier] = data
@@ -116,23 +118,25 @@ class Answers:
         """Count an answer that is read before the next SYNC, and so belongs to none that is open."""
         if self._owed_slots & slot.bit:
             self._owed_slots &= ~slot.bit
+            self._missed_slots &= ~slot.bit
             self.counts["late"] += 1
         else:
             self.counts["duplicate"] += 1
 
     def end(self) -> int:
         """End a cycle; returns the axes without a complete answer, bit i for axis i."""
-        self._owed_slots = self._all & ~self._answered_slots
+        self._missed_slots = self._owed_slots = self._all & ~self._answered_slots
         if not (self._owed_slots or self._before):
             self.counts["frames"] += self._answered_slots.bit_count()
             return 0
         absent = 0
         for slot in self.slots.values():
             if slot.bit in self._before:
+                self._owed_slots |= slot.bit
                 for column, value in zip(slot.columns, self._before[slot.bit], strict=True):
                     self.values[column] = value
                 self.counts["late"] += 1
-            elif not self._owed_slots & slot.bit:
+            elif not self._missed_slots & slot.bit:
                 self.counts["frames"] += 1
                 continue
             absent |= 1 << slot.axis

@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from math import ceil
 from types import TracebackType
 
 from drivers.canopen.bus import BusAddress
@@ -35,6 +36,9 @@ SYNC_COB_ID_OBJECT = ObjectEntry(0x1005, 0, 32, signed=False)
 CYCLE_PERIOD = ObjectEntry(0x1006, 0, 32, signed=False)
 """Period [us]; a producer sends no SYNC while it is 0 (CiA 301)."""
 PRODUCES = 1 << 30
+LEASE_S = 0.4  #: Time for which the kernel goes on alone; less than the 0.5 s of the amplifiers' own watch
+LEAST_SYNCS = 3
+RENEWAL_S = 0.025  #: Time between two renewals
 STEERING_S = 0.25  #: Time between two corrections of the kernel's interval
 LARGEST_CORRECTION = 0.2
 """Fraction of the period; a kernel that is later than that produces time stamps which are refused."""
@@ -104,17 +108,21 @@ def steered_us(period_us: int, interval_us: int, late_ns: int, phase_ns: int, pe
     return round(min(max(wanted_us, (1.0 - LARGEST_CORRECTION) * period_us), (1.0 + LARGEST_CORRECTION) * period_us))
 
 
-def _setup(flags: int, interval_us: int) -> bytes:
+def setup_message(flags: int, interval_us: int) -> bytes:
+    """Return a message to the broadcast manager: send so many SYNCs as last for `LEASE_S`, then none."""
     seconds, rest_us = divmod(interval_us, 1_000_000)
-    head = _HEAD.pack(_TX_SETUP, flags, 0, 0, 0, seconds, rest_us, SYNC_COB_ID, 1)
+    count = max(LEAST_SYNCS, ceil(LEASE_S * 1e6 / interval_us))
+    head = _HEAD.pack(_TX_SETUP, flags, count, seconds, rest_us, 0, 0, SYNC_COB_ID, 1)
     return head + FRAME.pack(SYNC_COB_ID, 0, bytes(8))
 
 
 class KernelProducer(AbstractContextManager["KernelProducer"]):
     """SYNC by the kernel's broadcast manager (CAN_BCM), whose timer needs no process to wake up.
 
-    It ends with the process that started it. Each interval counts from the actual time of the last SYNC, so the period
-    is too long by the lateness of the timer: `seen` measures that and shortens the interval.
+    It ends with the process that started it, and `LEASE_S` after that process has seen its last SYNC: a recorder that
+    hangs must not keep the axes running, one that is stopped for 300 ms must lose nothing. Each interval counts from
+    the actual time of the last SYNC, so the period is too long by the lateness of the timer: `seen` measures that and
+    shortens the interval.
     """
 
     name = "the kernel"
@@ -125,21 +133,26 @@ class KernelProducer(AbstractContextManager["KernelProducer"]):
         self._socket: socket.socket | None = None
         self._interval_us = period_us
         self._window = max(8, round(STEERING_S * 1e6 / period_us))
-        self._begun_ns = self._phase_ns = self._periods = 0
+        self._begun_ns = self._phase_ns = self._periods = self._renewed_ns = 0
 
     def __exit__(self, *_: object) -> None:
         self.stop()
 
     def start(self) -> None:
-        """Send SYNC from now on; BusError where the kernel has no broadcast manager, or the bus is not SocketCAN."""
+        """Send SYNC from now on, or again; while it runs, this counts as `seen`.
+
+        Raises:
+            BusError: the kernel has no broadcast manager, or the bus is not SocketCAN.
+        """
         address = self._link.address
         if not isinstance(address, BusAddress) or address.interface != "socketcan":
             raise BusError(str(address), "SYNC by the kernel needs one bus of interface socketcan")
         try:
-            self._socket = socket.socket(socket.AF_CAN, socket.SOCK_DGRAM, socket.CAN_BCM)
-            self._socket.connect((address.channel,))
+            if self._socket is None:
+                self._socket = socket.socket(socket.AF_CAN, socket.SOCK_DGRAM, socket.CAN_BCM)
+                self._socket.connect((address.channel,))
             self._link.sync_producer = self.name
-            self._socket.send(_setup(_SET_AND_START_TIMER, self._interval_us))
+            self._socket.send(setup_message(_SET_AND_START_TIMER, self._interval_us))
         except OSError as error:
             self.stop()
             name = errno.errorcode.get(error.errno or 0, "")
@@ -148,6 +161,10 @@ class KernelProducer(AbstractContextManager["KernelProducer"]):
 
     def seen(self, monotonic_ns: int, periods: int) -> None:
         """Process a SYNC and its periods since the one before, 0 for the first; keeps average period and phase."""
+        if self._socket is not None and not 0 <= monotonic_ns - self._renewed_ns < RENEWAL_S * 1e9:
+            # The timer itself is not started again, if it has ended: the recorder was stopped for too long.
+            self._renewed_ns = monotonic_ns
+            self._socket.send(setup_message(_SET_TIMER, self._interval_us))
         if periods == 0:
             self._begun_ns, self._phase_ns, self._periods = monotonic_ns, 0, 0
             return
@@ -160,7 +177,7 @@ class KernelProducer(AbstractContextManager["KernelProducer"]):
         self._begun_ns, self._periods = monotonic_ns, 0
         if interval_us != self._interval_us:
             self._interval_us = interval_us
-            self._socket.send(_setup(_SET_TIMER, interval_us))
+            self._socket.send(setup_message(_SET_TIMER, interval_us))
 
     def stop(self) -> None:
         """Stop sending, if started."""
@@ -192,7 +209,9 @@ class DriveProducer(AbstractContextManager["DriveProducer"]):
             error.add_note(f"{WHILE}stopping SYNC: {problem}")
 
     def start(self) -> None:
-        """Let the drive send SYNC."""
+        """Let the drive send SYNC; nothing happens if it does."""
+        if self._before is not None:
+            return
         access = self._network.link.objects(self._node_id)
         self._before = (access.read(SYNC_COB_ID_OBJECT), access.read(CYCLE_PERIOD))
         self._network.link.sync_producer = self.name

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import struct
+
 import pytest
 
 from drivers.errors import BusError, ObjectAccessError
-from drivers.stream.sync import PRODUCES, DriveProducer, KernelProducer
+from drivers.stream.sync import PRODUCES, DriveProducer, KernelProducer, setup_message
 from tests.drivers.scripted import ScriptedBus, ScriptedNode, cell
 
 PERIOD_US = 2000
@@ -76,3 +78,11 @@ def test_the_kernel_sends_on_its_own_buses_alone() -> None:
         with pytest.raises(BusError, match="needs one bus of interface socketcan"):
             producer.start()
         assert network.link.sync_producer is None
+
+
+@pytest.mark.parametrize("period_us", [1000, 20_000, 1_000_000])
+def test_the_kernel_sends_for_less_than_the_amplifiers_wait_and_then_no_more(period_us: int) -> None:
+    """Struct bcm_msg_head: `count` frames every ival1, and then, with ival2 = 0, none."""
+    opcode, flags, count, *rest = struct.unpack_from("@3I4l2I0q", setup_message(1, period_us))
+    assert (opcode, flags, rest) == (1, 1, [*divmod(period_us, 1_000_000), 0, 0, 0x80, 1])
+    assert count == max(3, 400_000 // period_us)

@@ -172,6 +172,15 @@ def test_each_bus_of_two_has_its_own_order(delays_ns: list[list[int]], stops_ns:
 
 
 @pytest.mark.parametrize("producer", [True, False])
+def test_two_answers_late_in_a_row_are_in_no_other_sample(producer: bool) -> None:
+    late = [300_000] * 4 + [PERIOD_NS + 200_000, PERIOD_NS + 200_000] + [300_000] * (CYCLES - 6)
+    samples, counts, _ = run([late] * 2, (), producer=producer)
+    assert [sample.missing for sample in samples] == [0] * 4 + [3, 3] + [0] * (CYCLES - 6)
+    assert [sample.position_counts[0] for sample in samples if not sample.missing] == [0, 1, 2, 3, *range(6, CYCLES)]
+    assert (counts.missing, counts.duplicate) == (4, 0)
+
+
+@pytest.mark.parametrize("producer", [True, False])
 @pytest.mark.parametrize("stop_ms", [30, 100, 300])
 def test_a_stop_of_many_periods_loses_nothing(stop_ms: int, producer: bool) -> None:
     stop = (5 * PERIOD_NS + 1000, 5 * PERIOD_NS + 1_000_000 * stop_ms)
