@@ -75,10 +75,10 @@ test-vcan: setup vcan-tools
 
 # What brings a kernel with vcan where this one has none.
 vcan-tools:
-	@[ -e /sys/class/net/vcan0 ] || { command -v linux.uml && command -v ip; } >/dev/null || { \
+	@[ -e /sys/class/net/vcan0 ] || { command -v linux.uml && command -v ip && command -v candump; } >/dev/null || { \
 		[ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq && \
-		apt-get install -y -qq --no-install-recommends user-mode-linux iproute2; } || { \
-		echo "this needs vcan0, or as root: apt-get install user-mode-linux iproute2" >&2; exit 1; }
+		apt-get install -y -qq --no-install-recommends user-mode-linux iproute2 can-utils; } || { \
+		echo "this needs vcan0, or as root: apt-get install user-mode-linux iproute2 can-utils" >&2; exit 1; }
 
 CHROMIUM = $$(command -v chromium || command -v chromium-browser || command -v google-chrome)
 

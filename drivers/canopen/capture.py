@@ -9,6 +9,7 @@ they wait here in a bounded backlog; overflow is counted. The process ends when 
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import select
@@ -34,6 +35,7 @@ SYNC = 0x080
 _TIMESPEC, _U32, _MEMINFO = struct.Struct("@ll"), struct.Struct("=I"), struct.Struct("=9I")
 _DROPS = 8  # SK_MEMINFO_DROPS
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_U32.size)
+_ANCILLARY_HEAD = struct.Struct("@Nii")  # struct cmsghdr: its length with the data, level, type
 _SEND_BYTES = 1 << 16
 _PAUSE_NS = 200_000
 _CLOCK_STEP_NS = 1_000_000  #: A larger difference between two bursts is no slewing: the wall clock was set
@@ -56,6 +58,71 @@ has 0, and the monotonic time at which nothing was left to receive. Frames lost 
 it, and in the backlog; identifier and flags of struct can_frame; `Kind`; bytes of data; whether it was sent by this
 very socket, and by any program of this machine; eight bytes.
 """
+
+
+class _Vector(ctypes.Structure):
+    """Struct iovec."""
+
+    _fields_ = (("base", ctypes.c_void_p), ("length", ctypes.c_size_t))
+
+
+class _Message(ctypes.Structure):
+    """Struct mmsghdr: struct msghdr, and the bytes received."""
+
+    _fields_ = (
+        ("name", ctypes.c_void_p),
+        ("name_length", ctypes.c_uint32),
+        ("vectors", ctypes.c_void_p),
+        ("vector_count", ctypes.c_size_t),
+        ("control", ctypes.c_void_p),
+        ("control_length", ctypes.c_size_t),
+        ("flags", ctypes.c_int),
+        ("padding", ctypes.c_void_p * 0),
+        ("received", ctypes.c_uint),
+    )
+
+
+class Batch:
+    """Receives many frames in one system call (recvmmsg), which Python's socket cannot."""
+
+    def __init__(self, handle: int) -> None:
+        self._handle = handle
+        self._receive = ctypes.CDLL(None, use_errno=True).recvmmsg
+        self.frames = (ctypes.c_char * (BURST * FRAME.size))()
+        self._control = (ctypes.c_char * (BURST * _ANCILLARY_BYTES))()
+        self._vectors = (_Vector * BURST)()
+        self._messages = (_Message * BURST)()
+        for number in range(BURST):
+            vector, message = self._vectors[number], self._messages[number]
+            vector.base, vector.length = ctypes.addressof(self.frames) + number * FRAME.size, FRAME.size
+            message.vectors, message.vector_count = ctypes.addressof(self._vectors) + number * ctypes.sizeof(_Vector), 1
+            message.control = ctypes.addressof(self._control) + number * _ANCILLARY_BYTES
+            message.control_length = _ANCILLARY_BYTES
+        self._fresh = bytes(self._messages)
+
+    def receive(self) -> int:
+        """Receive what waits, `BURST` frames at most; returns their number. OSError as for a socket."""
+        ctypes.memmove(self._messages, self._fresh, len(self._fresh))
+        count: int = self._receive(self._handle, self._messages, BURST, socket.MSG_DONTWAIT, None)
+        if count < 0:
+            raise OSError(ctypes.get_errno(), "recvmmsg")
+        return count
+
+    def about(self, number: int) -> tuple[int, int, int, int | None]:
+        """Return bytes, flags, time stamp [ns since 1970; 0 without] and drop counter of a received frame."""
+        message = self._messages[number]
+        stamp_ns, drops = 0, None
+        at, end = number * _ANCILLARY_BYTES, number * _ANCILLARY_BYTES + message.control_length
+        while at + _ANCILLARY_HEAD.size <= end:
+            length, level, kind = _ANCILLARY_HEAD.unpack_from(self._control, at)
+            data = at + socket.CMSG_LEN(0)
+            if level == socket.SOL_SOCKET and kind == SCM_TIMESTAMPNS:
+                seconds, rest_ns = _TIMESPEC.unpack_from(self._control, data)
+                stamp_ns = seconds * 1_000_000_000 + rest_ns
+            elif level == socket.SOL_SOCKET and kind == SO_RXQ_OVFL:
+                (drops,) = _U32.unpack_from(self._control, data)
+            at += socket.CMSG_SPACE(length - socket.CMSG_LEN(0))
+        return message.received, message.flags, stamp_ns, drops
 
 
 class DropCounter:
@@ -130,7 +197,7 @@ class Capture:
         self._interface_before = self._read_interface()
         self._empty_ns = 0
         self._reported_drops = (0, 0, 0)
-        self._frame = bytearray(FRAME.size)
+        self._batch = Batch(bus.fileno())
 
     def run(self, parent: int) -> None:
         """Capture until the parent, given by its process id, or the bus is gone."""
@@ -169,39 +236,26 @@ class Capture:
 
     def receive(self) -> int:
         """Receive waiting frames, a burst at most; returns the error number that ended the bus, else 0."""
-        burst: list[tuple[int, int, bytes, int, int]] = []
-        number = 0
-        while len(burst) < BURST:
-            try:
-                size, ancillary, flags, _ = self._bus.recvmsg_into(
-                    (self._frame,), _ANCILLARY_BYTES, socket.MSG_DONTWAIT
-                )
-            except BlockingIOError:
-                break
-            except InterruptedError:
-                continue
-            except OSError as error:
-                number = error.errno or errno.EIO
-                break
-            if size == 0:
-                number = errno.ENODEV
-                break
-            stamp_ns = 0
-            for level, kind, data in ancillary:
-                if level == socket.SOL_SOCKET and kind == SCM_TIMESTAMPNS:
-                    seconds, rest_ns = _TIMESPEC.unpack(data)
-                    stamp_ns = seconds * 1_000_000_000 + rest_ns
-                elif level == socket.SOL_SOCKET and kind == SO_RXQ_OVFL:
-                    self._drops.see(_U32.unpack(data)[0])
-            can_id, length, payload = FRAME.unpack(self._frame)
-            if flags & MSG_OWN and can_id != SYNC:
-                continue  # of our own frames only SYNC is of interest: its actual time
-            burst.append((can_id, length, payload, stamp_ns, flags))
+        number = count = 0
+        try:
+            count = self._batch.receive()
+        except (BlockingIOError, InterruptedError):
+            return 0
+        except OSError as error:
+            number = error.errno or errno.EIO
         before_ns, wall_ns, self._now_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
         now_ns = (before_ns + self._now_ns) // 2
         if self._now_ns - before_ns > _PAUSE_NS:
             wall_ns = now_ns + self._time.offset_ns  # preempted between the readings: they do not belong together
-        for can_id, length, payload, stamp_ns, flags in burst:
+        for index in range(count):
+            size, flags, stamp_ns, drops = self._batch.about(index)
+            if size == 0:
+                return errno.ENODEV
+            if drops is not None:
+                self._drops.see(drops)
+            can_id, length, payload = FRAME.unpack_from(self._batch.frames, index * FRAME.size)
+            if flags & MSG_OWN and can_id != SYNC:
+                continue  # of our own frames only SYNC is of interest: its actual time
             monotonic_ns = self._time.of(stamp_ns or wall_ns, wall_ns, now_ns)
             if len(self._backlog) >= self._most_bytes:
                 self._backlog_dropped += 1

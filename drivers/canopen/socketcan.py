@@ -122,6 +122,10 @@ class BurstBus(can.BusABC):
 
     _received: deque[can.Message]
 
+    def take(self) -> can.Message | None:
+        """Return a frame that was received with the one before; None where the bus has to be asked."""
+        return self._received.popleft() if self._received and self._filters is None else None
+
     def recv(self, timeout: float | None = None) -> can.Message | None:
         if self._received and self._filters is None:
             return self._received.popleft()

@@ -1,8 +1,10 @@
-"""`make bench-stream`: what the stream loses of six axes on SocketCAN, with a busy Python thread beside it.
+"""`make bench-stream`: what the stream loses of six axes on SocketCAN, and what a frame costs, beside candump.
 
 Writes out/bench-stream.json and asserts nothing but that every frame is accounted for: sent = received + counted lost.
 The frames come from a process of their own (tests/bench/stream_sender.py) at the rate asked for, and go through the
-real SyncStream; the highest rate that a minute holds without a loss is looked for downwards from 1 kHz.
+real SyncStream; the highest rate without a loss is looked for downwards from 1 kHz, with a busy Python thread beside
+it. Then drivegain, candump (can-utils) and a plain listener receive the same frames, one after the other and alone, and
+drivegain's capture process is stopped for 30, 100 and 300 ms.
 """
 
 from __future__ import annotations
@@ -11,13 +13,16 @@ import argparse
 import json
 import os
 import platform
+import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,12 +39,41 @@ from tests.drivers.scripted import PROFILE
 from tests.vcan.run import INTERFACE, OUT
 
 RATES_HZ = (1000, 900, 800, 700, 600, 500, 400, 300, 200, 100)
+COMPARED_HZ = 250
+STOPS_S = (0.03, 0.1, 0.3)
+LISTENER = """
+import socket, sys
+end = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+end.setsockopt(socket.SOL_SOCKET, 33, 4 << 20)  # SO_RCVBUFFORCE
+end.bind((sys.argv[1],))
+frame = bytearray(16)
+while True:
+    end.recv_into(frame)
+    sys.stdout.write("x\\n")
+    sys.stdout.flush()
+"""
+SPARE = """
+import os, signal, sys, time
+os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+count, begun = 0, time.monotonic()
+def end(*_):
+    print(count, time.monotonic() - begun)
+    sys.exit()
+signal.signal(signal.SIGTERM, end)
+while True:
+    count += 1
+"""
+LISTENERS = {
+    "nothing": ("sleep", "1000000"),
+    "candump": ("candump", "-L", INTERFACE),
+    "plain listener": (sys.executable, "-S", "-c", LISTENER, INTERFACE),
+}
 FLOOD_CYCLES = 20_000
 PATIENCE_S = 20.0
 ADDRESS = BusAddress("socketcan", INTERFACE)
 AXES = tuple(Axis(f"J{node}", node, PROFILE, None) for node in range(1, 1 + NODES))
 WIRE_QUEUE = Path("/proc/sys/net/core/netdev_max_backlog")
-TICKS = os.sysconf("SC_CLK_TCK")
+CPUCLOCK_SCHED = 2  # linux/posix-timers.h: the clock of another process is made from its id
 
 
 Beside = Callable[[], AbstractContextManager[list[int]]]
@@ -62,6 +96,8 @@ def main() -> int:
     held_hz = round(runs[-1]["asked_hz"])
     quiet = one_run(1_000_000 // held_hz, round(held_hz * arguments.seconds / 4), nothing)
     flood = one_run(0, FLOOD_CYCLES, busy)
+    stopped = one_run(1_000_000 // COMPARED_HZ, COMPARED_HZ * 12, nothing, STOPS_S)
+    compared = compare(arguments.seconds / 4)
     result = {
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": machine(),
@@ -69,16 +105,87 @@ def main() -> int:
         "runs": runs,
         "without_busy_thread": quiet,
         "flood": flood,
+        "capture_stopped_for_30_100_300_ms": stopped,
+        "compared": compared,
     }
     path = Path(os.environ.get(OUT, "out")) / "bench-stream.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(result, indent=2) + "\n")
     _print_line(f"written: {path}")
-    return 0 if all(run["identity_holds"] for run in (*runs, quiet, flood)) else 1
+    return 0 if all(run["identity_holds"] for run in (*runs, quiet, flood, stopped)) else 1
 
 
-def one_run(period_us: int, cycles: int, beside: Beside) -> dict[str, Any]:
-    """So many cycles through the stream; a period of 0 sends them as fast as the sender can."""
+def compare(seconds: float) -> list[dict[str, Any]]:
+    """Processor time of a frame at one rate, and the highest rate without a loss, of each listener alone.
+
+    The time is the difference of a long and a short run, less that of the sender alone: starting costs the same.
+    """
+    rows, cost_us = [], dict[str, float]()
+    lengths = round(COMPARED_HZ * seconds / 4), round(COMPARED_HZ * seconds)
+    alone = 1.0 / spare(lambda: time.sleep(seconds / 4))[1]
+    for name in ("nothing", "drivegain", "candump", "plain listener"):
+        used = [spare(partial(hear, name, 1_000_000 // COMPARED_HZ, cycles)) for cycles in lengths]
+        busy_s = [counted[0] - counted[0] * counted[1] * alone for counted in used]
+        frames = FRAMES_A_CYCLE * (lengths[1] - lengths[0])
+        cost_us[name] = 1e6 * (busy_s[1] - busy_s[0]) / frames
+        if name == "nothing":
+            continue
+        for rate_hz in RATES_HZ:
+            run = hear(name, 1_000_000 // rate_hz, round(rate_hz * seconds))
+            if run["lost"] == 0 and run["rate_held"]:
+                break
+        rate, cost = rate_hz if run["lost"] == 0 else None, round(cost_us[name] - cost_us["nothing"], 1)
+        rows.append({"listener": name, "processor_us_a_frame": cost, "highest_rate_hz_without_loss": rate})
+        _print_line(json.dumps(rows[-1]))
+    return rows
+
+
+def hear(name: str, period_us: int, cycles: int) -> dict[str, Any]:
+    """So many cycles to one of the listeners, or to none."""
+    return one_run(period_us, cycles, nothing) if name == "drivegain" else listen(LISTENERS[name], period_us, cycles)
+
+
+def spare(action: Callable[[], object]) -> tuple[float, float]:
+    """Count in a program of the lowest priority while something is done; returns seconds, and counts a second.
+
+    A guest charges processor time to whoever runs at a tick, and what wakes up with the ticks escapes it. What is left
+    to others does not.
+    """
+    with subprocess.Popen((sys.executable, "-S", "-c", SPARE), stdout=subprocess.PIPE, text=True) as process:
+        time.sleep(0.5)
+        action()
+        process.terminate()
+        count, seconds = map(float, process.communicate()[0].split())
+    return seconds, count / seconds
+
+
+def listen(command: tuple[str, ...], period_us: int, cycles: int) -> dict[str, Any]:
+    """So many cycles to a program that writes a line for each frame."""
+    with tempfile.TemporaryFile() as out, _sender(period_us, cycles) as sender:
+        with subprocess.Popen(command, stdout=out) as process:
+            time.sleep(1.0)  # until it listens
+            sent_text, sending_s = sender.communicate("go\n")[0].split()
+            time.sleep(1.0)
+            process.terminate()
+        out.seek(0)
+        received, sent, sent_hz = sum(1 for _ in out), int(sent_text), cycles / float(sending_s)
+    return {"lost": sent - received, "rate_held": sent_hz > 0.99 * 1e6 / period_us}
+
+
+def _stop_for(pid: int, stops_s: Sequence[float]) -> None:
+    """Stop a process for these times, two seconds apart."""
+    for stop_s in stops_s:
+        time.sleep(2.0)
+        os.kill(pid, signal.SIGSTOP)
+        time.sleep(stop_s)
+        os.kill(pid, signal.SIGCONT)
+
+
+def one_run(period_us: int, cycles: int, beside: Beside, stops_s: Sequence[float] = ()) -> dict[str, Any]:
+    """So many cycles through the stream; a period of 0 sends them as fast as the sender can.
+
+    The capture process is stopped meanwhile for the given times.
+    """
     ends: list[SocketcanBus] = []
 
     def opened(_address: object) -> SocketcanBus:
@@ -104,6 +211,8 @@ def one_run(period_us: int, cycles: int, beside: Beside) -> dict[str, Any]:
             if begin is not None:
                 begin.write("go\n")
                 begin.flush()
+            stopping = threading.Thread(target=_stop_for, args=(ends[0].capture_pid, stops_s), name="stop")
+            stopping.start()
             sample = stream.advance()
             regular = stream.statistics
             while sample.position_counts[0] != LAST:
@@ -111,6 +220,7 @@ def one_run(period_us: int, cycles: int, beside: Beside) -> dict[str, Any]:
                 wrong += sample.missing == 0 and len(set(sample.position_counts)) != 1
                 regular = stream.statistics
                 sample = stream.advance()
+            stopping.join()
         seconds = time.monotonic() - begun_s
         main_s, all_s = time.thread_time() - main_before, time.process_time() - all_before
         capture_s = _processor_s(ends[0].capture_pid) - capture_before
@@ -190,8 +300,8 @@ def busy() -> Iterator[list[int]]:
 
 
 def _processor_s(process: int) -> float:
-    fields = Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS
+    """Return the processor time of a process [s], to the nanosecond; /proc counts ticks, which a guest misses."""
+    return time.clock_gettime(~process << 3 | CPUCLOCK_SCHED)
 
 
 def _spread(values: np.ndarray[Any, Any]) -> dict[str, float]:

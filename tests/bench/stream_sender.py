@@ -37,6 +37,7 @@ def main(interface: str, period_us: int, cycles: int) -> None:
         # It reads nothing: what others send must not queue up for it.
         bus.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
         sync = _FRAME.pack(0x080, 0, bytes(8))
+        time.sleep(PAUSE_S / 10)  # until the first SYNC is waited for
         begun_ns = time.monotonic_ns()
         sent = 0
         for cycle in range(cycles):
