@@ -3,9 +3,9 @@
     python -m tests.studies.any_robot --only kr270 --seeds 1 2
 
 Each seed has plans and noise of its own: runs in turn without load and with the weighed payload, a fit, then
-recordings with a second body, which `weigh` finds with the calibration alone. A finished seed is kept in
-out/robot-study/ and not made again while the robot's row of ROBOTS and its files are the same. Writes
-out/robot-study.json and prints the table of docs/evidence/robots.md.
+recordings with that payload and with a second body, which `weigh` finds with the calibration alone. A finished seed
+is kept in out/robot-study/ and not made again while the robot's row of ROBOTS and its files are the same. Writes
+out/robot-study.json and, if all robots and seeds are there, the tables of docs/evidence/robots.md.
 """
 
 from __future__ import annotations
@@ -32,11 +32,13 @@ from daq.workflow.weigh import weigh_logs
 from ident.arrays import BoolArray, FloatArray
 from tests.pipeline.cells import make_plan, record_run, run_job
 from tests.studies.fingerprint import digest, finish, is_finished
+from tests.studies.robot_tables import write_tables
 
 OUT = Path("out/robot-study")
+TABLES = Path("docs/evidence/data")
 SEEDS = (1, 2, 3, 4)
-SECOND_PLAN, SECOND_NOISE = 9, 99
-"""Number of the plan and of the noise of a seed's first recording with the second body; later ones count down."""
+LAST_PLAN, LAST_NOISE = 9, 99
+"""Numbers of a seed's plans and noise for weighing, from which it counts down; those of the fit count up."""
 WITHIN = 1.96  #: σ of a 95 % interval
 
 
@@ -87,26 +89,40 @@ def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
             simulation=robot.simulation,
             exchanges=robot.exchanges,
         )
-        logs = []
-        for number in range(robot.weighed):
-            name, own = f"second-{number}", 10 * seed + SECOND_PLAN - number
-            plan = make_plan(job, f"{name}.yaml", seed=own, seconds=robot.seconds, exchanges=0)
-            logs.append(folder / f"{name}.mcap")
-            noise = 100 * seed + SECOND_NOISE - number
-            record_run(job, plan, logs[-1], mounted=robot.second, declared=False, seed=noise)
-        body = weigh_logs(load_calibration(folder / "calibration.yaml"), logs).body
-    true = load_simulation(shipped_simulation(robot.simulation), robot.second).payload
-    assert true is not None
+        first = job.cell.payloads[0].name
+        plans = [
+            make_plan(
+                job, f"weighed-{number}.yaml", seed=10 * seed + LAST_PLAN - number, seconds=robot.seconds, exchanges=0
+            )
+            for number in range(robot.weighed)
+        ]
+        # The weighed payload of the fit once more, in one run that no fit has seen, then the second body in each.
+        mounted = [(first, plans[0]), *((robot.second, plan) for plan in plans)]
+        logs: dict[str, list[Path]] = {first: [], robot.second: []}
+        for number, (body, plan) in enumerate(mounted):
+            logs[body].append(folder / f"{body}-{number}.mcap")
+            record_run(job, plan, logs[body][-1], mounted=body, declared=False, seed=100 * seed + LAST_NOISE - number)
+        calibration = load_calibration(folder / "calibration.yaml")
+        weighed = {body: weigh_logs(calibration, mine).body for body, mine in logs.items()}
+    payloads: dict[str, float] = {}
+    for role, name in (("payload", robot.second), ("first_payload", first)):
+        true = load_simulation(shipped_simulation(robot.simulation), name).payload
+        assert true is not None
+        payloads |= {
+            f"{role}_kg": true.mass_kg,
+            f"{role}_error_percent": 100.0 * (weighed[name].mass_kg / true.mass_kg - 1.0),
+            f"{role}_std_percent": 100.0 * weighed[name].mass_std_kg / true.mass_kg,
+        }
     return {
         "robot": robot.name,
         "seed": seed,
+        "gain_unit": {axis.name: axis.gain_unit for axis in job.cell.axes},
+        "nameplate_gain": {axis.name: axis.nameplate_gain for axis in job.cell.axes},
+        "true_gain": job.truth,
         "gain_error_percent": {axis: error for axis, (error, _) in job.gains.items()},
         "gain_std_percent": {axis: std for axis, (_, std) in job.gains.items()},
         "floor_percent": job.calibration["relative_error_percent"]["total"],
-        "payload_kg": true.mass_kg,
-        "payload_error_percent": 100.0 * (body.mass_kg / true.mass_kg - 1.0),
-        "payload_std_percent": 100.0 * body.mass_std_kg / true.mass_kg,
-    }
+    } | payloads
 
 
 def kept(robot: StudiedRobot, seed: int, out: Path = OUT) -> dict[str, Any]:
@@ -190,6 +206,8 @@ def main(arguments: list[str] | None = None) -> int:
     over_all = pooled(everything)
     document = {"robots": robots, "pooled": over_all, "rows": everything}
     replace_file(OUT.with_suffix(".json"), f"{json.dumps(document, indent=2)}\n".encode())
+    if len(rows) == len(ROBOTS) and set(options.seeds) >= set(SEEDS):
+        write_tables(TABLES, robots, everything)
     sys.stdout.write(
         f"{table(robots)}\n\n95 % intervals that hold: {over_all['gain_coverage_percent']:.0f} % of "
         f"{over_all['gains']} gains, {over_all['mass_coverage_percent']:.0f} % of {over_all['masses']} masses\n"

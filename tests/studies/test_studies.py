@@ -19,6 +19,7 @@ from tests.studies.blind_cells import FAMILIES, NOTHING, blind_cases, confusion
 from tests.studies.direct_cell import RawRun, demand_rad, run_of
 from tests.studies.followed_cell import follow, without_rest
 from tests.studies.raw_runs import read_runs, write_runs
+from tests.studies.robot_tables import write_tables
 from tests.studies.side_by_side import Shard
 from tests.studies.study_cells import CORRELATION_S, WORLDS, declared_payload, spec_of, world_cell
 from tests.studies.study_plans import CELL
@@ -64,6 +65,22 @@ def test_the_figures_of_a_robot_are_over_all_its_gains_and_seeds() -> None:
         "masses": 2,
         "mass_coverage_percent": 50.0,
     }
+
+
+def test_the_tables_of_robots_show_identified_gains_and_masses(tmp_path: Path) -> None:
+    masses = {f"{role}_{what}": value for role, kg in (("first_payload", 10.0), ("payload", 4.0))
+              for what, value in (("kg", kg), ("error_percent", -1.0), ("std_percent", 0.5))}  # fmt: skip
+    row = {
+        "robot": "arm", "seed": 1, "floor_percent": 3.0, "gain_unit": {"J1": "Nm/A"}, "nameplate_gain": {"J1": -20.0},
+        "true_gain": {"J1": -25.0}, "gain_error_percent": {"J1": 4.0}, "gain_std_percent": {"J1": 2.6},
+    }  # fmt: skip
+    rows = [row | masses, {**row, **masses, "seed": 2, "gain_error_percent": {"J1": 0.0}}]
+    write_tables(tmp_path, [figures(rows)], rows)
+    last = {path.stem: path.read_text(encoding="utf-8").splitlines()[-1] for path in tmp_path.iterdir()}
+    # -25 + 4 % is -26: 30 % more than the nameplate says, and 2.6 % of -25 are 2.5 % of -26.
+    assert last["robots-gains"] == "arm,J1,Nm/A,-20,-26,2.50,30.00,4.00"
+    assert last["robots-payloads"] == "arm,10,9.9,0.50,1.00,4,3.96,0.50,1.00"
+    assert last["robots"] == "arm,1,3.0,2.00,4.00,1.00,1.00,100"
 
 
 def test_runs_come_back_with_their_demand(tmp_path: Path) -> None:
