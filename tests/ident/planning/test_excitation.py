@@ -19,6 +19,7 @@ from ident.model.model import Model
 from ident.model.robot import Motion
 from ident.model.urdf import robot_from_urdf
 from ident.planning.excitation import (
+    UNSEEN_PERCENT,
     Design,
     Excitation,
     Expectation,
@@ -134,6 +135,11 @@ def test_deviations_scale_with_noise_and_repetition(seed: int, factor: float, ti
     often = design.std_percent(times * design.information(excitation, (None, 0)))
     assert noisy == pytest.approx(factor * once, rel=1e-6)
     assert often == pytest.approx(once / np.sqrt(times), rel=1e-6)
+    rank = louder.rank(louder.information(excitation, (None, 0)))
+    assert 0 <= rank <= louder.rank(times * louder.information(excitation, (None, 0))) <= len(GAINS)
+    # Each gain is a sum of independent directions with squares of weights that add up to one.
+    assert rank < len(GAINS) or (noisy <= UNSEEN_PERCENT * (1.0 + 1e-9)).all()
+    assert rank > 0 or (noisy > UNSEEN_PERCENT * (1.0 - 1e-9)).all()
     # More moves never give less information.
     more = design.information(excitation, (None, 0)) + design.information(
         _excitation(np.random.default_rng(7), 20), (None, 0)
