@@ -332,6 +332,19 @@ def spread(columns: FloatArray, to_motors: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("kmd,d...k->m...k", back, columns, optimize=True))
 
 
+def preload_directions(to_motors: FloatArray) -> FloatArray:
+    """N, torques of the axes that move nothing: an orthonormal basis of the null space of Aᵀ.
+
+    Args:
+        to_motors: Aᵀ, shape (d, m, k).
+
+    Returns:
+        shape (k, m, m − d).
+    """
+    whole, _ = np.linalg.qr(np.transpose(to_motors, (2, 1, 0)), mode="complete")
+    return np.asarray(whole[:, :, len(to_motors) :])
+
+
 def without_preload(followed: TreeMotion, torque: FloatArray) -> FloatArray:
     """Take internal preload out of torques of the axes [Nm or N], B Aᵀ τ, shape (m, k)."""
     to_motors = np.transpose(followed.to_motors, (2, 1, 0))
