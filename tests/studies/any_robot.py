@@ -1,11 +1,13 @@
-"""Gains of every shipped robot and the mass of a second payload, over the whole driver path.
+"""Gains of every shipped robot and the mass of a second payload, over the whole driver path; effects of closed chains.
 
-    python -m tests.studies.any_robot --only kr270 --seeds 1 2
+    python -m tests.studies.any_robot --only KR270 --seeds 1 2
+    python -m tests.studies.any_robot --part effects --seeds 1
 
 Each seed has plans and noise of its own: runs in turn without load and with the weighed payload, a fit, then
-recordings with a second body, which `weigh` finds with the calibration alone. A finished seed is kept in
-out/robot-study/ and not made again while the robot's row of ROBOTS and its files are the same. Writes
-out/robot-study.json and prints the table of docs/evidence/robots.md.
+recordings with that payload and with a second body, which `weigh` finds with the calibration alone. A finished seed
+is kept in out/robot-study/ and not made again while the robot's row of ROBOTS and its files are the same. Writes
+out/robot-study.json and, if all robots and seeds are there, the tables of docs/evidence/robots.md. The effects that a
+plant has beside the declared ones, and what `residual` names, are in chain_effects.py.
 """
 
 from __future__ import annotations
@@ -14,7 +16,6 @@ import argparse
 import contextlib
 import io
 import json
-import shutil
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -31,12 +32,15 @@ from daq.workflow.calibration_file import load_calibration
 from daq.workflow.weigh import weigh_logs
 from ident.arrays import BoolArray, FloatArray
 from tests.pipeline.cells import make_plan, record_run, run_job
-from tests.studies.fingerprint import digest, finish, is_finished
+from tests.studies.chain_effects import PLANTED, kept_effect, table_of_effects
+from tests.studies.fingerprint import digest, made_once
+from tests.studies.robot_tables import write_tables
 
 OUT = Path("out/robot-study")
+TABLES = Path("docs/evidence/data")
 SEEDS = (1, 2, 3, 4)
-SECOND_PLAN, SECOND_NOISE = 9, 99
-"""Number of the plan and of the noise of a seed's first recording with the second body; later ones count down."""
+LAST_PLAN, LAST_NOISE = 9, 99
+"""Numbers of a seed's plans and noise for weighing, from which it counts down; those of the fit count up."""
 WITHIN = 1.96  #: σ of a 95 % interval
 
 
@@ -87,40 +91,45 @@ def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
             simulation=robot.simulation,
             exchanges=robot.exchanges,
         )
-        logs = []
-        for number in range(robot.weighed):
-            name, own = f"second-{number}", 10 * seed + SECOND_PLAN - number
-            plan = make_plan(job, f"{name}.yaml", seed=own, seconds=robot.seconds, exchanges=0)
-            logs.append(folder / f"{name}.mcap")
-            noise = 100 * seed + SECOND_NOISE - number
-            record_run(job, plan, logs[-1], mounted=robot.second, declared=False, seed=noise)
-        body = weigh_logs(load_calibration(folder / "calibration.yaml"), logs).body
-    true = load_simulation(shipped_simulation(robot.simulation), robot.second).payload
-    assert true is not None
+        first = job.cell.payloads[0].name
+        plans = [
+            make_plan(
+                job, f"weighed-{number}.yaml", seed=10 * seed + LAST_PLAN - number, seconds=robot.seconds, exchanges=0
+            )
+            for number in range(robot.weighed)
+        ]
+        # The weighed payload of the fit once more, in one run that no fit has seen, then the second body in each.
+        mounted = [(first, plans[0]), *((robot.second, plan) for plan in plans)]
+        logs: dict[str, list[Path]] = {first: [], robot.second: []}
+        for number, (body, plan) in enumerate(mounted):
+            logs[body].append(folder / f"{body}-{number}.mcap")
+            record_run(job, plan, logs[body][-1], mounted=body, declared=False, seed=100 * seed + LAST_NOISE - number)
+        calibration = load_calibration(folder / "calibration.yaml")
+        weighed = {body: weigh_logs(calibration, mine).body for body, mine in logs.items()}
+    payloads: dict[str, float] = {}
+    for role, name in (("payload", robot.second), ("first_payload", first)):
+        true = load_simulation(shipped_simulation(robot.simulation), name).payload
+        assert true is not None
+        payloads |= {
+            f"{role}_kg": true.mass_kg,
+            f"{role}_error_percent": 100.0 * (weighed[name].mass_kg / true.mass_kg - 1.0),
+            f"{role}_std_percent": 100.0 * weighed[name].mass_std_kg / true.mass_kg,
+        }
     return {
         "robot": robot.name,
         "seed": seed,
+        "gain_unit": {axis.name: axis.gain_unit for axis in job.cell.axes},
+        "nameplate_gain": {axis.name: axis.nameplate_gain for axis in job.cell.axes},
+        "true_gain": job.truth,
         "gain_error_percent": {axis: error for axis, (error, _) in job.gains.items()},
         "gain_std_percent": {axis: std for axis, (_, std) in job.gains.items()},
         "floor_percent": job.calibration["relative_error_percent"]["total"],
-        "payload_kg": true.mass_kg,
-        "payload_error_percent": 100.0 * (body.mass_kg / true.mass_kg - 1.0),
-        "payload_std_percent": 100.0 * body.mass_std_kg / true.mass_kg,
-    }
+    } | payloads
 
 
 def kept(robot: StudiedRobot, seed: int, out: Path = OUT) -> dict[str, Any]:
     """Return the row of a seed, which is made unless it is there; logs are deleted once it is."""
-    path = out / f"{robot.name}-{seed}.json"
-    if not is_finished(path, robot.fingerprint):
-        folder = out / f"{robot.name}-{seed}"
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        replace_file(path, f"{json.dumps(study(robot, seed, folder), indent=2)}\n".encode())
-        finish(path, robot.fingerprint)
-        shutil.rmtree(folder)
-    row: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return row
+    return made_once(out, f"{robot.name}-{seed}", robot.fingerprint, lambda folder: study(robot, seed, folder))
 
 
 def figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -179,22 +188,34 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.studies.any_robot", description=__doc__)
     parser.add_argument("--only", nargs="+", choices=[robot.name for robot in ROBOTS], metavar="ROBOT")
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
+    parser.add_argument("--part", nargs="+", choices=["gains", "effects"], default=["gains", "effects"])
     options = parser.parse_args(arguments)
     OUT.mkdir(parents=True, exist_ok=True)
-    rows: dict[str, list[dict[str, Any]]] = {}
-    for robot in ROBOTS:
-        if options.only is None or robot.name in options.only:
-            rows[robot.name] = [kept(robot, seed) for seed in options.seeds]
-    everything = [row for mine in rows.values() for row in mine]
-    robots = [figures(mine) for mine in rows.values()]
-    over_all = pooled(everything)
-    document = {"robots": robots, "pooled": over_all, "rows": everything}
-    replace_file(OUT.with_suffix(".json"), f"{json.dumps(document, indent=2)}\n".encode())
+    chosen = {robot.name for robot in ROBOTS if options.only is None or robot.name in options.only}
+    path = OUT.with_suffix(".json")
+    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    if "gains" in options.part:
+        document |= _gains(chosen, options.seeds)
+    if "effects" in options.part:
+        effects = [kept_effect(one, seed, OUT) for one in PLANTED if one.robot in chosen for seed in options.seeds]
+        document["effects"] = effects
+        sys.stdout.write(f"\nUndeclared effects:\n\n{table_of_effects(effects)}\n" if effects else "")
+    replace_file(path, f"{json.dumps(document, indent=2)}\n".encode())
+    return 0
+
+
+def _gains(chosen: set[str], seeds: list[int]) -> dict[str, Any]:
+    """Figures of the chosen robots, printed as a table; of all of them also the tables of the documentation."""
+    mine = [[kept(robot, seed) for seed in seeds] for robot in ROBOTS if robot.name in chosen]
+    everything = [row for rows in mine for row in rows]
+    robots, over_all = [figures(rows) for rows in mine], pooled(everything)
+    if len(robots) == len(ROBOTS) and set(seeds) >= set(SEEDS):
+        write_tables(TABLES, robots, everything)
     sys.stdout.write(
         f"{table(robots)}\n\n95 % intervals that hold: {over_all['gain_coverage_percent']:.0f} % of "
         f"{over_all['gains']} gains, {over_all['mass_coverage_percent']:.0f} % of {over_all['masses']} masses\n"
     )
-    return 0
+    return {"robots": robots, "pooled": over_all, "rows": everything}
 
 
 if __name__ == "__main__":

@@ -11,14 +11,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daq.config.cell_file import load_cell
-from daq.simulation.simulation_file import load_simulation
+from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from drivers.simulation.effects import build_effect
 from drivers.simulation.plant import Plant
+from ident.effects.dictionary import EFFECTS
 from tests.conftest import CHECKOUT
 from tests.studies.any_robot import ROBOTS, StudiedRobot, figures, pooled
 from tests.studies.blind_cells import FAMILIES, NOTHING, blind_cases, confusion
+from tests.studies.chain_effects import PLANTED, PlantedEffect
 from tests.studies.direct_cell import RawRun, demand_rad, run_of
+from tests.studies.fingerprint import made_once
 from tests.studies.followed_cell import follow, without_rest
 from tests.studies.raw_runs import read_runs, write_runs
+from tests.studies.robot_tables import write_tables
 from tests.studies.side_by_side import Shard
 from tests.studies.study_cells import CORRELATION_S, WORLDS, declared_payload, spec_of, world_cell
 from tests.studies.study_plans import CELL
@@ -45,6 +50,30 @@ def test_a_studied_robot_has_a_weighed_payload_and_a_second_body_that_no_cell_de
     assert robot.fingerprint != replace(robot, seconds=robot.seconds + 1.0).fingerprint
 
 
+def test_what_is_made_once_is_not_made_again(tmp_path: Path) -> None:
+    def make(folder: Path) -> dict[str, int]:
+        assert folder.is_dir()
+        made.append(folder)
+        return {"times": len(made)}
+
+    made: list[Path] = []
+    found = [made_once(tmp_path, "a", mark, make) for mark in ("one", "one", "two")]
+    assert [one["times"] for one in found] == [1, 1, 2]
+    assert not made[0].exists()
+
+
+@pytest.mark.parametrize("planted", PLANTED, ids=lambda planted: planted.robot)
+def test_a_planted_effect_exists_on_both_sides(planted: PlantedEffect) -> None:
+    cell = load_cell(CHECKOUT / f"configs/cells/{planted.cell}.yaml")
+    assert planted.place in cell.place_names
+    assert planted.size in planted.effect.parameters.values()
+    known = {family[0].name: family[0] for family in EFFECTS}[planted.name]
+    assert planted.coefficient in {column.name for column in known.coefficients}
+    spec = load_simulation(shipped_simulation(planted.cell))
+    passive = tuple(name for name in cell.place_names if name not in cell.axis_names)
+    build_effect(planted.effect, len(spec.axes), passive)
+
+
 def test_the_figures_of_a_robot_are_over_all_its_gains_and_seeds() -> None:
     row = {"robot": "arm", "floor_percent": 3.0, "payload_std_percent": 0.2}
     errors = ({"J1": -0.5, "J2": 0.1}, 0.3), ({"J1": 0.2, "J2": 1.0}, -0.5)
@@ -64,6 +93,22 @@ def test_the_figures_of_a_robot_are_over_all_its_gains_and_seeds() -> None:
         "masses": 2,
         "mass_coverage_percent": 50.0,
     }
+
+
+def test_the_tables_of_robots_show_identified_gains_and_masses(tmp_path: Path) -> None:
+    masses = {f"{role}_{what}": value for role, kg in (("first_payload", 10.0), ("payload", 4.0))
+              for what, value in (("kg", kg), ("error_percent", -1.0), ("std_percent", 0.5))}  # fmt: skip
+    row = {
+        "robot": "arm", "seed": 1, "floor_percent": 3.0, "gain_unit": {"J1": "Nm/A"}, "nameplate_gain": {"J1": -20.0},
+        "true_gain": {"J1": -25.0}, "gain_error_percent": {"J1": 4.0}, "gain_std_percent": {"J1": 2.6},
+    }  # fmt: skip
+    rows = [row | masses, {**row, **masses, "seed": 2, "gain_error_percent": {"J1": 0.0}}]
+    write_tables(tmp_path, [figures(rows)], rows)
+    last = {path.stem: path.read_text(encoding="utf-8").splitlines()[-1] for path in tmp_path.iterdir()}
+    # -25 + 4 % is -26: 30 % more than the nameplate says, and 2.6 % of -25 are 2.5 % of -26.
+    assert last["robots-gains"] == "arm,J1,Nm/A,-20,-26,2.50,30.00,4.00"
+    assert last["robots-payloads"] == "arm,10,9.9,0.50,1.00,4,3.96,0.50,1.00"
+    assert last["robots"] == "arm,1,3.0,2.00,4.00,1.00,1.00,100"
 
 
 def test_runs_come_back_with_their_demand(tmp_path: Path) -> None:
