@@ -89,8 +89,9 @@ def read_regular(path: Path, largest_bytes: int) -> bytes:
         OSError: as `open_regular`, or the file is larger.
     """
     with open_regular(path) as stream:
-        content = stream.read(largest_bytes + 1)
-    if len(content) > largest_bytes:
+        large = os.fstat(stream.fileno()).st_size > largest_bytes
+        content = b"" if large else stream.read(largest_bytes + 1)
+    if large or len(content) > largest_bytes:
         raise OSError(errno.EFBIG, f"more than {largest_bytes} bytes", str(path))
     return content
 

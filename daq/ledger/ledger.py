@@ -69,7 +69,7 @@ class Ledger(HistoryStore):
         """See `HistoryStore.add`."""
         if self.document(digest) is None:
             self._check_like(calibration)
-            self._enter_calibration(calibration, digest, at, at)
+            at = self._enter_calibration(calibration, digest, at, at)
         return super().add(calibration, digest=digest, at=at)
 
     def record_applied(
@@ -127,14 +127,16 @@ class Ledger(HistoryStore):
         if not verdict.holds:  # its entries prove nothing
             return Verification(self.place, verdict, broken)
         broken += tuple(contradictions(verdict.entries, self.cell.name, self))
-        unknown, new = unknown_writes(writes_to(self.cell, verdict.entries), self.audited())
+        unknown, new = unknown_writes(writes_to(self.cell, verdict), self.audited())
         return Verification(self.place, verdict, broken, tuple(unknown), new != unknown)
 
     def warn_if_lost(self) -> bool:
         """Warn, and return true, if the index is empty though the audit log has entries of this cell."""
-        audited = () if self.entries() else read(self.place.audit)
-        entered = any(entered_calibration(one, self.cell.name) for one in audited)
-        if lost := entered or bool(writes_to(self.cell, audited, everywhere=True)):
+        if self.entries():
+            return False
+        verdict = verify(self.place.audit)
+        entered = any(entered_calibration(one, self.cell.name) for one in verdict.entries)
+        if lost := entered or bool(writes_to(self.cell, verdict, everywhere=True)):
             _LOG.warning("the history lacks what the audit has; to make it anew: drivegain history CELL --rebuild")
         return lost
 
@@ -174,11 +176,16 @@ class Ledger(HistoryStore):
             _LOG.warning("the audit log does not have this write: %s", error)
             return event
 
-    def _enter_calibration(self, calibration: Calibration, digest: str, entered: datetime, at: datetime) -> None:
+    def _enter_calibration(self, calibration: Calibration, digest: str, entered: datetime, at: datetime) -> datetime:
+        """Enter a calibration in the audit log, once; return when it was entered: an earlier process may have done it.
+
+        Its row has this time, too, so that `verify` can compare the two.
+        """
         try:
-            known = [found for one in read(self.place.audit) for found in entered_calibration(one, self.cell.name)]
-            if any(digest == one for one, _, _ in known):
-                return
+            for one in read(self.place.audit):
+                for known, earlier, _ in entered_calibration(one, self.cell.name):
+                    if known == digest:
+                        return earlier
             details = {
                 "sha256": digest,
                 "cell": self.cell.name,
@@ -189,6 +196,7 @@ class Ledger(HistoryStore):
             self._append(AuditAction.CALIBRATION_ENTERED, at, self.who, subject, details)
         except (AuditUnusable, OSError) as error:
             _LOG.warning("the audit log does not have this calibration: %s", error)
+        return entered
 
     def _append(
         self, action: AuditAction, at: datetime, who: str, subject: str, details: Mapping[str, object]
