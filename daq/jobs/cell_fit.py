@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import re
@@ -28,7 +29,7 @@ from daq.errors import (
     exit_code,
     writing,
 )
-from daq.files import read_regular, replace_file
+from daq.files import follow_links, read_regular, replace_file
 from daq.jobs.fleet_survey import CellLogs, StoredLog, at_hand, fingerprint
 from daq.workflow.calibration_file import as_document, decode, encode
 from daq.workflow.fit import calibration_of, check_holdout, close_loop, fit
@@ -235,12 +236,18 @@ def open_cache(folder: Path, loop: Loop) -> CalibrationCache:
 
 
 def _check_replaceable(path: Path) -> None:
-    """Refuse a folder, and a link to a device or a pipe: a link is followed, and what it leads to would be replaced."""
+    """Refuse a folder, another user's link, and a link to a device or a pipe: what it leads to would be replaced."""
+    mode, found = 0, ""
     try:
+        follow_links(path)
         mode = path.stat().st_mode
-    except OSError:
-        return  # nothing there, or the write will fail with a message
-    if stat.S_ISDIR(mode):
+    except OSError as error:  # else nothing is there, or the write will fail with a message
+        if error.errno not in (errno.ELOOP, errno.EPERM):
+            return
+        found = error.strerror
+    if found:
+        pass
+    elif stat.S_ISDIR(mode):
         found = "a folder"
     elif path.is_symlink() and not stat.S_ISREG(mode):
         found = "a link to something that is no regular file"

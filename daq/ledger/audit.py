@@ -173,7 +173,7 @@ def append(
             raise OSError(28, "No space left on device", str(path))
         os.fsync(descriptor)
         if not content:
-            fsync_folder(path.resolve().parent)
+            fsync_folder(Path(os.path.realpath(path)).parent)
         return new[-1]
 
 

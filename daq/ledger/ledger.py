@@ -16,7 +16,7 @@ from pathlib import Path
 
 from daq.config.cell import Cell
 from daq.config.policy import HistoryPlace
-from daq.errors import AuditUnusable, DataError, HistoryUnreadable, OutputFailed
+from daq.errors import AuditUnusable, DataError, HistoryUnreadable, OutputFailed, evidence
 from daq.files import fsync_folder
 from daq.ledger.audit import AuditAction, AuditEntry, AuditVerdict, append, read, verify
 from daq.ledger.entry import Acknowledgement, Event, iso
@@ -173,7 +173,7 @@ class Ledger(HistoryStore):
             found = self._append(AuditAction.WRITE_FOUND, event.at, event.who, event.target, details)
             return replace(event, audit=found.sha256)
         except (AuditUnusable, OSError) as error:
-            _LOG.warning("the audit log does not have this write: %s", error)
+            _LOG.warning("the audit log does not have this write: %s", evidence(error))
             return event
 
     def _enter_calibration(self, calibration: Calibration, digest: str, entered: datetime, at: datetime) -> datetime:
@@ -195,7 +195,7 @@ class Ledger(HistoryStore):
             subject = f"history of {self.cell.name}"
             self._append(AuditAction.CALIBRATION_ENTERED, at, self.who, subject, details)
         except (AuditUnusable, OSError) as error:
-            _LOG.warning("the audit log does not have this calibration: %s", error)
+            _LOG.warning("the audit log does not have this calibration: %s", evidence(error))
         return entered
 
     def _append(
@@ -258,7 +258,7 @@ def rebuild(cell: Cell, place: HistoryPlace, *, who: str, at: datetime, heads: C
             new.replace(place.store)
         else:
             place.store.unlink(missing_ok=True)
-        fsync_folder(place.store.resolve().parent)
+        fsync_folder(place.store.parent)
     except OSError as error:
         raise OutputFailed.of(place.store, error) from error
     return Rebuilt(*counts, kept, trusted)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import shutil
 import sqlite3
 from contextlib import closing
-from dataclasses import replace
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -18,8 +16,7 @@ from daq.errors import ExitCode, HistoryUnreadable
 from daq.ledger.audit import AuditAction, read
 from daq.ledger.entry import WriteAction
 from daq.ledger.store import HistoryStore
-from daq.workflow.calibration_file import save_calibration
-from tests.daq.calibrations import demo_calibration, recorded
+from tests.daq.calibrations import calibration_for
 
 NOT_DRIVEGAINS = {
     "view": "CREATE VIEW v AS SELECT 1",
@@ -56,22 +53,6 @@ def cell(tmp_path: Path) -> Path:
     kept = shutil.ignore_patterns("*.jsonl", "*.sqlite*")
     shutil.copytree(Path(__file__).parents[3] / "configs", tmp_path / "configs", ignore=kept)
     return tmp_path / "configs" / "cells" / "demo.yaml"
-
-
-def calibration_for(cell: Path, factor: float = 1.0) -> Path:
-    """A calibration of this cell that every gate lets through; its file."""
-    declared, now = load_cell(cell), datetime.now(UTC)
-    calibration = recorded(demo_calibration(), now - timedelta(hours=1))
-    calibration = replace(
-        calibration,
-        created=now.isoformat(),
-        configuration_sha256=declared.digest,
-        recording_configuration_sha256=declared.recording_digest,
-        gains=tuple(replace(gain, value=gain.value * factor) for gain in calibration.gains),
-    )
-    path = cell.parent / f"calibration-{factor:g}.yaml"
-    save_calibration(calibration, path)
-    return path
 
 
 @pytest.fixture
