@@ -244,7 +244,7 @@ def _check_replaceable(path: Path) -> None:
     except OSError as error:  # else nothing is there, or the write will fail with a message
         if error.errno not in (errno.ELOOP, errno.EPERM):
             return
-        found = error.strerror
+        found = error.strerror or ""
     if found:
         pass
     elif stat.S_ISDIR(mode):

@@ -42,7 +42,7 @@ def resolve_links(file: Path) -> Path:
             raise
         raise ControllerUnfit(
             str(file),
-            found=error.strerror,
+            found=error.strerror or "",
             expected="a link of the file's owner, or of you, that leads to the controller's file",
             remedy="name the file itself, or make the link anew",
         ) from error
