@@ -31,7 +31,6 @@ ProtectProc=invisible
 ProtectHostname=yes
 RestrictNamespaces=yes
 RestrictSUIDSGID=yes
-RemoveIPC=yes
 LockPersonality=yes
 PrivateMounts=yes
 SystemCallFilter=@system-service
