@@ -247,9 +247,10 @@ def _check_points(file: _Lines, indices: list[int]) -> None:
 
 def _check_thousands(file: _Lines, index: int, values: FloatArray) -> None:
     """Refuse a column in which the decimal sign must group thousands: 987 beside 1.234, and never 1.2 or 0.987."""
+    if np.abs(values).max() >= 1000.0 or not (values % 1.0).any():
+        return
     thousands = 1000.0 * values
-    fine = (thousands != np.rint(thousands)) & (np.abs(thousands - np.rint(thousands)) > 1e-6 * np.abs(values))
-    if fine.any() or not (values % 1.0).any():  # quick, and most columns end here
+    if (np.abs(thousands - np.rint(thousands)) > 1e-6).any():  # more than three digits: most columns end here
         return
     texts = [file.fields(row)[index] for row in file.rows]
     sign = re.escape(file.table.decimal)
