@@ -24,7 +24,10 @@ from drivers.stream.sample import CellEvent, EventKind
 SYNC_COB_ID = 0x080
 _NMT_COB_ID = 0x000
 _EMCY, HEARTBEAT = 0x080, 0x700
+LSS = frozenset((0x7E4, 0x7E5))  #: Layer setting services (CiA 305): a device gets another node id or bit rate
 _RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))  #: Set-points of a drive (CiA 301, predefined connection set)
+_LSS_NAME = "a layer setting service, which changes node ids"
+_NAMES = {_NMT_COB_ID: "an NMT command", SYNC_COB_ID: "a SYNC", **dict.fromkeys(LSS, _LSS_NAME)}
 PUMP_S = 1.0  #: Longest time spent on frames that have already arrived, however fast more arrive
 # linux/can/error.h: classes of an error frame, and the controller's state in its second byte.
 _CONTROLLER, _RESTARTED = 0x004, 0x100
@@ -67,15 +70,16 @@ def nmt_name(state: int | None) -> str:
 
 def command_name(identifier: int, names: Mapping[int, str]) -> str:
     """Describe a frame that only the recorder should send; `names` of the axes are by node id."""
-    if identifier == SYNC_COB_ID:
-        return "a SYNC (080h)"
-    if identifier == _NMT_COB_ID:
-        return "an NMT command (000h)"
-    if identifier < SDO_REQUEST:
-        return f"a set-point of {node_label(identifier & 0x7F, names)} ({identifier:03X}h)"
-    if identifier >= HEARTBEAT:
-        return f"a heartbeat with the recorder's own node id {identifier - HEARTBEAT} ({identifier:03X}h)"
-    return f"an SDO request to {node_label(identifier - SDO_REQUEST, names)} ({identifier:03X}h)"
+    shown, node_id = f"({identifier:03X}h)", identifier & 0x7F
+    if identifier >= HEARTBEAT and identifier not in LSS:
+        name = f"a heartbeat with the recorder's own node id {node_id}"
+    elif identifier >= SDO_REQUEST and identifier not in LSS:
+        name = f"an SDO request to {node_label(node_id, names)}"
+    elif node_id in names:
+        name = f"a set-point of {node_label(node_id, names)}"
+    else:
+        name = _NAMES.get(identifier, f"a frame with the recorder's own node id {node_id}")
+    return f"{name} {shown}"
 
 
 class Link:
@@ -96,8 +100,8 @@ class Link:
         self.answered: set[int] = set()  #: Nodes that sent any SDO answer
         self.silent: set[int] = set()  #: Nodes that did not answer their last request, and sent nothing since
         self.heard: set[int] = set()  #: Node ids of which any frame arrived since the bus was opened
-        #: Number of frames by identifier that only we should send (NMT, SYNC, SDO request, set-point of one of our
-        #: axes, our own heartbeat) and that we did not send.
+        #: Number of frames by identifier that only we should send (NMT, SYNC, LSS, SDO request, set-point of one of our
+        #: axes, any frame with our own node id) and that we did not send.
         self.foreign: dict[int, int] = {}
         self.own_id: int | None = None  #: Node id of our heartbeat, None before one was chosen
         self.names: Mapping[int, str] = {}  #: Of our axes by node id
@@ -184,7 +188,8 @@ class Link:
         service, node_id = message.arbitration_id & 0x780, message.arbitration_id & 0x7F
         if message.is_extended_id or message.is_remote_frame:
             return False
-        ours = (service in _RPDOS and node_id in self.names) or (service == HEARTBEAT and node_id == self.own_id)
+        ours = (service in _RPDOS and node_id in self.names) or self.is_own(message.arbitration_id)
+        ours = ours or message.arbitration_id in LSS
         if message.arbitration_id in (_NMT_COB_ID, SYNC_COB_ID) or (service == SDO_REQUEST and node_id) or ours:
             if message.arbitration_id != SYNC_COB_ID or self.sync_producer is None:
                 self.note_foreign(message.arbitration_id)
@@ -226,6 +231,12 @@ class Link:
             states = ((_OVERFLOW, "overflows, frames are lost"), (_WARNING, "counts errors"), (_ACTIVE, "recovered"))
             description = ", ".join(text for mask, text in states if bits & mask) or f"reports {bits:02X}h"
             self._events.append((0, EventKind.CONTROLLER, bits, f"the CAN controller {description}"))
+
+    def is_own(self, identifier: int) -> bool:
+        """Whether only a device with our own node id sends a frame with this identifier."""
+        service = identifier & 0x780
+        sent_by_it = 0 < service <= HEARTBEAT and service != SDO_REQUEST
+        return self.own_id is not None and sent_by_it and identifier & 0x7F == self.own_id
 
     def note_foreign(self, identifier: int) -> None:
         """Count a command, or a heartbeat with our node id, that neither we nor our SYNC producer sent."""
