@@ -7,7 +7,7 @@ while it waits. See docs/decisions/0002-stream-owns-the-bus.md.
 from __future__ import annotations
 
 import struct
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 from typing import Protocol
@@ -28,6 +28,8 @@ LSS = frozenset((0x7E4, 0x7E5))  #: Layer setting services (CiA 305): a device g
 _RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))  #: Set-points of a drive (CiA 301, predefined connection set)
 _LSS_NAME = "a layer setting service, which changes node ids"
 _NAMES = {_NMT_COB_ID: "an NMT command", SYNC_COB_ID: "a SYNC", **dict.fromkeys(LSS, _LSS_NAME)}
+BOOTS_S = 0.5  #: Two boot-up messages in this time are those of two devices
+SURPLUS_BEATS = 2  #: A change of the NMT state may have one of its own
 PUMP_S = 1.0  #: Longest time spent on frames that have already arrived, however fast more arrive
 # linux/can/error.h: classes of an error frame, and the controller's state in its second byte.
 _CONTROLLER, _RESTARTED = 0x004, 0x100
@@ -97,7 +99,11 @@ class Link:
         self.policy = policy
         self.nmt: dict[int, int] = {}  #: Last NMT state of each node that sent a heartbeat
         self.heard_ns: dict[int, int] = {}  #: Time of that heartbeat by the clock
-        self.answered: set[int] = set()  #: Nodes that sent any SDO answer
+        self.answered: Counter[int] = Counter()  #: SDO answers of each node
+        self.boots: Counter[int] = Counter()  #: Boot-up messages of each node id right after another
+        self.twice: dict[int, str] = {}  #: Node ids whose request was answered twice, and by what
+        self.asked_by: dict[int, object] = {}  #: Client of the last SDO request to each node; none where it had none
+        self._beats: dict[int, tuple[int, int]] = {}  # number of heartbeats, and since when [ns]
         self.silent: set[int] = set()  #: Nodes that did not answer their last request, and sent nothing since
         self.heard: set[int] = set()  #: Node ids of which any frame arrived since the bus was opened
         #: Number of frames by identifier that only we should send (NMT, SYNC, LSS, SDO request, set-point of one of our
@@ -135,6 +141,9 @@ class Link:
 
     def send(self, messages: Sequence[can.Message]) -> None:
         """Send frames in their order."""
+        for message in messages:
+            if SDO_REQUEST < message.arbitration_id < HEARTBEAT:
+                self.asked_by.pop(message.arbitration_id - SDO_REQUEST, None)
         with bus_errors(self.address):
             send_burst(self.bus, messages)
 
@@ -200,7 +209,11 @@ class Link:
         self.silent.discard(node_id)
         if service == HEARTBEAT and message.data:
             previous, state = self.nmt.get(node_id), message.data[0] & 0x7F
-            self.nmt[node_id], self.heard_ns[node_id] = state, self.clock()
+            now_ns = self.clock()
+            self._note_boot(node_id, state, now_ns)
+            count, since_ns = self._beats.get(node_id, (0, now_ns))
+            self._beats[node_id] = (count + 1, since_ns)
+            self.nmt[node_id], self.heard_ns[node_id] = state, now_ns
             if previous != state:
                 self._events.append((node_id, EventKind.NMT, state, f"NMT {nmt_name(previous)} -> {nmt_name(state)}"))
         elif service == _EMCY and len(message.data) == 8:
@@ -210,7 +223,7 @@ class Link:
             text = f"EMCY {code:04X}h {describe(code)}, error register {register:02X}h, data {data.hex()}"
             self._events.append((node_id, kind, code, text))
         elif service == SDO_ANSWER:
-            self.answered.add(node_id)
+            self.answered[node_id] += 1
             for listener in self._listeners.get(node_id, ()):
                 listener.receive(message.data)
         else:
@@ -244,6 +257,39 @@ class Link:
         if self.foreign[identifier] == 1:  # once: a master would fill the log
             seen = command_name(identifier, self.names)
             self._events.append((0, EventKind.BUS_BUSY, identifier, f"{seen} that we did not send"))
+
+    def _note_boot(self, node_id: int, state: int, now_ns: int) -> None:
+        again = state == NmtState.BOOT_UP == self.nmt.get(node_id)
+        if again and now_ns - self.heard_ns[node_id] < BOOTS_S * 1e9:
+            self.boots[node_id] += 1
+
+    def note_twice(self, node_id: int, first: bytes, second: bytes) -> None:
+        """Note that a node gave two answers to one request, unless another program asked the same."""
+        if SDO_REQUEST + node_id not in self.foreign:
+            entry = f"{first[2]:02X}{first[1]:02X}h:{first[3]:02X}"
+            values = f"{first[4:].hex(' ')} and {second[4:].hex(' ')}"
+            self.twice.setdefault(node_id, f"two answers to one request for {entry} ({values})")
+
+    def count_beats(self, node_id: int) -> None:
+        """Count the heartbeats of a node from now on: its period has changed."""
+        self._beats[node_id] = (0, self.clock())
+
+    def shared_id(self, node_id: int, period_ms: int) -> str:
+        """Describe the evidence that two devices have a node id; empty without any.
+
+        Args:
+            node_id: of the node.
+            period_ms: of its heartbeat since `count_beats`, or since its first one; 0 where that is unknown.
+        """
+        if node_id in self.twice:
+            return self.twice[node_id]
+        if self.boots[node_id]:
+            return f"{self.boots[node_id] + 1} boot-up messages within {BOOTS_S:g} s"
+        count, since_ns = self._beats.get(node_id, (0, 0))
+        elapsed_ms = (self.clock() - since_ns) * 1e-6
+        if period_ms and count > SURPLUS_BEATS + 1.5 * elapsed_ms / period_ms:
+            return f"{count} heartbeats in {elapsed_ms:.0f} ms, its period is {period_ms} ms"
+        return ""
 
     def take_events(self, time_ns: int, node_ids: Sequence[int]) -> tuple[CellEvent, ...]:
         """Return the events since the last call in their order; axis is None for nodes that are no axes of ours."""

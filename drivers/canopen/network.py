@@ -158,20 +158,25 @@ class CanopenNetwork:
         if missing := [axis for axis in self.axes if axis.node_id not in answered]:
             raise NodeMissing(missing, answered, self.bounds.answer_s)
         identities = tuple(read_identity(self.link.objects(node_id)) for node_id in self.node_ids)
+        self._require_own_ids(0)
         for axis, found in zip(self.axes, identities, strict=True):
-            expected = axis.identity or found
-            for name, want, have in (
-                ("vendor id 1018h:01", expected.vendor_id, found.vendor_id),
-                ("product code 1018h:02", expected.product_code, found.product_code),
-                ("serial number 1018h:04", expected.serial, found.serial or 0),
-            ):
-                if want is not None and want != have:
-                    raise SetupRefused(
-                        axis,
-                        f"{name} is {have:#x}, the cell configuration expects {want:#x}; was an amplifier exchanged? "
-                        "correct the configuration only after checking the hardware",
-                    )
+            if axis.identity is not None and (differing := axis.identity.differences(found)):
+                raise SetupRefused(
+                    axis,
+                    f"{differing[0]}; was an amplifier exchanged? correct the configuration only after checking the "
+                    "hardware",
+                )
         return identities
+
+    def _require_own_ids(self, period_ms: int) -> None:
+        """Refuse an axis whose node id another device has too; `period_ms` is that of its heartbeat, 0 if unknown."""
+        for axis in self.axes:
+            if shared := self.link.shared_id(axis.node_id, period_ms):
+                raise SetupRefused(
+                    axis,
+                    f"found {shared}; expected one device with this node id; two have it, and both would move: nothing "
+                    "has moved, give one of them another node id",
+                )
 
     def prepare(self) -> None:
         """Set every node up: identity, heartbeats, PRE-OPERATIONAL, mapping, profile position mode, OPERATIONAL.
@@ -194,6 +199,7 @@ class CanopenNetwork:
         }
         for setup in new.values():
             setup.check(self.profiles)
+        self._require_own_ids(0)
         self._setups.update(new)
         for setup in self._setups.values():
             setup.send_heartbeats(self.heartbeat_ms)
@@ -207,6 +213,7 @@ class CanopenNetwork:
         for axis, identity, scale in zip(self.axes, identities, self.scales(), strict=True):
             self._readback[axis.name] = self._setups[axis.node_id].describe(identity, scale, self.guard_ms)
         self._command_all(NmtCommand.START, NmtState.OPERATIONAL)
+        self._require_own_ids(self.heartbeat_ms)
 
     @property
     def pdos(self) -> tuple[AxisPdos, ...]:

@@ -182,6 +182,7 @@ class AxisSetup:
         if self._heartbeat_ms is None:
             self._heartbeat_ms = self._access.read(HEARTBEAT_TIME)
         self._access.write(HEARTBEAT_TIME, period_ms)
+        self._link.count_beats(self._axis.node_id)
 
     def map_pdos(self) -> None:
         """Map position, current and statusword into TPDOs and the set-points into RPDOs; all other PDOs go off.
