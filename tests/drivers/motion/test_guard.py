@@ -7,7 +7,7 @@ from itertools import pairwise
 import can
 import pytest
 
-from drivers.errors import BusBusy
+from drivers.errors import BusBusy, SetupRefused
 from drivers.motion.execute import execute
 from drivers.motion.move import Move
 from drivers.stream.sample import CellEvent, EventKind
@@ -173,6 +173,22 @@ def test_what_a_killed_recorder_left_under_another_id_is_used_again() -> None:
         network.prepare()
         assert bus.nodes[0].value(0x1016, 1) == RECORDER << 16 | 500
     assert bus.nodes[0].value(0x1016, 1) == 0
+
+
+def test_a_device_with_any_node_id_leaves_the_recorder_an_id_of_its_own_or_the_run_is_refused() -> None:
+    for node_id in range(1, 128):
+        network, bus = cell(2)
+        for node in bus.nodes:
+            give_guard(node)
+        join(bus, node_id, beat_ms=100)
+        if node_id <= 2:
+            with pytest.raises(SetupRefused, match=f"J{node_id} .*two have it"), network:
+                network.prepare()
+            continue
+        with network:
+            network.prepare()
+            assert network.recorder_id == (126 if node_id == 127 else 127)
+            assert [node.value(0x1016, 1) >> 16 for node in bus.nodes[:2]] == [network.recorder_id] * 2
 
 
 def test_a_bus_without_a_free_node_id_is_refused_before_anything_is_set_up() -> None:
