@@ -37,7 +37,8 @@ from ident.estimators.estimate import RelativeError, relative_error
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
 from ident.model.model import Column, Model
-from ident.planning.excitation import UNSEEN, ExtraMoves, side_of_cube
+from ident.planning.excitation import UNSEEN, side_of_cube
+from ident.planning.verdict import ExtraMoves
 from ident.prediction import placed_effect, standard_parameters
 
 MAX_PASSES = 8  #: Of the effects' columns; load friction of a tenth of the load needs three

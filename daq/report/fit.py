@@ -23,7 +23,7 @@ from ident.discovery.evidence import Evidence, without_effects
 from ident.effects.effect import PlacedEffect
 from ident.estimators.comparison import Comparison, EstimatorTrial
 from ident.estimators.estimate import RelativeError
-from ident.planning.excitation import GOOD_PERCENT, GainVerdict
+from ident.planning.verdict import GOOD_PERCENT, GainVerdict
 
 
 def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | None) -> Iterator[RenderableType]:

@@ -89,6 +89,8 @@ class PlannedGain(JudgedGain):
     """Prediction for one gain."""
 
     predicted_std_percent: Figure
+    known_preload_std_percent: Figure = Field(description="σ if internal preload of redundant motors were known [%]")
+    hidden_by: Literal["preload", "motion"] | None = Field(description="why the gain is unseen, or weak by preload")
     alone_percent: dict[str, Figure] = Field(description="σ that each source of information gives alone [%]")
 
 
@@ -103,6 +105,9 @@ class PlanReport(StrictModel):
     duration_s: float
     condition: float
     assumed: list[str]
+    rank: int = Field(description="independent directions of the gains that the moves determine to 10 %")
+    known_preload_rank: int | None = Field(description="the same if internal preload were known")
+    hidden: list[str] = Field(description="sentences on gains that the moves do not show, with what to do")
     gains: list[PlannedGain]
 
 

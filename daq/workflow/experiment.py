@@ -20,7 +20,6 @@ from ident.planning.excitation import (
     Design,
     Excitation,
     Expectation,
-    ExtraMoves,
     effective_noise,
     nominal_links,
     nominal_parameters,
@@ -29,6 +28,7 @@ from ident.planning.excitation import (
     side_of_cube,
     visible,
 )
+from ident.planning.verdict import ExtraMoves
 
 LINK_RADIUS = 0.08
 """Radius of a guessed link, as a share of the length of the joint chain: 6 cm for an arm of the TX-40's size."""

@@ -47,18 +47,8 @@ from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS
 from ident.model.urdf import read_urdf
-from ident.planning.excitation import (
-    GOOD_PERCENT,
-    Design,
-    Excitation,
-    Expectation,
-    ExpectedPayload,
-    ExtraMoves,
-    GainVerdict,
-    effective_noise,
-    recorded,
-    verdicts,
-)
+from ident.planning.excitation import Design, Excitation, Expectation, ExpectedPayload, effective_noise, recorded
+from ident.planning.verdict import GOOD_PERCENT, ExtraMoves, GainVerdict, verdicts
 
 
 @dataclass(frozen=True, slots=True)
@@ -491,7 +481,7 @@ def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
         extra = extra_moves(experiment_of(fitted.cell))
     judged = verdicts(Design(expectation, system.base), list(_excitations(fitted)), extra)
     true = 100.0 * fitted.estimate.gains_std / np.abs(fitted.estimate.gains)
-    return tuple(_scaled(gain, float(std)) for gain, std in zip(judged, true, strict=True))
+    return tuple(_scaled(gain, float(std)) for gain, std in zip(judged.gains, true, strict=True))
 
 
 def needed_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
@@ -515,4 +505,5 @@ def _scaled(gain: GainVerdict, std_percent: float) -> GainVerdict:
     factor = std_percent / gain.std_percent if np.isfinite(gain.std_percent) and gain.std_percent else 1.0
     advice = gain.advice and replace(gain.advice, std_percent=factor * gain.advice.std_percent)
     alone = {source: factor * alone for source, alone in gain.alone_percent.items()}
-    return replace(gain, std_percent=std_percent, alone_percent=alone, advice=advice)
+    known = gain.known_preload_percent and factor * gain.known_preload_percent
+    return replace(gain, std_percent=std_percent, known_preload_percent=known, alone_percent=alone, advice=advice)

@@ -19,6 +19,7 @@ from daq.errors import UsageError
 from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_CONDITION_OF_CHAIN, LARGEST_STD_PERCENT
 from daq.workflow.experiment import (
     POSITION_MARGIN,
+    RUNS,
     Experiment,
     PlannedMove,
     duration_of,
@@ -28,6 +29,7 @@ from daq.workflow.experiment import (
 )
 from drivers.motion.move import Trapezoid
 from ident.arrays import FloatArray
+from ident.planning.verdict import verdicts
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,6 +332,8 @@ def plan(
         raise _unfit(cell, duration_s, words, f"at most {largest_condition:.0f}", remedy)
     if predicted[worst] > largest_std_percent:
         words = f"{predicted[worst]:.1f} % predicted for the gain of {cell.axes[worst].name}"
+        judged = verdicts(experiment.design, [(experiment.excitation(draft.paths)[0], RUNS)])
+        remedy = ". ".join((remedy, *judged.sentences(cell.axis_names)))
         raise _unfit(cell, duration_s, words, f"at most {largest_std_percent:g} %", remedy)
     return Plan(
         cell=cell.name,

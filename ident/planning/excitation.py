@@ -9,19 +9,12 @@ divided by σ_i, are
 with τ the whole expected torque. The information about all unknowns is the sum of JᵀJ over the rows, and the covariance
 of ln g the inverse of its Schur complement: the part of the gains' columns that is independent of all others. The
 expectation before a fit is a nominal robot, made from the URDF: good enough to choose moves, never to fit.
-
-A gain is identifiable in three ways, and each is judged by the deviation that it would give alone:
-
-- gravity: the known payload's static torque in the motor's own rows, beside all unknowns there;
-- inertia: the rest of the known payload's torque in the motor's own rows;
-- coupling: parameters that its rows share with those of other axes, whose gains are known by their own means.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,12 +26,13 @@ from ident.equations.currents import without_preload
 from ident.equations.rows import row_filter, row_masks
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, Body, Payload
-from ident.model.model import DriveTrain, Model, seen_torques
+from ident.model.model import DriveTrain, Model
 from ident.model.robot import Motion, Robot
 from ident.model.urdf import read_urdf
 
 IntArray = NDArray[np.intp]
 
+UNSEEN_PERCENT = 10.0  #: Standard deviation above which the nameplate is the better source
 UNSEEN = 1e-9  #: Share of a column that counts as nothing when the others are projected out of it
 LINK_MASS_KG = 5.0  #: Mass of each link where the URDF has no inertias, as a slender rod to the next joint
 ROD_RADIUS_M = 0.05
@@ -167,9 +161,14 @@ class Design:
         whole, _ = np.linalg.qr(to_motors.transpose(2, 1, 0), mode="complete")
         transform = without_preload(whole[:, :, len(to_motors) :], expected.gains, expected.noise_a)
         transform *= np.all(excitation.use, axis=0).astype(np.float64)[:, None, None]
-        gains = transform @ seen_torques(to_motors).transpose(2, 0, 1)
         columns = np.einsum("kij,jak->iak", transform, torque, optimize=True)
-        return np.concatenate((columns, torque, gains.transpose(1, 2, 0)), axis=1)
+        return np.concatenate((columns, torque, transform.transpose(1, 2, 0)), axis=1)
+
+    def with_known_preload(self, whitened: FloatArray, use: BoolArray) -> FloatArray:
+        """``whitened`` of a redundant drive if its preload were known: an equation for each motor, (n, b + 10, k)."""
+        expected = self.expectation
+        torque = whitened[:, self.width : 2 * self.width] * np.all(use, axis=0)
+        return np.asarray(torque / (expected.gains * expected.noise_a)[:, None, None])
 
     def information(self, excitation: Excitation, payloads: Sequence[int | None]) -> FloatArray:
         """Information of one motion, repeated once with each of these payloads, shape (p, p)."""
@@ -254,28 +253,49 @@ class Design:
 
     def std_percent(self, information: FloatArray) -> FloatArray:
         """Predicted standard deviation of each gain, shape (n,) [% of it]; inf where it is not identifiable."""
+        scaled, scale = self._scaled(information)
+        last = self._factor_of_gains(scaled)
+        if last is None:
+            return self._std_of_singular(scaled) / scale
+        inverse = np.linalg.inv(last)
+        return np.asarray(100.0 * np.sqrt(np.einsum("ij,ij->j", inverse, inverse)) / scale)
+
+    def rank(self, information: FloatArray) -> int:
+        """How many of the n independent directions of ln g are known to UNSEEN_PERCENT.
+
+        They are the eigenvectors of its covariance, of unit length: their errors are independent of each other.
+        """
+        scaled, scale = self._scaled(information)
+        last = self._factor_of_gains(scaled)
+        alone = self._gains_alone(scaled) if last is None else last @ last.T
+        return int(np.sum(np.linalg.eigvalsh(alone * np.outer(scale, scale)) >= (100.0 / UNSEEN_PERCENT) ** 2))
+
+    def _scaled(self, information: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Information with ones on its diagonal, and the scale of the gains."""
         scale = np.sqrt(np.diag(information))
         scale[scale == 0.0] = 1.0
-        scaled = information / np.outer(scale, scale)
-        gains = slice(self.others, self.size)
+        return information / np.outer(scale, scale), scale[self.others :]
+
+    def _factor_of_gains(self, scaled: FloatArray) -> FloatArray | None:
+        """Cholesky factor of the information about the gains alone; None where rounding would decide."""
         try:
             factor = np.linalg.cholesky(scaled)
         except np.linalg.LinAlgError:
-            return self._std_of_singular(scaled) / scale[gains]
-        last = factor[gains, gains]
-        if float(np.diag(factor).min()) < 1e-5:  # nearly singular: rounding decides
-            return self._std_of_singular(scaled) / scale[gains]
-        inverse = np.linalg.inv(last)
-        return np.asarray(100.0 * np.sqrt(np.einsum("ij,ij->j", inverse, inverse)) / scale[gains])
+            return None
+        gains = slice(self.others, self.size)
+        return None if float(np.diag(factor).min()) < 1e-5 else np.asarray(factor[gains, gains])
 
-    def _std_of_singular(self, scaled: FloatArray) -> FloatArray:
-        """Predict with unknowns that are not identifiable: they drop out, and gains that depend on them are inf."""
+    def _gains_alone(self, scaled: FloatArray) -> FloatArray:
+        """Information about the gains alone, shape (n, n); other unknowns that are not identifiable drop out."""
         others, gains = slice(None, self.others), slice(self.others, None)
         values, vectors = np.linalg.eigh(scaled[others, others])
         kept = values > UNSEEN * values[-1]
         onto = vectors[:, kept].T @ scaled[others, gains]
-        rest = scaled[gains, gains] - onto.T @ (onto / values[kept, None])
-        left, directions = np.linalg.eigh(rest)
+        return np.asarray(scaled[gains, gains] - onto.T @ (onto / values[kept, None]))
+
+    def _std_of_singular(self, scaled: FloatArray) -> FloatArray:
+        """Predict with unknowns that are not identifiable: they drop out, and gains that depend on them are inf."""
+        left, directions = np.linalg.eigh(self._gains_alone(scaled))
         seen = left > UNSEEN
         variance = (directions[:, seen] ** 2) @ (1.0 / left[seen])
         variance[(directions[:, ~seen] ** 2).sum(axis=1) > 1e-6] = np.inf
@@ -356,168 +376,3 @@ def nominal_parameters(
         own = 14 * joints[motor]
         parameters[first : first + 3] = parameters[own + 10 : own + 13]
     return parameters
-
-
-GOOD_PERCENT = 1.0  #: Largest standard deviation of a good gain: drives are sold with gains known to some percent
-UNSEEN_PERCENT = 10.0  #: Standard deviation above which the nameplate is the better source
-SHARE_OF_BEST = 3.0  #: A source counts when it alone gives at most so many times the deviation of the best one
-
-
-class GainSource(Enum):
-    """Source of information about a gain."""
-
-    GRAVITY = "gravity"
-    INERTIA = "inertia"
-    COUPLING = "coupling with other axes"
-
-
-class Verdict(Enum):
-    """How well a gain is identifiable."""
-
-    GOOD = "good"
-    WEAK = "weak"
-    UNSEEN = "unseen"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ExtraMoves:
-    """Moves that could be added to an experiment, made once without load and once with each payload."""
-
-    words: str  #: description, to follow "add": ``fast moves of J1 with the arm stretched``
-    seconds: float  #: their duration, once
-    excitation: Excitation  #: their rows
-
-
-@dataclass(frozen=True, slots=True)
-class Advice:
-    """Extra moves that improve a gain most, and its deviation with them [%]."""
-
-    words: str
-    seconds: float
-    std_percent: float
-
-
-@dataclass(frozen=True, slots=True)
-class GainVerdict:
-    """Verdict on one gain."""
-
-    axis: int  #: index from 0
-    std_percent: float  #: predicted standard deviation [% of the gain]; inf where it is not identifiable
-    alone_percent: dict[GainSource, float]  #: standard deviation that each source would give alone [%]
-    gravity_acts: bool  #: whether gravity of any body on the last link acts on this axis
-    verdict: Verdict  #: good, weak or unseen
-    advice: Advice | None  #: for a gain that is not good; None where no extra moves were offered or none helps
-
-    @property
-    def sources(self) -> tuple[GainSource, ...]:
-        """Sources of information, the best first; empty for a gain that is not identifiable."""
-        best = min(self.alone_percent.values())
-        order = sorted(self.alone_percent.items(), key=lambda item: item[1])
-        return tuple(source for source, alone in order if np.isfinite(alone) and alone <= SHARE_OF_BEST * best)
-
-    def words(self, axis_name: str) -> str:
-        """Describe it for a report: ``J1 is identifiable only through inertia: σ 3.1 %; add 5 s of … (σ 1.9 %)``."""
-        through = " and ".join(source.value for source in self.sources)
-        if not self.gravity_acts:
-            shared = GainSource.COUPLING in self.sources
-            through = "inertia" + (", partly through parameters shared with other axes" if shared else "")
-        only = "only " if len(self.sources) == 1 or not self.gravity_acts else ""
-        text = f"{axis_name} is not identifiable"
-        if self.sources and np.isfinite(self.std_percent):
-            text = f"{axis_name} is identifiable {only}through {through}: σ {self.std_percent:.2g} %"
-        if self.advice is None:
-            return text
-        return f"{text}; add {self.advice.seconds:.0f} s of {self.advice.words} (σ {self.advice.std_percent:.2g} %)"
-
-
-Runs = Sequence[tuple[Excitation, Sequence[int | None]]]
-"""Motions, each with the payload of every repetition: an index into ``Expectation.payloads``, or None."""
-
-
-def verdicts(design: Design, runs: Runs, extras: Sequence[ExtraMoves] = ()) -> tuple[GainVerdict, ...]:
-    """Judge every gain of a planned or recorded experiment.
-
-    Args:
-        design: unknowns, expected parameters and gains, noise. After a fit: its gains, parameters and residuals.
-        runs: for a plan ``[(excitation, (None, 0))]``, its moves without and with the payload; for recorded runs one
-            pair each, ``(excitation, (None,))`` or ``(excitation, (payload,))``.
-        extras: moves that could be added; for each gain that is not good the best of them is named.
-
-    Returns:
-        one verdict an axis, in their order.
-    """
-    whitened = [(design.whitened(excitation), payloads) for excitation, payloads in runs]
-    information = np.sum([design.information_of(w, payloads) for w, payloads in whitened], axis=0)
-    found = design.std_percent(information)
-    own = _own_rows(design, runs, whitened)
-    everything: tuple[int | None, ...] = (None, *range(len(design.expectation.payloads)))
-    added = [(extra, information + design.information(extra.excitation, everything)) for extra in extras]
-    with_extras = [(extra, design.std_percent(sum_)) for extra, sum_ in added]
-    judged = []
-    for axis, std in enumerate(found.tolist()):
-        blind = np.sum([design.information_of(w, payloads, axis) for w, payloads in whitened], axis=0)
-        gravity, inertia, acts = own[axis]
-        alone = {
-            GainSource.GRAVITY: gravity,
-            GainSource.INERTIA: inertia,
-            GainSource.COUPLING: float(design.std_percent(blind)[axis]),
-        }
-        weak = Verdict.WEAK if std <= UNSEEN_PERCENT else Verdict.UNSEEN
-        verdict = Verdict.GOOD if std <= GOOD_PERCENT else weak
-        advice = None if verdict is Verdict.GOOD else _advice(axis, std, with_extras)
-        judged.append(GainVerdict(axis, std, alone, acts, verdict, advice))
-    return tuple(judged)
-
-
-def _advice(axis: int, std_percent: float, tried: Sequence[tuple[ExtraMoves, FloatArray]]) -> Advice | None:
-    better = [(float(found[axis]), index) for index, (_, found) in enumerate(tried) if found[axis] < std_percent]
-    if not better:
-        return None
-    best, index = min(better)
-    return Advice(tried[index][0].words, tried[index][0].seconds, best)
-
-
-def _own_rows(
-    design: Design, runs: Runs, whitened: Sequence[tuple[FloatArray, Sequence[int | None]]]
-) -> list[tuple[float, float, bool]]:
-    """Judge gravity and inertia in each motor's own rows.
-
-    Return for each motor the deviations that gravity and inertia of the known payload give alone [%], and whether
-    gravity of any body on the last link acts there.
-    """
-    count = len(design.expectation.gains)
-    others: list[list[FloatArray]] = [[] for _ in range(count)]
-    known: list[list[FloatArray]] = [[] for _ in range(count)]
-    weights, wholes = np.zeros(count), np.zeros(count)
-    for (excitation, _), (columns, payloads) in zip(runs, whitened, strict=True):
-        motion = excitation.motion
-        still = np.zeros_like(motion.position_rad)
-        static = design.whitened(Excitation(Motion(motion.position_rad, still, still), excitation.use))
-        static, moving = static[:, : design.width], columns[:, : design.width]
-        weights += np.einsum("nck,nck->n", static[:, -10:], static[:, -10:])
-        wholes += np.einsum("nck,nck->n", moving[:, -10:], moving[:, -10:])
-        for payload in payloads:
-            place, source = design.columns(payload)
-            rest = np.zeros((count, moving.shape[2], design.others))  # columns of J for all unknowns but the gains
-            rest[:, :, place] = moving[:, source].transpose(0, 2, 1)
-            mounted = np.zeros(design.width) if payload is None else design.known(payload)
-            gravity = np.einsum("nck,c->nk", static, mounted)
-            inertia = np.einsum("nck,c->nk", moving, mounted) - gravity
-            for motor in range(count):
-                others[motor].append(rest[motor])
-                known[motor].append(np.stack((gravity[motor], inertia[motor]), axis=1))
-    acts = (weights > 1e-12 * wholes).tolist()
-    alone = [_beside(np.concatenate(o), np.concatenate(k)) for o, k in zip(others, known, strict=True)]
-    return [(gravity, inertia, act) for (gravity, inertia), act in zip(alone, acts, strict=True)]
-
-
-def _beside(others: FloatArray, known: FloatArray) -> tuple[float, float]:
-    """100 over the norm of each of two columns with the others projected out; inf where nothing is left."""
-    norms = np.linalg.norm(others, axis=0)
-    used = others[:, norms > 0.0] / norms[norms > 0.0]
-    left = known - used @ np.linalg.lstsq(used, known, rcond=1e-9)[0] if used.shape[1] else known
-    before, after = np.linalg.norm(known, axis=0), np.linalg.norm(left, axis=0)
-    seen = after > 1e-6 * np.maximum(before.max(), 1e-300)
-    with np.errstate(divide="ignore"):
-        gravity, inertia = np.where(seen, 100.0 / after, np.inf).tolist()
-    return gravity, inertia

@@ -37,14 +37,14 @@ def _body(rng: np.random.Generator, mass: float) -> FloatArray:
     return np.concatenate((inertia[np.triu_indices(3)], mass * centre, [mass]))
 
 
-def axis_positions(mechanism: Mechanism, rng: np.random.Generator, seconds: float) -> FloatArray:
-    """Positions of the motors that the closures allow, around the assembly pose, shape (k, m)."""
+def axis_positions(mechanism: Mechanism, rng: np.random.Generator, seconds: float, share: float = 1.0) -> FloatArray:
+    """Positions of the motors that the closures allow, around the assembly pose, shape (k, m), in a share of all."""
     robot = mechanism.robot
     home = mechanism.model.assembly.position_rad[list(robot.axis_joints)]
     if mechanism is not PLANAR:
         reach = np.full(robot.axis_count, 0.6 if mechanism is FIVE_BAR else 0.06)
-        return home + positions(rng, seconds, RATE_HZ, reach)
-    pose = positions(rng, seconds, RATE_HZ, np.array([0.08, 0.08, 0.4]))
+        return home + share * positions(rng, seconds, RATE_HZ, reach)
+    pose = share * positions(rng, seconds, RATE_HZ, np.array([0.08, 0.08, 0.4]))
     motors = np.stack([leg_angles(pose, leg)[0] for leg in range(4)], axis=1)
     return np.asarray(motors + 2.0 * np.pi * np.round((home - motors[0]) / (2.0 * np.pi)))
 
@@ -63,9 +63,15 @@ def preload_of(model: Model, to_motors: FloatArray, time_s: FloatArray, size_nm:
 
 
 def recorded(
-    mechanism: Mechanism, seed: int = 4, *, seconds: float = 15.0, noise_a: float = 0.0, preload_nm: float = 0.3
+    mechanism: Mechanism,
+    seed: int = 4,
+    *,
+    seconds: float = 15.0,
+    noise_a: float = 0.0,
+    preload_nm: float = 0.3,
+    share: float = 1.0,
 ) -> Made:
-    """A run without load and one with 2 kg on the platform."""
+    """A run without load and one with 2 kg on the platform, in a share of the workspace around its middle."""
     model, rng = mechanism.model, np.random.default_rng(0)
     standard = np.zeros(len(model.columns))
     for columns in model.link_columns:
@@ -76,7 +82,7 @@ def recorded(
     conditioning = Conditioning(standstill_rad_s=(0.02,) * model.robot.axis_count)
     rng, runs = np.random.default_rng(seed), []
     for mounted in (None, MOUNTED):
-        q = axis_positions(mechanism, rng, seconds)
+        q = axis_positions(mechanism, rng, seconds, share)
         run = Run("loaded" if mounted else "bare", np.arange(len(q)) / RATE_HZ, q, np.zeros_like(q), mounted)
         data = differentiate(run, model.drive_train, conditioning)
         whole = standard.copy()

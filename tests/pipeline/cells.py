@@ -19,6 +19,7 @@ from daq.errors import ExitCode
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from drivers.canopen.bus import open_bus
 from drivers.simulation.cell import SimulatedCell
+from drivers.simulation.spec import UndeclaredEffect
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,30 @@ def run_job(
         simulation: name of the shipped simulation; that of the cell when None.
         exchanges: of moves in planning.
     """
+    job, logs = record_job(
+        name, folder, seconds=seconds, pairs=pairs, seed=seed, simulation=simulation, exchanges=exchanges
+    )
+    _do(["fit", *map(str, logs), "--out", str(folder / "calibration.yaml")])
+    return job
+
+
+def record_job(
+    name: str,
+    folder: Path,
+    *,
+    seconds: float,
+    pairs: int,
+    seed: int,
+    simulation: str | None = None,
+    exchanges: int = 100,
+    effects: tuple[UndeclaredEffect, ...] = (),
+) -> tuple[Job, list[Path]]:
+    """Plan and record as `run_job` does, without a fit; return the job and its logs.
+
+    Args:
+        name, folder, seconds, pairs, seed, simulation, exchanges: as of `run_job`.
+        effects: of the plant, beside those of the simulation file.
+    """
     # A copy: what is written to a controller leaves an audit and a history beside the cell file.
     shutil.copytree(shipped_configurations(), folder / "configs")
     cell_file = folder / "configs" / "cells" / f"{name}.yaml"
@@ -89,9 +114,16 @@ def run_job(
         plan = make_plan(job, f"plan-{pair}.yaml", seed=10 * seed + pair, seconds=seconds, exchanges=exchanges)
         for mounted in (None, cell.payloads[0].name):
             logs.append(folder / f"{'bare' if mounted is None else 'loaded'}-{pair}.mcap")
-            record_run(job, plan, logs[-1], mounted=mounted, declared=mounted is not None, seed=100 * seed + len(logs))
-    _do(["fit", *map(str, logs), "--out", str(folder / "calibration.yaml")])
-    return job
+            record_run(
+                job,
+                plan,
+                logs[-1],
+                mounted=mounted,
+                declared=mounted is not None,
+                seed=100 * seed + len(logs),
+                effects=effects,
+            )
+    return job, logs
 
 
 def make_plan(job: Job, name: str, *, seed: int, seconds: float, exchanges: int = 100) -> Path:
@@ -103,7 +135,16 @@ def make_plan(job: Job, name: str, *, seed: int, seconds: float, exchanges: int 
     return path
 
 
-def record_run(job: Job, plan: Path, log: Path, *, mounted: str | None, declared: bool, seed: int) -> None:
+def record_run(
+    job: Job,
+    plan: Path,
+    log: Path,
+    *,
+    mounted: str | None,
+    declared: bool,
+    seed: int,
+    effects: tuple[UndeclaredEffect, ...] = (),
+) -> None:
     """Record a plan over the driver.
 
     Args:
@@ -113,6 +154,7 @@ def record_run(job: Job, plan: Path, log: Path, *, mounted: str | None, declared
         mounted: body of the simulation, or None.
         declared: whether the recording names it as a weighed payload of the cell.
         seed: of the noise.
+        effects: of the plant, beside those of the simulation file.
     """
     spec = load_simulation(shipped_simulation(job.simulation), mounted)
     chosen = []
@@ -121,7 +163,7 @@ def record_run(job: Job, plan: Path, log: Path, *, mounted: str | None, declared
         chosen = ["--payload", str(mounted), "--mass", str(mass_kg)]
     bus = open_bus(bus_address(job.cell))
     try:
-        with SimulatedCell(replace(spec, seed=seed), bus):
+        with SimulatedCell(replace(spec, seed=seed, effects=spec.effects + effects), bus):
             moving = ["--enable-motion", "--operator", "test"]
             _do(["record", str(job.cell_file), str(plan), "--out", str(log), *moving, *chosen])
     finally:

@@ -1,11 +1,13 @@
-"""Gains of every shipped robot and the mass of a second payload, over the whole driver path.
+"""Gains of every shipped robot and the mass of a second payload, over the whole driver path; effects of closed chains.
 
-    python -m tests.studies.any_robot --only kr270 --seeds 1 2
+    python -m tests.studies.any_robot --only KR270 --seeds 1 2
+    python -m tests.studies.any_robot --part effects --seeds 1
 
 Each seed has plans and noise of its own: runs in turn without load and with the weighed payload, a fit, then
 recordings with that payload and with a second body, which `weigh` finds with the calibration alone. A finished seed
 is kept in out/robot-study/ and not made again while the robot's row of ROBOTS and its files are the same. Writes
-out/robot-study.json and, if all robots and seeds are there, the tables of docs/evidence/robots.md.
+out/robot-study.json and, if all robots and seeds are there, the tables of docs/evidence/robots.md. The effects that a
+plant has beside the declared ones, and what `residual` names, are in chain_effects.py.
 """
 
 from __future__ import annotations
@@ -14,7 +16,6 @@ import argparse
 import contextlib
 import io
 import json
-import shutil
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -31,7 +32,8 @@ from daq.workflow.calibration_file import load_calibration
 from daq.workflow.weigh import weigh_logs
 from ident.arrays import BoolArray, FloatArray
 from tests.pipeline.cells import make_plan, record_run, run_job
-from tests.studies.fingerprint import digest, finish, is_finished
+from tests.studies.chain_effects import PLANTED, kept_effect, table_of_effects
+from tests.studies.fingerprint import digest, made_once
 from tests.studies.robot_tables import write_tables
 
 OUT = Path("out/robot-study")
@@ -127,16 +129,7 @@ def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
 
 def kept(robot: StudiedRobot, seed: int, out: Path = OUT) -> dict[str, Any]:
     """Return the row of a seed, which is made unless it is there; logs are deleted once it is."""
-    path = out / f"{robot.name}-{seed}.json"
-    if not is_finished(path, robot.fingerprint):
-        folder = out / f"{robot.name}-{seed}"
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        replace_file(path, f"{json.dumps(study(robot, seed, folder), indent=2)}\n".encode())
-        finish(path, robot.fingerprint)
-        shutil.rmtree(folder)
-    row: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return row
+    return made_once(out, f"{robot.name}-{seed}", robot.fingerprint, lambda folder: study(robot, seed, folder))
 
 
 def figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -195,24 +188,34 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.studies.any_robot", description=__doc__)
     parser.add_argument("--only", nargs="+", choices=[robot.name for robot in ROBOTS], metavar="ROBOT")
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
+    parser.add_argument("--part", nargs="+", choices=["gains", "effects"], default=["gains", "effects"])
     options = parser.parse_args(arguments)
     OUT.mkdir(parents=True, exist_ok=True)
-    rows: dict[str, list[dict[str, Any]]] = {}
-    for robot in ROBOTS:
-        if options.only is None or robot.name in options.only:
-            rows[robot.name] = [kept(robot, seed) for seed in options.seeds]
-    everything = [row for mine in rows.values() for row in mine]
-    robots = [figures(mine) for mine in rows.values()]
-    over_all = pooled(everything)
-    document = {"robots": robots, "pooled": over_all, "rows": everything}
-    replace_file(OUT.with_suffix(".json"), f"{json.dumps(document, indent=2)}\n".encode())
-    if len(rows) == len(ROBOTS) and set(options.seeds) >= set(SEEDS):
+    chosen = {robot.name for robot in ROBOTS if options.only is None or robot.name in options.only}
+    path = OUT.with_suffix(".json")
+    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    if "gains" in options.part:
+        document |= _gains(chosen, options.seeds)
+    if "effects" in options.part:
+        effects = [kept_effect(one, seed, OUT) for one in PLANTED if one.robot in chosen for seed in options.seeds]
+        document["effects"] = effects
+        sys.stdout.write(f"\nUndeclared effects:\n\n{table_of_effects(effects)}\n" if effects else "")
+    replace_file(path, f"{json.dumps(document, indent=2)}\n".encode())
+    return 0
+
+
+def _gains(chosen: set[str], seeds: list[int]) -> dict[str, Any]:
+    """Figures of the chosen robots, printed as a table; of all of them also the tables of the documentation."""
+    mine = [[kept(robot, seed) for seed in seeds] for robot in ROBOTS if robot.name in chosen]
+    everything = [row for rows in mine for row in rows]
+    robots, over_all = [figures(rows) for rows in mine], pooled(everything)
+    if len(robots) == len(ROBOTS) and set(seeds) >= set(SEEDS):
         write_tables(TABLES, robots, everything)
     sys.stdout.write(
         f"{table(robots)}\n\n95 % intervals that hold: {over_all['gain_coverage_percent']:.0f} % of "
         f"{over_all['gains']} gains, {over_all['mass_coverage_percent']:.0f} % of {over_all['masses']} masses\n"
     )
-    return 0
+    return {"robots": robots, "pooled": over_all, "rows": everything}
 
 
 if __name__ == "__main__":

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from daq.files import replace_file
 
@@ -49,6 +53,26 @@ def is_finished(path: Path, fingerprint: str) -> bool:
 def finish(path: Path, fingerprint: str) -> None:
     """Mark a finished file."""
     replace_file(mark_of(path), f"{fingerprint}\n".encode())
+
+
+def made_once(out: Path, name: str, fingerprint: str, make: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
+    """Return the document `name`.json of a folder; it is made unless it is there with this fingerprint.
+
+    Args:
+        out: the folder.
+        name: of the document, and of the folder of logs that is deleted once it is made.
+        fingerprint: of what it depends on.
+        make: fills the folder of logs and returns the document.
+    """
+    path, logs = out / f"{name}.json", out / name
+    if not is_finished(path, fingerprint):
+        shutil.rmtree(logs, ignore_errors=True)
+        logs.mkdir(parents=True)
+        replace_file(path, f"{json.dumps(make(logs), indent=2)}\n".encode())
+        finish(path, fingerprint)
+        shutil.rmtree(logs)
+    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return document
 
 
 def mark_of(path: Path) -> Path:

@@ -11,12 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daq.config.cell_file import load_cell
-from daq.simulation.simulation_file import load_simulation
+from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from drivers.simulation.effects import build_effect
 from drivers.simulation.plant import Plant
+from ident.effects.dictionary import EFFECTS
 from tests.conftest import CHECKOUT
 from tests.studies.any_robot import ROBOTS, StudiedRobot, figures, pooled
 from tests.studies.blind_cells import FAMILIES, NOTHING, blind_cases, confusion
+from tests.studies.chain_effects import PLANTED, PlantedEffect
 from tests.studies.direct_cell import RawRun, demand_rad, run_of
+from tests.studies.fingerprint import made_once
 from tests.studies.followed_cell import follow, without_rest
 from tests.studies.raw_runs import read_runs, write_runs
 from tests.studies.robot_tables import write_tables
@@ -44,6 +48,30 @@ def test_a_studied_robot_has_a_weighed_payload_and_a_second_body_that_no_cell_de
     assert first.mass_kg == cell.payloads[0].mass_kg
     assert second.mass_kg < 0.7 * first.mass_kg
     assert robot.fingerprint != replace(robot, seconds=robot.seconds + 1.0).fingerprint
+
+
+def test_what_is_made_once_is_not_made_again(tmp_path: Path) -> None:
+    def make(folder: Path) -> dict[str, int]:
+        assert folder.is_dir()
+        made.append(folder)
+        return {"times": len(made)}
+
+    made: list[Path] = []
+    found = [made_once(tmp_path, "a", mark, make) for mark in ("one", "one", "two")]
+    assert [one["times"] for one in found] == [1, 1, 2]
+    assert not made[0].exists()
+
+
+@pytest.mark.parametrize("planted", PLANTED, ids=lambda planted: planted.robot)
+def test_a_planted_effect_exists_on_both_sides(planted: PlantedEffect) -> None:
+    cell = load_cell(CHECKOUT / f"configs/cells/{planted.cell}.yaml")
+    assert planted.place in cell.place_names
+    assert planted.size in planted.effect.parameters.values()
+    known = {family[0].name: family[0] for family in EFFECTS}[planted.name]
+    assert planted.coefficient in {column.name for column in known.coefficients}
+    spec = load_simulation(shipped_simulation(planted.cell))
+    passive = tuple(name for name in cell.place_names if name not in cell.axis_names)
+    build_effect(planted.effect, len(spec.axes), passive)
 
 
 def test_the_figures_of_a_robot_are_over_all_its_gains_and_seeds() -> None:

@@ -17,7 +17,7 @@ from daq.workflow import fit as fit_module
 from daq.workflow import fit as verdicts_module
 from daq.workflow.fit import Fit, fit, gain_verdicts, needed_verdicts
 from ident.data.run import Run
-from ident.planning.excitation import GOOD_PERCENT, Verdict
+from ident.planning.verdict import GOOD_PERCENT, Verdict
 from tests.ident.recordings import MOUNTED, record, tx40_truth
 
 

@@ -26,23 +26,29 @@ from tests.ident.closed_recordings import Made, recorded
 from tests.ident.mechanisms import FIVE_BAR, PLANAR, THREE_LEGS, Mechanism
 
 FloatArray = NDArray[np.float64]
-Torque = Callable[[FloatArray, FloatArray], FloatArray]
+Torque = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
 
 
-def _friction(q: FloatArray, v: FloatArray) -> FloatArray:
-    del q
+def _friction(q: FloatArray, v: FloatArray, load: FloatArray) -> FloatArray:
+    del q, load
     return 0.25 * np.sign(v) + 0.1 * v
 
 
-def _spring(q: FloatArray, v: FloatArray) -> FloatArray:
-    del v
+def _spring(q: FloatArray, v: FloatArray, load: FloatArray) -> FloatArray:
+    del v, load
     return 3.0 * (q - 0.2)
+
+
+def _load_friction(q: FloatArray, v: FloatArray, load: FloatArray) -> FloatArray:
+    del q
+    return np.abs(load) * np.sign(v)
 
 
 CASES = (
     (FIVE_BAR, "right-rod", _friction, "passive-friction"),
     (PLANAR, "elbow-2", _friction, "passive-friction"),
     (THREE_LEGS, "slide-1", _spring, "spring"),
+    (THREE_LEGS, "slide-0", _load_friction, "load-friction"),
     (FIVE_BAR, "left-rod", _spring, "passive-spring"),
 )
 
@@ -52,11 +58,17 @@ def _planted(mechanism: Mechanism, joint: str, torque: Torque, size: float) -> t
     made = recorded(mechanism, 7, seconds=18.0 if mechanism is THREE_LEGS else 25.0, noise_a=0.01)
     runs = []
     index = [one.name for one in made.model.robot.joints].index(joint)
+    driven = list(made.model.robot.axis_joints)
     for run in made.runs:
         data = differentiate(run, made.model.drive_train, made.conditioning)
         followed: TreeMotion = made.model.follow(data.motion())
         q, v = followed.joints.position_rad[:, index], followed.joints.velocity_rad_s[:, index]
-        needed = followed.to_joints[:, index] * (size * torque(q, v))[:, None]
+        standard = made.standard.copy()
+        if run.payload is not None:
+            standard[made.model.flange] += made.payload
+        loads = made.model.torques(data.motion(), standard)[0]
+        load = loads[driven.index(index)] if index in driven else np.zeros(len(q))
+        needed = followed.to_joints[:, index] * (size * torque(q, v, load))[:, None]
         a = followed.to_motors
         motors = np.einsum("kmd,kd->km", a @ np.linalg.inv(np.swapaxes(a, 1, 2) @ a), needed)
         current = run.current_a.copy()
@@ -67,7 +79,7 @@ def _planted(mechanism: Mechanism, joint: str, torque: Torque, size: float) -> t
 
 @pytest.mark.parametrize(("mechanism", "joint", "torque", "family"), CASES, ids=lambda one: getattr(one, "name", None))
 def test_an_effect_is_named_on_its_joint(mechanism: Mechanism, joint: str, torque: Torque, family: str) -> None:
-    size = {"five-bar": 1.0, "planar": 0.06, "three-legs": 150.0}[mechanism.name]
+    size = 0.12 if torque is _load_friction else {"five-bar": 1.0, "planar": 0.06, "three-legs": 150.0}[mechanism.name]
     made, runs = _planted(mechanism, joint, torque, size)
     identified = identify(made.model, runs, made.conditioning, keep_rows=True)
     steps = find_effects(gather(identified), np.random.default_rng(0))

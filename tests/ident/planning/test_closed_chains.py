@@ -1,11 +1,13 @@
-"""Plans of closed chains: what is reached, and what a motion tells of the gains."""
+"""Plans of closed chains: what is reached, which gains a motion shows, and which of them internal preload hides."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from ident.data.dataset import differentiate
+from ident.equations.rows import Observation
 from ident.estimators.identify import identify
 from ident.model.robot import Motion
 from ident.planning.clearance import LARGEST_MISFIT, Capsule, Checker, Scene
@@ -18,6 +20,7 @@ from ident.planning.excitation import (
     recorded,
     visible,
 )
+from ident.planning.verdict import Hidden, Identifiability, verdicts
 from tests.ident.closed_recordings import Made, axis_positions
 from tests.ident.closed_recordings import recorded as made_of
 from tests.ident.mechanisms import BASE_M, CRANK_M, FIVE_BAR, PLANAR, ROD_M, Mechanism
@@ -26,7 +29,10 @@ NOTHING = Scene((), (), (), None, (), 0.0)
 NOISE_A = 0.02
 
 
-def _design(mechanism: Mechanism, made: Made, noise_a: np.ndarray[tuple[int], np.dtype[np.float64]]) -> Design:
+FloatArray = NDArray[np.float64]
+
+
+def _design(mechanism: Mechanism, made: Made, noise_a: FloatArray) -> Design:
     parameters = made.standard
     payload = ExpectedPayload(frozenset({"m"}), made.payload)
     expectation = Expectation(made.model, mechanism.gains, parameters, (payload,), noise_a)
@@ -59,6 +65,66 @@ def test_moves_show_every_gain_of_a_redundant_drive_and_rest_shows_none() -> Non
     runs: tuple[int | None, ...] = (None, 0)
     assert np.all(design.std_percent(design.information(moves, runs)) < UNSEEN_PERCENT)
     assert not np.any(design.std_percent(design.information(rest, runs)) < UNSEEN_PERCENT)
+    shown, unmoved = verdicts(design, [(moves, runs)]), verdicts(design, [(rest, runs)])
+    assert not shown.sentences("ABCD")
+    assert shown.rank == shown.known_preload_rank == 4
+    assert unmoved.hidden(Hidden.MOTION) == (0, 1, 2, 3)
+    # At rest, currents whose preload is known still give one ratio of the gains: in the null space of Aᵀ they are zero.
+    assert (unmoved.rank, unmoved.known_preload_rank) == (0, 1)
+    assert "nor would they if internal preload were known" in unmoved.sentences("ABCD")[0]
+
+
+def _judged(made: Made, design: Design) -> Identifiability:
+    runs = []
+    for run, payload in zip(made.runs, (None, 0), strict=True):
+        data = differentiate(run, made.model.drive_train, made.conditioning)
+        runs.append((recorded(made.model.drive_train, data, made.conditioning), (payload,)))
+    return verdicts(design, runs)
+
+
+def _spread_with_known_preload(rows: Observation, noise_a: FloatArray) -> FloatArray:
+    """Scatter of the gains [%] of least squares in which each motor's own current drives its axis: V g = τ.
+
+    The preload of these rows is zero, and the equations know it. The unknowns are those of the fit.
+    """
+    rng, count = np.random.default_rng(0), len(noise_a)
+    use, known, found = rows.use[0], rows.known(), []
+    weight = 1.0 / (PLANAR.gains * noise_a)
+    linear = [-rows.of_joint(axis, use).T * weight[axis] for axis in range(count)]
+    for _ in range(40):
+        drive = []
+        for axis in range(count):
+            columns = np.zeros((int(use.sum()), count))
+            columns[:, axis] = weight[axis] * (rows.current[axis, use] + noise_a[axis] * rng.standard_normal(use.sum()))
+            drive.append(columns)
+        matrix = np.hstack((np.concatenate(drive), np.concatenate(linear)))
+        scale = np.linalg.norm(matrix, axis=0)
+        right = np.concatenate([weight[axis] * known[axis, use] for axis in range(count)])
+        found.append((np.linalg.lstsq(matrix / scale, right)[0] / scale)[:count])
+    return np.asarray(100.0 * np.std(found, axis=0) / np.abs(PLANAR.gains))
+
+
+def test_preload_hides_gains_while_the_pose_hardly_changes() -> None:
+    """A tenth of the workspace: fits with and without knowledge of the preload differ as the verdict says."""
+    noise_a = 0.002
+    made = made_of(PLANAR, 3, seconds=18.0, noise_a=noise_a, preload_nm=0.0, share=0.1)
+    identified = identify(made.model, made.runs, made.conditioning, keep_rows=True)
+    fitted = identified.estimate
+    assert identified.gathered is not None
+    judged = _judged(made, _design(PLANAR, made, fitted.axis_noise))
+    predicted = np.array([(gain.std_percent, gain.known_preload_percent) for gain in judged.gains])
+    fits = (
+        100.0 * fitted.gains_std / np.abs(fitted.gains),
+        _spread_with_known_preload(identified.gathered[1], fitted.axis_noise),
+    )
+    ratio = np.stack(fits, axis=1) / predicted
+    assert np.all((ratio > 0.5) & (ratio < 2.0))
+    assert np.all(predicted[:, 0] > 2.5 * predicted[:, 1])
+    louder = _judged(made, _design(PLANAR, made, 12.0 * fitted.axis_noise))
+    assert louder.hidden(Hidden.PRELOAD) == (0, 1, 2, 3)
+    assert louder.rank < 4 == louder.known_preload_rank
+    (sentence,) = louder.sentences(["A", "B", "C", "D"])
+    assert sentence.startswith("Internal preload obscures the gains of A, B, C and D")
 
 
 def test_a_five_bar_goes_where_its_rods_reach() -> None:

@@ -19,18 +19,16 @@ from ident.model.model import Model
 from ident.model.robot import Motion
 from ident.model.urdf import robot_from_urdf
 from ident.planning.excitation import (
+    UNSEEN_PERCENT,
     Design,
     Excitation,
     Expectation,
     ExpectedPayload,
-    ExtraMoves,
-    GainSource,
-    Verdict,
     effective_noise,
     recorded,
-    verdicts,
     visible,
 )
+from ident.planning.verdict import ExtraMoves, GainSource, Verdict, verdicts
 from tests.ident.arms import TX40
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth, record, tx40_truth
 
@@ -137,6 +135,11 @@ def test_deviations_scale_with_noise_and_repetition(seed: int, factor: float, ti
     often = design.std_percent(times * design.information(excitation, (None, 0)))
     assert noisy == pytest.approx(factor * once, rel=1e-6)
     assert often == pytest.approx(once / np.sqrt(times), rel=1e-6)
+    rank = louder.rank(louder.information(excitation, (None, 0)))
+    assert 0 <= rank <= louder.rank(times * louder.information(excitation, (None, 0))) <= len(GAINS)
+    # Each gain is a sum of independent directions with squares of weights that add up to one.
+    assert rank < len(GAINS) or (noisy <= UNSEEN_PERCENT * (1.0 + 1e-9)).all()
+    assert rank > 0 or (noisy > UNSEEN_PERCENT * (1.0 - 1e-9)).all()
     # More moves never give less information.
     more = design.information(excitation, (None, 0)) + design.information(
         _excitation(np.random.default_rng(7), 20), (None, 0)
@@ -168,7 +171,7 @@ def test_a_gain_whose_axis_never_moves_is_not_seen() -> None:
     excitation = _excitation(np.random.default_rng(1), still=3)
     found = design.std_percent(design.information(excitation, (None, 0)))
     assert np.isinf(found[3])
-    judged = verdicts(design, [(excitation, (None, 0))])
+    judged = verdicts(design, [(excitation, (None, 0))]).gains
     assert judged[3].verdict is Verdict.UNSEEN
     assert "not identifiable" in judged[3].words("J4")
 
@@ -176,18 +179,18 @@ def test_a_gain_whose_axis_never_moves_is_not_seen() -> None:
 def test_axis_1_upright_is_identifiable_only_through_inertia_and_on_a_wall_through_gravity() -> None:
     truth = tx40_truth()
     excitation = _excitation(np.random.default_rng(1))
-    upright = verdicts(_design(truth), [(excitation, (None, 0))])[0]
+    upright = verdicts(_design(truth), [(excitation, (None, 0))]).gains[0]
     assert not upright.gravity_acts
     assert np.isinf(upright.alone_percent[GainSource.GRAVITY])
     assert "identifiable only through inertia" in upright.words("J1")
-    wall = verdicts(_design(truth, gravity=(9.81, 0.0, 0.0)), [(excitation, (None, 0))])[0]
+    wall = verdicts(_design(truth, gravity=(9.81, 0.0, 0.0)), [(excitation, (None, 0))]).gains[0]
     assert wall.gravity_acts
     assert np.isfinite(wall.alone_percent[GainSource.GRAVITY])
     assert "only through inertia" not in wall.words("J1")
 
 
 def test_no_source_alone_is_better_than_all_of_them() -> None:
-    for gain in verdicts(_design(tx40_truth()), [(_excitation(np.random.default_rng(4)), (None, 0))]):
+    for gain in verdicts(_design(tx40_truth()), [(_excitation(np.random.default_rng(4)), (None, 0))]).gains:
         assert all(alone >= gain.std_percent * (1.0 - 1e-9) for alone in gain.alone_percent.values())
         assert gain.sources
 
@@ -197,7 +200,7 @@ def test_the_advice_is_the_best_of_what_was_tried_and_says_what_it_gives() -> No
     weak = Design(replace(design.expectation, noise_a=100.0 * design.expectation.noise_a), design.base)
     excitation = _excitation(np.random.default_rng(1), 100)
     extras = [ExtraMoves(f"{rows} rows", 5.0, _excitation(np.random.default_rng(rows), rows)) for rows in (30, 300, 60)]
-    judged = verdicts(weak, [(excitation, (None, 0))], extras)
+    judged = verdicts(weak, [(excitation, (None, 0))], extras).gains
     for gain in judged:
         assert gain.advice is not None
         assert gain.advice.words == "300 rows"

@@ -1,0 +1,141 @@
+"""Effects that no file declares on closed chains, over the whole driver path: what `residual` names, and where.
+
+Each seed has plans and noise of its own: runs without load and with the weighed payload of a plant that has the effect,
+then `residual`. A part of the robot study (any_robot.py).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from daq.cli.app import main as drivegain
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.errors import ExitCode
+from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from drivers.simulation.spec import UndeclaredEffect
+from tests.pipeline.cells import as_json, record_job
+from tests.studies.fingerprint import digest, made_once
+
+
+@dataclass(frozen=True, slots=True)
+class PlantedEffect:
+    """A robot whose plant has an effect, and what `residual` has to find."""
+
+    robot: str  #: in the table
+    cell: str  #: shipped cell and simulation
+    effect: UndeclaredEffect  #: of the plant
+    name: str  #: effect of `ident` that it is
+    place: str  #: axis or joint without a motor
+    coefficient: str  #: parameter of that effect to compare
+    size: float  #: its true value
+    seconds: float = 40.0  #: of each run [s]
+    pairs: int = 1  #: of runs without and with the cell's payload, each with a plan of its own
+    exchanges: int = 60  #: tries of the planner
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the row and of the files that it names."""
+        cell, simulation = shipped_configurations() / "cells" / f"{self.cell}.yaml", shipped_simulation(self.cell)
+        files = (cell.read_text(), load_cell(cell).urdf, simulation.read_text(), load_simulation(simulation).urdf)
+        return digest(self, files)
+
+
+PLANTED = (
+    PlantedEffect(
+        robot="Orthoglide",
+        cell="orthoglide",
+        effect=UndeclaredEffect("load-friction", 0, {"coefficient": 0.2}),
+        name="load-friction",
+        place="slide-x",
+        coefficient="coefficient",
+        size=0.2,
+    ),
+    PlantedEffect(
+        robot="DualV",
+        cell="dualv",
+        effect=UndeclaredEffect("spring", 0, {"stiffness_nm_per_rad": 3.0, "rest_rad": 0.1}, joint="elbow-2"),
+        name="passive-spring",
+        place="elbow-2",
+        coefficient="stiffness",
+        size=3.0,
+    ),
+)
+"""One on a driven joint that gravity loads, one on a joint without a motor beside a redundant drive."""
+
+
+def study_effect(planted: PlantedEffect, seed: int, folder: Path) -> dict[str, Any]:
+    """Effects that `residual` names in one seed, and what they change; the folder is filled with plans and logs."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        job, logs = record_job(
+            planted.cell,
+            folder,
+            seconds=planted.seconds,
+            pairs=planted.pairs,
+            seed=seed,
+            exchanges=planted.exchanges,
+            effects=(planted.effect,),
+        )
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        code = drivegain(["residual", *map(str, logs), "--json"])
+    assert code == ExitCode.OK, f"drivegain residual ended with {code}"
+    found = as_json(printed.getvalue())
+    wanted, kept = (planted.name, planted.place), {(one["name"], one["axis"]) for one in found["effects"]}
+    added = [one for turn in found["turns"] for one in turn["added"]]
+    sizes = [
+        coefficient
+        for one in added
+        if (one["effect"], one["axis"]) == wanted
+        for coefficient in one["coefficients"]
+        if coefficient["name"] == planted.coefficient
+    ]
+    changes = {one["axis"]: one for one in found["gain_changes"]}
+    return {
+        "robot": planted.robot,
+        "seed": seed,
+        "effect": planted.name,
+        "place": planted.place,
+        "size": planted.size,
+        "named": wanted in kept,
+        "named_first": bool(added) and (added[0]["effect"], added[0]["axis"]) == wanted,
+        "found_size": sizes[-1]["value"] if sizes else None,
+        "found_size_std": sizes[-1]["std"] if sizes else None,
+        "others": [f"{name} on {place}" for name, place in sorted(kept - {wanted})],
+        "added": added,
+        "error_before_percent": found["before"]["cross_validated_error_percent"]["total"],
+        "error_after_percent": found["after"]["cross_validated_error_percent"]["total"],
+        "gain_change_percent": {axis: one["change_percent"] for axis, one in changes.items()},
+        "gain_error_before_percent": {a: 100.0 * (one["before"] / job.truth[a] - 1.0) for a, one in changes.items()},
+        "gain_error_after_percent": {a: 100.0 * (one["after"] / job.truth[a] - 1.0) for a, one in changes.items()},
+        "gain_std_after_percent": {a: 100.0 * one["after_std"] / abs(job.truth[a]) for a, one in changes.items()},
+        "summary": found["summary"],
+    }
+
+
+def kept_effect(planted: PlantedEffect, seed: int, out: Path) -> dict[str, Any]:
+    """Return the row of a seed, which is made unless it is there; logs are deleted once it is."""
+    name = f"{planted.robot}-{planted.name}-{seed}"
+    return made_once(out, name, planted.fingerprint, lambda folder: study_effect(planted, seed, folder))
+
+
+def table_of_effects(rows: Sequence[dict[str, Any]]) -> str:
+    """One line a planted effect and seed."""
+    lines = [
+        "| robot | effect | planted | found ± σ | first | others | error % | gain error %, worst |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        size = f"{row['found_size']:.3g} ± {row['found_size_std']:.2g}" if row["named"] else "not named"
+        errors = f"{row['error_before_percent']:.2f} → {row['error_after_percent']:.2f}"
+        worst = (max(map(abs, row[f"gain_error_{when}_percent"].values())) for when in ("before", "after"))
+        gains = " → ".join(f"{error:.2f}" for error in worst)
+        lines.append(
+            f"| {row['robot']} | {row['effect']} on {row['place']} | {row['size']:g} | {size} | "
+            f"{'yes' if row['named_first'] else 'no'} | {', '.join(row['others']) or 'none'} | {errors} | {gains} |"
+        )
+    return "\n".join(lines)
