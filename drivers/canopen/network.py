@@ -27,6 +27,7 @@ from drivers.errors import (
     BusError,
     DriverError,
     NodeMissing,
+    ObjectAccessError,
     SetupRefused,
     StateRefused,
     node_label,
@@ -38,6 +39,7 @@ from drivers.stream.sample import Sample
 
 ASKED_AT_ONCE = 8  #: Candidates for the recorder's node id that are tried together
 LOWEST_USUAL_ID = 112  #: The recorder takes the highest free id: this one or a higher one on any usual bus
+SECOND_ANSWER_S = 0.05  #: For the answer of a second device with one node id
 STANDSTILL_COUNTS = 1024  #: An encoder at rest flickers, and an axis may sink onto its brake between two readings
 
 
@@ -197,7 +199,13 @@ class CanopenNetwork:
         answered = answering(self.link, self.node_ids, self.bounds.answer_s)
         if missing := [axis for axis in self.axes if axis.node_id not in answered]:
             raise NodeMissing(missing, answered, self.bounds.answer_s)
-        identities = tuple(read_identity(self.link.objects(node_id)) for node_id in self.node_ids)
+        try:
+            identities = tuple(read_identity(self.link.objects(node_id)) for node_id in self.node_ids)
+        except ObjectAccessError:
+            # The refusal may be that of a second device with this node id, which was faster.
+            self.link.wait(SECOND_ANSWER_S)
+            self._require_own_ids(0)
+            raise
         self._require_own_ids(0)
         for axis, found in zip(self.axes, identities, strict=True):
             if axis.identity is not None and (differing := axis.identity.differences(found)):

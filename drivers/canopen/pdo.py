@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # the load of a bus is computed without opening one
 HEARTBEAT_MS = 100  #: Period of the heartbeats of every node, and of the recorder
 PDO_BYTES = 8
 PDOS = 4  #: PDOs of the predefined connection set, in each direction
+MOST_ENTRIES = 64  #: Objects that one PDO can carry, a bit each (CiA 301)
 NOT_VALID = 1 << 31
 READ_ONLY = 0x0601_0002  #: Abort of a write to an object that a drive keeps fixed (CiA 301)
 _EXTENDED = 1 << 29  #: COB-ID of 29 bits
@@ -227,7 +228,9 @@ def read_record(access: ObjectAccess, direction: Direction, number: int) -> PdoR
     mapped = None if identifier is None else access.read_optional(count)
     if identifier is None or mapped is None:
         return None
-    entries = tuple(access.read(_entry(count, sub)) for sub in range(1, mapped + 1))
+    # 254 and 255 mean a multiplexed PDO, which has no entries (CiA 301).
+    subs = range(1, mapped + 1) if mapped <= MOST_ENTRIES else ()
+    entries = tuple(access.read(_entry(count, sub)) for sub in subs)
     return PdoRecord(direction, number, identifier, access.read(transmission), entries)
 
 

@@ -218,6 +218,7 @@ class SynchronousSdoClient(SdoClient):
     def receive(self, data: bytearray) -> None:
         """Accept an answer that was read from the bus; CiA 301: an SDO always has eight bytes."""
         if len(data) == 8:
+            self._note_surplus(self._answered, bytes(data))
             self.responses.put(bytes(data))
 
     def send_request(self, request: bytes) -> None:
@@ -251,8 +252,10 @@ class SynchronousSdoClient(SdoClient):
     def request_response(self, sdo_request: bytes) -> bytes:
         """Send a request and return the answer that belongs to it, or raise SdoAbortedError, SdoCommunicationError."""
         self._bus.pump(0.0)
-        while not self.responses.empty():
-            self._note_surplus(self.responses.get_nowait())
+        self.responses.queue.clear()
+        before, self._answered = self._answered, b""
+        if self._bus.asked_by.get(self.tx_cobid - SDO_ANSWER) is not self:
+            before = b""
         self.send_request(sdo_request)
         requested = bytes(sdo_request[1:4])
         names_object = sdo_request[0] >> 5 in (_INITIATE_DOWNLOAD, _INITIATE_UPLOAD, _INITIATE_BLOCK_UPLOAD)
@@ -265,7 +268,7 @@ class SynchronousSdoClient(SdoClient):
                 raise
             about = response[1:4]
             if names_object and about != requested and not (response[0] == _ABORT and about == b"\0\0\0"):
-                self._note_surplus(response)  # or a late answer to an earlier request
+                self._note_surplus(before, response)  # or a late answer to an earlier request
                 continue
             self._answered = response if names_object and requested not in self._unanswered else b""
             self._unanswered.discard(requested)
@@ -276,12 +279,11 @@ class SynchronousSdoClient(SdoClient):
         raise SdoCommunicationError(f"{MOST_SURPLUS} answers to other requests")
 
     def _give_up(self, requested: bytes) -> None:
-        self._answered = b""
         self._unanswered.add(requested)
         self.abort()
 
-    def _note_surplus(self, response: bytes) -> None:
+    def _note_surplus(self, first: bytes, second: bytes) -> None:
         """Report a second answer to one request: two devices have the node id."""
         node_id = self.tx_cobid - SDO_ANSWER
-        if self._answered and response[1:4] == self._answered[1:4] and self._bus.asked_by.get(node_id) is self:
-            self._bus.note_twice(node_id, self._answered, response)
+        if first and second[1:4] == first[1:4] and self._bus.asked_by.get(node_id) is self:
+            self._bus.note_twice(node_id, first, second)

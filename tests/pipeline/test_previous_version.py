@@ -18,6 +18,7 @@ from daq.cli.app import main
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.ledger.audit import read as read_audit
+from daq.ledger.audit import verify
 from daq.ledger.store import HistoryStore
 from daq.ledger.verify import writes_to
 from daq.log.reader import read_log
@@ -94,7 +95,7 @@ def test_the_history_is_what_was_written(cell: Path, capsys: pytest.CaptureFixtu
 def test_the_history_knows_all_writes_of_the_audit(cell: Path) -> None:
     declared = _where_it_was_made(cell)
     assert declared.history is not None
-    writes = writes_to(declared, read_audit(declared.history.audit))
+    writes = writes_to(declared, verify(declared.history.audit))
     assert [write.ended.who.split()[0] for write in writes] == ["Ada", "Bert", "Cleo"]
     with HistoryStore(declared.history.store) as store:
         assert [event.who.split()[0] for event in store.events()] == ["Ada", "Bert", "Cleo"]

@@ -24,7 +24,7 @@ from daq.workflow.record import LATE_LOSSES_S, Clocks, Recorded, record
 from daq.workflow.safeguards import NEVER
 from drivers.canopen.network import CanopenNetwork, SignalBlocker
 from drivers.canopen.socketcan import Losses
-from drivers.errors import NodeMisplaced, SampleLost
+from drivers.errors import MotionRefused, NodeMisplaced, SampleLost
 from drivers.stream.sample import EventKind
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell
 
@@ -59,7 +59,7 @@ class Rig:
 
         patch.setattr("daq.workflow.record.network_of", network_of)
 
-    def run(self, clocks: Clocks | None = None) -> Recorded:
+    def run(self, clocks: Clocks | None = None, *, unguarded: bool = True) -> Recorded:
         """Record the plan."""
         declared = load_cell(self.cell_file)
         clocks = clocks or Clocks(lambda: WALL_NS, self.bus.clock)
@@ -74,7 +74,7 @@ class Rig:
             granted_by="the test",
             run_id="1",
             clocks=clocks,
-            unguarded=True,  # the scripted drives have no 1016h
+            unguarded=unguarded,  # the scripted drives have no 1016h
         )
 
     def profiles(self) -> list[bytes]:
@@ -157,6 +157,13 @@ def test_moves_are_planned_from_where_the_axes_are_known_to_be(
     sound = Rig(checkout, tmp_path / "sound", monkeypatch, "lockstep")
     sound.run()
     assert lockstep.profiles() == sound.profiles() != []
+
+
+def test_axes_that_would_go_on_when_the_recorder_is_killed_do_not_move_unasked(lockstep: Rig) -> None:
+    with pytest.raises(MotionRefused, match=r"UNGUARDED: J1: no 1016h.*pass --unguarded to move J1, J2, .*emergency"):
+        lockstep.run(unguarded=False)
+    assert not lockstep.out.exists()
+    assert not any(node.powered_cycles for node in lockstep.bus.nodes)
 
 
 def test_an_axis_that_never_answers_is_not_waited_for_for_ever(lockstep: Rig) -> None:

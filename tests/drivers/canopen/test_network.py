@@ -183,6 +183,15 @@ def test_a_pdo_whose_cob_id_is_fixed_gets_the_rest() -> None:
         assert bus.nodes[0].objects[key] == before[key]
 
 
+def test_a_multiplexed_pdo_is_switched_off_and_on_again() -> None:
+    network, bus = cell(1)
+    bus.nodes[0].store(0x1A01, 0, 255)
+    with network:
+        network.prepare()
+        assert bus.nodes[0].value(0x1801, 1) >> 31 == 1
+    assert (bus.nodes[0].value(0x1801, 1), bus.nodes[0].value(0x1A01, 0)) == (0x281, 255)
+
+
 def test_a_drive_with_small_pdos_gets_more_of_them() -> None:
     network, bus = cell(1)
     write = bus.nodes[0].sdo

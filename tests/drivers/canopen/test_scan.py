@@ -178,6 +178,16 @@ def test_they_are_refused_before_anything_is_written(serial: int) -> None:
     assert [f for f in bus.sent if 0x600 < f.arbitration_id < 0x680 and f.data[0] >> 5 == 1] == []
 
 
+def test_a_second_device_that_refuses_first_is_named_too() -> None:
+    network, bus = cell(2)
+    stranger = Hostile(2, bus, lambda data, _: None)
+    stranger.objects = {key: value for key, value in stranger.objects.items() if key[0] in (0x1000, 0x1017)}
+    stranger._refresh = lambda: None  # type: ignore[method-assign]
+    bus.nodes = (bus.nodes[0], stranger, bus.nodes[1])
+    with network, pytest.raises(SetupRefused, match=r"J2 \(node 2\): found two answers .* two have it"):
+        network.prepare()
+
+
 def heartbeat(state: int) -> can.Message:
     return can.Message(arbitration_id=0x702, is_extended_id=False, data=bytes((state,)))
 
