@@ -21,7 +21,7 @@ from enum import Enum
 from pathlib import Path
 
 from daq.errors import AuditUnusable
-from daq.files import fsync_folder, read_regular, sha256, sha256_of
+from daq.files import follow_links, fsync_folder, read_regular, sha256, sha256_of
 
 MAX_BYTES = 2**30  #: Largest audit log; it is read whole
 _TRIES, _PAUSE_S = 100, 0.05  #: For the lock, which is held for one line
@@ -227,7 +227,7 @@ def _locked(path: Path) -> Iterator[int]:
     # O_NONBLOCK: a FIFO of that name must not keep us waiting for its other end.
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK
     try:
-        descriptor = os.open(path, flags, 0o666)
+        descriptor = os.open(follow_links(path), flags, 0o666)
     except IsADirectoryError as error:
         raise _no_file(path, "a folder") from error
     try:

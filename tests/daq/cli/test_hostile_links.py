@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -13,8 +14,10 @@ from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationError, ExitCode
 from daq.files import follow_links, replace_file
 from daq.jobs.cell_fit import _check_replaceable
+from daq.ledger.audit import AuditAction, append
 from tests.daq.calibrations import calibration_for
 
+NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
 JOB = """
 policy: {motion: allowed}
 recalibration:
@@ -85,6 +88,20 @@ def test_the_link_of_another_user_is_followed_nowhere(cell: Path, tmp_path: Path
         load_cell(cell)
     os.chown(target, 4711, 4711)  # whoever made the link may write the file
     assert load_cell(cell).name == "demo"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
+def test_no_entry_goes_through_another_users_link(tmp_path: Path) -> None:
+    """`rollback --to FILE --audit AUDIT` names an audit log that no cell file has judged."""
+    link, target = tmp_path / "audit.jsonl", tmp_path / "elsewhere"
+    target.touch()
+    link.symlink_to(target)
+    append(link, AuditAction.PROPOSED, at=NOW, who="K.", subject="x", details={})
+    written = target.read_bytes()
+    os.lchown(link, 4711, 4711)
+    with pytest.raises(OSError, match="user 4711 has made"):
+        append(link, AuditAction.PROPOSED, at=NOW, who="K.", subject="x", details={})
+    assert target.read_bytes() == written
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
