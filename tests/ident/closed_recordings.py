@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,7 @@ def preload_of(model: Model, to_motors: FloatArray, time_s: FloatArray, size_nm:
     return out
 
 
+@cache
 def recorded(
     mechanism: Mechanism,
     seed: int = 4,

@@ -15,7 +15,7 @@ from ident.model.urdf import LinkPair, robot_from_urdf
 FloatArray = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mechanism:
     """A URDF with its closures, and where its motors may go.
 

@@ -88,7 +88,7 @@ DAMAGE = st.lists(
 )
 
 
-@settings(FUZZ, max_examples=400)
+@settings(FUZZ, max_examples=200)
 @given(DAMAGE)
 def test_no_damage_gives_other_numbers(
     good: Path, tmp_path: Path, damage: list[tuple[str, float, int, int, bytes]]
@@ -140,7 +140,7 @@ def _records(draw: st.DrawFn) -> bytes:
     return chunk_record(draw(st.binary(max_size=80)), size, draw(st.sampled_from(("zstd", "", "lz4", "\0"))))
 
 
-@settings(FUZZ, max_examples=400)
+@settings(FUZZ, max_examples=200)
 @given(st.lists(_records(), max_size=5))
 def test_records_made_up_with_right_checksums_are_read_or_named(tmp_path: Path, records: list[bytes]) -> None:
     path = finished_file(tmp_path / "made.mcap", [HEADER, *records])
@@ -172,7 +172,7 @@ def _messages(draw: st.DrawFn) -> bytes:
     return raw_record(Opcode.MESSAGE, head + data, draw(st.none() | st.none() | BITS16))
 
 
-@settings(FUZZ, max_examples=400)
+@settings(FUZZ, max_examples=200)
 @given(st.lists(_messages(), max_size=6), st.booleans(), TEXTS)
 @example([], True, "1")
 def test_messages_made_up_in_genuine_chunks_are_read_or_named(

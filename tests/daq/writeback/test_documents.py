@@ -24,7 +24,7 @@ from daq.writeback.formats.scalar import ControllerDocument, rewrite_gain
 from daq.writeback.formats.xml_document import XmlDocument
 from daq.writeback.formats.yaml_document import YamlDocument
 
-EXAMPLES = settings(max_examples=150)
+EXAMPLES = settings(max_examples=80)
 _numbers = st.sampled_from(["32.96", "-11.52", "7", "0", "1e3", "2.5E-3", "0.10", "-0.0", "123456789.125"])
 _gains = st.floats(1e-3, 1e4).flatmap(lambda gain: st.sampled_from([gain, -gain]))
 _ends = st.sampled_from(["\n", "\r\n"])

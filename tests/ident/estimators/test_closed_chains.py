@@ -25,7 +25,6 @@ SEEDS = range(10, 15)
 NOISE_A = 0.03
 
 
-@cache
 def _made(name: str) -> Made:
     return recorded(next(one for one in MECHANISMS if one.name == name))
 
