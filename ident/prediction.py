@@ -16,7 +16,7 @@ from ident.effects.signals import declared_signals, payload_parameters
 from ident.equations.rows import row_masks
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload
-from ident.model.model import Model, seen_torques
+from ident.model.model import Model, without_preload
 from ident.model.robot import Motion
 
 SAME_MASS = 0.01  #: Share by which two weighings of one body may differ
@@ -48,6 +48,8 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
         columns = columns_at(placed.effect, run, placed.axis)
         at_all = at_joints(placed.effect, placed.axis, columns, model.drive_train)
         torque += np.einsum("p,npk->nk", coefficients, at_all)
+    if calibration.effects and model.is_redundant:
+        torque = without_preload(model.follow(data.motion()), torque)
     return np.asarray(torque.T)
 
 
@@ -81,8 +83,7 @@ def measured_torque(
     torque = np.asarray((_gains(calibration, model) * np.asarray(current_a)) @ model.drive_train.direction)
     if motion is None or not model.is_redundant:
         return torque
-    seen = seen_torques(np.transpose(model.follow(motion).to_motors, (2, 1, 0)))
-    return np.asarray(np.einsum("amk,km->ka", seen, torque))
+    return without_preload(model.follow(motion), torque.T).T
 
 
 def measured_current(calibration: Calibration, model: Model, current_a: FloatArray, motion: Motion) -> FloatArray:

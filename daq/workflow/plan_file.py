@@ -17,7 +17,7 @@ from daq.workflow.experiment import PlannedMove, duration_of, paths_of, scene_of
 from daq.workflow.plan import Plan
 from drivers.errors import MotionRefused
 from ident.arrays import FloatArray
-from ident.planning.clearance import Checker
+from ident.planning.clearance import CLOSURES, Checker, Obstruction
 
 LONGEST_S = 3600.0
 Velocity = Annotated[float, Field(ge=0.01, le=1)]  #: Slower than a hundredth of its limits a move would hardly end
@@ -141,23 +141,37 @@ def check_approach(cell: Cell, plan: Plan, start_rad: FloatArray) -> None:
     """Refuse a way to the first target that leaves what the cell file declares.
 
     Args:
-        cell: with `workspace` or `clearance`; without both, nothing is known of the room.
+        cell: with `workspace`, `clearance` or closures; without any, nothing is known of the room.
         plan: for this cell.
         start_rad: where the robot stands [rad; m of a prismatic joint], shape (n,).
 
     Raises:
         MotionRefused: with the place and the bodies that come too close.
     """
-    if cell.clearance is None:
+    if not _is_bounded(cell):
         return
     found = _checker(cell).obstruction(start_rad, np.array(plan.moves[0].target_rad))
     if found is not None:
-        where = ", ".join(axis.unit.spell(p) for axis, p in zip(cell.axes, found.position, strict=True))
         raise MotionRefused(
-            f"the way from here to the first target of the plan: found {1000 * found.distance_m:.0f} mm between "
-            f"{found.first} and {found.second} at ({where}); bring the robot near the first target by hand, or correct "
-            "`workspace` and `clearance` in the cell file"
+            f"the way from here to the first target of the plan: found {_spell(cell, found)}; bring the robot near the "
+            f"first target by hand, or correct {_keys(found)} in the cell file"
         )
+
+
+def _is_bounded(cell: Cell) -> bool:
+    """Whether the cell file says where the robot must not go."""
+    return cell.clearance is not None or cell.chain is not None
+
+
+def _spell(cell: Cell, found: Obstruction) -> str:
+    where = ", ".join(axis.unit.spell(p) for axis, p in zip(cell.axes, found.position, strict=True))
+    if found.first == CLOSURES:
+        return f"that the loops do not close, or are close to a singularity, at ({where})"
+    return f"{1000 * found.distance_m:.0f} mm between {found.first} and {found.second} at ({where})"
+
+
+def _keys(found: Obstruction) -> str:
+    return "`closures`, `motors` and `limits`" if found.first == CLOSURES else "`workspace` and `clearance`"
 
 
 def _checker(cell: Cell) -> Checker:
@@ -170,16 +184,16 @@ def _checker(cell: Cell) -> Checker:
 
 def _check_room(path: Path, cell: Cell, moves: tuple[PlannedMove, ...]) -> None:
     """Refuse ways that leave what the cell file declares."""
-    if cell.clearance is None:
+    if not _is_bounded(cell):
         return
     checker = _checker(cell)
+    minimum_m = checker.scene.minimum_m
     for number, way in enumerate(paths_of(cell, moves), start=1):
         found = checker.obstruction(np.asarray(way.start), np.asarray(way.end))
         if found is not None:
-            where = ", ".join(axis.unit.spell(p) for axis, p in zip(cell.axes, found.position, strict=True))
             raise _refused(
                 f"{path}: moves[{number}], on the way there",
-                f"{1000 * found.distance_m:.0f} mm between {found.first} and {found.second} at ({where})",
-                f"at least {1000 * cell.clearance.minimum_m:.0f} mm",
-                "correct the move, or `workspace` and `clearance` in the cell file",
+                _spell(cell, found),
+                "poses inside the workspace" if found.first == CLOSURES else f"at least {1000 * minimum_m:.0f} mm",
+                f"correct the move, or {_keys(found)} in the cell file",
             )

@@ -5,7 +5,7 @@ frames in the base and R = R₁ᵀ R₂,
 
     φ = (R₁ᵀ (p₂ − p₁),  ½ vee(R − Rᵀ)) in the chosen directions,     J_c = ∂φ/∂q,
 
-so that a closure of two rotations leaves the third free at any angle. J_c has rank r, also where closures are
+so that a closure of two rotations leaves the third free below 180°. J_c has rank r, also where closures are
 redundant (the parallelograms of an Orthoglide hold its platform twice). Elimination with full pivots splits the joints
 into r dependent and d = n − r independent ones: J_c G = 0 with G the identity in the independent rows, and Newton's
 method on the dependent joints alone returns positions to φ = 0 (coordinate partitioning, Wehage and Haug 1982).

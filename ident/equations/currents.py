@@ -36,7 +36,10 @@ LONG = 20  #: So many rows a column are reduced to a triangle first
 
 @dataclass(frozen=True, slots=True)
 class Whitened:
-    """e = drive g − linear χ − known, all rows below each other; each row has noise of one."""
+    """e = drive g − linear χ − known, all rows below each other, in units of the noise.
+
+    Each row has noise of one; with preload cov e = P, and ‖e‖² is still that of the likelihood, as P is a projection.
+    """
 
     drive: FloatArray  #: per unit of each gain, shape (rows, m)
     linear: FloatArray  #: per unit of each parameter, shape (rows, p)
@@ -90,7 +93,7 @@ class Currents(ABC):
 
     @abstractmethod
     def cost(self, gains: FloatArray, parameters: FloatArray, noise: FloatArray) -> float:
-        """Cost that an estimate makes least: −log L up to constants."""
+        """Cost that an estimate makes least: −log L up to constants, and with preload for this σ alone."""
 
     def settled(self, gains: FloatArray, free: int) -> tuple[FloatArray, FloatArray]:
         """χ and σ of each current [A] for given gains, shapes (p,) and (m,): a fixed point of a few rounds."""
@@ -129,7 +132,7 @@ class OwnCurrents(Currents):
     def corrected(self, gains: FloatArray, noise: FloatArray, whitened: Whitened, residual: FloatArray) -> FloatArray:
         """Put the predicted current in place of the measured one."""
         del noise
-        out = np.where(whitened.drive != 0.0, whitened.drive, 0.0)
+        out = whitened.drive.copy()
         motor = np.repeat(np.arange(len(gains)), [len(factor) for factor in self.triangles.factors])
         out[np.arange(len(motor)), motor] -= residual / gains[motor]
         return out
@@ -165,7 +168,12 @@ class PreloadedCurrents(Currents):
 
     @classmethod
     def of_rows(cls, rows: Sequence[FloatArray], preload: FloatArray) -> PreloadedCurrents:
-        """Sort the motors' rows [V_i | W_i | known_i], each of shape (r, m + p + 1)."""
+        """Sort the motors' rows [V_i | W_i | known_i], each of shape (r, m + p + 1).
+
+        Args:
+            rows: of each motor.
+            preload: N of each row, shape (r, m, m − d).
+        """
         stacked = np.stack(rows, axis=1)
         count = len(rows)
         return cls(stacked[:, :, :count], stacked[:, :, count:-1], stacked[:, :, -1], preload)
@@ -190,9 +198,7 @@ class PreloadedCurrents(Currents):
         """Take the corrections σ e out of the measured currents."""
         count = len(gains)
         corrections = noise[:, None] * residual.reshape(count, -1)
-        # What a motor's current does at the axes, preload aside: its column of 1 − N Nᵀ.
-        seen = np.eye(count) - self.preload @ np.swapaxes(self.preload, 1, 2)
-        felt = np.swapaxes(self.transform(gains, noise) @ seen, 0, 1)  # (m, r, m)
+        felt = np.swapaxes(self.transform(gains, noise), 0, 1)  # (m, r, m): a motor's current, without preload
         return np.asarray(whitened.drive - (felt * corrections.T).reshape(-1, count))
 
     def noise(

@@ -74,7 +74,7 @@ class Reduction:
         """
         for joint, rows in enumerate(self.joint_rows):
             if not rows:
-                reason = f"joint {joint + 1} never moves faster than its standstill speed in any run"
+                reason = f"{self.model.robot.axes[joint].name} never moves faster than its standstill speed in any run"
                 raise DataUnfit(", ".join(self.runs), reason)
         names = tuple(column.name for column in self.model.columns)
         return base_parameters(np.concatenate([self._standard(index) for index in range(len(self.joints))]), names)

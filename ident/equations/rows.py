@@ -139,8 +139,8 @@ def _balanced(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Rows of a redundantly driven robot: columns of the parameters and of the gains at the axes, and N.
 
-    Both sides of Aᵀ diag(v) g = Gᵀ W χ go through the filter, because A changes from sample to sample; then, with the A
-    of each row, they are written as torques of the axes.
+    Both sides of Aᵀ diag(v) g = Gᵀ W χ go through the filter, because A changes from sample to sample; then, with an A
+    that went through the same filter, they are written as torques of the axes.
     """
     columns, to_motors = model.balance(data.motion(part))
     currents = data.current_a[part].T
@@ -248,7 +248,10 @@ class Observation(Equations):
         return replace(self, **{name: getattr(self, name)[..., rows] for name in OF_ROWS})
 
     def extended(self, columns: tuple[Column, ...], torque: FloatArray) -> Observation:
-        """Add columns to W, torque of shape (n, extra, r) [Nm per unit]."""
+        """Add columns to W, torque of shape (n, extra, r) [Nm per unit]; what preload hides of them is left out."""
+        if self.preload.size:
+            hidden = np.einsum("alr,apr->lpr", self.preload, torque)
+            torque = torque - np.einsum("alr,lpr->apr", self.preload, hidden)
         return replace(self, columns=self.columns + columns, effects=np.concatenate((self.effects, torque), axis=1))
 
     def _by_move(self, first_column: int = 0) -> tuple[tuple[FloatArray, ...], ...]:

@@ -147,10 +147,11 @@ def require_rows(system: System) -> None:
     for motor, rows in enumerate(system.motors.rows):
         if not rows:
             train = system.drive_train
+            axes = system.model.robot.axes
             joints = np.flatnonzero((train.direction[motor] != 0) | (train.to_motor[motor] != 0))
             raise DataUnfit(
                 ", ".join(system.runs),
-                f"joints {' and '.join(str(joint + 1) for joint in joints)}, which motor {motor + 1} is coupled to, "
+                f"{' and '.join(axes[joint].name for joint in joints)}, which motor {motor + 1} turns with, "
                 "never move at the same time; record moves in which they do, or use another estimator than ml",
             )
         if rows <= len(system.unknowns):

@@ -21,22 +21,23 @@ import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.errors import ModelError
-from ident.model.robot import Closure, JointKind, Motion, Place, Poses, Robot, poses
+from ident.model.closures import loops, origin
+from ident.model.robot import JointKind, Motion, Robot, poses
 
 LARGEST_CONDITION = 500.0
 """Largest condition of J_d, the derivatives to the joints that follow; mechanisms stay below 30 in their workspace."""
 CLOSED = 1e-12  #: |φ| at which Newton's iteration ends, in units of the robot's size or radians
 SMALLEST_RANK = 1e-7  #: Singular value of J, relative to the largest, that counts as zero
 LARGEST_GAP = 0.3  #: |φ| at the declared assembly pose, in units of the robot's size or radians
+LARGEST_MISFIT = 0.02
+"""Largest difference between a measured position of a redundant drive's motor and the pose that fits all of them best
+[rad, or m divided by the robot's size]: a bent arm stays below it, a wrong zero or sign does not."""
 LONGEST_STRIDE = 64
-"""At most every so manyth sample is reached from the assembly pose; the others start from their neighbours."""
+"""At least every 64th sample is reached from the assembly pose; the others start from their neighbours."""
 STRIDE_RAD = 0.25  #: Largest motion between two such samples [rad, or m divided by the robot's size]
 STEP_RAD = 0.15  #: Longest step on that way [rad, or m divided by the robot's size]
 LONGEST_STEP_RAD = 1.5  #: Longer steps of Newton lead to another pose, or nowhere
 MAX_ITERATIONS = 30
-
-_AFTER = {"x": "y", "y": "z", "z": "x"}
-_INDEX = {"x": 0, "y": 1, "z": 2}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +85,7 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
     _check(robot, start)
     size_m = _size(robot, start)
     position = _closed_near(robot, start, size_m)
-    jacobian = _loops(robot, position[None], size_m).jacobian[0]
+    jacobian = loops(robot, position[None], size_m).jacobian[0]
     free = _null_space(jacobian)
     found = free.shape[1]
     if mobility is not None and found != mobility:
@@ -120,17 +121,18 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
     """Let all joints follow the motors' joints.
 
     Of the several poses that belong to a position of the motors, it is the one that is reached from the assembly pose
-    by moving them there in a straight line: a function of the position alone, whatever was asked before.
+    by moving them there in a straight line: a function of the position alone, whatever was asked before. Samples
+    between two such poses start from an interpolation, which leads to the same pose.
 
     Args:
         robot: with n joints and m motors.
         assembly: of the robot.
-        axes: motion of the motors' joints, arrays of shape (k, m). Of a redundantly driven robot (m > d) the pose that
-            fits them best.
+        axes: motion of the motors' joints, arrays of shape (k, m). A redundantly driven robot (m > d) gets the pose
+            that fits them best.
 
     Raises:
-        ModelError: the loops cannot be closed at a position, or it is close to a singularity, where small errors of
-            position are large forces.
+        ModelError: the loops cannot be closed at a position, the positions of a redundant drive's motors do not fit
+            each other, or it is close to a singularity, where small errors of position are large forces.
     """
     motors, x, rest = list(robot.axis_joints), list(assembly.independent), list(assembly.dependent)
     measured = np.asarray(axes.position_rad, dtype=np.float64)
@@ -139,26 +141,27 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
         one = np.broadcast_to(np.eye(count), (samples, count, count))
         return TreeMotion(axes, one, one, np.ones(samples))
     position = positions(robot, assembly, measured)
-    loops = _loops(robot, position, assembly.size_m)
-    q, r = np.linalg.qr(loops.jacobian[:, :, rest])
+    closing = loops(robot, position, assembly.size_m)
+    q, r = np.linalg.qr(closing.jacobian[:, :, rest])
     to_joints = np.zeros((samples, count, d))
     to_joints[:, x] = np.eye(d)
-    to_joints[:, rest] = -np.linalg.solve(r, np.swapaxes(q, 1, 2) @ loops.jacobian[:, :, x])
+    to_joints[:, rest] = -np.linalg.solve(r, np.swapaxes(q, 1, 2) @ closing.jacobian[:, :, x])
     to_motors = to_joints[:, motors]
     speed_x = _least_squares(to_motors, np.asarray(axes.velocity_rad_s))
     velocity = np.einsum("knd,kd->kn", to_joints, speed_x)
     bias = np.zeros((samples, count))
-    turning = _loops(robot, position, assembly.size_m, velocity).bias
+    turning = loops(robot, position, assembly.size_m, velocity).bias
     bias[:, rest] = -np.linalg.solve(r, np.einsum("kcr,kc->kr", q, turning)[..., None])[..., 0]
     acceleration_x = _least_squares(to_motors, np.asarray(axes.acceleration_rad_s2) - bias[:, motors])
     acceleration = np.einsum("knd,kd->kn", to_joints, acceleration_x) + bias
-    condition = np.linalg.norm(r, axis=(1, 2)) * np.linalg.norm(_solve_each(r, np.eye(len(rest))), axis=(1, 2))
-    worst = int(np.argmax(condition))
-    if condition[worst] > LARGEST_CONDITION:
-        raise ModelError(
-            f"the motion comes close to a singularity at {_at(robot, measured[worst])}: condition "
-            f"{condition[worst]:.3g} of the closures; expected below {LARGEST_CONDITION:g}: record moves away from it"
-        )
+    condition = _condition(r)
+    for of, values in (("closures", condition), ("motors", _condition_of_motors(robot, assembly, to_motors))):
+        worst = int(np.argmax(values))
+        if values[worst] > LARGEST_CONDITION:
+            raise ModelError(
+                f"the motion comes close to a singularity at {_at(robot, measured[worst])}: condition "
+                f"{values[worst]:.3g} of the {of}; expected below {LARGEST_CONDITION:g}: record moves away from it"
+            )
     return TreeMotion(Motion(position, velocity, acceleration), to_joints, to_motors, condition)
 
 
@@ -180,12 +183,21 @@ class Reach:
 
 
 def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatArray:
-    """Positions of all joints, shape (k, n), of those of the motors' joints, shape (k, m); see `follow`.
+    """Positions of all joints [rad or m], shape (k, n), of those of the motors' joints, shape (k, m); see `follow`.
 
     Raises:
-        ModelError: the loops cannot be closed at a position.
+        ModelError: the loops cannot be closed at a position, or motors of a redundant drive do not fit each other.
     """
     found = reach(robot, assembly, axes_rad)
+    units = _units(robot, assembly)
+    apart = np.abs(found.position_rad[:, list(robot.axis_joints)] - axes_rad) / units  # zero where m = d
+    worst, axis = divmod(int(np.argmax(apart)), apart.shape[1])
+    if apart[worst, axis] > LARGEST_MISFIT:
+        raise ModelError(
+            f"the motors do not fit each other at {_at(robot, axes_rad[worst])}: {robot.axes[axis].name} is "
+            f"{apart[worst, axis] * units[axis]:.2g} away from where the others hold it; expected at most "
+            f"{LARGEST_MISFIT * units[axis]:.2g} (rad or m): are signs, zeros and ratios of the axes right?"
+        )
     if not found.closed.all():
         worst = int(np.argmax(found.gap))
         raise ModelError(
@@ -195,18 +207,39 @@ def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatAr
     return found.position_rad
 
 
+def _units(robot: Robot, assembly: Assembly) -> FloatArray:
+    """A radian, or the robot's size, of each motor's joint, shape (m,)."""
+    return np.array([1.0 if joint.kind is JointKind.REVOLUTE else assembly.size_m for joint in robot.axes])
+
+
+def _condition(triangle: FloatArray) -> FloatArray:
+    """Condition by the Frobenius norm of a triangle in each sample, shape (k,)."""
+    inverse = _solve_each(triangle, np.eye(triangle.shape[-1]))
+    return np.asarray(np.linalg.norm(triangle, axis=(1, 2)) * np.linalg.norm(inverse, axis=(1, 2)))
+
+
+def _condition_of_motors(robot: Robot, assembly: Assembly, to_motors: FloatArray) -> FloatArray:
+    """Condition of A in each sample, shape (k,): where it is large, motors hardly move some of the coordinates x."""
+    if robot.axis_count == assembly.mobility:
+        return np.ones(len(to_motors))
+    kinds = [robot.joints[joint].kind for joint in assembly.independent]
+    size = np.array([1.0 if kind is JointKind.REVOLUTE else assembly.size_m for kind in kinds])
+    _, triangle = np.linalg.qr(to_motors * size / _units(robot, assembly)[:, None])
+    return _condition(triangle)
+
+
 def _at(robot: Robot, axes_rad: FloatArray) -> str:
     named = zip(robot.axes, axes_rad, strict=True)
     return ", ".join(f"{joint.name} {value:.4g}" for joint, value in named) + " (rad or m)"
 
 
 def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
-    """Close the loops at positions of the motors' joints, shape (k, m), as far as they close; see `follow`."""
+    """Close the loops at positions of the motors' joints [rad or m], shape (k, m), as far as they close."""
     samples, motors = len(axes_rad), list(robot.axis_joints)
     if not robot.closures:
         return Reach(axes_rad, np.zeros(samples), np.zeros(samples), np.ones(samples))
     start = assembly.position_rad[motors]
-    units = np.array([1.0 if joint.kind is JointKind.REVOLUTE else assembly.size_m for joint in robot.axes])
+    units = _units(robot, assembly)
     largest = float(np.max(np.abs(np.diff(axes_rad, axis=0)) / units, initial=0.0))
     stride = min(LONGEST_STRIDE, max(1, int(STRIDE_RAD / max(largest, 1e-9))))
     coarse = np.unique(np.append(np.arange(0, samples, stride), samples - 1))
@@ -236,10 +269,10 @@ def _newton(
     if not redundant:
         position[:, motors] = axes_rad
     for _ in range(MAX_ITERATIONS):
-        loops = _loops(robot, position, assembly.size_m)
-        gap = np.max(np.abs(loops.residual), axis=1)
-        q, r = np.linalg.qr(loops.jacobian[:, :, rest])
-        wanted = np.concatenate((loops.residual[:, :, None], loops.jacobian[:, :, x]), axis=2)
+        closing = loops(robot, position, assembly.size_m)
+        gap = np.max(np.abs(closing.residual), axis=1)
+        q, r = np.linalg.qr(closing.jacobian[:, :, rest])
+        wanted = np.concatenate((closing.residual[:, :, None], closing.jacobian[:, :, x]), axis=2)
         answer = -_solve_each(r, np.swapaxes(q, 1, 2) @ wanted)
         change = np.zeros_like(position)
         change[:, rest] = answer[:, :, 0]
@@ -254,8 +287,7 @@ def _newton(
         position += change
         if np.all(lost | ((gap < CLOSED) & (step < tolerance_rad))):
             break
-    condition = np.linalg.norm(r, axis=(1, 2)) * np.linalg.norm(_solve_each(r, np.eye(len(rest))), axis=(1, 2))
-    return position, gap, condition
+    return position, gap, _condition(r)
 
 
 def _between(coarse: IntArray, found: FloatArray, finer: IntArray) -> FloatArray:
@@ -284,20 +316,20 @@ def _closed_near(robot: Robot, start: FloatArray, size_m: float) -> FloatArray:
     """Close the loops near a declared pose: with the motors where they are if that is possible."""
     motors = list(robot.axis_joints)
     rest = [joint for joint in range(robot.joint_count) if joint not in motors]
-    declared = float(np.max(np.abs(_loops(robot, start[None], size_m).residual)))
+    declared = float(np.max(np.abs(loops(robot, start[None], size_m).residual)))
     for moved in (rest, list(range(robot.joint_count))) if declared < LARGEST_GAP else ():
         position = start.copy()
         for _ in range(MAX_ITERATIONS):
-            loops = _loops(robot, position[None], size_m)
-            gap = float(np.max(np.abs(loops.residual)))
+            closing = loops(robot, position[None], size_m)
+            gap = float(np.max(np.abs(closing.residual)))
             if gap < CLOSED or not np.isfinite(gap):
                 break
-            position[moved] -= np.linalg.lstsq(loops.jacobian[0][:, moved], loops.residual[0], rcond=1e-8)[0]
+            position[moved] -= np.linalg.lstsq(closing.jacobian[0][:, moved], closing.residual[0], rcond=1e-8)[0]
         if gap < CLOSED and float(np.max(np.abs(position - start))) < np.pi:
             return position
-    loops = _loops(robot, start[None], size_m)
+    closing = loops(robot, start[None], size_m)
     ends = np.cumsum([len(closure.directions) for closure in robot.closures])
-    parts = np.split(np.abs(loops.residual[0]), ends[:-1])
+    parts = np.split(np.abs(closing.residual[0]), ends[:-1])
     worst = max(zip(robot.closures, parts, strict=True), key=lambda pair: float(pair[1].max()))
     name, values = worst[0].name, ", ".join(map(_gap, worst[0].directions, worst[1] * size_m, worst[1]))
     raise ModelError(
@@ -335,9 +367,9 @@ def _generic_rank(robot: Robot, position: FloatArray, free: FloatArray, size_m: 
     for _ in range(4):
         beside = position + 0.02 * free @ draw.standard_normal(free.shape[1])
         for _ in range(MAX_ITERATIONS):
-            loops = _loops(robot, beside[None], size_m)
-            beside -= np.linalg.lstsq(loops.jacobian[0], loops.residual[0], rcond=1e-8)[0]
-        moved = _null_space(_loops(robot, beside[None], size_m).jacobian[0])
+            closing = loops(robot, beside[None], size_m)
+            beside -= np.linalg.lstsq(closing.jacobian[0], closing.residual[0], rcond=1e-8)[0]
+        moved = _null_space(loops(robot, beside[None], size_m).jacobian[0])
         best = max(best, int(np.linalg.matrix_rank(moved[list(robot.axis_joints)], tol=1e-6)))
     return best
 
@@ -359,7 +391,7 @@ def _size(robot: Robot, position: FloatArray) -> float:
     placed = poses(robot, position[None])
     points = [*placed.origin_m[1:, 0]]
     for closure in robot.closures:
-        points += [_origin(placed, place)[0] for place in (closure.first, closure.second)]
+        points += [origin(placed, place)[0] for place in (closure.first, closure.second)]
     return float(max(np.linalg.norm(points, axis=1).max(), 1e-3))
 
 
@@ -367,176 +399,3 @@ def _least_squares(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Solution of A x = b, shapes (k, m, d) and (k, m); for square A exact."""
     q, r = np.linalg.qr(matrix)
     return np.asarray(np.linalg.solve(r, np.einsum("kmd,km->kd", q, right)[..., None])[..., 0])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Loops:
-    """φ, J and J̇ q̇ of all closures over k samples."""
-
-    residual: FloatArray  #: shape (k, c)
-    jacobian: FloatArray  #: shape (k, c, n)
-    bias: FloatArray  #: shape (k, c); empty without a velocity
-
-
-def closure_equations(
-    robot: Robot, position: FloatArray, velocity: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """φ, J and J̇ q̇ of all closures, in units of 1 m, shapes (k, c), (k, c, n) and (k, c).
-
-    Args:
-        robot: with closures.
-        position, velocity: of all joints, shape (k, n); J̇ q̇ is empty without velocities.
-    """
-    loops = _loops(robot, position, 1.0, velocity)
-    return loops.residual, loops.jacobian, loops.bias
-
-
-def _loops(robot: Robot, position: FloatArray, size_m: float, velocity: FloatArray | None = None) -> _Loops:
-    placed, samples = poses(robot, position), len(position)
-    axes = [placed.rotation[i + 1] @ joint.axis for i, joint in enumerate(robot.joints)]
-    moved = None if velocity is None else _spin(robot, placed, axes, position, velocity)
-    width = sum(len(closure.directions) for closure in robot.closures)
-    residual = np.empty((samples, width))
-    jacobian = np.empty((samples, width, robot.joint_count))
-    bias = np.empty((samples, width if moved is not None else 0))
-    first = 0
-    for closure in robot.closures:
-        part = slice(first, first + len(closure.directions))
-        residual[:, part], jacobian[:, part], turning = _closure(robot, closure, placed, axes, moved)
-        if moved is not None:
-            bias[:, part] = turning
-        lengths = [first + row for row, one in enumerate(closure.directions) if "r" not in one]
-        for array in (residual, jacobian, bias) if moved is not None else (residual, jacobian):
-            array[:, lengths] /= size_m
-        first = part.stop
-    return _Loops(residual, jacobian, bias)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Spin:
-    """Motion of every link with all joint accelerations zero; arrays of shape (n + 1, k, 3), in the base frame."""
-
-    angular: FloatArray  #: ω
-    linear: FloatArray  #: velocity of the frame's origin
-    angular_bias: FloatArray  #: its angular acceleration
-    linear_bias: FloatArray  #: its origin's acceleration
-
-
-def _spin(robot: Robot, placed: Poses, axes: list[FloatArray], position: FloatArray, velocity: FloatArray) -> _Spin:
-    shape = (robot.joint_count + 1, len(position), 3)
-    w, v, dw, dv = (np.zeros(shape) for _ in range(4))
-    for index, joint in enumerate(robot.joints):
-        p, i = joint.parent + 1, index + 1
-        along = axes[index] * velocity[:, index, None]
-        arm = placed.origin_m[i] - placed.origin_m[p]
-        w[i], dw[i] = w[p], dw[p]
-        v[i] = v[p] + _cross(w[p], arm)
-        dv[i] = dv[p] + _cross(dw[p], arm) + _cross(w[p], _cross(w[p], arm))
-        if joint.kind is JointKind.REVOLUTE:
-            w[i] = w[p] + along
-            dw[i] = dw[p] + _cross(w[p], along)
-        else:
-            v[i] += along
-            dv[i] += 2.0 * _cross(w[p], along)
-    return _Spin(w, v, dw, dv)
-
-
-_AHEAD, _BEHIND = np.array([1, 2, 0]), np.array([2, 0, 1])
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross products of vectors, shape (…, 3); without the checks of numpy's, which take longer than the products."""
-    return np.asarray(a[..., _AHEAD] * b[..., _BEHIND] - a[..., _BEHIND] * b[..., _AHEAD])
-
-
-def _cross_columns(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross products of columns, shape (k, 3, n), with a vector of each sample, shape (k, 3)."""
-    b = b[:, :, None]
-    return np.asarray(a[:, _AHEAD] * b[:, _BEHIND] - a[:, _BEHIND] * b[:, _AHEAD])
-
-
-def _origin(placed: Poses, place: Place) -> FloatArray:
-    at = place.joint + 1
-    return np.asarray(placed.origin_m[at] + placed.rotation[at] @ place.translation_m)
-
-
-def _columns(robot: Robot, placed: Poses, axes: list[FloatArray], place: Place) -> tuple[FloatArray, FloatArray]:
-    """Velocity of a frame's origin, and its angular velocity, per unit of each joint's: shapes (k, 3, n)."""
-    point = _origin(placed, place)
-    linear, angular = (np.zeros((len(point), 3, robot.joint_count)) for _ in range(2))
-    joint = place.joint
-    while joint >= 0:
-        if robot.joints[joint].kind is JointKind.REVOLUTE:
-            angular[:, :, joint] = axes[joint]
-            linear[:, :, joint] = _cross(axes[joint], point - placed.origin_m[joint + 1])
-        else:
-            linear[:, :, joint] = axes[joint]
-        joint = robot.joints[joint].parent
-    return linear, angular
-
-
-def _closure(
-    robot: Robot, closure: Closure, placed: Poses, axes: list[FloatArray], moved: _Spin | None
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """φ, J and J̇ q̇ of one closure, in m and rad.
-
-    Lengths are Rᵀ(p₂ − p₁) in the first frame. Angles are entries of E = R₁ᵀR₂ that are zero where the frames are
-    parallel and that change by the angle: the second frame's axis b along the first one's c, for a turn about a, with
-    (a, b, c) cyclic. Where the frames may turn about one axis, it is that axis of the second frame that must be
-    parallel to the first one's: this holds at every angle.
-    """
-    first, second = closure.first, closure.second
-    frame = placed.rotation[first.joint + 1] @ first.rotation
-    other = placed.rotation[second.joint + 1] @ second.rotation
-    apart = _origin(placed, second) - _origin(placed, first)
-    turned = np.swapaxes(frame, 1, 2)
-    (v1, w1), (v2, w2) = (_columns(robot, placed, axes, place) for place in (first, second))
-    residual, jacobian, bias = [], [], []
-    gap = np.einsum("kij,kj->ki", turned, apart)
-    lengths = turned @ (v2 - v1 - _cross_columns(w1, apart))
-    turning = turned @ (w2 - w1)
-    parallel = np.swapaxes(frame, 1, 2) @ other
-    if moved is not None:
-        motion = [_place_motion(moved, placed, place) for place in (first, second)]
-        (u1, o1, du1, do1), (u2, o2, du2, do2) = motion
-        rate = u2 - u1
-        drift = du2 - du1 - _cross(do1, apart) - 2.0 * _cross(o1, rate) + _cross(o1, _cross(o1, apart))
-        drift = np.einsum("kij,kj->ki", turned, drift)
-        spin = np.einsum("kij,kj->ki", turned, o2 - o1)
-        spin_bias = np.einsum("kij,kj->ki", turned, do2 - do1 - _cross(o1, o2 - o1))
-    for direction in closure.directions:
-        if direction in _INDEX:
-            i = _INDEX[direction]
-            residual.append(gap[:, i])
-            jacobian.append(lengths[:, i])
-            if moved is not None:
-                bias.append(drift[:, i])
-            continue
-        along, axis = _parallel_axes(closure.directions, direction[1])
-        column, unit = parallel[:, :, axis], np.eye(3)[along]
-        residual.append(column[:, along])
-        lever = _cross(column, unit)
-        jacobian.append(np.einsum("ki,kin->kn", lever, turning))
-        if moved is not None:
-            swung = _cross(_cross(spin, column), unit)
-            bias.append(np.einsum("ki,ki->k", spin_bias, lever) + np.einsum("ki,ki->k", spin, swung))
-    return np.stack(residual, 1), np.stack(jacobian, 1), np.stack(bias, 1) if bias else np.empty((len(apart), 0))
-
-
-def _parallel_axes(directions: tuple[str, ...], about: str) -> tuple[int, int]:
-    """Entry of E = R₁ᵀR₂ that must be zero so that the frames do not turn about an axis."""
-    following = _AFTER[about]
-    last = _AFTER[following]
-    if sum(direction in directions for direction in ("rx", "ry", "rz")) == 2:
-        free = next(axis for axis in "xyz" if f"r{axis}" not in directions)
-        return _INDEX[following if last == free else last], _INDEX[free]
-    return _INDEX[last], _INDEX[following]
-
-
-def _place_motion(moved: _Spin, placed: Poses, place: Place) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Velocity of a frame's origin, its angular velocity, and both accelerations without joint accelerations."""
-    at = place.joint + 1
-    arm = placed.rotation[at] @ place.translation_m
-    w, dw = moved.angular[at], moved.angular_bias[at]
-    linear = moved.linear[at] + _cross(w, arm)
-    return linear, w, moved.linear_bias[at] + _cross(dw, arm) + _cross(w, _cross(w, arm)), dw

@@ -108,10 +108,11 @@ class Model:
                 f"{axes} joints; give one motor for each"
             )
         object.__setattr__(self, "assembly", assemble(self.robot))
-        if self.is_redundant and self.drive_train.coupled:
+        ratio = self.drive_train.ratio
+        if self.is_redundant and np.count_nonzero(ratio - np.diag(np.diag(ratio))):
             raise ModelError(
-                "the robot has more motors than degrees of freedom, and motors that turn with several joints; expected "
-                "a diagonal drive train there"
+                "the robot has more motors than degrees of freedom, and motors that turn with the joint of another; "
+                "expected a diagonal drive train there"
             )
 
     @property
@@ -206,7 +207,11 @@ class Model:
         return projected, np.ascontiguousarray(np.transpose(followed.to_motors, (2, 1, 0)))
 
     def follow(self, motion: Motion) -> TreeMotion:
-        """Motion of all joints from that of the axes; see `ident.model.closed_chain.follow`."""
+        """Motion of all joints from that of the axes; see `ident.model.closed_chain.follow`.
+
+        Raises:
+            ModelError: the motion is not one of m axes, or the loops cannot be closed.
+        """
         self._joint_first(motion)
         return follow(self.robot, self.assembly, motion)
 
@@ -234,18 +239,23 @@ class Model:
     def torques(self, motion: Motion, standard: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Torque of links and payload at each axis, the same with friction of the axes, and all [Nm or N], each (m, k).
 
+        Those of a redundant drive are without preload.
+
         Args:
             motion: of m axes over k samples.
             standard: χ_st, shape (c,).
+
+        Raises:
+            ModelError: the motion is not one of m axes, or the loops cannot be closed.
         """
         position, velocity, acceleration = self._joint_first(motion)
         links, motors = np.split(standard, [JOINT_COLUMNS * self.robot.joint_count])
         links, motors = links.reshape(-1, JOINT_COLUMNS), motors.reshape(-1, 3, 1)
         own = links[list(self.robot.axis_joints)]
-        if not self.robot.closures:
+        followed = self.follow(motion) if self.robot.closures else None
+        if followed is None:
             load = rigid_torque(self.robot, position, velocity, acceleration, links[:, :10])
         else:
-            followed = self.follow(motion)
             joints = self._first(followed.joints)
             load = self.at_axes(followed, rigid_torque(self.robot, joints[0], joints[1], joints[2], links[:, :10]))
         geared = load + own[:, 11, None] * velocity + own[:, 12, None] * np.sign(velocity)
@@ -254,17 +264,19 @@ class Model:
             r = self.drive_train.direction[motor]
             cross = np.outer(r, r) - np.diag(r**2)
             whole += cross @ (inertia * acceleration + viscous * velocity) + r[:, None] * dry * np.sign(r @ velocity)
-        if self.is_redundant:
-            seen = seen_torques(np.transpose(self.follow(motion).to_motors, (2, 1, 0)))
-            load, geared, whole = (np.einsum("amk,mk->ak", seen, part) for part in (load, geared, whole))
+        if followed is not None and self.is_redundant:
+            return without_preload(followed, load), without_preload(followed, geared), without_preload(followed, whole)
         return load, geared, whole
 
     def inertia(self, position_rad: FloatArray, standard: FloatArray) -> FloatArray:
         """Mass matrix of links and payload: torque at axis i per unit of acceleration of axis j, shape (m, m, k).
 
         Args:
-            position_rad: of the axes, shape (k, m).
+            position_rad: of the axes [rad or m], shape (k, m).
             standard: χ_st, shape (c,).
+
+        Raises:
+            ModelError: the loops cannot be closed.
         """
         links = standard[self.link_columns]
         if not self.robot.closures:
@@ -320,6 +332,7 @@ def spread(columns: FloatArray, to_motors: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("kmd,d...k->m...k", back, columns, optimize=True))
 
 
-def seen_torques(to_motors: FloatArray) -> FloatArray:
-    """B Aᵀ, which takes the preload out of torques of the axes, shapes (d, m, k) and (m, m, k)."""
-    return spread(to_motors, to_motors)
+def without_preload(followed: TreeMotion, torque: FloatArray) -> FloatArray:
+    """Take internal preload out of torques of the axes [Nm or N], B Aᵀ τ, shape (m, k)."""
+    to_motors = np.transpose(followed.to_motors, (2, 1, 0))
+    return np.asarray(spread(np.einsum("dmk,mk->dk", to_motors, torque), to_motors))

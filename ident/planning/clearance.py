@@ -66,6 +66,7 @@ class Obstruction:
     position: tuple[float, ...]  #: of the axes there [rad or m]
 
 
+CLOSURES = "the closures"  #: What is in the way where the loops of a closed chain do not close, or are nearly singular
 LARGEST_CONDITION = 60.0
 """Largest condition of the closures in a planned pose (Frobenius): nearer to a singularity, forces in loops grow."""
 LARGEST_MISFIT = 0.01
@@ -195,23 +196,25 @@ class Checker:
         found = self._reached(position.reshape(-1, position.shape[2]))
         usable = found.usable.reshape(shape)
         margins = self._margins(found.joints, self._everywhere)
-        # A body moves at most as far between two poses as the fastest of its ends.
+        # A body moves at most as far between two poses as the fastest of its ends: from the nearer one at most half of
+        # that, and two bodies that both move come closer by all of it. (The way of an end between poses is taken as
+        # straight; it is bent by less than a hundredth of its length.)
+        both = np.array([max(pair) < len(self.scene.capsules) for pair in self._pairs] + [False] * len(self._confined))
         placed = self._placed(found.joints).reshape(-1, *shape, 3, 2)
         travel = np.linalg.norm(np.diff(placed, axis=2), axis=3).max(axis=(0, 2, 3), initial=0.0)
         answers: list[Obstruction | None] = []
         for way, moved in enumerate(travel.tolist()):
-            own = margins.reshape(-1, *shape)[:, way]
+            own = margins.reshape(-1, *shape)[:, way] - moved * np.where(both, 1.0, 0.5)[:, None]
             if not usable[way].all():
                 at = tuple(position[way, int(np.argmin(usable[way]))].tolist())
-                answers.append(Obstruction("the closures", "a pose that they allow", 0.0, at))
-            elif not own.size or own.min() >= 0.5 * moved:
+                answers.append(Obstruction(CLOSURES, "a pose that they allow", 0.0, at))
+            elif not own.size or own.min() >= 0.0:
                 answers.append(None)
             else:
                 row, sample = np.unravel_index(int(np.argmin(own)), own.shape)
                 first, second = self._names_of(int(row))
-                answers.append(
-                    Obstruction(first, second, float(own[row, sample]), tuple(position[way, sample].tolist()))
-                )
+                distance_m = float(own[row, sample]) + (self.scene.minimum_m if row < len(self._pairs) else 0.0)
+                answers.append(Obstruction(first, second, distance_m, tuple(position[way, sample].tolist())))
         return answers
 
     def _names_of(self, row: int) -> tuple[str, str]:

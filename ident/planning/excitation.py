@@ -26,7 +26,7 @@ from ident.equations.currents import without_preload
 from ident.equations.rows import row_filter, row_masks
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, Body, Payload
-from ident.model.model import DriveTrain, Model, seen_torques
+from ident.model.model import DriveTrain, Model
 from ident.model.robot import Motion, Robot
 from ident.model.urdf import read_urdf
 
@@ -161,9 +161,8 @@ class Design:
         whole, _ = np.linalg.qr(to_motors.transpose(2, 1, 0), mode="complete")
         transform = without_preload(whole[:, :, len(to_motors) :], expected.gains, expected.noise_a)
         transform *= np.all(excitation.use, axis=0).astype(np.float64)[:, None, None]
-        gains = transform @ seen_torques(to_motors).transpose(2, 0, 1)
         columns = np.einsum("kij,jak->iak", transform, torque, optimize=True)
-        return np.concatenate((columns, torque, gains.transpose(1, 2, 0)), axis=1)
+        return np.concatenate((columns, torque, transform.transpose(1, 2, 0)), axis=1)
 
     def with_known_preload(self, whitened: FloatArray, use: BoolArray) -> FloatArray:
         """``whitened`` of a redundant drive if its preload were known: an equation for each motor, (n, b + 10, k)."""

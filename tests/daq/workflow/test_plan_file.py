@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,7 +18,8 @@ from daq.config.clearance import Clearance
 from daq.errors import ConfigurationInconsistent, ExitCode, SchemaMismatch
 from daq.report.plan_preview import find_preview
 from daq.workflow.plan import Plan, plan
-from daq.workflow.plan_file import load_plan, save_plan
+from daq.workflow.plan_file import check_approach, load_plan, save_plan
+from drivers.errors import MotionRefused
 from ident.planning.clearance import Box
 
 CELLS = Path(__file__).parents[3] / "configs" / "cells"
@@ -55,6 +57,21 @@ def test_a_plan_is_read_as_it_was_made(tmp_path_factory: pytest.TempPathFactory,
     assert found.duration_s == pytest.approx(made.duration_s)
     assert found.predicted_std_percent == pytest.approx(made.predicted_std_percent, abs=5e-4)
     assert (found.units, found.cell, found.seed) == (made.units, cell.name, seed)
+
+
+def test_moves_that_would_tear_a_closed_chain_are_refused(tmp_path: Path) -> None:
+    cell, path = load_cell(CELLS / "dualv.yaml"), tmp_path / "plan.yaml"
+    text = (
+        "format: drivegain-plan\ncell: dualv\nseed: 1\ncondition: 1500.0\nmoves:\n"
+        "  - {target_deg: [0, 0, 0, 0], velocity: 0.5, acceleration: 0.5, dwell_s: 0.1}\n"
+    )
+    path.write_text(text)
+    check_approach(cell, load_plan(path, cell), np.radians([0.3, 0.0, 0.0, 0.0]))
+    with pytest.raises(MotionRefused, match=r"the loops do not close, or are close to a singularity, at .*closures"):
+        check_approach(cell, load_plan(path, cell), np.radians([0.0, 8.0, 0.0, 0.0]))
+    path.write_text(text + "  - {target_deg: [0, 12, 0, 0], velocity: 0.5, acceleration: 0.5}\n")
+    with pytest.raises(ConfigurationInconsistent, match=r"moves\[1\], on the way there: found that the loops do not"):
+        load_plan(path, cell)
 
 
 def test_a_plan_of_an_earlier_version_is_read(demo: Cell, tmp_path: Path) -> None:

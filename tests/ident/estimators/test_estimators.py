@@ -170,7 +170,7 @@ def test_coupled_joints_that_never_move_together_are_named_and_only_ml_minds(cle
     )
     require_distinct(apart, gains=True)
     assert wls(apart).gains == pytest.approx(wls(system).gains)
-    with pytest.raises(DataUnfit, match=r"joints 5 and 6.*never move at the same time"):
+    with pytest.raises(DataUnfit, match=r"(?i)\w+5 and \w+6.*never move at the same time"):
         ml(apart)
 
 
@@ -180,5 +180,5 @@ def test_an_axis_that_never_moves_is_named(truth: Truth, clean_runs: tuple[Run, 
         position = run.position_rad.copy()
         position[:, 3] = 0.4
         still.append(replace(run, position_rad=position))
-    with pytest.raises(DataUnfit, match="joint 4 never moves"):
+    with pytest.raises(DataUnfit, match="J4 never moves"):
         _fit(truth, tuple(still))

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ident.errors import ModelError
-from ident.model.closed_chain import assemble, closure_equations, follow, reach
+from ident.model.closed_chain import assemble, follow, reach
+from ident.model.closures import loops
 from ident.model.model import DriveTrain, Model
 from ident.model.robot import DIRECTIONS, Closure, Motion, Place, Robot, poses
 from ident.model.urdf import LinkPair, read_urdf, robot_from_urdf
@@ -81,10 +82,10 @@ def test_derivatives_of_any_closure(seed: int, directions: list[str]) -> None:
     robot = Robot(joints, tree.gravity_m_s2, (Closure("any", ends[0], ends[1], tuple(directions)),), (0,))
     q, v = rng.uniform(-1, 1, (2, 1, 7))
     h = 1e-6
-    _, jacobian, bias = closure_equations(robot, q, v)
-    (ahead, ahead_j, _), (behind, behind_j, _) = (closure_equations(robot, q + sign * h * v) for sign in (1, -1))
-    assert jacobian[0] @ v[0] == pytest.approx((ahead - behind)[0] / (2 * h), abs=1e-7)
-    assert bias[0] == pytest.approx((ahead_j - behind_j)[0] @ v[0] / (2 * h), abs=1e-6)
+    here = loops(robot, q, velocity=v)
+    ahead, behind = (loops(robot, q + sign * h * v) for sign in (1, -1))
+    assert here.jacobian[0] @ v[0] == pytest.approx((ahead.residual - behind.residual)[0] / (2 * h), abs=1e-7)
+    assert here.bias[0] == pytest.approx((ahead.jacobian - behind.jacobian)[0] @ v[0] / (2 * h), abs=1e-6)
 
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
@@ -93,10 +94,11 @@ def test_joints_follow_with_their_derivatives(mechanism: Mechanism) -> None:
     assembly = assemble(robot, mechanism.mobility)
     found = follow(robot, assembly, motion)
     q, v, a = found.joints.position_rad, found.joints.velocity_rad_s, found.joints.acceleration_rad_s2
-    assert np.max(np.abs(closure_equations(robot, q)[0])) < 1e-11
+    assert np.max(np.abs(loops(robot, q).residual)) < 1e-11
     motors = list(robot.axis_joints)
     assert np.max(np.abs(q[:, motors] - motion.position_rad)) < 1e-11
-    _, jacobian, bias = closure_equations(robot, q, v)
+    closing = loops(robot, q, velocity=v)
+    jacobian, bias = closing.jacobian, closing.bias
     assert np.max(np.abs(np.einsum("kcn,kn->kc", jacobian, v))) < 1e-10
     assert np.max(np.abs(np.einsum("kcn,kn->kc", jacobian, a) + bias)) < 1e-9
     differences = (q[2:] - q[:-2]) / (2 * STEP_S)
@@ -211,11 +213,12 @@ def test_short_cuts_agree_with_the_regressor(mechanism: Mechanism) -> None:
     torque = np.einsum("mck,c->mk", model.regressor(motion), standard)
     assert load == pytest.approx(torque, rel=1e-9, abs=1e-9)
     assert whole == pytest.approx(torque, rel=1e-9, abs=1e-9)
-    faster = Motion(motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2 + 1.0)
-    if model.is_redundant:  # all motors at will would tear the platform apart
-        return
+    # Of a redundant drive not all motors at will, which would tear the platform apart, but as its coordinates move.
+    per_x = model.follow(motion).to_motors.sum(axis=2)
+    faster = Motion(motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2 + per_x)
     change = np.einsum("mck,c->mk", model.regressor(faster), standard) - torque
-    assert model.inertia(motion.position_rad, standard).sum(axis=1) == pytest.approx(change, rel=1e-8)
+    found = np.einsum("mjk,kj->mk", model.inertia(motion.position_rad, standard), per_x)
+    assert found == pytest.approx(change, rel=1e-8, abs=1e-9)
 
 
 def test_a_robot_without_closures_is_the_special_case() -> None:
@@ -252,6 +255,23 @@ def test_bad_descriptions_are_refused_by_name() -> None:
         _wrong(FIVE_BAR, motors=("left", "right-crank"))
     with pytest.raises(ModelError, match="directions q; expected some of x, y, z, rx, ry, rz"):
         _wrong(FIVE_BAR, closures=(LinkPair("tip", "left-tip", "right-tip", ("q",)),))
+
+
+def test_motors_of_a_redundant_drive_that_do_not_fit_each_other_are_named() -> None:
+    motion = _axes_motion(PLANAR, 30)
+    robot, assembly = PLANAR.robot, assemble(PLANAR.robot)
+    turned = motion.position_rad.copy()
+    turned[:, 1] += 0.15  # a wrong zero
+    with pytest.raises(ModelError, match=r"motors do not fit each other at .*: .* away from where the others hold it"):
+        follow(robot, assembly, replace(motion, position_rad=turned))
+    # What an encoder or a bent arm makes is no wrong zero.
+    shaken = motion.position_rad + np.random.default_rng(0).normal(0.0, 1e-3, turned.shape)
+    assert follow(robot, assembly, replace(motion, position_rad=shaken)).to_motors.shape == (30, 4, 3)
+
+
+def test_a_redundant_drive_train_is_diagonal() -> None:
+    with pytest.raises(ModelError, match="expected a diagonal drive train"):
+        Model(PLANAR.robot, DriveTrain(5.0 * np.eye(4)[[1, 0, 2, 3]]))
 
 
 def test_a_position_out_of_reach_is_named() -> None:
