@@ -34,9 +34,9 @@ class PlantedEffect:
     place: str  #: axis or joint without a motor
     coefficient: str  #: parameter of that effect to compare
     size: float  #: its true value
-    seconds: float = 40.0  #: of each run [s]
+    seconds: float = 11.0  #: of each run [s]; enough for these sizes
     pairs: int = 1  #: of runs without and with the cell's payload, each with a plan of its own
-    exchanges: int = 60  #: tries of the planner
+    exchanges: int = 0  #: tries of the planner; random moves will do
 
     @property
     def fingerprint(self) -> str:
