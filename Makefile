@@ -11,7 +11,7 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-vcan vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study coverage-study paper planning-study robot-study crash-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study weigh-study words wheel lock clean
+.PHONY: help setup demo test test-vcan vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study coverage-study paper planning-study robot-study crash-study kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study weigh-study words wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -31,6 +31,7 @@ help:
 	@echo "make paper   the paper's Tables 1 to 8 on the simulated cell (docs/evidence/paper.md); minutes"
 	@echo "make planning-study  planned against random moves (docs/evidence/planning.md); minutes"
 	@echo "make crash-study  recorders killed at random moments, damaged logs; some minutes"
+	@echo "make kill-study  jobs killed at 60 random moments, each finished by the next one; some minutes"
 	@echo "make console-study  60 minutes on SocketCAN with the console alternately open and closed: losses, jitter, processor, memory"
 	@echo "make drift-study  detection delay and false alarms of a drifting gain (docs/evidence/drift.md); a minute"
 	@echo "make holdout-study  which wrong gains the hold-out gate detects (docs/evidence/hold-out.md); a minute"
@@ -152,6 +153,9 @@ drift-study: setup
 
 crash-study: setup
 	$(BIN)/python -m tests.studies.crash_study
+
+kill-study: setup
+	$(BIN)/python -m tests.studies.recalibration_study --moments 60
 
 console-study: setup vcan-tools
 	@mkdir -p out

@@ -63,6 +63,11 @@ class DaqError(Exception):
         return type(self).__new__, (type(self), *self.args), self.__dict__
 
 
+def evidence(error: Exception) -> str:
+    """Return where and what an error found, without its remedy: for a warning about work that is done all the same."""
+    return f"{error.subject}: {error.found}" if isinstance(error, DaqError) else str(error)
+
+
 class UsageError(DaqError):
     """The command asks for something that cannot be done."""
 

@@ -32,7 +32,9 @@ def replace_file(
         OSError: from the file system, also if owner or access lists cannot be kept. Only a failing fsync of the folder
             leaves the new content in place.
     """
-    target = path.resolve()
+    target = Path(os.path.realpath(path))
+    if target.is_symlink():
+        raise _circle(path)
     model = like or (target if target.exists() else None)
     # For the owner alone until it has the rights of the other file: an open descriptor outlives a later chmod.
     temporary, descriptor = _new_file(target, 0o666 if model is None else 0o600)
@@ -50,6 +52,59 @@ def replace_file(
         temporary.unlink(missing_ok=True)
         raise
     fsync_folder(target.parent)
+
+
+def follow_links(path: Path) -> Path:
+    """Resolve the symbolic links of a name, those of its folders included, as long as they can be trusted.
+
+    A file that is gone resolves to where its links still lead.
+
+    Args:
+        path: as it was declared. A name that was resolved before has no links left to judge.
+
+    Raises:
+        OSError: the links form a circle (ELOOP), or another user, neither root nor the owner of the file, has made one
+            (EPERM); ``strerror`` says so. Where the file is gone, the owner of its folder counts.
+    """
+    links, target = _links(path), Path(os.path.realpath(path))
+    owner, there = None, False
+    try:
+        there = os.path.lexists(target)
+        owner = (target if there else target.parent).lstat().st_uid
+    except OSError as error:  # else access is denied, or the folder is gone
+        if error.errno == errno.ELOOP:
+            raise _circle(path) from error
+    if target.is_symlink():
+        raise _circle(path)
+    for link in links:
+        made_by = link.lstat().st_uid
+        if made_by not in {0, os.geteuid(), owner}:
+            named = "" if link == path else f" ({link})"
+            whose = f"to a file of user {owner}" if there else f"to {target}, which is not there"
+            raise OSError(errno.EPERM, f"a symbolic link{named} that user {made_by} has made, {whose}", str(path))
+    return target
+
+
+def has_links(path: Path) -> bool:
+    """Whether a symbolic link is in a name, be it one of a folder."""
+    return bool(_links(path))
+
+
+def _circle(path: Path) -> OSError:
+    return OSError(errno.ELOOP, "symbolic links that go round in a circle", str(path))
+
+
+def _links(file: Path) -> tuple[Path, ...]:
+    """Symbolic links on the way to a file, the links that they lead to included."""
+    found: dict[Path, None] = {}
+    names = [file.absolute()]
+    while names:
+        name = names.pop()
+        for place in (name, *name.parents):
+            if place not in found and place.is_symlink():
+                found[place] = None
+                names.append(place.parent / place.readlink())
+    return tuple(found)
 
 
 def fsync_folder(folder: Path) -> None:
@@ -89,8 +144,9 @@ def read_regular(path: Path, largest_bytes: int) -> bytes:
         OSError: as `open_regular`, or the file is larger.
     """
     with open_regular(path) as stream:
-        content = stream.read(largest_bytes + 1)
-    if len(content) > largest_bytes:
+        large = os.fstat(stream.fileno()).st_size > largest_bytes
+        content = b"" if large else stream.read(largest_bytes + 1)
+    if large or len(content) > largest_bytes:
         raise OSError(errno.EFBIG, f"more than {largest_bytes} bytes", str(path))
     return content
 
@@ -140,7 +196,8 @@ def hold_lock(lock: Path) -> Iterator[None]:
                         lock.unlink()
                 return
         finally:
-            os.close(descriptor)
+            with suppress(OSError):  # the work under it is done; the descriptor is closed all the same (close(2))
+                os.close(descriptor)
 
 
 def _open_lock(lock: Path) -> int:

@@ -82,11 +82,12 @@ class BusBusy(DriverError):
         )
 
     @classmethod
-    def by_heartbeat(cls, address: object, node_id: int) -> BusBusy:
-        """Report a device that sends the recorder's heartbeat, and so keeps the axes running when it is killed."""
+    def by_own_id(cls, address: object, identifier: int) -> BusBusy:
+        """Report a device with the recorder's node id: its heartbeat keeps the axes running when the recorder dies."""
+        frame = "heartbeat" if identifier >= 0x700 else "frame"
         return cls(
             str(address),
-            f"a heartbeat {0x700 + node_id:03X}h of another device, which has node id {node_id} too",
+            f"a {frame} {identifier:03X}h of another device, which has node id {identifier & 0x7F} too",
             "an id that only the recorder uses",
             "the axes are stopped; give that device another node id, or record again: the recorder then takes another",
         )
@@ -203,12 +204,17 @@ class MotionRefused(DriverError):
 
 
 class MotionTimeout(DriverError):
-    """A move did not end in time."""
+    """A move did not end in time; `acknowledge` is the value of statusword bit 12 where that did not come."""
 
-    def __init__(self, move: int, axes: tuple[int, ...], names: Sequence[str], waited_s: float) -> None:
-        super().__init__(
-            f"move {move}: {', '.join(names)} did not reach the target within {waited_s:g} s; stopping all axes; "
-            "check brakes and limits, or use slower moves"
-        )
+    def __init__(
+        self, move: int, axes: tuple[int, ...], nodes: Sequence[Node], waited_s: float, acknowledge: int | None = None
+    ) -> None:
+        names = ", ".join(map(node_label, nodes))
+        if acknowledge is None:
+            found, remedy = "did not reach the target", "check brakes and limits, or use slower moves"
+        else:
+            found = f"did not {'set' if acknowledge else 'clear'} statusword bit 12 (set-point acknowledge)"
+            remedy = "check that the drive is in profile position mode (6061h = 1) and accepts set-points by RPDO"
+        super().__init__(f"move {move}: {names} {found} within {waited_s:g} s; stopping all axes; {remedy}")
         self.move = move
         self.axes = axes

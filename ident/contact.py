@@ -35,10 +35,10 @@ from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
-from ident.equations.rows import row_filter
+from ident.equations.rows import row_filter, row_masks
 from ident.errors import DataUnfit
 from ident.model.model import Model
-from ident.prediction import measured_torque, predict_torque, predicted_rows
+from ident.prediction import measured_torque, predict_torque
 
 DRIVERS = ("constant", "torque", "speed", "acceleration")  #: Of the residual's scale
 PREDICTED_SHARE = 0.95  #: Share of quiet rows inside the band
@@ -168,7 +168,7 @@ def prediction_band(
 def _residual(calibration: Calibration, model: Model, run: Run, conditioning: Conditioning) -> _Residual:
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
-    use, _ = predicted_rows(model, data, conditioning)
+    use, _ = row_masks(model, data, conditioning)
     if not use.any():
         raise DataUnfit(data.name, "no row is left after the standstill and validity masks; did the robot move?")
     predicted = predict_torque(calibration, model, data).T

@@ -6,14 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.arrays import BoolArray, FloatArray
+from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration, Parameter
-from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import EFFECTS, UNNAMED
 from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, Side, at_joints, check_settings, columns_at
 from ident.effects.signals import declared_signals, payload_parameters
-from ident.equations.rows import row_masks
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model, without_preload
@@ -95,17 +93,6 @@ def measured_current(calibration: Calibration, model: Model, current_a: FloatArr
         return np.asarray(current_a)
     torque = measured_torque(calibration, model, current_a, motion)
     return np.asarray(torque @ model.drive_train.to_motor.T / _gains(calibration, model))
-
-
-def predicted_rows(model: Model, data: Dataset, conditioning: Conditioning) -> tuple[BoolArray, BoolArray]:
-    """Rows of each joint and of each motor whose prediction counts; see `ident.equations.rows.row_masks`.
-
-    Motors of a redundant drive share their loads, so that stiction of one is in the torque of all.
-    """
-    use, motor_use = row_masks(model.drive_train, data, conditioning)
-    if model.is_redundant:
-        use[:] = motor_use[:] = use.all(axis=0) & motor_use.all(axis=0)
-    return use, motor_use
 
 
 def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:

@@ -78,7 +78,7 @@ class Scale:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WeighedBody:
-    """A body on the flange; parameters are in the last joint's frame and in the order of LINK_PARAMETERS."""
+    """A body on the flange; parameters are in its joint's frame and in the order of LINK_PARAMETERS."""
 
     values: FloatArray  #: NaN for a parameter that the motion does not show, shape (10,) [SI]
     #: From leaving out moves, the calibration taken as exact; NaN likewise, shape (10, 10).
@@ -108,7 +108,7 @@ class WeighedBody:
 
     @property
     def centre_m(self) -> tuple[FloatArray, FloatArray]:
-        """Centre of mass in the last joint's frame and its σ [m], shape (3,) each."""
+        """Centre of mass in the frame of the joint that carries it, and its σ [m], shape (3,) each."""
         return self._derived(_centre)
 
     @property

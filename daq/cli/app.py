@@ -7,6 +7,7 @@ import gc
 import io
 import json
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -17,7 +18,7 @@ import typer
 from typer.core import TyperGroup
 
 from daq.cli.failure import Failure, show_failure
-from daq.cli.terminal import STARTED, WRITTEN, remove_empty_folders
+from daq.cli.terminal import STARTED, WRITTEN, interruptible, remove_empty_folders
 from daq.cli.verb import HELP_NAMES, Job, Listed
 from daq.environment import software
 from daq.errors import DaqError, ExitCode, OutputFailed
@@ -84,9 +85,12 @@ class _Verbs(TyperGroup):
                 formatter.write_dl([(f"{listed.name:{width}}", listed.summary) for listed in verbs])
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the verb; an interrupt is one line that says what was written."""
+        """Run the verb; an interrupt, SIGTERM or SIGHUP is one line that says what was written."""
+        # Signals that are ignored stay so: nohup.
+        ending = tuple(one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) is signal.SIG_DFL)
         try:
-            return super().invoke(ctx)
+            with interruptible(signals=ending):
+                return super().invoke(ctx)
         except KeyboardInterrupt as interrupt:
             writes = ctx.invoked_subcommand in {"apply", "rollback"}
             nothing = "nothing was changed" if writes else "no file was written"

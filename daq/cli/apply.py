@@ -21,7 +21,7 @@ import typer
 from daq.cli.terminal import WRITTEN, at_most_one, delay_signals, interruptible, output_console, write_output
 from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
 from daq.environment import login
-from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, ExitCode, UsageError
+from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, ExitCode, UsageError, evidence
 from daq.report.text import terminal_text
 
 if TYPE_CHECKING:
@@ -396,7 +396,10 @@ def record_in_history(cell: Cell, actor: Applier, record: Callable[[Ledger], obj
         with Ledger(cell, cell.history, str(actor)) as ledger:
             record(ledger)
     except Exception as error:  # noqa: BLE001 - the controller has its gains: no error of the history may call that undone
-        _LOG.warning("the history does not know of this: %s", error)
+        _LOG.warning(
+            "the history does not have this write: %s; `drivegain history CELL --add CALIBRATION` enters it",
+            evidence(error),
+        )
 
 
 def saving_of(ram_only: bool, save_unknown: bool, *, drives: bool = True) -> Saving:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -47,7 +48,7 @@ def plan_verb(
 
     check_output(out, (cell,), "drivegain-plan")
     if preview is not None:
-        if preview.resolve() == out.resolve():
+        if os.path.realpath(preview) == os.path.realpath(out):
             raise UsageError("--preview", found="the name of --out", expected="another", remedy="choose another name")
         check_folder(preview)
         check_replaceable(preview, MARK, "preview of a plan")

@@ -31,6 +31,10 @@ def record_verb(
     mass: Annotated[float | None, typer.Option(help="Mass of the payload read off the scale [kg].", min=0.0)] = None,
     operator: Annotated[str | None, typer.Option(help="Operator of this recording; you, by default.")] = None,
     speed: Annotated[float, typer.Option(help="Share of the plan's speed, for a first run.", min=0.05, max=1.0)] = 1.0,
+    unguarded: Annotated[
+        bool,
+        typer.Option("--unguarded", help="Move axes that do not stop by themselves when this program is killed."),
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Execute the moves of a plan and log every sample; Ctrl-C and SIGTERM stop the axes.
@@ -81,6 +85,7 @@ def record_verb(
                 block_signals=block_signals,
                 progress=lambda count, total: report_progress(count, total, "moves"),
                 feed=feed,
+                unguarded=unguarded,
             )
     except KeyboardInterrupt as interrupt:
         made = next((path for path in (out, part) if path.exists()), None)
@@ -109,15 +114,19 @@ def record_verb(
 def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:
     """Say in notes of an error what became of the samples, and what helps a cell that is too slow for its clock."""
     from daq.config.cell import PacingMode
+    from daq.config.checks import SIMULATED_INTERFACES
 
     if part.exists():
         error.add_note(
             f"kept: the samples recorded until then are in {part}, which `fit` does not read; {_next_command(part)}"
         )
     if isinstance(error, SampleLost) and cell.sync is not None and cell.sync.pacing is PacingMode.TIMED:
+        real = any(bus.interface not in SIMULATED_INTERFACES for bus in cell.buses)
         error.add_note(
-            "hint: a cell of `drivegain simulate` answers as fast as its computer can and needs `sync.pacing: "
-            "lockstep` in the cell file; on a real cell, check the load of bus and computer"
+            "hint: check the load of bus and computer, or use a longer `sync.period_us`"
+            if real
+            else "hint: a cell of `drivegain simulate` answers as fast as its computer can and needs `sync.pacing: "
+            "lockstep` in the cell file"
         )
 
 

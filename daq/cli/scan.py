@@ -43,15 +43,17 @@ def scan_verb(
     from drivers.profiles.cia402 import State
 
     declared = load_cell(cell)
-    found, reset = {}, []
+    found, reset, misfits = {}, list[str](), dict[str, str]()
     scales: dict[str, ScaleReading | None] = {}
     causes: dict[str, str] = {}
     for part in bus_parts(declared):
         axes = tuple(axis for axis in drive_axes(declared) if axis.node_id in part.node_ids)
         with CanopenNetwork(part.address, axes) as network:
             found[part.name] = network.scan(wait_s=wait)
-            here = {node.node_id for node in found[part.name]}
-            scales |= {axis.name: _scale_of(network, axis) for axis in axes if axis.node_id in here}
+            sound = {node.node_id for node in found[part.name] if node.identity and not node.problems}
+            here = [axis for axis in axes if axis.node_id in sound]
+            scales |= {axis.name: _scale_of(network, axis) for axis in here}
+            misfits |= {axis.name: text for axis in here if (text := _misfit_of(network, axis))}
         in_fault = {node.node_id for node in found[part.name] if node.state is State.FAULT}
         faulty = tuple(axis for axis in axes if axis.node_id in in_fault)
         if reset_faults and faulty:
@@ -67,7 +69,7 @@ def scan_verb(
         check_nameplates(cell, declared, readings)
     except ConfigurationInconsistent as error:
         mistyped.append(str(error))
-    rows = [row for name, nodes in found.items() for row in scan_rows(declared, nodes, name)]
+    rows = [row for name, nodes in found.items() for row in scan_rows(declared, nodes, name, misfits)]
     if json:
         address = str(cell_address(declared))
         signals = current_signals(declared)
@@ -92,6 +94,18 @@ def _scale_of(network: CanopenNetwork, axis: Axis) -> ScaleReading | None:
         return read_scale(network.link.objects(axis.node_id), axis.profile)
     except DriverError:
         return None
+
+
+def _misfit_of(network: CanopenNetwork, axis: Axis) -> str:
+    """Describe the objects of its profile that a drive lacks; empty where it has them, or does not answer."""
+    from daq.config.drive import shipped_profiles
+    from drivers.canopen.needs import misfit
+    from drivers.errors import DriverError
+
+    try:
+        return misfit(network.link.objects(axis.node_id), axis.profile, shipped_profiles)
+    except DriverError:
+        return ""
 
 
 def _fault_of(network: CanopenNetwork, axis: Axis) -> str:

@@ -11,6 +11,7 @@ import typer
 
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.errors import UsageError
+from daq.files import read_regular
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 _SHIPPED = ("demo", "clean", "rx90", "kr270", "seven-axis", "gantry", "five-bar", "orthoglide", "dualv")
 _SHIPPED_FAULTS = "faults-example"
+LARGEST_NAME_FILE_BYTES = 4096  #: Size of a file that names a body
 
 
 def simulate(
@@ -53,7 +55,7 @@ def simulate(
 
     from daq.cli.terminal import at_most_one, interruptible
     from daq.simulation.simulation_file import load_scenario, load_simulation, require_simulator, shipped_simulation
-    from drivers.canopen.bus import BusAddress, open_bus
+    from drivers.canopen.bus import BusAddress, bus_errors, open_bus
     from drivers.canopen.hub import Hub
     from drivers.canopen.split_bus import BusPart, SplitAddress, open_cell_bus
 
@@ -97,7 +99,8 @@ def simulate(
         faulty = len(spec.faults) or "no"
         typer.echo(f"{len(spec.axes)} amplifiers on {address}, payload {what}, {faulty} faults; Ctrl-C ends it")
         typer.echo(how_to_reach(parts, spec.sync_period_us))
-        cell.serve_forever()
+        with bus_errors(address):
+            cell.serve_forever()
 
 
 class MountedFile:
@@ -135,7 +138,8 @@ class MountedFile:
 
     def _read(self) -> str | None:
         with suppress(OSError):
-            name = self._path.read_text(encoding="utf-8", errors="replace").partition("\n")[0].strip()
+            head = read_regular(self._path, LARGEST_NAME_FILE_BYTES)
+            name = head.decode("utf-8", "replace").partition("\n")[0].strip()
             return None if name == "none" else name or self._name  # empty while it is being written
         return None
 

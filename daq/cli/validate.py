@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -84,7 +85,8 @@ def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]
                 expected="calibrations written by `drivegain fit --cases`",
                 remedy="name another folder",
             )
-        files += [file for file in found if file.resolve() not in {other.resolve() for other in files}]
+        known = {os.path.realpath(file) for file in files}
+        files += [file for file in found if os.path.realpath(file) not in known]
     stems = Counter(file.stem for file in files)
     return {file.stem if stems[file.stem] == 1 else str(file): load_calibration(file) for file in files}
 

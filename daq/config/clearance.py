@@ -21,7 +21,7 @@ Point = tuple[float, float, float]
 class Clearance:
     """The room around the arm, in the types of `ident.planning.clearance`."""
 
-    workspace: Box | None  #: box for everything on the last link, None if it is not declared
+    workspace: Box | None  #: box for everything on the link with the payload, None if it is not declared
     minimum_m: float  #: smallest distance [m]
     capsules: tuple[Capsule, ...]  #: shape of the arm; empty if it is not declared
     obstacles: tuple[Box, ...]  #: boxes in the base frame
@@ -29,7 +29,7 @@ class Clearance:
 
 @dataclass(frozen=True, slots=True)
 class WorkspaceSection:
-    """A box in the base frame in which everything on the last link must stay."""
+    """A box in the base frame in which everything on the link with the payload must stay."""
 
     lower_m: Point
     upper_m: Point

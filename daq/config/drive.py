@@ -7,11 +7,13 @@ depend on its form.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
 from daq.config.yaml_file import Fault, Positive, StrictModel, describe, parse_yaml, read_model
+from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent
 from drivers.profiles.profile import (
     Amplitude,
@@ -205,6 +207,15 @@ class DriveModel(StrictModel):
         if self.torque is not None and (self.rated is None or self.rated.torque is None):
             raise ValueError("torque with rated.torque, of which it is given in thousandths")
         return self
+
+
+def shipped_profiles() -> tuple[DriveProfile, ...]:
+    """Return the shipped profiles, without those that need an entry of the operator."""
+    profiles = []
+    for path in sorted((shipped_configurations() / "drives").glob("*.yaml")):
+        with suppress(ConfigurationInconsistent):
+            profiles.append(drive_from_text(path.read_bytes(), path.name))
+    return tuple(profiles)
 
 
 def drive_from_text(text: bytes, name: str) -> DriveProfile:

@@ -11,8 +11,9 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from daq.config.yaml_file import Fault
+from daq.config.yaml_file import Fault, FileName
 from daq.errors import ConfigurationInconsistent
+from daq.files import follow_links
 
 _Percent = Annotated[float, Field(ge=0)]
 
@@ -76,23 +77,45 @@ def max_change_faults(policy: ApplyPolicy, axes: Collection[str]) -> Iterator[Fa
             yield Fault(("policy", "apply", "max_change", name), f"axis {name!r}", f"one of {', '.join(axes)}")
 
 
+def judged(cell_file: Path, key: str, path: Path) -> Path:
+    """Resolve a path that a cell file names or implies, so far as its links can be trusted (`daq.files.follow_links`).
+
+    Raises:
+        ConfigurationInconsistent: they cannot.
+    """
+    try:
+        return follow_links(path)
+    except OSError as error:
+        raise ConfigurationInconsistent(
+            f"{cell_file}: {key}",
+            found=f"{path}, {error.strerror}",
+            expected="a path without links, or with your own",
+            remedy="correct the link, or name the file itself",
+        ) from error
+
+
 @dataclass(frozen=True, slots=True)
 class HistorySection:
     """`history`: file names relative to the cell file. By default they are beside it, with its name."""
 
-    store: str | None = None
-    audit: str | None = None
+    store: FileName | None = None
+    audit: FileName | None = None
 
     def place(self, cell_file: Path, controller: str | None) -> HistoryPlace:
-        """Resolve the file names; refuse a history that would replace the cell file or the controller file."""
+        """Resolve the file names; refuse a history that would replace the cell file or the controller file.
+
+        Raises:
+            ConfigurationInconsistent: it would, or a link in one of the names must not be followed.
+        """
         folder, stem = cell_file.parent, cell_file.stem
-        store = (folder / (self.store or f"{stem}.history.sqlite")).resolve()
+        store = judged(cell_file, "history.store", folder / (self.store or f"{stem}.history.sqlite"))
         for other in (cell_file, folder / (controller or cell_file.name)):
             if str(store) == os.path.realpath(other) or (store.exists() and other.exists() and store.samefile(other)):
                 where, found = f"{cell_file}: history.store", f"the same file as {other}"
                 expected, remedy = "a file of the history's own", "give it another name"
                 raise ConfigurationInconsistent(where, found=found, expected=expected, remedy=remedy)
-        return HistoryPlace(store, (folder / (self.audit or f"{stem}.audit.jsonl")).resolve())
+        audit = judged(cell_file, "history.audit", folder / (self.audit or f"{stem}.audit.jsonl"))
+        return HistoryPlace(store, audit)
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,10 +21,11 @@ import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
 
 from daq.errors import ConfigurationMissing, SchemaMismatch, YamlInvalid
-from daq.files import read_regular
+from daq.files import follow_links, read_regular
 
 Location = tuple[str | int, ...]
 MAX_BYTES = 4 * 2**20  #: Largest configuration [bytes]
+MAX_EXAMINED = 2**20  #: Largest file whose flaw is searched by the slow parser, in a second or two [bytes]
 MAX_DEPTH = 40  #: Deepest nesting; more takes time and memory beyond the size of the file
 MAX_VALUES = 50_000  #: Largest number of keys and values; the largest shipped configuration has a hundredth of that
 MAX_BITS = 64  #: Longest integer: no object of an amplifier is longer
@@ -38,7 +39,12 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 def _beside(name: str, info: ValidationInfo) -> Path:
-    return Path(name) if info.context is None else (info.context / name).resolve()
+    if info.context is None:
+        return Path(name)
+    try:
+        return follow_links(info.context / name)
+    except OSError as error:
+        raise ValueError(f"a path without {error.strerror}") from error
 
 
 if TYPE_CHECKING:
@@ -173,8 +179,17 @@ def parse_yaml(text: bytes, name: str) -> Document:
             remedy="give the files in the order of the command's help",
         )
     lines: dict[Location, int] = {}
+    plain = _is_plain(text)
+    if not plain and len(text) > MAX_EXAMINED:
+        raise YamlInvalid(
+            name,
+            found=f"{len(text)} bytes that are no YAML, or with aliases, more than {MAX_VALUES} values, or more than "
+            f"{MAX_DEPTH} lists in lists",
+            expected="a configuration",
+            remedy="is this the right file?",
+        )
     try:
-        loader = _QuickLoader(text) if _is_plain(text) else _Loader(text, name)
+        loader = _QuickLoader(text) if plain else _Loader(text, name)
         try:
             node = loader.get_single_node()
             tree = None if node is None else _convert(loader, node, (), name, lines)

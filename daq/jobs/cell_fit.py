@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import math
 import re
 import stat
 import tempfile
@@ -28,7 +30,7 @@ from daq.errors import (
     exit_code,
     writing,
 )
-from daq.files import read_regular, replace_file
+from daq.files import follow_links, read_regular, replace_file
 from daq.jobs.fleet_survey import CellLogs, StoredLog, at_hand, fingerprint
 from daq.workflow.calibration_file import as_document, decode, encode
 from daq.workflow.fit import calibration_of, check_holdout, close_loop, fit
@@ -183,9 +185,12 @@ class CalibrationCache:
             wanted = (FORMAT, self._inputs(cell), hashlib.sha256(read_regular(file, MAX_BYTES)).hexdigest())
             if (state["format"], state["inputs_sha256"], state["calibration_sha256"]) != wanted:
                 return None
-            return _SUMMARY.validate_python(state["summary"]), float(state["seconds"])
+            found = _SUMMARY.validate_python(state["summary"]), float(state["seconds"])
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return None  # unreadable: made anew
+        summary, seconds = found
+        numbers = [number for gain in summary.gains for number in (gain.value, gain.std, gain.nameplate)]
+        return found if all(map(math.isfinite, (*numbers, summary.error_percent, seconds))) else None
 
     def store(self, cell: CellLogs, fitted: Fitted) -> Path:
         """Store a calibration; after a kill at any point, the cache is whole or the entry is made anew.
@@ -235,16 +240,15 @@ def open_cache(folder: Path, loop: Loop) -> CalibrationCache:
 
 
 def _check_replaceable(path: Path) -> None:
-    """Refuse a folder, and a link to a device or a pipe: a link is followed, and what it leads to would be replaced."""
+    """Refuse a folder, another user's link, and a link to a device or a pipe: what it leads to would be replaced."""
     try:
+        follow_links(path)
         mode = path.stat().st_mode
-    except OSError:
-        return  # nothing there, or the write will fail with a message
-    if stat.S_ISDIR(mode):
-        found = "a folder"
-    elif path.is_symlink() and not stat.S_ISREG(mode):
-        found = "a link to something that is no regular file"
-    else:
+        foreign = path.is_symlink() and not stat.S_ISREG(mode)
+        found = "a folder" if stat.S_ISDIR(mode) else "a link to something that is no regular file" if foreign else ""
+    except OSError as error:  # another one: nothing is there, or the write will fail with a message
+        found = (error.strerror or "") if error.errno in (errno.ELOOP, errno.EPERM) else ""
+    if not found:
         return
     raise UsageError(
         str(path),

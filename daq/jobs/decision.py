@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from datetime import datetime
-from pathlib import Path
 
 from daq.config.policy import AppliedBy
-from daq.errors import DaqError, writing
+from daq.errors import DaqError, evidence, writing
 from daq.files import replace_file, sha256, sha256_of
 from daq.jobs.context import JobContext
 from daq.jobs.journal import Level
@@ -39,7 +38,7 @@ def decide_outcome(context: JobContext, session: Session, calibration: Calibrati
     path, now = session.folder / CALIBRATION, context.tools.now()
     digest = sha256_of(path) or ""
     before = session.state.target
-    if before is not None and before.base_sha256 != before.after_sha256 == sha256_of(Path(before.file)):
+    if before is not None and before.base_sha256 != before.after_sha256 == sha256_of(context.target.file):
         # The job was killed right after its write: it is entered, and never repeated.
         words = "the controller's file has these gains already: an earlier job of this session wrote it"
         context.journal.say(Level.NOTICE, words)
@@ -75,19 +74,20 @@ def decide_outcome(context: JobContext, session: Session, calibration: Calibrati
     # An operator writes drives, whatever the policy says.
     needs_person = context.cell.apply.by is AppliedBy.PERSON or bool(context.target.controller.objects)
     if proposal.refusals or needs_person or touched:
-        append(
-            context.target.history.audit,
-            AuditAction.PROPOSED,
-            at=context.tools.now(),
-            who=context.who,
-            subject=str(resolve_links(context.target.file)),
-            details={
-                "session": session.state.session,
-                "calibration_sha256": digest,
-                "sha256_before": target.base_sha256,
-                "sha256_after": after,
-            },
-        )
+        with writing(context.target.history.audit):
+            append(
+                context.target.history.audit,
+                AuditAction.PROPOSED,
+                at=context.tools.now(),
+                who=context.who,
+                subject=str(resolve_links(context.target.file)),
+                details={
+                    "session": session.state.session,
+                    "calibration_sha256": digest,
+                    "sha256_before": target.base_sha256,
+                    "sha256_after": after,
+                },
+            )
         context.journal.say(Level.NOTICE, "proposed: an operator has to apply it", folder=str(session.folder))
         return session.update(outcome=Outcome.PROPOSED)
     written = _apply(context, proposal, now)
@@ -110,7 +110,8 @@ def _note_applied(context: JobContext, ledger: Ledger, digest: str, after_sha256
     try:
         ledger.record_applied(digest, at=context.tools.now(), target=target, sha256_after=after_sha256)
     except DaqError as error:
-        context.journal.say(Level.WARNING, "the history does not know of this write", text=str(error))
+        words = "the history does not have this write; the next job, apply or history --add enters it"
+        context.journal.say(Level.WARNING, words, text=evidence(error))
 
 
 def decision_of(proposal: Proposal[FileEdit], known: Spread) -> Decision:

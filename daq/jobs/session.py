@@ -8,23 +8,24 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Collection
-from contextlib import suppress
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime, timedelta
 from enum import Enum
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from daq.config.yaml_file import StrictModel
-from daq.errors import writing
-from daq.files import read_regular, replace_file
+from daq.errors import ConfigurationInconsistent, writing
+from daq.files import follow_links, read_regular, replace_file
 
 STATE, CALIBRATION, REPORT = "state.json", "calibration.yaml", "report"
 LARGEST_STATE_BYTES = 4 << 20  # a job writes a few kilobytes
 _STAMP = "%Y%m%dT%H%M%SZ"
+_Count = Annotated[int, Field(ge=0, le=2**53)]  #: Exact in a metric, which is a float
 _NAME = re.compile(r"[0-9]{8}T[0-9]{6}Z(?:-[0-9]{2})?")
 
 
@@ -56,10 +57,10 @@ class RecordedRun(StrictModel):
 
     name: str
     sha256: str
-    attempts: int
-    samples: int
-    lost_cycles: int
-    missing: tuple[int, ...]
+    attempts: _Count
+    samples: _Count
+    lost_cycles: _Count
+    missing: tuple[_Count, ...]
 
 
 class Fitted(StrictModel):
@@ -117,7 +118,7 @@ class SessionState(StrictModel):
     configuration_sha256: str
     plans_sha256: str = ""  #: of the approved plans that the runs name
     began: str
-    attempt: int = 1
+    attempt: _Count = 1
     attempt_began: str
     runs: tuple[RecordedRun, ...] = ()
     fitted: Fitted | None = None
@@ -125,7 +126,7 @@ class SessionState(StrictModel):
     decision: Decision | None = None
     target: Target | None = None
     outcome: Outcome | None = None
-    exit_code: int | None = None
+    exit_code: _Count | None = None
     problem: str = ""
     ended: str | None = None
     audit_sha256: str | None = None  #: of the audit entry about the end of the session
@@ -169,13 +170,31 @@ def sessions(folder: Path, cell: str | None = None) -> tuple[Session, ...]:
     Args:
         folder: of the sessions; several cells may share one.
         cell: name of the cell; None for all cells.
+
+    Raises:
+        ConfigurationInconsistent: it is no folder, or cannot be read.
     """
     found: list[Session] = []
-    with suppress(FileNotFoundError):
+    with suppress(FileNotFoundError), _listing(folder):
         folders = [entry for entry in folder.iterdir() if _NAME.fullmatch(entry.name)]
         read = ((entry, _read(entry / STATE)) for entry in folders)
         found = [Session(entry, state) for entry, state in read if state is not None and cell in (None, state.cell)]
     return tuple(sorted(found, key=lambda session: (session.began, session.folder.name)))
+
+
+@contextmanager
+def _listing(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise ConfigurationInconsistent(
+            str(folder),
+            found=(error.strerror or type(error).__name__).lower(),
+            expected="the folder of a cell's sessions",
+            remedy="correct `recalibration.folder` of the cell file, or move that file away",
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +230,7 @@ def save(session: Session) -> Session:
     """
     path = session.folder / STATE
     with writing(path):
-        replace_file(path, (session.state.model_dump_json(indent=2) + "\n").encode())
+        replace_file(follow_links(path), (session.state.model_dump_json(indent=2) + "\n").encode())
     return session
 
 

@@ -24,14 +24,21 @@ ProtectSystem=full
 ProtectHome=read-only
 ProtectKernelTunables=yes
 ProtectKernelModules=yes
+ProtectKernelLogs=yes
 ProtectControlGroups=yes
 ProtectClock=yes
+ProtectProc=invisible
 ProtectHostname=yes
 RestrictNamespaces=yes
 RestrictSUIDSGID=yes
 LockPersonality=yes
+PrivateMounts=yes
+SystemCallFilter=@system-service
+SystemCallErrorNumber=EPERM
 RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK AF_CAN
 SystemCallArchitectures=native"""
+#: Capabilities of a service of root: to keep the owner of a controller's file, and to lose no frame of the bus.
+_CAPABILITIES = {"root": "CAP_CHOWN CAP_DAC_OVERRIDE CAP_FOWNER CAP_NET_ADMIN CAP_SYS_NICE"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +137,10 @@ def _service(cell: Cell, section: Recalibration, wanted: Installation) -> str:
     seconds = round(60 * section.max_duration_min) + 2 * STOP_S
     # The lock of the bus is in a folder that all share, so the service must see the same /tmp and /run.
     hardening = (
-        "" if wanted.user else f"\n# It reads its cell, writes beside it, and speaks CAN; no more.\n{_NEEDS_LITTLE}\n"
+        ""
+        if wanted.user
+        else f"\n# It reads its cell, writes beside it, and speaks CAN; no more.\n{_NEEDS_LITTLE}\n"
+        f"CapabilityBoundingSet={_CAPABILITIES.get(wanted.owner, '')}\n"
     )
     owner = "" if wanted.user else f"# Whose the cell file is: what the job writes stays theirs.\nUser={wanted.owner}\n"
     writable = "" if wanted.user else _writable(cell, section, wanted.cell_file)

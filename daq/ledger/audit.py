@@ -21,8 +21,9 @@ from enum import Enum
 from pathlib import Path
 
 from daq.errors import AuditUnusable
-from daq.files import fsync_folder, open_regular, sha256, sha256_of
+from daq.files import fsync_folder, read_regular, sha256, sha256_of
 
+MAX_BYTES = 2**30  #: Largest audit log; it is read whole
 _TRIES, _PAUSE_S = 100, 0.05  #: For the lock, which is held for one line
 FIRST = "0" * 64  #: Previous digest of the first entry
 GONE = "gone"  #: Takes the place of a missing file's digest
@@ -151,6 +152,8 @@ def append(
         OSError: from the file system; at most an unfinished line was left.
     """
     with _locked(path) as descriptor:
+        if os.fstat(descriptor).st_size > MAX_BYTES:
+            raise _no_file(path, f"more than {MAX_BYTES} bytes")
         with os.fdopen(descriptor, "rb", closefd=False) as stream:
             content = stream.read()
         new: list[AuditEntry] = []
@@ -170,7 +173,7 @@ def append(
             raise OSError(28, "No space left on device", str(path))
         os.fsync(descriptor)
         if not content:
-            fsync_folder(path.resolve().parent)
+            fsync_folder(Path(os.path.realpath(path)).parent)
         return new[-1]
 
 
@@ -249,8 +252,7 @@ def _locked(path: Path) -> Iterator[int]:
 
 def _content_of(path: Path) -> bytes:
     try:
-        with open_regular(path) as stream:
-            return stream.read()
+        return read_regular(path, MAX_BYTES)
     except FileNotFoundError:
         return b""
     except OSError as error:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from daq.config.cell import Cell
 from daq.config.policy import HistoryPlace
-from daq.errors import AuditUnusable, DataError, HistoryUnreadable, OutputFailed
+from daq.errors import AuditUnusable, DataError, HistoryUnreadable, OutputFailed, evidence
 from daq.files import fsync_folder
 from daq.ledger.audit import AuditAction, AuditEntry, AuditVerdict, append, read, verify
 from daq.ledger.entry import Acknowledgement, Event, iso
@@ -69,7 +69,7 @@ class Ledger(HistoryStore):
         """See `HistoryStore.add`."""
         if self.document(digest) is None:
             self._check_like(calibration)
-            self._enter_calibration(calibration, digest, at, at)
+            at = self._enter_calibration(calibration, digest, at, at)
         return super().add(calibration, digest=digest, at=at)
 
     def record_applied(
@@ -127,14 +127,16 @@ class Ledger(HistoryStore):
         if not verdict.holds:  # its entries prove nothing
             return Verification(self.place, verdict, broken)
         broken += tuple(contradictions(verdict.entries, self.cell.name, self))
-        unknown, new = unknown_writes(writes_to(self.cell, verdict.entries), self.audited())
+        unknown, new = unknown_writes(writes_to(self.cell, verdict), self.audited())
         return Verification(self.place, verdict, broken, tuple(unknown), new != unknown)
 
     def warn_if_lost(self) -> bool:
         """Warn, and return true, if the index is empty though the audit log has entries of this cell."""
-        audited = () if self.entries() else read(self.place.audit)
-        entered = any(entered_calibration(one, self.cell.name) for one in audited)
-        if lost := entered or bool(writes_to(self.cell, audited, everywhere=True)):
+        if self.entries():
+            return False
+        verdict = verify(self.place.audit)
+        entered = any(entered_calibration(one, self.cell.name) for one in verdict.entries)
+        if lost := entered or bool(writes_to(self.cell, verdict, everywhere=True)):
             _LOG.warning("the history lacks what the audit has; to make it anew: drivegain history CELL --rebuild")
         return lost
 
@@ -171,14 +173,19 @@ class Ledger(HistoryStore):
             found = self._append(AuditAction.WRITE_FOUND, event.at, event.who, event.target, details)
             return replace(event, audit=found.sha256)
         except (AuditUnusable, OSError) as error:
-            _LOG.warning("the audit log does not have this write: %s", error)
+            _LOG.warning("the audit log does not have this write: %s", evidence(error))
             return event
 
-    def _enter_calibration(self, calibration: Calibration, digest: str, entered: datetime, at: datetime) -> None:
+    def _enter_calibration(self, calibration: Calibration, digest: str, entered: datetime, at: datetime) -> datetime:
+        """Enter a calibration in the audit log, once; return when it was entered: an earlier process may have done it.
+
+        Its row has this time, too, so that `verify` can compare the two.
+        """
         try:
-            known = [found for one in read(self.place.audit) for found in entered_calibration(one, self.cell.name)]
-            if any(digest == one for one, _, _ in known):
-                return
+            for one in read(self.place.audit):
+                for known, earlier, _ in entered_calibration(one, self.cell.name):
+                    if known == digest:
+                        return earlier
             details = {
                 "sha256": digest,
                 "cell": self.cell.name,
@@ -188,7 +195,8 @@ class Ledger(HistoryStore):
             subject = f"history of {self.cell.name}"
             self._append(AuditAction.CALIBRATION_ENTERED, at, self.who, subject, details)
         except (AuditUnusable, OSError) as error:
-            _LOG.warning("the audit log does not have this calibration: %s", error)
+            _LOG.warning("the audit log does not have this calibration: %s", evidence(error))
+        return entered
 
     def _append(
         self, action: AuditAction, at: datetime, who: str, subject: str, details: Mapping[str, object]
@@ -250,7 +258,7 @@ def rebuild(cell: Cell, place: HistoryPlace, *, who: str, at: datetime, heads: C
             new.replace(place.store)
         else:
             place.store.unlink(missing_ok=True)
-        fsync_folder(place.store.resolve().parent)
+        fsync_folder(place.store.parent)
     except OSError as error:
         raise OutputFailed.of(place.store, error) from error
     return Rebuilt(*counts, kept, trusted)

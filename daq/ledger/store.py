@@ -8,24 +8,30 @@ the next process that opens the file undoes the unfinished transaction (docs/dec
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import re
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
 from datetime import datetime
+from functools import cache
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 from urllib.parse import quote
 
+from daq.config import yaml_file
 from daq.errors import DaqError, DataError, HistoryUnreadable, OutputFailed
 from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, differences, iso, listed, row_of, zoned
 from daq.workflow.calibration_file import decode, encode
 from ident.calibration import Calibration, Gain
 
-BUSY_S = 20.0  #: How long to wait for another process' transaction: each is a few rows
+BUSY_S = 5.0  #: How long to wait for another process' transaction: each is a few rows
+MAX_BYTES = 2**30  #: Largest file; a calibration a day for a hundred years is smaller
+MAX_ROWS = 200_000  #: Most rows of one query, besides MAX_TEXT the bound on what is read into memory
+MAX_TEXT = 2 * yaml_file.MAX_BYTES  #: Longest value [bytes]; a calibration's file is the longest
 
 APPLICATION_ID = 0x64726776  #: In the header of every history (PRAGMA application_id); read as text it says drgv
 VERSION = 1
@@ -78,6 +84,25 @@ CREATE TABLE acknowledgement (
 """
 
 
+_SCHEMA_ROWS = 64  #: More than a history has
+
+
+@cache
+def _own_schema() -> frozenset[tuple[str, str, str]]:
+    """Return kind, name and SQL of everything in the schema of a new history."""
+    with contextlib.closing(sqlite3.connect(":memory:")) as connection:
+        connection.executescript(_TABLES)
+        return _schema(connection)
+
+
+def _schema(connection: sqlite3.Connection) -> frozenset[tuple[str, str, str]]:
+    """Return kind, name and SQL of what a file's schema has, without comments and spacing."""
+    rows = connection.execute("SELECT type, name, sql FROM sqlite_schema").fetchmany(_SCHEMA_ROWS)
+    return frozenset(
+        (str(kind), str(name), " ".join(re.sub("--.*", "", sql or "").split())) for kind, name, sql in rows
+    )
+
+
 _COLUMNS = ", ".join(one.name for one in fields(Entry) if one.name not in ("gains", "events"))
 _NOT_WRITABLE = ("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY", "SQLITE_CANTOPEN")
 
@@ -86,15 +111,19 @@ def _connect(path: Path, *, write: bool = False) -> sqlite3.Connection:
     """Open the file, made where it is missing and is to be written, and check that it is a history.
 
     Raises:
-        HistoryUnreadable: it is none, of another version, broken, or locked for long.
+        HistoryUnreadable: it is none, of another version, broken, changed in its schema, too large, or locked for long.
         OutputFailed: there is none, and none can be made.
     """
     with _translate_sqlite_errors(path, write=write):
+        with contextlib.suppress(OSError):  # SQLite finds out what is wrong with it
+            if (size := path.stat().st_size) > MAX_BYTES:
+                raise _broken(path, f"{size} bytes, more than {MAX_BYTES}")
         # Not "ro" to read, which could not undo an unfinished transaction; "rw" opens a read-only file all the same.
         address = f"file:{quote(os.fsencode(path.absolute()))}?mode={'rwc' if write else 'rw'}"
         connection = sqlite3.connect(address, uri=True, timeout=BUSY_S, isolation_level=None)
         try:
             connection.row_factory = sqlite3.Row
+            connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_TEXT)
             connection.execute("PRAGMA foreign_keys = ON")
             connection.execute("PRAGMA trusted_schema = OFF")
             # EXTRA: a power cut behind the commit does not bring the journal, and the old content, back.
@@ -137,6 +166,10 @@ def _check(connection: sqlite3.Connection, path: Path) -> None:
             if later
             else "no drivegain ever made this version: restore the file from a backup; nothing was written",
         )
+    # A view in the place of a table need never end, and a trigger changes what is entered.
+    if differing := _schema(connection) ^ _own_schema():
+        kind, name, _ = min(differing, key=lambda one: (one not in _schema(connection), one))
+        raise _broken(path, f"{kind} {name!r} in its schema, which drivegain did not make so")
 
 
 @contextlib.contextmanager
@@ -279,6 +312,10 @@ class HistoryStore:
         for row in self._rows("SELECT digest, axis, value, std, unit, nameplate FROM gain ORDER BY place"):
             gains.setdefault(row["digest"], []).append(Gain(*row[1:]))
         with _translate_sqlite_errors(self.path):
+            for row in rows:
+                _check_numbers(
+                    row["digest"], gains.get(row["digest"], ()), row["error_percent"], row["holdout_percent"]
+                )
             return tuple(
                 Entry(
                     **{**dict(row), **{name: zoned(row[name]) for name in ("created", "recorded", "entered")}},
@@ -345,8 +382,9 @@ class HistoryStore:
             yield from differences(f"row of {name}", dict(row), row_of(calibration, digest, entered), said)
             gains = self._rows("SELECT * FROM gain WHERE digest = ? ORDER BY place", (digest,))
             axes, wanted = [gain["axis"] for gain in gains], [gain.axis for gain in calibration.gains]
-            if axes != wanted:
-                yield f"gains of {name}: found {listed(axes)}, expected {listed(wanted)} {said}"
+            if axes != wanted or [gain["place"] for gain in gains] != list(range(len(gains))):
+                places = f", numbered {listed(gain['place'] for gain in gains)}" if axes == wanted else ""
+                yield f"gains of {name}: found {listed(axes)}{places}, expected {listed(wanted)} {said}, from 0"
                 continue
             for found, expected in zip(gains, calibration.gains, strict=True):
                 yield from differences(f"gain of {expected.axis} in {name}", dict(found), asdict(expected), said)
@@ -404,7 +442,10 @@ class HistoryStore:
         with _translate_sqlite_errors(self.path):
             if _is_empty(self._connection):
                 return []
-            return self._connection.execute(query, values).fetchall()
+            rows = self._connection.execute(query, values).fetchmany(MAX_ROWS + 1)
+        if len(rows) > MAX_ROWS:
+            raise _broken(self.path, f"more than {MAX_ROWS} rows")
+        return rows
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
@@ -426,6 +467,18 @@ class HistoryStore:
                 with contextlib.suppress(sqlite3.Error):
                     connection.execute("ROLLBACK")
                 raise
+
+
+def _check_numbers(digest: str, gains: Sequence[Gain], *errors_percent: float | None) -> None:
+    """Check the numbers of a calibration's rows.
+
+    Raises:
+        ValueError: one is not finite, or σ or an error is negative.
+    """
+    numbers = [number for gain in gains for number in (gain.value, gain.std, gain.nameplate)]
+    positive = [*(gain.std for gain in gains), *(error for error in errors_percent if error is not None)]
+    if not all(map(math.isfinite, (*numbers, *positive))) or min(positive, default=0.0) < 0.0:
+        raise ValueError(f"calibration {digest[:12]}… with a number that is not finite, or a σ or an error below zero")
 
 
 def _insert(connection: sqlite3.Connection, table: str, row: Mapping[str, object]) -> None:

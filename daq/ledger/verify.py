@@ -11,13 +11,13 @@ from datetime import UTC, datetime
 from daq.config.cell import Cell
 from daq.config.policy import HistoryPlace
 from daq.errors import DataError
-from daq.ledger.audit import AuditAction, AuditEntry, verify
+from daq.ledger.audit import AuditAction, AuditEntry, AuditVerdict, Content, verify
 from daq.ledger.entry import Acknowledgement, Event, WriteAction, differences, drives_of, iso, utc
 from daq.ledger.store import HistoryStore
 from daq.workflow.calibration_file import decode
 
 _ENDS = {AuditAction.APPLIED: WriteAction.APPLIED, AuditAction.ROLLED_BACK: WriteAction.ROLLED_BACK}
-_BEGINS = (AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN)
+_BEGINS = {AuditAction.APPLY_BEGUN: WriteAction.APPLIED, AuditAction.ROLLBACK_BEGUN: WriteAction.ROLLED_BACK}
 _NEVER = datetime.min.replace(tzinfo=UTC)
 
 
@@ -28,12 +28,12 @@ class AuditedWrite:
     #: The entry before the write, with its details; None where the audit log has none. Of a write that was found later,
     #: the entry of the finding.
     begun: AuditEntry | None
-    ended: AuditEntry  #: the entry after it
+    ended: AuditEntry  #: the entry after it; the one before it, where the writer was killed in between
 
     @property
     def action(self) -> WriteAction:
         """Applied or rolled back."""
-        return _ENDS.get(self.ended.action) or WriteAction(_text(self.ended, "action"))
+        return {**_ENDS, **_BEGINS}.get(self.ended.action) or WriteAction(_text(self.ended, "action"))
 
     @property
     def calibration(self) -> str | None:
@@ -63,8 +63,10 @@ def is_end(entry: AuditEntry) -> bool:
     )
 
 
-def writes_to(cell: Cell, entries: Sequence[AuditEntry], *, everywhere: bool = False) -> list[AuditedWrite]:
-    """Return the writes of this cell's calibrations, and the rollbacks of them.
+def writes_to(cell: Cell, verdict: AuditVerdict, *, everywhere: bool = False) -> list[AuditedWrite]:
+    """Return the writes of this cell's calibrations, and the rollbacks of them, in their order.
+
+    A write that was begun and never ended is one where the controller has its content, unless it was found later.
 
     Another cell may have the same audit log, and even the same controller file: what was written with its calibrations,
     and rolled back from there, is in its own history.
@@ -74,20 +76,25 @@ def writes_to(cell: Cell, entries: Sequence[AuditEntry], *, everywhere: bool = F
     file = cell.controller_path
     # Not `resolve_links`: a link that it refuses today was followed on the day of the write.
     targets = {drives_of(cell.name), *(() if file is None else (os.path.realpath(file),))}
+    entries = verdict.entries
     begun = {one.number: one for one in entries if one.action in _BEGINS}
+    left = {write.begun.number for write in verdict.open_writes if write.content is Content.AFTER}
+    left -= {_number(one) for one in entries if one.action is AuditAction.WRITE_FOUND}
     found: list[AuditedWrite] = []
     owners = dict.fromkeys(targets, cell.name)
     for one in entries:
-        if not is_end(one) or not (everywhere or one.subject in targets):
+        unended = one.number in left
+        if not (is_end(one) or unended) or not (everywhere or one.subject in targets):
             continue
-        write = AuditedWrite(one if one.action is AuditAction.WRITE_FOUND else begun.get(_number(one)), one)
+        known = unended or one.action is AuditAction.WRITE_FOUND
+        write = AuditedWrite(one if known else begun.get(_number(one)), one)
         if write.action is WriteAction.APPLIED:
             owner = None if write.begun is None else _calibration(write.begun, "cell")
             owners[one.subject] = owner or (cell.name if one.subject in targets else "")
         if owners.get(one.subject) == cell.name:
             later = len(found)
             at = at_of(one)
-            if one.details.get("migrated") is True and at is not None:  # its entry is younger than the write
+            if one.action is AuditAction.WRITE_FOUND and at is not None:  # its entry may be younger than the write
                 times = [at_of(other.ended) for other in found]
                 later = next((i for i, other in enumerate(times) if other is not None and other > at), later)
             found.insert(later, write)
@@ -151,7 +158,7 @@ def catch_up(
                 with contextlib.suppress(DataError):  # not comparable: of a history that was begun earlier
                     store.add(decode(document, f"entry {one.number}"), digest=digest, at=entered_at)
                     known.add(digest)
-    _, new = unknown_writes(writes_to(cell, verdict.entries, everywhere=True), audited)
+    _, new = unknown_writes(writes_to(cell, verdict, everywhere=True), audited)
     stopped, entered = set[str](), []
     for write in new:
         one, at, after = write.ended, at_of(write.ended), write.sha256_after
@@ -201,14 +208,16 @@ def contradictions(entries: Sequence[AuditEntry], cell: str, store: HistoryStore
             yield f"{name}: found entry {entry.number} of the audit, {entry.action.value}, expected an acknowledgement"
         else:
             yield from differences(name, asdict(noted), asdict(expected), _named(entry))
-    documents = {entry.digest: store.document(entry.digest) for entry in store.entries()}
+    rows = {entry.digest: (entry.entered, store.document(entry.digest)) for entry in store.entries()}
     for one in entries:
-        for digest, _, document in entered_calibration(one, cell):
+        for digest, entered_at, document in entered_calibration(one, cell):
             name, said = f"calibration {digest[:12]}…", f"as entry {one.number} of the audit says"
-            if digest not in documents:
+            if digest not in rows:
                 yield f"{name}: found no such row, expected one {said}"
-            elif documents[digest] != document:
+                continue
+            if rows[digest][1] != document:
                 yield f"document of {name}: found another one, expected it {said}"
+            yield from differences(name, {"entered": rows[digest][0]}, {"entered": entered_at}, said)
 
 
 def _event_flaws(name: str, event: Event, entry: AuditEntry, entries: Sequence[AuditEntry]) -> Iterator[str]:
@@ -216,7 +225,7 @@ def _event_flaws(name: str, event: Event, entry: AuditEntry, entries: Sequence[A
     expected: dict[str, object] = {"target": entry.subject, "who": entry.who, "at": at_of(entry)}
     if is_end(entry):
         expected["action"] = AuditedWrite(begun, entry).action.value
-    if event.sha256_after is not None and (after := _text(begun, "sha256_after")) is not None:
+    if (after := _text(begun, "sha256_after")) is not None:
         expected["sha256_after"] = after
     if entry.action in (AuditAction.APPLIED, AuditAction.WRITE_FOUND) and (digest := _calibration(begun, "sha256")):
         expected["digest"] = digest

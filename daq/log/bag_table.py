@@ -123,6 +123,7 @@ class BagFile(RecordFile):
         data = self.unpack(offset, chunk)
         at = 0
         while at < len(data):
+            self.spend(offset)
             opcode, length = struct.unpack_from("<BQ", data, at) if len(data) - at >= 9 else (0, len(data))
             at += 9 + length
             if at > len(data):

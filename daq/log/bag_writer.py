@@ -36,7 +36,7 @@ from daq.log.message import (
     reading_bytes,
     text_bytes,
 )
-from daq.log.reader import Log, read_log
+from daq.log.reader import Log, SampleChecks, read_log
 from ident.arrays import FloatArray
 from ident.model.model import DriveTrain
 
@@ -51,7 +51,7 @@ class BagWritten:
     messages: dict[str, int]  #: number of messages by topic
     duration_s: float  #: from the first to the last message [s]
     partial: bool  #: the log was never finished
-    valid: bool  #: whether the recorder marked the run valid
+    valid: bool  #: whether the recorder marked the run valid, and its cycles and time steps are even
     reason: str  #: why not
 
 
@@ -100,8 +100,10 @@ def export_bag(path: Path, out: Path, gains: Mapping[str, float] | None = None) 
         fsync_folder(out)
     except OSError as error:
         raise OutputFailed.of(out, error) from error
-    said = log.statistics
-    return BagWritten(dict(sorted(counts.items())), (last_ns - first_ns) * 1e-9, log.partial, said.valid, said.reason)
+    checks = SampleChecks(path)
+    checks.take(log.samples)
+    verdict = checks.verdict(log.head.run.rate_hz, log.statistics)
+    return BagWritten(dict(sorted(counts.items())), (last_ns - first_ns) * 1e-9, log.partial, *verdict)
 
 
 def _messages(log: Log, cell: Cell, gains: Sequence[float]) -> Iterator[tuple[int, str, bytes]]:

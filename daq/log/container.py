@@ -48,6 +48,11 @@ LARGEST_CHUNK = 64 * 2**20
 LARGEST_RATIO = 200
 """Largest ratio of unpacked bytes to the size of the file, to bound the memory; our logs have 2 to 20."""
 
+RECORDS, BYTES_A_RECORD = 500_000, 4
+"""Records that are read one by one, not as an array: so many, and one for so many bytes of the file. Ours need more
+bytes each; without a bound, megabytes of equal events take gigabytes and minutes."""
+BYTES_A_UNIT = 64  #: An event of so many bytes counts as another record: its text is kept
+
 Record = TypeVar("Record", bound=McapRecord)
 _PARSERS: tuple[tuple[Opcode, Callable[[ReadDataStream], McapRecord]], ...] = (
     (Opcode.HEADER, Header.read),
@@ -73,7 +78,7 @@ class RecordFile:
         self.path = path
         self.sha256 = ""
         self.whole_bytes = 0
-        self._allowance = 0
+        self._allowance = self._records_left = 0
         self._zstd = zstandard.ZstdDecompressor()
 
     def __iter__(self) -> Iterator[tuple[int, McapRecord]]:
@@ -95,6 +100,7 @@ class RecordFile:
             with open_regular(self.path) as stream:
                 size = os.fstat(stream.fileno()).st_size
                 self._allowance = LARGEST_CHUNK + LARGEST_RATIO * size
+                self._records_left = RECORDS + size // BYTES_A_RECORD
                 yield from records(stream, size)
         except OSError as error:
             raise LogMissing(
@@ -215,6 +221,16 @@ class RecordFile:
         """Make the error for an MCAP file that is not a log of a cell."""
         return LogForeign(str(self.path), found=found, expected=expected, remedy="is this a log of a cell?")
 
+    def spend(self, offset: int, kept_bytes: int = 0) -> None:
+        """Count a record that is read by itself, with the bytes of it that are kept.
+
+        Raises:
+            LogCorrupt: there are more than a recording of this size has.
+        """
+        self._records_left -= 1 + kept_bytes // BYTES_A_UNIT
+        if self._records_left < 0:
+            raise self.corrupt(offset, "too many messages for a file of its size", "a recording")
+
     def unpack(self, offset: int, chunk: Chunk) -> bytes:
         """Decompress a chunk.
 
@@ -317,12 +333,14 @@ class ChunkContents:
             opcode, length, channel, _, _, _ = self._message_head(offset, data, start)
             record = data[start : start + 9 + length]
             start += 9 + length
+            self._file.spend(offset)
             if opcode != Opcode.MESSAGE:
                 continue
             topic = self._topic(channel)
             if topic == SAMPLES_TOPIC:
                 samples.append(record)
             elif topic == EVENTS_TOPIC:
+                self._file.spend(offset, length)
                 try:
                     self.events.append(event_from_bytes(record[_MESSAGE_HEAD.size :]))
                 except (ValueError, struct.error) as error:
@@ -343,6 +361,7 @@ class ChunkContents:
         """Read the schemas and channels at the start of a chunk; return the position of the first message."""
         start = 0
         while start < len(data) and data[start] != Opcode.MESSAGE:
+            self._file.spend(offset)
             end = start + 9 + int.from_bytes(data[start + 1 : start + 9], "little")
             if end > len(data):
                 raise self._file.corrupt(offset, "a record beyond the end of its chunk", "one inside")

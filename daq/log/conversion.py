@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import pi
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.cell import DEGREE, Cell
 from daq.config.cell_file import cell_from_bundle
-from daq.errors import ClockImplausible, CurrentSaturated, CyclesLost, LogIncomplete, PositionImplausible, RunInvalid
+from daq.errors import CurrentSaturated, LogIncomplete, PositionImplausible, RunInvalid
 from daq.log.metadata import Readback, reports_only_losses
-from daq.log.reader import Log, LossyLogs, read_log
+from daq.log.reader import Log, LossyLogs, SampleChecks, read_log
 from drivers.stream.sample import CellEvent, EventKind, Quantity
 from ident.arrays import BoolArray, FloatArray
 from ident.data.run import Recording, Run
@@ -24,11 +26,8 @@ from ident.model.model import DriveTrain
 _LOG = logging.getLogger("drivegain")
 LIMIT_MARGIN = 0.05  #: Largest excursion beyond the limits, as a share of the joint's range
 LARGEST_SATURATED = 0.1  #: Largest share of an axis's samples with an active limit; these samples are masked
-STEP_TOLERANCE = 0.5
-"""Largest deviation of a time step, as a share of the period. From half a period on it could be another cycle."""
 BESIDE_S = 0.005  #: Distance from a torque within which the current belongs to it
 NEARBY_S = 0.01, 0.03  #: Distances from it at which the current has another noise, but hardly another value
-RATE_TOLERANCE = 0.01  #: Largest relative difference between the requested rate and that of the time stamps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,7 +142,10 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
             expected="a valid run",
             remedy="record it again" + ("; or use it anyway with --accept-losses" if only_losses else ""),
         )
-    _check_cycles(log, rate_hz)
+    checks = SampleChecks(log.path)
+    checks.take(samples)
+    if (fault := checks.fault(rate_hz)) is not None:
+        raise fault
     scale = scaling(cell, log.head.readback)
     is_counter = [axis.position_rad_per_count is None for axis in log.head.readback.axes]
     counts = np.where(is_counter, unwrapped(samples.position_counts), samples.position_counts)
@@ -180,7 +182,7 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
             # An import without the time of day writes 0.
             recorded_s=run.started_wall_ns * 1e-9 if run.started_wall_ns else None,
             entered_kg=run.entered_kg,
-            serials=tuple(serial if type(serial := drive.get("serial")) is int else None for drive in drives),
+            serials=tuple(map(_serial, drives)),
             saturated_percent=tuple((100.0 * share).tolist()),
             lost_cycles=log.statistics.lost_cycles,
             missing=log.statistics.missing,
@@ -188,6 +190,12 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
             operator=run.operator or None,
         ),
     )
+
+
+def _serial(drive: Mapping[str, Any]) -> int | None:
+    """Serial number of an amplifier (1018h:04, 32 bits); None if it reported none."""
+    serial = drive.get("serial")
+    return serial if type(serial) is int and 0 <= serial < 2**32 else None
 
 
 def moves(events: tuple[CellEvent, ...], time_ns: NDArray[np.int64]) -> NDArray[np.int64] | None:
@@ -308,44 +316,3 @@ def unwrapped(
     words = np.concatenate((last[None, :], counts)).astype(np.int32).view(np.uint32)
     steps = np.diff(words, axis=0).view(np.int32)
     return np.asarray(total + steps.cumsum(axis=0, dtype=np.int64), dtype=np.int64)
-
-
-def _check_cycles(log: Log, rate_hz: float) -> None:
-    cycle, time_ns = log.samples.cycle, log.samples.time_ns
-    if len(cycle) < 2:
-        raise CyclesLost(str(log.path), found="one sample", expected="a run", remedy="record it again")
-    steps = np.diff(cycle.astype(np.int64))
-    if np.any(steps != 1):
-        first = int(np.argmax(steps != 1))
-        raise CyclesLost(
-            str(log.path),
-            found=f"cycle {cycle[first + 1]} after {cycle[first]} ({np.count_nonzero(steps != 1)} gaps)",
-            expected="every SYNC cycle once",
-            remedy="record again with less load on the bus and the computer; lost cycles are never interpolated",
-        )
-    _check_steps(log, rate_hz)
-    duration_s = float(time_ns[-1] - time_ns[0]) * 1e-9
-    stamped_hz = (len(cycle) - 1) / duration_s if duration_s > 0.0 else 0.0
-    if abs(stamped_hz / rate_hz - 1.0) > RATE_TOLERANCE:
-        raise ClockImplausible(
-            str(log.path),
-            found=f"time stamps at {stamped_hz:.6g} Hz",
-            expected=f"{rate_hz:.6g} Hz, as requested",
-            remedy="was the computer's clock set during the run? record it again",
-        )
-
-
-def _check_steps(log: Log, rate_hz: float) -> None:
-    """Refuse uneven time steps: central differences assume evenly spaced samples."""
-    cycle, period_ns = log.samples.cycle, 1e9 / rate_hz
-    step_ns = np.diff(log.samples.time_ns)
-    off = np.abs(step_ns - period_ns) > STEP_TOLERANCE * period_ns
-    if off.any():
-        first = int(np.argmax(off))
-        raise ClockImplausible(
-            str(log.path),
-            found=f"cycle {cycle[first + 1]} {step_ns[first] * 1e-6:.4g} ms after cycle {cycle[first]} "
-            f"({np.count_nonzero(off)} such steps)",
-            expected=f"{period_ns * 1e-6:.4g} ms, give or take {100.0 * STEP_TOLERANCE:g} %",
-            remedy="SYNC came late: record again with less load on the computer, or with a longer sync.period_us",
-        )

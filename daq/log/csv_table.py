@@ -17,11 +17,12 @@ import numpy as np
 
 from daq.config.import_description import Column, CsvLayout, ImportDescription, TimeColumn, TimeUnit
 from daq.errors import TableUnfit
-from daq.files import open_regular
+from daq.files import read_regular
 from daq.log.table import Stamps, Table, stamps_of_ns, stamps_of_numbers
 from ident.arrays import FloatArray
 
 ABSOLUTE_S = 1e8  #: Stamps above this are since 1970, and floats are too coarse for them: 0.2 µs
+LARGEST_BYTES = 2**30  #: Largest file; an hour of six axes at 1 kHz has half of it
 LARGEST_JUMP = 3.0  #: Largest step to a last number that may be cut off, in multiples of the largest step before it
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d{1,9})\d*)?(Z|[+-]\d\d:?\d\d)")
 
@@ -58,6 +59,10 @@ class _Lines:
         parts = row.split() if self.table.delimiter == " " else row.split(self.table.delimiter)
         return [part.strip().strip('"').strip() for part in parts]
 
+    def place(self, row: int, index: int) -> str:
+        """Name a field in a message: `run.csv:42, column i3`."""
+        return f"{self.path}:{self.first_line + row}, column {self.names[index] if self.names else index + 1}"
+
     def number(self, text: str) -> float:
         """Read a field; NaN if it is no number."""
         try:
@@ -73,8 +78,7 @@ def _read_lines(path: Path, table: CsvLayout) -> tuple[_Lines, tuple[str, ...]]:
         TableUnfit: the file cannot be read, has no rows, ends early, or a line has another number of fields.
     """
     try:
-        with open_regular(path) as stream:
-            data = stream.read()
+        data = read_regular(path, LARGEST_BYTES)
     except OSError as error:
         raise TableUnfit(
             str(path),
@@ -216,7 +220,51 @@ def _numbers(file: _Lines, columns: Sequence[str | int]) -> FloatArray:
         raise _not_numeric(file, indices) from error
     if not np.isfinite(values).all():
         raise _not_numeric(file, indices)
+    _check_points(file, indices)
+    for index, column in zip(indices, values.T, strict=True):
+        _check_thousands(file, index, column)
     return np.asarray(values, dtype=np.float64)
+
+
+def _check_points(file: _Lines, indices: list[int]) -> None:
+    """Refuse a point in a number under a decimal comma: it may group thousands, or be decimal after all."""
+    if file.table.decimal != ",":
+        return
+    for number, row in enumerate(file.rows):
+        if "." not in row:
+            continue
+        fields = file.fields(row)
+        for index in indices:
+            if "." in fields[index]:
+                raise TableUnfit(
+                    file.place(number, index),
+                    found=f"{fields[index]!r}, with a point",
+                    expected="a number with a decimal comma alone, as `table` of the import description has it",
+                    remedy="if points group thousands, export the numbers without them; if they are decimal, write "
+                    '`decimal: "."`',
+                )
+
+
+def _check_thousands(file: _Lines, index: int, values: FloatArray) -> None:
+    """Refuse a column in which the decimal sign must group thousands: 987 beside 1.234, and never 1.2 or 0.987."""
+    if np.abs(values).max() >= 1000.0 or not (values % 1.0).any():
+        return
+    thousands = 1000.0 * values
+    if (np.abs(thousands - np.rint(thousands)) > 1e-6).any():  # more than three digits: most columns end here
+        return
+    texts = [file.fields(row)[index] for row in file.rows]
+    sign = re.escape(file.table.decimal)
+    grouped, plain = re.compile(rf"[-+]?[1-9]\d{{0,2}}{sign}\d{{3}}"), re.compile(r"[-+]?\d{1,3}")
+    first = next((number for number, text in enumerate(texts) if grouped.fullmatch(text)), None)
+    beside = next((text for text in texts if plain.fullmatch(text) and text.strip("+-0")), None)
+    if first is None or beside is None or not all(grouped.fullmatch(text) or plain.fullmatch(text) for text in texts):
+        return
+    raise TableUnfit(
+        file.place(first, index),
+        found=f"{texts[first]!r} beside {beside!r}: three digits behind every {file.table.decimal!r} of the column",
+        expected="numbers whose thousands are not grouped",
+        remedy="export them without grouping; if these are decimals, export all numbers with the same three",
+    )
 
 
 def _check_shape(file: _Lines, named: int) -> None:
@@ -265,9 +313,8 @@ def _not_numeric(file: _Lines, indices: list[int]) -> TableUnfit:
         fields = file.fields(row)
         for index in indices:
             if not math.isfinite(file.number(fields[index])):
-                label = file.names[index] if file.names else str(index + 1)
                 return TableUnfit(
-                    f"{file.path}:{file.first_line + number}, column {label}",
+                    file.place(number, index),
                     found=repr(fields[index]),
                     expected="a finite number",
                     remedy=_remedy(file, number, fields[index]),
@@ -280,7 +327,8 @@ def _not_numeric(file: _Lines, indices: list[int]) -> TableUnfit:
 def _remedy(file: _Lines, row: int, text: str) -> str:
     """Advice for a field that is not a finite number."""
     if file.table.decimal == "." and re.fullmatch(r"[-+]?\d+,\d+", text):
-        return 'write `decimal: ","` under `table` in the import description'
+        grouped = "; if commas group thousands, export the numbers without them" if text[-4:-3] == "," else ""
+        return 'write `decimal: ","` under `table` in the import description' + grouped
     if row == 0 and not file.table.header:
         return "if this line is a header, write `header: true` under `table` in the import description"
     return "samples are never invented: cut the recording there, or export it again"

@@ -42,7 +42,7 @@ class Exported:
     columns: tuple[str, ...]  #: names of the columns
     rows: int  #: number of rows
     partial: bool  #: the log was never finished
-    valid: bool  #: whether the recorder marked the run valid
+    valid: bool  #: whether the recorder marked the run valid, and its cycles and time steps are even
     reason: str  #: why not
 
 
@@ -73,7 +73,7 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
         UsageError: a file of that name exists.
         OutputFailed: the file system refuses.
         ConfigurationMissing: the package for the format is missing.
-        LogUnreadable: the log is damaged or incomplete; nothing is written.
+        LogUnreadable: the log is damaged or contradicts itself; nothing is written.
     """
     require_format(kind)
     if out.exists():
@@ -101,8 +101,7 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
             unfinished.replace(out)
     except OSError as error:
         raise OutputFailed.of(out, error) from error
-    said = reader.statistics
-    return Exported(names, rows, reader.partial, said.valid, said.reason)
+    return Exported(names, rows, reader.partial, *reader.checks.verdict(reader.head.run.rate_hz, reader.statistics))
 
 
 def tables(
@@ -121,7 +120,7 @@ def tables(
     """
     last: tuple[NDArray[np.int32], NDArray[np.int64]] | None = None
     first_ns = 0
-    names = _column_names(cell)
+    names = column_names(cell)
     every = {
         f"{names[axis]}.{_SLOW_COLUMNS[quantity]}": sorted(
             (one.time_ns, one.value) for one in readings if (one.axis, one.quantity) == (axis, quantity)
@@ -160,7 +159,7 @@ def _columns(
         "time_s": (block.time_ns - first_ns) * 1e-9,
         "move": np.full(len(block.cycle), -1, dtype=np.int64) if move is None else move,
     }
-    for index, (axis, name) in enumerate(zip(cell.axes, _column_names(cell), strict=True)):
+    for index, (axis, name) in enumerate(zip(cell.axes, column_names(cell), strict=True)):
         current = axis.gain_unit.partition("/")[2].strip() or "A"
         columns |= {
             f"{name}.position_{axis.unit.si_name}": joints[:, index],
@@ -173,10 +172,17 @@ def _columns(
     return columns
 
 
-def _column_names(cell: Cell) -> list[str]:
-    """Name of each axis in the columns; `A+` and `A-` are both `A_`, and get the number of the axis."""
-    plain = [re.sub(r"\W+", "_", axis.name) for axis in cell.axes]
-    return [name if plain.count(name) == 1 else f"{name}{number}" for number, name in enumerate(plain, start=1)]
+def column_names(cell: Cell) -> list[str]:
+    """Name of each axis in the columns; names that become equal get the axis's number: `A+` and `A-` are `A_1`, `A_2`.
+
+    Where that is an axis of the cell too, all names begin with their number.
+    """
+    plain = [re.sub(r"\W+", "_", name) for name in cell.axis_names]
+    numbered = [f"{name}{number}" for number, name in enumerate(plain, start=1)]
+    named = [one if plain.count(one) == 1 else other for one, other in zip(plain, numbered, strict=True)]
+    return (
+        named if len(set(named)) == len(named) else [f"{number}_{name}" for number, name in enumerate(plain, start=1)]
+    )
 
 
 _SLOW_COLUMNS = {Quantity.TORQUE: "motor_torque_Nm", Quantity.TEMPERATURE: "temperature_degC"}

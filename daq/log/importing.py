@@ -8,7 +8,6 @@ without a rounding error of its own: raw = round(value / count).
 from __future__ import annotations
 
 import hashlib
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import ceil, log2, pi
@@ -23,38 +22,33 @@ from daq.config.import_description import (
     PositionUnit,
     ScaledColumns,
     Side,
-    TemperatureColumns,
     VelocityUnit,
     load_import,
 )
-from daq.errors import ConfigurationInconsistent, PositionImplausible, TableUnfit
+from daq.errors import ConfigurationInconsistent, TableUnfit
 from daq.log.conversion import check_limits, scaling, unwrapped
 from daq.log.formats import reader_of, with_columns
 from daq.log.metadata import AxisReadback, Readback, RunInfo, RunStatistics, Timing
-from daq.log.resampling import Clock, clock_of
+from daq.log.plausibility import (
+    LARGEST_RAW,
+    check_counts,
+    check_current,
+    check_motion,
+    check_sizes,
+    check_speed,
+    check_steps,
+    check_velocity,
+)
+from daq.log.resampling import Clock, clock_of, on_clock
 from daq.log.table import Table
 from daq.log.writer import NOTHING_KEPT, LogContent, LogWriter
 from drivers.stream.sample import Quantity, Sample, SlowReading
 from ident.arrays import FloatArray, IntArray
 from ident.model.bodies import Payload
 
-_LOG = logging.getLogger("drivegain")
-LARGEST_RAW = 2**31 - 1
-SMALLEST_MOTION = 0.02  #: Smallest motion of at least one joint, as a share of its range
-LARGEST_OUTLIER = 1000.0
-"""Largest current, in multiples of the 99th percentile of its column; a real peak is some ten times that."""
-SPEED_MARGIN = 3.0
-"""Largest speed, in multiples of the joint's velocity limit, which is often a guess; a wrong rate is off by more."""
-SPEED_PERCENTILE = 99.9
-"""Percentile of a run's speeds that is compared with the limit: a few outliers do not mean a wrong rate."""
-SLOW_SHARE = 0.1
-"""Share of the velocity limits; if no joint is ever faster, the real rate may be ten times the declared one."""
+FEWEST_ROWS = 3  #: Rows of a recording; fewer have neither a rate nor a motion
 TORQUE_HZ, TEMPERATURE_HZ = 20.0, 1.0
 """Rates at which the controller's own torque and temperatures are kept: enough for a slope and for a warm-up."""
-LARGEST_NUMBER = 1e12  #: Of a position, speed, current or torque in any unit
-TEMPERATURES_C = (-60.0, 250.0)  #: Of a drive or a motor; kelvin above -23 °C are more
-VELOCITY_WINDOW_S = 0.1  #: Time over which the ways by velocities and by positions are compared
-STILL = 1e-3  #: Difference of speed that is no contradiction, as a share of the velocity limit
 UNIX_NS = range(10**18, 3 * 10**18)  #: Stamps from 2001 to 2065 are since 1970; any others since some start
 LATEST_NS = 9 * 10**18  #: The latest stamp that a log holds, roughly
 
@@ -91,13 +85,13 @@ def import_recording(
     wanted = with_columns(wanted, data, cell.axis_names)
     _check_cell(wanted, cell, description)
     files = _read_tables(wanted, data)
-    _check_sizes(wanted, cell, files)
+    check_sizes(wanted, cell, files)
     table = files[wanted.position.file]
     position = table.take(wanted.position.columns)
     current = files[wanted.current.file].take(wanted.current.columns)
-    _check_current(current, wanted, files[wanted.current.file])
+    check_current(current, wanted, files[wanted.current.file])
     if wanted.position.unit is PositionUnit.COUNTS:
-        _check_counts(position, wanted, table)
+        check_counts(position, wanted, table)
     clock = _clock(wanted, files)
     rate_hz = wanted.rate_hz if clock is None else clock.timing.rate_hz
     assert rate_hz is not None  # load_import requires one of the two
@@ -105,7 +99,7 @@ def import_recording(
         position = position[clock.row]
     counts, count_rad = _counts(wanted, cell, position, clock)
     factors = wanted.current.factors(cell.axis_names)
-    raw, unit = quantise(_on_clock(current, clock) * np.array(factors))
+    raw, unit = quantise(on_clock(current, clock) * np.array(factors))
     readback = Readback(
         tuple(
             AxisReadback(axis.name, float(unit[i]), None if count_rad is None else float(count_rad[i]))
@@ -116,9 +110,10 @@ def import_recording(
     # As a fit reads them: the log keeps an encoder's counts as the counter had them, with its wraps.
     joint_rad = scale.joint_position(unwrapped(counts.astype(np.int32)) if count_rad is None else counts)
     check_limits(str(table.path), joint_rad, cell)
-    _check_motion(str(table.path), joint_rad, cell)
-    _check_speed(str(table.path), joint_rad, rate_hz, cell)
-    _check_velocity(wanted, cell, files, clock, joint_rad, rate_hz)
+    check_motion(str(table.path), joint_rad, cell)
+    check_steps(wanted, table, joint_rad, rate_hz, clock, cell)
+    check_speed(str(table.path), joint_rad, rate_hz, cell)
+    check_velocity(wanted, cell, files, clock, joint_rad, rate_hz)
     digests = {name: file.digest for name, file in files.items()}
     slow = _slow(wanted, cell, files, clock)
     started_ns, started_wall_ns, timing = _start(wanted, files, clock)
@@ -165,6 +160,14 @@ def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
             expected="as many in each",
             remedy="one of them ends early, or they are of different runs; export them again",
         )
+    position = tables[wanted.position.file]
+    if len(position.values) < FEWEST_ROWS:
+        raise TableUnfit(
+            str(position.path),
+            found=f"{len(position.values)} rows of numbers",
+            expected="a row for each sample of a motion",
+            remedy="was the export interrupted? export the recording again",
+        )
     return tables
 
 
@@ -173,11 +176,6 @@ def _clock(wanted: ImportDescription, files: dict[str, Table]) -> Clock | None:
     if wanted.time is None:
         return None
     return clock_of(files[wanted.time.file], wanted.time, np.hstack([file.values for file in files.values()]))
-
-
-def _on_clock(values: FloatArray, clock: Clock | None) -> FloatArray:
-    """Move columns of the file, shape (rows, n), to the samples of the log, shape (k, n)."""
-    return values if clock is None else clock.currents(values[clock.row])
 
 
 def _slow(
@@ -189,12 +187,12 @@ def _slow(
     found = []
     if (torque := wanted.torque) is not None:
         factors = np.array(torque.factors(cell.axis_names))
-        values = _on_clock(files[torque.file].take(torque.columns), clock) * factors
+        values = on_clock(files[torque.file].take(torque.columns), clock) * factors
         if torque.side is Side.JOINT:
             values = values @ np.linalg.inv(cell.ratio)  # τ_joint = Rᵀ τ_motor (eq. 24)
         found.append((Quantity.TORQUE, max(1, round(rate_hz / TORQUE_HZ)), values))
     if (temperature := wanted.temperature) is not None:
-        values = _on_clock(files[temperature.file].take(temperature.columns), clock)
+        values = on_clock(files[temperature.file].take(temperature.columns), clock)
         found.append((Quantity.TEMPERATURE, max(1, round(rate_hz / TEMPERATURE_HZ)), values))
     return found
 
@@ -244,40 +242,6 @@ def quantise(values: FloatArray) -> tuple[IntArray, FloatArray]:
     exponent = [ceil(log2(top / LARGEST_RAW)) if top > 1e-200 else -30 for top in largest.tolist()]
     quantum = np.ldexp(1.0, np.array(exponent))
     return np.rint(values / quantum).astype(np.int64), quantum
-
-
-def _check_sizes(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) -> None:
-    """Refuse numbers that no robot has in any unit: the file is damaged, or a column is another."""
-    for key, section in wanted.sections():
-        table, size = files[section.file], LARGEST_NUMBER
-        values, least, largest = table.take(section.columns), -size, size
-        if isinstance(section, TemperatureColumns):
-            least, largest = TEMPERATURES_C
-        if isinstance(section, ScaledColumns):
-            with np.errstate(over="ignore"):
-                values = values * np.array(section.factors(cell.axis_names))
-        wrong = np.argwhere(~((least <= values) & (values <= largest)))
-        if wrong.size:
-            row, column = wrong[0].tolist()
-            raise TableUnfit(
-                table.place(row, section.columns[column]),
-                found=f"{values[row, column]:g}, as {key}",
-                expected=f"from {least:g} to {largest:g}",
-                remedy="correct the number, or the columns or the factor of that section in the import description",
-            )
-
-
-def _check_counts(position: FloatArray, wanted: ImportDescription, file: Table) -> None:
-    """Refuse counts that are no whole numbers of 32 bits."""
-    wrong = np.argwhere((position != np.rint(position)) | (np.abs(position) > LARGEST_RAW))
-    if wrong.size:
-        row, column = wrong[0].tolist()
-        raise TableUnfit(
-            file.place(row, wanted.position.columns[column]),
-            found=f"{position[row, column]!r}",
-            expected="a whole number of encoder counts of at most 31 bits",
-            remedy="correct `unit` in the import description",
-        )
 
 
 def _counts(
@@ -362,100 +326,3 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
                 remedy="correct the unit; convert the columns of the file to it",
             )
     _payload(wanted, cell)
-
-
-def _check_velocity(
-    wanted: ImportDescription,
-    cell: Cell,
-    files: dict[str, Table],
-    clock: Clock | None,
-    joint_rad: FloatArray,
-    rate_hz: float,
-) -> None:
-    """Compare velocity columns with the positions, by the way moved in VELOCITY_WINDOW_S: it needs no derivative."""
-    if (velocity := wanted.velocity) is None:
-        return
-    stated = _on_clock(files[velocity.file].take(velocity.columns), clock)
-    if velocity.unit in {VelocityUnit.DEG, VelocityUnit.MM}:
-        units = [axis.unit.si if velocity.side is Side.JOINT else pi / 180.0 for axis in cell.axes]
-        stated = stated * np.array(units)
-    if velocity.side is Side.MOTOR:
-        stated = stated @ np.linalg.inv(cell.ratio).T
-    step = min(max(1, round(VELOCITY_WINDOW_S * rate_hz)), len(stated) - 1)
-    summed = np.cumsum(0.5 * (stated[1:] + stated[:-1]) / rate_hz, axis=0)
-    summed = np.vstack((np.zeros_like(stated[:1]), summed))
-    expected, moved = (values[step:] - values[:-step] for values in (summed, joint_rad))
-    still = np.array([STILL * axis.limits.velocity for axis in cell.axes]) * step / rate_hz
-    error, size = (np.sqrt(np.mean(values**2, axis=0)) for values in (expected - moved, moved))
-    for index in np.flatnonzero(error > velocity.tolerance * size + still).tolist():
-        way, stated_way = moved[:, index], expected[:, index]
-        ratio = float(way @ stated_way) / max(float(stated_way @ stated_way), 1e-300)
-        raise TableUnfit(
-            f"{files[velocity.file].path}, column {velocity.columns[index]}, axis {cell.axes[index].name}",
-            found=f"positions that move {ratio:.3g} times as fast as this velocity says, and differ from it by "
-            f"{100.0 * float(error[index]) / max(float(size[index]), 1e-300):.3g} %",
-            expected=f"velocities that agree with the positions to {100.0 * velocity.tolerance:g} %",
-            remedy="check `unit` and `side` of both, the order of their columns, and the rate or the unit of the time; "
-            "or leave `velocity` out",
-        )
-
-
-def _check_current(current: FloatArray, wanted: ImportDescription, file: Table) -> None:
-    """Refuse outliers: one absurd number would make the count of its column so coarse that the others become zero."""
-    size = np.abs(current)
-    usual = np.percentile(size, 99.0, axis=0)
-    for index, column in enumerate(wanted.current.columns):
-        row = int(np.argmax(size[:, index]))
-        if size[row, index] == 0.0:
-            raise TableUnfit(
-                f"{file.path}, column {column}",
-                found="zero in every row",
-                expected="the current reference of a motor that moves",
-                remedy="is the channel connected, and the column the right one?",
-            )
-        if size[row, index] > LARGEST_OUTLIER * max(usual[index], 1e-200):
-            raise TableUnfit(
-                file.place(row, column),
-                found=f"{current[row, index]:.6g}, while 99 % of the column are within {usual[index]:.3g}",
-                expected="a current",
-                remedy="samples are never invented: cut the recording there, or export it again",
-            )
-
-
-def _check_speed(name: str, joint_rad: FloatArray, rate_hz: float, cell: Cell) -> None:
-    """Refuse implausible speeds. A wrong rate scales them all; over many samples they are far above the noise."""
-    step = max(1, min(round(0.1 * rate_hz), len(joint_rad) // 10))
-    speeds = np.abs(joint_rad[step:] - joint_rad[:-step]) * rate_hz / step
-    fastest = np.percentile(speeds, SPEED_PERCENTILE, axis=0)
-    limits = np.array([axis.limits.velocity for axis in cell.axes])
-    for axis, speed, limit in zip(cell.axes, fastest.tolist(), limits.tolist(), strict=True):
-        if speed > SPEED_MARGIN * limit:
-            raise TableUnfit(
-                f"{name}, axis {axis.name}",
-                found=f"{axis.unit.spell(speed)}/s over {step} samples at {rate_hz:g} Hz",
-                expected=f"at most {axis.unit.spell(limit)}/s, the limit in the cell configuration",
-                remedy="most likely rate_hz is too high, or the unit of the time column or of the positions is another",
-            )
-    share = float((fastest / limits).max())
-    if share < SLOW_SHARE:
-        _LOG.warning(
-            "warning: %s: at %g Hz no joint is faster than %.2g %% of its velocity limit; is the rate of the recording "
-            "right? A rate that is too low falsifies inertias without any other sign, and moves that slow do not "
-            "identify them.",
-            name,
-            rate_hz,
-            100.0 * share,
-        )
-
-
-def _check_motion(name: str, joint_rad: FloatArray, cell: Cell) -> None:
-    """Refuse runs without motion: radians taken for degrees shrink it 57 times, which limits do not reveal."""
-    ranges = [axis.limits.position[1] - axis.limits.position[0] for axis in cell.axes]
-    share = np.ptp(joint_rad, axis=0) / np.array(ranges)
-    if share.max() < SMALLEST_MOTION:
-        raise PositionImplausible(
-            name,
-            found=f"motion over at most {100.0 * share.max():.2g} % of any joint's range",
-            expected=f"at least {100.0 * SMALLEST_MOTION:g} % on one joint",
-            remedy="most likely radians were taken for degrees, or joint for motor side; correct the description",
-        )

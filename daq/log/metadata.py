@@ -20,11 +20,14 @@ RUN, STATISTICS, READBACK = "drivegain.run", "drivegain.statistics", "readback.j
 """Names of two metadata records and an attachment."""
 RECORDED = "recorded"  #: Origin of a log that is no import; `salvage` adds to it
 LARGEST_COUNT = 2**64  #: Largest number of cycles, which are uint64 in the log
+CLOCK_NS = range(-(2**63), 2**63)  #: Times and differences of clocks, which are int64 [ns]
+RATES_HZ = (1e-3, 1e6)  #: Slowest and fastest sampling rate
 VERSION = "1"  #: Version of the log contract; a reader refuses any other
 SEAL = "crc32"  #: Entry with the checksum of the others. Outside chunks, a log without its end has no other checksum.
 
 
 _Count = Annotated[int, Field(ge=0, le=LARGEST_COUNT)]
+_Clock = Annotated[int, Field(ge=CLOCK_NS.start, lt=CLOCK_NS.stop)]
 
 
 class Role(Enum):
@@ -97,7 +100,7 @@ class RunStatistics:
     partial: bool = False  #: the log was salvaged from a recording that was never finished
     #: Difference of the two clocks at the end [ns]; compared with the start it reveals a changed wall clock. None in
     #: salvaged and imported logs.
-    wall_minus_monotonic_ns: int | None = None
+    wall_minus_monotonic_ns: _Clock | None = None
 
 
 class Loss(Enum):
@@ -163,7 +166,7 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
         ValueError: an entry is invalid.
     """
     if record["version"] != VERSION:
-        raise ValueError(f"version {record['version']!r} of the log contract; this software reads {VERSION}")
+        raise ValueError(f"version {record['version']!r:.40} of the log contract; this software reads {VERSION}")
     payload = None
     if Role(record["role"]) is Role.LOADED:
         known = _validated(dict[str, FiniteFloat], record["payload_known"])
@@ -171,17 +174,17 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
             raise ValueError(f"known payload {record['payload_known']!r:.80}: expected parameters with a mass above 0")
         payload = Payload(record["payload"], record["mounting"], known)
     rate_hz = float(record["rate_hz"])
-    if not 0.0 < rate_hz < 1e6:
-        raise ValueError(f"sampling rate {record['rate_hz']!r}")
+    if not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
+        raise ValueError(f"sampling rate {record['rate_hz']!r:.40}")
     speed = float(record.get("speed", "1"))
     if not 0.0 < speed <= 1.0:
-        raise ValueError(f"share of the plan's speed {record['speed']!r}")
+        raise ValueError(f"share of the plan's speed {record['speed']!r:.40}")
     entered = record.get("payload_entered_kg", "")
     if entered and not 0.0 < float(entered) < math.inf:
         raise ValueError(f"mass of the payload as entered {entered!r:.40}")
-    wall_ns = int(record["started_wall_ns"])
-    if not 0 <= wall_ns < 2**63:
-        raise ValueError(f"start time {record['started_wall_ns']!r}")
+    wall_ns, monotonic_ns = int(record["started_wall_ns"]), int(record["started_monotonic_ns"])
+    if wall_ns < 0 or wall_ns not in CLOCK_NS or monotonic_ns not in CLOCK_NS:
+        raise ValueError(f"start times {record['started_wall_ns']!r:.40}, {record['started_monotonic_ns']!r:.40}")
     return RunInfo(
         run_id=record["run_id"],
         rate_hz=rate_hz,
@@ -189,7 +192,7 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
         operator=record["operator"],
         software=record["software"],
         started_wall_ns=wall_ns,
-        started_monotonic_ns=int(record["started_monotonic_ns"]),
+        started_monotonic_ns=monotonic_ns,
         origin=record["origin"],
         speed=speed,
         entered_kg=float(entered) if entered else None,

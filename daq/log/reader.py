@@ -11,10 +11,11 @@ import numpy as np
 from mcap.records import Attachment, Chunk, Header, McapRecord, Metadata
 from numpy.typing import NDArray
 
-from daq.errors import LogIncomplete, LogMissing, LogUnreadable
+from daq.config.yaml_file import MAX_BYTES
+from daq.errors import ClockImplausible, CyclesLost, DataError, LogIncomplete, LogMissing, LogUnreadable
 from daq.log.bag_table import foreign_recording
 from daq.log.container import UNFINISHED, ChunkContents, RecordFile
-from daq.log.message import ENCAPSULATION_WORD, SAMPLES_TOPIC
+from daq.log.message import ENCAPSULATION_WORD, LARGEST_AXES, SAMPLES_TOPIC
 from daq.log.metadata import (
     READBACK,
     RUN,
@@ -31,6 +32,11 @@ from daq.log.metadata import (
 from drivers.stream.sample import CellEvent, SlowReading
 
 BLOCK_SAMPLES = 4096  #: Samples of a block; at most these and one chunk are in memory
+LARGEST_ENTRIES = 1000  #: Attachments and metadata of a log; those of the shipped cells are a dozen
+LARGEST_METADATA = 2**20  #: Characters of one metadata record; ours have a few hundred
+STEP_TOLERANCE = 0.5
+"""Largest deviation of a time step, as a share of the period. From half a period on it could be another cycle."""
+RATE_TOLERANCE = 0.01  #: Largest relative difference between the requested rate and that of the time stamps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,8 +84,130 @@ class Log:
     partial: bool
 
 
+class SampleChecks:
+    """Counts, cycles and time steps of a log's samples, block by block in bounded memory."""
+
+    def __init__(self, path: Path) -> None:
+        """Store the path, for messages."""
+        self.samples = 0  #: number of samples
+        self.lost_cycles = 0  #: cycles missing between them
+        self.missing = np.zeros(LARGEST_AXES, dtype=np.int64)  #: samples without an answer, for each axis
+        self.widths: set[int] = set()  #: numbers of axes of the samples
+        self._path = path
+        self._highest = np.zeros(0, dtype=np.uint64)
+        self._last = np.zeros(0, dtype=np.uint64), np.zeros(0, dtype=np.int64)
+        self._first_ns = 0
+        self._gaps, self._first_gap = 0, ""
+        self._steps: dict[int, str] = {}  # the shortest and the longest [ns], with their cycles
+
+    def take(self, block: SampleBlock) -> None:
+        """Count the next samples."""
+        if not len(block.cycle):
+            return
+        if not self.samples:
+            self._first_ns = int(block.time_ns[0])
+        self.samples += len(block.cycle)
+        self.widths.add(block.position_counts.shape[1])
+        if (missing := block.missing[block.missing != 0]).size:
+            self.missing += [np.count_nonzero(missing >> np.uint32(axis) & 1) for axis in range(LARGEST_AXES)]
+        highest = np.maximum.accumulate(np.concatenate((self._highest, block.cycle)))
+        advance = np.diff(highest)
+        self.lost_cycles += sum(advance[advance > 1].tolist()) - int(np.count_nonzero(advance > 1))
+        self._highest = highest[-1:]
+        cycle, time_ns = (np.concatenate(pair) for pair in zip(self._last, (block.cycle, block.time_ns), strict=True))
+        self._last = cycle[-1:], time_ns[-1:]
+        if len(cycle) < 2:
+            return
+        gaps = np.flatnonzero(np.diff(cycle) != 1)
+        if gaps.size and not self._gaps:
+            self._first_gap = f"cycle {cycle[gaps[0] + 1]} after {cycle[gaps[0]]}"
+        self._gaps += gaps.size
+        step_ns = np.diff(time_ns)
+        for place in (int(np.argmin(step_ns)), int(np.argmax(step_ns))):
+            self._steps.setdefault(int(step_ns[place]), f"cycle {cycle[place + 1]} {{}} after cycle {cycle[place]}")
+        self._steps = {step: self._steps[step] for step in (min(self._steps), max(self._steps))}
+
+    def contradiction(
+        self, head: LogHead, statistics: RunStatistics, readings: Iterable[SlowReading]
+    ) -> LogIncomplete | None:
+        """Return the error for a log whose parts contradict each other; None for a sound one, lossy or not."""
+        axes = len(head.readback.axes)
+        missing = tuple(self.missing[:axes].tolist())
+        widths = ", ".join(map(str, sorted(self.widths)))
+        foreign = max((reading.axis for reading in readings if reading.axis >= axes), default=None)
+        pairs = (
+            (self.samples > 0, "no samples", f"some on {SAMPLES_TOPIC}"),
+            (self.widths <= {axes}, f"samples of {widths} axes", f"{axes}, as in its readback"),
+            (
+                foreign is None,
+                f"a torque or temperature of axis {foreign}, counted from 0",
+                f"those of {axes} axes, as in its readback",
+            ),
+            (
+                self.samples == statistics.samples,
+                f"{self.samples} samples",
+                f"{statistics.samples}, as its recorder counted",
+            ),
+            (
+                self.lost_cycles == statistics.lost_cycles,
+                f"{self.lost_cycles} lost cycles",
+                f"{statistics.lost_cycles}, as its recorder counted",
+            ),
+            (len(statistics.missing) == axes, f"losses of {len(statistics.missing)} axes", f"{axes}"),
+            (
+                missing == statistics.missing,
+                f"{list(missing)} missing answers of its axes",
+                f"{list(statistics.missing)}, as its recorder counted",
+            ),
+        )
+        for agrees, found, expected in pairs:
+            if not agrees:
+                remedy = "another tool may have cut or changed the log; take the original, or record again"
+                return LogIncomplete(str(self._path), found=found, expected=expected, remedy=remedy)
+        return None
+
+    def fault(self, rate_hz: float) -> DataError | None:
+        """Return why no fit takes these samples: lost or repeated cycles, uneven time steps, another rate."""
+        path = str(self._path)
+        if self.samples < 2:
+            return CyclesLost(path, found="one sample", expected="a run", remedy="record it again")
+        if self._gaps:
+            return CyclesLost(
+                path,
+                found=f"{self._first_gap} ({self._gaps} gaps)",
+                expected="every SYNC cycle once",
+                remedy="record again with less load on the bus and the computer; lost cycles are never interpolated",
+            )
+        period_ns = 1e9 / rate_hz
+        step_ns = max(self._steps, key=lambda step_ns: abs(step_ns - period_ns))
+        # Central differences assume evenly spaced samples.
+        if abs(step_ns - period_ns) > STEP_TOLERANCE * period_ns:
+            return ClockImplausible(
+                path,
+                found=f"{self._steps[step_ns].format(f'{step_ns * 1e-6:.4g} ms')}, its most uneven step",
+                expected=f"{period_ns * 1e-6:.4g} ms, give or take {100.0 * STEP_TOLERANCE:g} %",
+                remedy="SYNC came late: record again with less load on the computer, or with a longer sync.period_us",
+            )
+        stamped_hz = (self.samples - 1) * 1e9 / (int(self._last[1][0]) - self._first_ns)
+        if abs(stamped_hz / rate_hz - 1.0) > RATE_TOLERANCE:
+            return ClockImplausible(
+                path,
+                found=f"time stamps at {stamped_hz:.6g} Hz",
+                expected=f"{rate_hz:.6g} Hz, as requested",
+                remedy="was the computer's clock set during the run? record it again",
+            )
+        return None
+
+    def verdict(self, rate_hz: float, statistics: RunStatistics) -> tuple[bool, str]:
+        """Return whether the run is valid by its recorder and by its samples, and why not."""
+        fault = self.fault(rate_hz) if statistics.valid else None
+        return (statistics.valid, statistics.reason) if fault is None else (False, fault.found)
+
+
 class LogReader:
     """Read a log once in bounded memory: iterate over blocks, then use the other properties.
+
+    Every verb reads logs here, so all refuse the same ones: damaged ones, and those whose parts contradict each other.
 
     Raises (while iterating):
         LogUnreadable: one of its kinds, with the place in the file.
@@ -93,11 +221,15 @@ class LogReader:
         self._chunks = ChunkContents(self._file)
         self._attachments: dict[str, bytes] = {}
         self._metadata: dict[str, dict[str, str]] = {}
+        self.checks = SampleChecks(path)  #: of the samples read so far
 
     def __iter__(self) -> Iterator[SampleBlock]:
         """Yield blocks of samples; events are collected meanwhile."""
         try:
             yield from self._blocks(self._file)
+            contradiction = self.contradiction
+            if contradiction is not None:
+                raise contradiction
         except LogUnreadable as error:
             foreign = foreign_recording(self.path)
             if foreign is None:
@@ -116,6 +248,15 @@ class LogReader:
             raise
         except LogUnreadable as damage:
             self.damage = foreign_recording(self.path) or damage
+
+    @property
+    def contradiction(self) -> LogIncomplete | None:
+        """Error for a log whose samples contradict its recorder's counts or its readback; after the iteration.
+
+        Raises:
+            LogIncomplete: the counts or the readback are missing.
+        """
+        return self.checks.contradiction(self.head, self.statistics, self.readings)
 
     @property
     def events(self) -> list[CellEvent]:
@@ -164,6 +305,8 @@ class LogReader:
 
     def _sample_chunks(self, records: Iterable[tuple[int, McapRecord]]) -> Iterator[tuple[int, NDArray[np.void]]]:
         for offset, record in records:
+            if isinstance(record, Attachment | Metadata):
+                self._check_entry(offset, record)
             if isinstance(record, Attachment):
                 self._attachments[record.name] = record.data
             elif isinstance(record, Metadata):
@@ -178,6 +321,22 @@ class LogReader:
                 yield from self._chunks.samples(offset, self._file.unpack(offset, record))
             else:
                 self._chunks.define(record)
+
+    def _check_entry(self, offset: int, record: Attachment | Metadata) -> None:
+        """Refuse a second record of a name, of which a reader could take either, and more than a log ever has."""
+        known: Mapping[str, object] = self._attachments
+        kind, size, largest = "attachment", 0, MAX_BYTES
+        if isinstance(record, Attachment):
+            size = len(record.data)
+        else:
+            known, kind, largest = self._metadata, "metadata", LARGEST_METADATA
+            size = sum(len(key) + len(value) for key, value in record.metadata.items())
+        if record.name in known:
+            raise self._file.corrupt(offset, f"a second {kind} {record.name!r:.80}", "one of each name")
+        if len(self._attachments) + len(self._metadata) >= LARGEST_ENTRIES:
+            raise self._file.corrupt(offset, f"more than {LARGEST_ENTRIES} attachments and metadata", "a log of a cell")
+        if size > largest:
+            raise self._file.corrupt(offset, f"{kind} {record.name!r:.80} of {size} bytes", f"at most {largest}")
 
     @property
     def digest(self) -> str:
@@ -227,7 +386,7 @@ class LogReader:
             raise self._file.corrupt(offset, "samples of another layout", f"little-endian CDR of {axes} axes")
         if (records["seconds"] < 0).any() or (records["nanoseconds"] >= 1_000_000_000).any():
             raise self._file.corrupt(offset, "samples from before 1970 or of a second that is too long", "Unix time")
-        return SampleBlock(
+        block = SampleBlock(
             cycle=records["cycle"].astype(np.uint64),
             time_ns=records["seconds"].astype(np.int64) * 1_000_000_000 + records["nanoseconds"],
             position_counts=records["position_counts"].astype(np.int32),
@@ -235,6 +394,8 @@ class LogReader:
             statusword=records["statusword"].astype(np.uint16),
             missing=records["missing"].astype(np.uint32),
         )
+        self.checks.take(block)
+        return block
 
     def _incomplete(self, error: Exception, expected: str) -> LogIncomplete:
         found = f"none ({error.args[0]!r})" if isinstance(error, KeyError) else str(error)
@@ -253,34 +414,6 @@ def read_log(path: Path | str) -> Log:
     reader = LogReader(path)
     blocks = list(reader)
     head, statistics = reader.head, reader.statistics
-    if not blocks:
-        raise LogIncomplete(
-            str(path), found="no samples", expected=f"some on {SAMPLES_TOPIC}", remedy="record or import the run again"
-        )
-    axes = len(head.readback.axes)
-    widths = {block.position_counts.shape[1] for block in blocks}
-    if widths != {axes}:
-        raise LogIncomplete(
-            str(path),
-            found=f"samples of {', '.join(map(str, sorted(widths)))} axes",
-            expected=f"{axes}, as in its readback",
-            remedy="record or import the run again",
-        )
-    if foreign := {reading.axis for reading in reader.readings} - set(range(axes)):
-        raise LogIncomplete(
-            str(path),
-            found=f"a torque or temperature of axis {max(foreign)}, counted from 0",
-            expected=f"those of {axes} axes, as in its readback",
-            remedy="record or import the run again",
-        )
-    count = sum(len(block.cycle) for block in blocks)
-    if count != statistics.samples:
-        raise LogIncomplete(
-            str(path),
-            found=f"{count} samples",
-            expected=f"{statistics.samples}, as its recorder counted",
-            remedy="another tool may have cut the log; take the original",
-        )
     columns = {name: [getattr(block, name) for block in blocks] for name in SampleBlock.__slots__}
     blocks.clear()  # so that a long log is not in memory twice
     samples = SampleBlock(**{name: np.concatenate(columns.pop(name)) for name in SampleBlock.__slots__})

@@ -22,6 +22,10 @@ EVEN = 1e-3  #: Largest distance of a stamp from a uniform clock that leaves the
 COARSE = 1.5  #: Spread of the rounded stamps of a uniform clock [units of their last digit]: 1, and what the fit adds
 NEAR = 0.25  #: Steps this near to whole numbers of the usual one mean that samples are missing, not late [usual steps]
 CLOSEST = 0.1  #: Shortest step between two samples [usual steps]; a spline through closer ones amplifies their noise
+RATE_CHANGE, RATE_NOISE = 0.1, 6.0
+"""Largest change of the rate within a recording, beyond so many deviations of what jitter does to the mean of a window.
+A controller samples at one rate: stamps of another are of a clock that drifts, and scale velocities and inertias."""
+RATE_WINDOWS, SHORTEST_WINDOW = 20, 50  #: Windows of a recording, and the fewest steps of one
 SLOWEST, QUICKEST = 0.5, 2.0
 """Rates that may be stated, in multiples of the data's: far below, noise folds into the band of the motion."""
 
@@ -48,6 +52,11 @@ class Clock:
         return np.column_stack([np.interp(self.tick_s, self.time_s, column) for column in values.T])
 
 
+def on_clock(values: FloatArray, clock: Clock | None) -> FloatArray:
+    """Move columns of the file, shape (rows, n), to the samples of the log, shape (k, n)."""
+    return values if clock is None else clock.currents(values[clock.row])
+
+
 def clock_of(table: Table, wanted: TimeColumn, numbers: FloatArray) -> Clock:
     """Return the clock of a recording.
 
@@ -60,7 +69,8 @@ def clock_of(table: Table, wanted: TimeColumn, numbers: FloatArray) -> Clock:
 
     Raises:
         TableUnfit: a stamp is earlier than the one before, or repeats it with other numbers; a step is longer than
-            `largest_gap_periods`; or the stated rate is far from that of the stamps.
+            `largest_gap_periods`; the rate changes by more than RATE_CHANGE; or the stated rate is far from that of
+            the stamps.
     """
     assert table.stamps is not None  # its reader was asked for them
     row = np.flatnonzero(_distinct(table, wanted, numbers))
@@ -78,6 +88,7 @@ def clock_of(table: Table, wanted: TimeColumn, numbers: FloatArray) -> Clock:
         )
     timing = replace(check_stamps(time_s), rows=len(numbers), duplicates=duplicates, close=int(np.count_nonzero(~far)))
     _check_gaps(table, wanted, row, time_s, timing)
+    _check_rate(table, wanted, time_s)
     if wanted.rate_hz is not None:
         timing = _at_rate(table, wanted, wanted.rate_hz, time_s, timing)
     tick_s = np.arange(int(time_s[-1] * timing.rate_hz + EVEN) + 1) / timing.rate_hz
@@ -95,10 +106,7 @@ def check_stamps(time_s: FloatArray) -> Timing:
         rate.
     """
     step_s = np.diff(time_s)
-    usual_s = float(np.median(step_s))
-    periods = np.rint(step_s / usual_s)
-    if not np.all((periods >= 1.0) & (np.abs(step_s / usual_s - periods) < NEAR)):
-        periods = np.ones_like(step_s)
+    periods, usual_s = _periods(step_s)
     rate_hz = float(periods.sum() / time_s[-1])
     missing = round(float(periods.sum())) - len(step_s)
     clock_s = np.concatenate(([0.0], np.cumsum(periods))) / rate_hz
@@ -112,6 +120,35 @@ def check_stamps(time_s: FloatArray) -> Timing:
         missing=missing,
         resampled=missing > 0 or not _is_uniform(time_s),
     )
+
+
+def _periods(step_s: FloatArray) -> tuple[FloatArray, float]:
+    """Return each step in usual steps, shape (k,), all ones where they are not nearly whole; and the usual step [s]."""
+    usual_s = float(np.median(step_s))
+    periods = np.rint(step_s / usual_s)
+    whole = np.all((periods >= 1.0) & (np.abs(step_s / usual_s - periods) < NEAR))
+    return periods if whole else np.ones_like(step_s), usual_s
+
+
+def _check_rate(table: Table, wanted: TimeColumn, time_s: FloatArray) -> None:
+    """Refuse stamps whose rate drifts or jumps; jitter and missing samples leave its mean over a window alone."""
+    step_s = np.diff(time_s)
+    period_s = step_s / _periods(step_s)[0]
+    width = max(SHORTEST_WINDOW, len(period_s) // RATE_WINDOWS)
+    count = len(period_s) // width
+    if count < 2:
+        return
+    windows = period_s[: count * width].reshape(count, width)
+    mean_s = windows.mean(axis=1)
+    noise = RATE_NOISE * float(np.median(windows.std(axis=1))) / (np.sqrt(width) * float(mean_s.mean()))
+    if mean_s.max() / mean_s.min() - 1.0 > RATE_CHANGE + noise:
+        raise TableUnfit(
+            f"{table.path}, column {wanted.column}",
+            found=f"stamps at {1.0 / mean_s.max():.4g} to {1.0 / mean_s.min():.4g} Hz in parts of the recording",
+            expected=f"one rate, to {100.0 * RATE_CHANGE:g} %",
+            remedy="if these are times of arrival, give rate_hz instead of time; else import the parts of one rate as "
+            "recordings of their own",
+        )
 
 
 def _is_uniform(time_s: FloatArray) -> bool:

@@ -113,7 +113,15 @@ def _copy(
         for event in reader.events[known_events:]:
             log.event(event)
         known_events = len(reader.events)
-        log.readings(reader.readings[known_readings:])
+        fresh = reader.readings[known_readings:]
+        if foreign := {reading.axis for reading in fresh if reading.axis >= axes}:
+            raise LogIncomplete(
+                str(reader.path),
+                found=f"a torque or temperature of axis {max(foreign)}, counted from 0",
+                expected=f"those of {axes} axes, as in its cell configuration",
+                remedy="it is not a recording of this software",
+            )
+        log.readings(fresh)
         known_readings = len(reader.readings)
         columns = (getattr(block, name).tolist() for name in SampleBlock.__slots__)
         for cycle, time_ns, position, current, statusword, missing in zip(*columns, strict=True):
@@ -123,14 +131,16 @@ def _copy(
         log.event(event)
     log.readings(reader.readings[known_readings:])
     if reader.concluded:
-        valid, reason = reader.statistics.valid, reader.statistics.reason
+        contradiction = reader.contradiction
+        found = [] if contradiction is None else [f"{contradiction.found}; expected {contradiction.expected}"]
+        found = [reader.statistics.reason or "no reason given"] if not reader.statistics.valid else found
     else:  # no verdict of the recorder: that of the losses and faults in samples and events
         counted = log.statistics
         found = [f"{counted.lost_cycles} cycles lost"] if counted.lost_cycles else []
         found += [f"{sum(counted.missing)} missing answers"] if any(counted.missing) else []
         found += [f"{event.kind.value} ({event.text})" for event in reader.events if event.kind not in _HARMLESS][:3]
-        valid, reason = not found, ", ".join(found)
-    log.conclude(valid, reason, partial=True)
+    judged = RunStatistics(0, 0, (), valid=not found, reason=", ".join(found))
+    log.conclude(*reader.checks.verdict(reader.head.run.rate_hz, judged), partial=True)
 
 
 def _refuse_running(damaged: Path) -> None:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from daq.config.cell import Cell
     from daq.workflow.monitor import WatchedCell
     from drivers.canopen.scan import FoundNode
+    from drivers.profiles.profile import Identity
 
 
 def scan_view(
@@ -32,9 +33,10 @@ def scan_view(
     """
     yield scan_table(rows)
     for row in rows:
+        name = f"{printable(row['axis'])} (node {row['node_id']})" if row["axis"] else f"node {row['node_id']}"
         if row["enabled"]:
-            name = f"{printable(row['axis'])} (node {row['node_id']})" if row["axis"] else f"node {row['node_id']}"
             yield Text(f"{name} IS ENABLED: its motor has torque and may move at any time.", "bold red")
+        yield from (Text(f"{name}: {printable(remark)}", "yellow") for remark in row["remarks"])
     for name, fault in reset.items():
         yield Text(f"The fault of {printable(name)} was reset; it has no power. It was {printable(fault)}.")
     if any(row["in_fault"] for row in rows):
@@ -49,8 +51,10 @@ def scan_view(
 _IDENTITY = ("vendor_id", "product_code", "serial")
 
 
-def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[str, Any]]:
-    """Rows of the nodes of one bus, configured or found."""
+def scan_rows(
+    cell: Cell, found: tuple[FoundNode, ...], bus: str, misfits: Mapping[str, str] | None = None
+) -> list[dict[str, Any]]:
+    """Rows of the nodes of one bus, configured or found; `misfits` describes objects that a drive lacks, by axis."""
     from drivers.canopen.link import nmt_name  # noqa: PLC0415 - `info` shows currents without the CAN library
 
     homes = {axis.node_id: axis for axis in cell.axes if axis.node_id is not None}
@@ -65,8 +69,13 @@ def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[s
             verdict = "missing"
         elif axis is None:
             verdict = f"belongs on {homes[node_id].bus}" if node_id in homes else "not configured"
+        elif node.shared:
+            verdict = "two devices"
         else:
-            verdict = "ok" if expected is None or expected == identity else "other identity"
+            verdict = _identity_verdict(expected, identity)
+        misfit = "" if axis is None else (misfits or {}).get(axis.name, "")
+        if misfit and verdict == "ok":
+            verdict = "profile does not fit"
         in_fault = node is not None and node.state in FAULTY
         if in_fault:
             verdict = "in fault" if verdict == "ok" else f"{verdict}, in fault"
@@ -82,9 +91,30 @@ def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[s
                 "enabled": None if node is None or node.state is None else node.state in ENABLED,
                 "in_fault": in_fault,
                 "verdict": verdict,
+                "remarks": [*_remarks(node, expected), *([misfit] if misfit else [])],
             }
         )
     return rows
+
+
+def _identity_verdict(expected: Identity | None, found: Identity | None) -> str:
+    if expected is None:
+        return "ok"
+    if found is None:
+        return "no identity"
+    differing = expected.differences(found)
+    return f"other {differing[0].partition(' 1018h')[0]}" if differing else "ok"
+
+
+def _remarks(node: FoundNode | None, expected: Identity | None) -> Iterator[str]:
+    """What is wrong with a node, in words."""
+    if node is None:
+        return
+    if node.shared:
+        yield f"found {node.shared}; two devices have this node id, give one of them another"
+    if expected is not None and node.identity is not None:
+        yield from expected.differences(node.identity)
+    yield from node.problems
 
 
 _POWER = {True: "ENABLED", False: "off", None: "?"}

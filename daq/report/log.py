@@ -12,7 +12,6 @@ from typing import Any
 from rich.text import Text
 
 from daq.config.cell_file import cell_from_bundle
-from daq.errors import LogIncomplete
 from daq.log.conversion import scaling
 from daq.log.metadata import Timing
 from daq.log.reader import LogReader
@@ -28,35 +27,19 @@ def describe_log(path: Path) -> dict[str, Any]:
     """Read everything known of a log, in one pass and bounded memory.
 
     Raises:
-        LogUnreadable: the log cannot be read, or its counts contradict its samples; a fit refuses it too.
+        LogUnreadable: the log cannot be read, or its parts contradict each other.
         ConfigurationError: the cell in it is inconsistent.
     """
     reader = LogReader(path)
-    samples, first_ns, last_ns, widths = 0, None, 0, set[int]()
+    first_ns = last_ns = 0
     for block in reader:
-        samples += len(block.cycle)
-        widths.add(block.position_counts.shape[1])
-        first_ns = int(block.time_ns[0]) if first_ns is None else first_ns
+        first_ns = first_ns or int(block.time_ns[0])
         last_ns = int(block.time_ns[-1])
     head, statistics = reader.head, reader.statistics
     cell = cell_from_bundle(head.files, names={"cell.yaml": f"{path}, cell.yaml"})
-    run = head.run
-    # The checks of `daq.log.reader.read_log` and `daq.log.conversion.scaling` in bounded memory.
     scaling(cell, head.readback)
-    axes = len(cell.axes)
-    pairs = (
-        (f"{samples} samples", samples == statistics.samples, f"{statistics.samples}, as its recorder counted"),
-        (f"samples of {sorted(widths)} axes", widths <= {axes}, f"{axes}, as in its cell configuration"),
-        (f"losses of {len(statistics.missing)} axes", len(statistics.missing) == axes, f"{axes}"),
-    )
-    for found, agrees, expected in pairs:
-        if not agrees:
-            raise LogIncomplete(
-                str(path),
-                found=found,
-                expected=expected,
-                remedy="another tool may have cut or changed the log; take the original",
-            )
+    run, samples = head.run, reader.checks.samples
+    valid, reason = reader.checks.verdict(run.rate_hz, statistics)
     return {
         "log": str(path),
         "sha256": reader.digest,
@@ -70,13 +53,14 @@ def describe_log(path: Path) -> dict[str, Any]:
         **picked(run, "rate_hz", "speed"),
         "samples": samples,
         "duration_s": samples / run.rate_hz,
-        "stamped_duration_s": 0.0 if first_ns is None else (last_ns - first_ns) * 1e-9,
+        "stamped_duration_s": (last_ns - first_ns) * 1e-9,
         "moves": sum(event.kind is EventKind.MOVE_START for event in reader.events),
         "slow_readings": dict(Counter(reading.quantity.value for reading in reader.readings)),
         "lost_cycles": statistics.lost_cycles,
         "missing": dict(zip(cell.axis_names, statistics.missing, strict=True)),
         "partial": reader.partial,
-        **picked(statistics, "valid", "reason"),
+        "valid": valid,
+        "reason": reason,
         "events": [
             {"time_ns": e.time_ns, "axis": e.axis, "kind": e.kind.value, "code": e.code, "text": e.text}
             for e in reader.events

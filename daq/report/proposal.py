@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -152,7 +153,7 @@ def describe_file_rollback(written: Written) -> dict[str, Any]:
 
 
 def _rollback_diff(edit: Edit) -> str:
-    name = terminal_text(edit.place.resolve().name).plain
+    name = terminal_text(Path(edit.subject).name).plain
     before, after = (content.decode(errors="replace").splitlines() for content in (edit.before or b"", edit.after))
     return "\n".join(difflib.unified_diff(before, after, f"{name} (was)", f"{name} (restored)", lineterm="", n=1))
 

@@ -68,6 +68,7 @@ class ScannedNode(StrictModel):
     enabled: bool | None = Field(description="whether the motor has torque")
     in_fault: bool
     verdict: str
+    remarks: list[str] = Field(description="what is wrong with it")
 
 
 class ScanReport(StrictModel):

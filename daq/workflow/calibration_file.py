@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
+from daq.config.cell_schema import CUTOFF_HZ, FILTER_ORDER
 from daq.config.yaml_file import MAX_BYTES, StrictModel, parse_yaml, read_model
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, SchemaMismatch, YamlInvalid
 from daq.files import read_regular, replace_file
@@ -25,18 +26,35 @@ from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Sour
 from ident.errors import Diagnosis
 from ident.estimators.estimate import RelativeError
 
-_Deviation = Annotated[float, Field(ge=0.0)]
+_LARGEST = 1e30  #: Size of a number, in any unit: products of three of them are still finite
+_Number = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST)]
+_Positive = Annotated[float, Field(ge=0.0, le=_LARGEST)]
+_FILTER_BOUNDS = {
+    **dict.fromkeys(("position_cutoff_hz", "decimation_cutoff_hz"), CUTOFF_HZ),
+    "position_order": FILTER_ORDER,
+    "standstill_rad_s": (0.0, 1e6),
+    "standstill_share": (1e-6, 1.0),
+}
+
+
+def _check_filter(found: dict[str, int | float | list[float]]) -> dict[str, int | float | list[float]]:
+    """Check the settings that a filter is made of: one of order 10⁹, or of 10⁻³⁰⁰ Hz, takes all memory."""
+    for name, (least, most) in _FILTER_BOUNDS.items():
+        values = found.get(name, [])
+        if not all(least <= value <= most for value in (values if isinstance(values, list) else [values])):
+            raise ValueError(f"{name} from {least:g} to {most:g}")
+    return found
 
 
 class GainEntry(StrictModel):
     """One drive gain; the percentages are for people."""
 
     axis: str
-    value: float
-    std: _Deviation
+    value: _Number
+    std: _Positive
     std_percent: float | None
     unit: str
-    nameplate: float
+    nameplate: _Number
     change_percent: float | None
 
 
@@ -44,8 +62,8 @@ class ParameterEntry(StrictModel):
     """One dynamic parameter or coefficient of an effect."""
 
     name: str
-    value: float
-    std: _Deviation
+    value: _Number
+    std: _Positive
     std_percent: float | None
     unit: str
 
@@ -53,8 +71,8 @@ class ParameterEntry(StrictModel):
 class RelativeErrorEntry(StrictModel):
     """Relative errors in percent; null for an axis that did not move."""
 
-    axes: tuple[float | None, ...]
-    total: float
+    axes: tuple[_Positive | None, ...]
+    total: _Positive
 
 
 class EffectEntry(StrictModel):
@@ -62,10 +80,10 @@ class EffectEntry(StrictModel):
 
     name: str
     axis: str
-    settings: dict[str, float]
+    settings: dict[str, _Number]
     coefficients: tuple[ParameterEntry, ...]
-    error_before_percent: float
-    error_after_percent: float
+    error_before_percent: _Positive
+    error_after_percent: _Positive
     ambiguity: tuple[str, ...]
 
 
@@ -78,9 +96,9 @@ class CalibrationBody(StrictModel):
     parameters: tuple[ParameterEntry, ...]
     relative_error_percent: RelativeErrorEntry
     holdout_error_percent: RelativeErrorEntry | None
-    condition: float
-    rows: int
-    filter: dict[str, int | float | list[float]]
+    condition: _Positive
+    rows: Annotated[int, Field(ge=0, le=10**15)]
+    filter: Annotated[dict[str, int | float | list[float]], AfterValidator(_check_filter)]
     effects: tuple[EffectEntry, ...]
     sources: tuple[Source, ...]
     configuration_sha256: str
@@ -90,9 +108,9 @@ class CalibrationBody(StrictModel):
     session_began_s: float | None = None
     nameplate_holdout_error_percent: RelativeErrorEntry | None = None
     recording_configuration_sha256: str | None = None
-    covariance_factor: tuple[tuple[float, ...], ...] | None = None
+    covariance_factor: tuple[tuple[_Number, ...], ...] | None = None
     diagnoses: tuple[Diagnosis, ...] = ()
-    current_residual: tuple[float, ...] | None = None
+    current_residual: tuple[_Positive, ...] | None = None
     passive_joints: tuple[str, ...] = ()
 
 

@@ -68,9 +68,9 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     capsules = declared.capsules or guessed_capsules(robot)
     last = robot.carrier
     if not any(capsule.link == last for capsule in capsules):
-        # Around a steel body of that mass on the last link, from a side in front of the joint to three of them.
-        side, axis = side_of_cube(mass_kg), robot.joints[last].axis
-        capsules = (*capsules, Capsule("payload", last, _point(side * axis), _point(2.0 * side * axis), side))
+        # Around a steel body of that mass, from where it is mounted to three of its sides away.
+        side, axis, at = side_of_cube(mass_kg), robot.joints[last].axis, robot.mounting_m
+        capsules = (*capsules, Capsule("payload", last, _point(at + side * axis), _point(at + 2.0 * side * axis), side))
     links = [capsule.link for capsule in capsules]
     parents = [robot.joints[link].parent if link != BASE else None for link in links]
     candidates = tuple(
@@ -297,8 +297,8 @@ STROKES = (1.0, 0.7, 0.4)  #: Shares of the range that are tried until the way i
 def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     """Some five seconds of each kind, within limits and clear of everything; the same every time.
 
-    For every axis: fast with the arm stretched, fast with it folded (as the last link is seen from that axis), slow
-    with it stretched, and fast together with a neighbour; and of all axes together.
+    For every axis: fast with the arm stretched, fast with it folded (as the payload's link is seen from that axis),
+    slow with it stretched, and fast together with a neighbour; and of all axes together.
     """
     cell, checker = experiment.cell, experiment.scene.checker
     lower, upper = np.array([axis.limits.position for axis in cell.axes]).T

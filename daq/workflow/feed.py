@@ -40,6 +40,7 @@ SEND_BUFFER_BYTES = 1 << 20  #: Asked of the kernel, which may give less: second
 EVENTS_KEPT = 200  #: Events that a console gets which comes late
 BACKLOG = 128  #: Clients that may connect before the next is accepted; beyond, they are refused
 WAITER_ENDS_S = 3.0  #: Time for the thread that waits to end
+ACCEPT_AGAIN_S = 0.1  #: Time after which a client is accepted that could not be, as by a process without descriptors
 STOP, ACCEPTED = b"stop\n", b"accepted\n"
 LARGEST_PACKET = 1 << 18  #: [bytes]
 LARGEST_CONSOLES = 8  #: Served at the same time, and clients of the stop that have not asked yet
@@ -175,13 +176,13 @@ def socket_names(cell_file: Path) -> SocketNames:
 
 def connected(name: str, kind: int, timeout_s: float) -> socket.socket | None:
     """Connect to a socket of a program of this user; None where there is none."""
-    connection = socket.socket(socket.AF_UNIX, kind)
-    connection.settimeout(timeout_s)
-    with suppress(OSError):
+    with suppress(OSError), ExitStack() as closing:
+        connection = closing.enter_context(socket.socket(socket.AF_UNIX, kind))
+        connection.settimeout(timeout_s)
         connection.connect(name)
         if of_this_user(connection):
+            closing.pop_all()
             return connection
-    connection.close()
     return None
 
 
@@ -257,6 +258,7 @@ class Feed:
         self._packed: list[bytes] = []
         self._layout, self._batch = packet_struct(0), 1
         self._waiter: threading.Thread | None = None
+        self._ended = threading.Event()
 
     def __enter__(self) -> Feed:
         """Begin to listen for consoles and stops, in a thread that waits."""
@@ -268,12 +270,13 @@ class Feed:
                 self._listening.append(listener)
                 listener.bind(name)
                 listener.listen(BACKLOG)
+            selector = selectors.DefaultSelector()
         except OSError as error:
             for listener in self._listening:
                 listener.close()
             self.remark = f"no console can watch: {error.strerror or error}; is another program on this cell?"
             return self
-        self._waiter = threading.Thread(target=self._wait, name="drivegain feed", daemon=True)
+        self._waiter = threading.Thread(target=self._wait, args=(selector,), name="drivegain feed", daemon=True)
         self._waiter.start()
         return self
 
@@ -281,6 +284,7 @@ class Feed:
         self._flush()
         ended = end_of(error)
         self._send({"end": ended})
+        self._ended.set()
         if self._waiter is not None:
             for listener in self._listening:
                 with suppress(OSError):
@@ -374,17 +378,17 @@ class Feed:
                 self._consoles.remove(console)
             console.close()
 
-    def _wait(self) -> None:
+    def _wait(self, selector: selectors.BaseSelector) -> None:
         """Accept consoles and stops until the listeners are shut down."""
         with ExitStack() as closing:
             for listener in self._listening:
                 closing.enter_context(listener)
-            self._accept_all()
+            self._accept_all(selector)
 
-    def _accept_all(self) -> None:
+    def _accept_all(self, selector: selectors.BaseSelector) -> None:
         """Accept consoles, and wait for all clients of the stop at once: a silent one delays no other."""
         asking: deque[socket.socket] = deque()
-        with selectors.DefaultSelector() as selector:
+        with selector:
             for listener in self._listening:
                 selector.register(listener, selectors.EVENT_READ)
             while True:
@@ -399,6 +403,9 @@ class Feed:
                     try:
                         connection, _ = ready.accept()
                     except OSError:
+                        # No descriptor is free, or the client is gone: the next one, and a stop, must be served still.
+                        if not self._ended.wait(ACCEPT_AGAIN_S):
+                            continue
                         for silent in asking:
                             silent.close()
                         return

@@ -498,7 +498,7 @@ def _excitations(fitted: Fit) -> Iterator[tuple[Excitation, tuple[int | None, ..
         run, _ = load_run(log, fitted.cell, fitted.lossy)
         data = differentiate(run, found.model.drive_train, found.conditioning)
         mounted = None if run.payload is None else mountings.index(run.payload.mounting)
-        yield recorded(found.model.drive_train, data, found.conditioning), (mounted,)
+        yield recorded(found.model, data, found.conditioning), (mounted,)
 
 
 def _scaled(gain: GainVerdict, std_percent: float) -> GainVerdict:

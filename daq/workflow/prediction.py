@@ -28,10 +28,11 @@ from ident.arrays import FloatArray, IntArray
 from ident.calibration import Calibration
 from ident.data.conditioning import central_differences, decimator, low_pass
 from ident.data.dataset import moving_samples, planned
+from ident.equations.rows import row_masks
 from ident.errors import IdentificationError
 from ident.model.bodies import Payload
 from ident.model.robot import Motion
-from ident.prediction import as_calibrated, measured_current, predict_current, predicted_rows
+from ident.prediction import as_calibrated, measured_current, predict_current
 
 EDGE_S = 0.15  #: Of a window, where the low-pass is not yet what it is over a whole run (to 2·10⁻⁵ at 40 Hz)
 STEP_S = 0.2  #: Samples that are predicted at once: each prediction costs 2 ms, and most of it is not for the samples
@@ -175,7 +176,7 @@ class Predictor:
         whole = (centres >= self._margin) & (centres < position.shape[1] - self._margin)
         moving, motor_moving = moving_samples(velocity, self._still, self._model.drive_train)
         data = replace(data, moving=moving.T, motor_moving=motor_moving.T)
-        still = ~predicted_rows(self._model, data, settings)[1][:, whole]
+        still = ~row_masks(self._model, data, settings)[1][:, whole]
         predicted, measured = predicted[:, whole], measured[:, whole]
         predicted = np.where(still, np.nan, predicted)
         return Rows(self._cycle + 1 + centres[whole], predicted.T, (measured - predicted).T, self._band)

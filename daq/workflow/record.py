@@ -14,6 +14,7 @@ from daq.config import cell as declared
 from daq.config.bus import bus_loads, cell_address, drive_axes, load_warnings, polling_fits, polling_warnings
 from daq.config.cell import Cell, joint_names
 from daq.config.cell_file import bundle
+from daq.config.drive import shipped_profiles
 from daq.environment import software
 from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
 from daq.files import sha256
@@ -98,7 +99,13 @@ def network_of(cell: Cell, block_signals: SignalBlocker = nullcontext) -> Canope
     pacing, period_us = (declared.PacingMode.TIMED, 0) if cell.sync is None else (cell.sync.pacing, cell.sync.period_us)
     # The heartbeat is sent with SYNC: a long period must not stop the axes.
     guard_ms = max(GUARD_MS[pacing], 3 * period_us // 1000)
-    return CanopenNetwork(cell_address(cell), drive_axes(cell), guard_ms=guard_ms, block_signals=block_signals)
+    return CanopenNetwork(
+        cell_address(cell),
+        drive_axes(cell),
+        guard_ms=guard_ms,
+        block_signals=block_signals,
+        profiles=shipped_profiles,
+    )
 
 
 def record(
@@ -119,6 +126,7 @@ def record(
     progress: Callable[[int, int], None] = lambda _move, _moves: None,
     before_motion: Callable[[], None] = lambda: None,
     feed: Feed | None = None,
+    unguarded: bool = False,
 ) -> Recorded:
     """Make a plan's moves and log every sample.
 
@@ -136,10 +144,12 @@ def record(
         progress: receives the number of finished moves and of all moves.
         before_motion: last check before the log is opened; if it raises, the axes have no power and no file is made.
         feed: gets what the log gets, for consoles.
+        unguarded: whether axes may move that go on moving when this program is killed.
 
     Raises:
         UsageError: the weighed mass is not the payload's; nothing has moved and no file was made.
-        MotionRefused: motion is disabled, or the moves leave the limits; nothing has moved and no file was made.
+        MotionRefused: motion is disabled, an axis is unguarded, or the moves leave the limits; nothing has moved and no
+            file was made.
         DiskSpaceShort: before the run, nothing has moved; during it, the axes were stopped, and the log is complete but
             marked invalid.
         ConfigurationInconsistent, UsageError, OutputFailed: see daq/errors.py.
@@ -152,6 +162,12 @@ def record(
     check_entered_mass(cell, payload, entered_kg)
     with defer_full_gc(), network_of(cell, block_signals) as network, _sync_producer(cell, network) as producer:
         network.prepare()
+        if (without := network.without_guard()) and not unguarded:
+            raise MotionRefused(
+                f"found axes that are UNGUARDED: {'; '.join(network.unguarded())}; expected that every axis watches "
+                f"the recorder's heartbeat (1016h); nothing has moved; pass --unguarded to move {', '.join(without)} "
+                "all the same, with a hand at the emergency stop"
+            )
         polling = Polling(network, beside_stream=polling_fits(cell))
         scales = network.scales()
         check_nameplates(cell_file, cell, scales)

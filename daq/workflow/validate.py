@@ -26,7 +26,7 @@ from ident.data.run import Run
 from ident.effects.friction import TemperatureFriction
 from ident.effects.signals import REFERENCE_C
 from ident.equations.reduction import Reduction, reduce_runs
-from ident.equations.rows import row_filter
+from ident.equations.rows import row_filter, row_masks
 from ident.errors import DataUnfit, Diagnosis, IdentificationError
 from ident.estimators.diagnosis import (
     axis_error_diagnoses,
@@ -45,7 +45,6 @@ from ident.prediction import (
     measured_torque,
     mounted_parameters,
     predict_torque,
-    predicted_rows,
     standard_parameters,
 )
 from ident.weighing import RowsToWeigh, rows_to_weigh, weigh_rows
@@ -179,7 +178,7 @@ def predicted(
     roles = {source.role for source in calibration.sources if source.sha256 == run.digest}
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
-    use, _ = predicted_rows(model, data, conditioning)
+    use, _ = row_masks(model, data, conditioning)
     if not use.any():
         raise DataUnfit(data.name, "no row is left after the standstill and validity masks; did the robot move?")
     return Validation(
@@ -304,7 +303,7 @@ def cross_validate(
         condition, reduction = None, None
         with suppress(IdentificationError):
             reduction = reduce_runs(model, (run,), conditioning)
-            # A payload without columns of its own is part of the last link.
+            # A payload without columns of its own is part of the link that carries it.
             system = reduction.system(reduction.base(), ((),) * len(reduction.payloads))
             condition = wls(system, _gains(calibrations[first])).condition
         if reduction is not None and first in found:

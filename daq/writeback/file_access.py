@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import os
 import re
 import shlex
 import stat
@@ -19,7 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from daq.errors import CalibrationRefused, ControllerUnfit, OutputFailed
-from daq.files import hold_lock, replace_file
+from daq.files import follow_links, has_links, hold_lock, replace_file
 from daq.writeback.formats.document import read_bytes
 from daq.writeback.request import short_digest
 
@@ -37,29 +36,20 @@ def resolve_links(file: Path) -> Path:
             which every user may exchange the file.
     """
     try:
-        target, links = file.resolve(), _links(file)
-    except RuntimeError as error:  # of Python before 3.13
-        raise _circle(file) from error
+        target = follow_links(file)
     except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise _circle(file) from error
-        raise
-    owner, folder = None, None
+        if error.errno not in (errno.ELOOP, errno.EPERM):
+            raise
+        raise ControllerUnfit(
+            str(file),
+            found=error.strerror or "",
+            expected="a link of the file's owner, or of you, that leads to the controller's file",
+            remedy="name the file itself, or make the link anew",
+        ) from error
+    folder = None
     with contextlib.suppress(OSError):  # it is gone, or access is denied
         folder = target.parent.lstat()
-        owner = target.lstat().st_uid
-    for link in links:
-        made_by = link.lstat().st_uid
-        if made_by not in {0, os.geteuid(), owner}:
-            named = "" if link == file else f" ({link})"
-            whose = f"to {target}, which is not there" if owner is None else f"to a file of user {owner}"
-            raise ControllerUnfit(
-                str(file),
-                found=f"a symbolic link{named} that user {made_by} has made, {whose}",
-                expected="a link of the file's owner, or of you",
-                remedy="name the file itself, or make the link anew",
-            )
-    if links and folder is not None and folder.st_mode & stat.S_IWOTH:
+    if folder is not None and folder.st_mode & stat.S_IWOTH and has_links(file):
         raise ControllerUnfit(
             str(file),
             found=f"a symbolic link into {target.parent}, a folder that everybody may write",
@@ -67,19 +57,6 @@ def resolve_links(file: Path) -> Path:
             remedy="take that right away (`chmod o-w`), or name the file itself",
         )
     return target
-
-
-def _links(file: Path) -> tuple[Path, ...]:
-    """Symbolic links on the way to a file, the links that they lead to included."""
-    found: dict[Path, None] = {}
-    names = [file.absolute()]
-    while names:
-        name = names.pop()
-        for place in (name, *name.parents):
-            if place not in found and place.is_symlink():
-                found[place] = None
-                names.append(place.parent / place.readlink())
-    return tuple(found)
 
 
 def require_existing(file: Path) -> None:
@@ -107,15 +84,6 @@ def require_existing(file: Path) -> None:
             remedy="find the others (`find / -xdev -samefile FILE`) and make symbolic links of them, or give this name "
             f"a file of its own: cp -p {quoted} {quoted}.new && mv {quoted}.new {quoted}",
         )
-
-
-def _circle(file: Path) -> ControllerUnfit:
-    return ControllerUnfit(
-        str(file),
-        found="symbolic links that go round in a circle",
-        expected="a link that leads to the controller's file",
-        remedy="correct the link, or name the file itself",
-    )
 
 
 @contextlib.contextmanager

@@ -208,8 +208,9 @@ class FileTarget:
             try:
                 replace_file(target, edit.after, check=_last_check(target, edit), like=edit.source)
             except BaseException:  # an interrupt too: the file comes back whole, or not at all
-                if _content(target) == edit.after:  # and not one that another program has made
-                    target.unlink()
+                with contextlib.suppress(OSError):
+                    if _content(target) == edit.after:  # and not one that another program has made
+                        target.unlink()
                 raise
             return Written(edit, None)
         backup = back_up(target, edit.before, edit.after, now)
@@ -221,12 +222,13 @@ class FileTarget:
         except BaseException:
             # Before the rename the old file is in place; after it (the folder's fsync failed) the backup replaces it.
             # A file that was saved by another program in between stays, and so does the backup.
-            found = _content(target)
-            if found == edit.before:
-                backup.unlink()
-            elif found == edit.after:
-                backup.replace(target)
-                with contextlib.suppress(OSError):  # the name is there
+            # A file system that allows none of this leaves both.
+            with contextlib.suppress(OSError):
+                found = _content(target)
+                if found == edit.before:
+                    backup.unlink()
+                elif found == edit.after:
+                    backup.replace(target)
                     fsync_folder(target.parent)
             raise
         return Written(edit, backup)

@@ -146,7 +146,9 @@ def parse_signature(text: str) -> Signature:
     Raises:
         ValueError: it is none, or not a prehashed one.
     """
-    lines = text.removesuffix("\n").split("\n")
+    lines = (
+        text.replace("\r\n", "\n").removesuffix("\n").split("\n")
+    )  # line ends of a mail or of Windows are not signed
     shaped = len(lines) == _SIGNATURE_LINES and lines[0].startswith(UNTRUSTED) and lines[2].startswith(TRUSTED)
     if not shaped:
         raise ValueError("no signature: expected four lines, comment, signature, trusted comment, signature")

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
 from daq.config.cell import Cell
-from daq.errors import AuditUnusable, CalibrationRefused, OutputFailed
+from daq.errors import AuditUnusable, CalibrationRefused, OutputFailed, evidence
 from daq.files import sha256
-from daq.ledger.audit import AuditAction, AuditEntry, append, digest_now
+from daq.ledger.audit import GONE, AuditAction, AuditEntry, append, digest_now
 from daq.writeback.gates.gate import GateContext, Refusal
 from daq.writeback.gates.table import check_gates
 from daq.writeback.request import Edit, Request
@@ -85,7 +85,7 @@ class Target(Protocol[E]):
         Raises:
             ControllerChanged: the content is not the one that the change was planned for.
             DriverError: from the drives.
-            OSError: from the file system; the content is as it was.
+            OSError: from the file system; the content is as it was, unless its digest shows the new one.
         """
 
 
@@ -141,6 +141,7 @@ def apply(proposal: Proposal[E], now: datetime, *, audit: Path | None = None, wh
     Raises:
         CalibrationRefused: a check failed; every failed one is listed.
         CalibrationRefused, DriverError, OSError: see `Target.lock` and `Target.write`.
+        OutputFailed: the file system failed once the new content was in place, or so that the content is not known.
         AuditUnusable: the beginning could not be recorded; nothing was written.
     """
     edit = proposal.edit
@@ -201,15 +202,36 @@ def _write(
         try:
             written = target.write(edit, recorder.at, recorder.who)
         except BaseException as error:  # an interrupt ends a write too
+            # It may come when all is done: the digest shows the content, whatever the error says.
+            found = digest_now(edit.subject)
+            made = edit.has_effect and found == digests["sha256_after"]
             if begun is not None:
-                # An interrupt may come when all is done: the digest shows the content, whatever the error says.
-                said, found = f"{type(error).__name__}: {error}"[:500], digest_now(edit.subject)
-                recorder.end(AuditAction.FAILED, {"begun": begun.number, "error": said, "sha256_found": found})
+                says = {"begun": begun.number, "error": f"{type(error).__name__}: {error}"[:500]}
+                recorder.end(actions[1] if made else AuditAction.FAILED, {**says, "sha256_found": found})
+            if isinstance(error, OSError) and found != (before or GONE):
+                raise _disturbed(edit, error, made=made) from error
+            if made:
+                error.add_note(f"kept: {_IN_PLACE.format(edit.subject)}")
             raise
         if begun is None:
             return written
         ended = recorder.end(actions[1], {"begun": begun.number})
         return replace(written, audit_sha256=(ended or begun).sha256)
+
+
+_IN_PLACE = "{} has the new content, complete; the history lacks this write"
+
+
+def _disturbed(edit: Edit, error: OSError, *, made: bool) -> OutputFailed:
+    """Return the error for a write after which the content is the new one, or is not known."""
+    entering = "`drivegain history CELL --add CALIBRATION` enters it, `drivegain rollback CELL` undoes it"
+    asking = f"whether {edit.subject} has the new content is not known: compare it with the newest backup beside it"
+    return OutputFailed(
+        edit.subject,
+        found=f"{(error.strerror or type(error).__name__).lower()}, {'after' if made else 'during'} the replacement",
+        expected="a file system that completes what it began",
+        remedy=f"check the disk; {_IN_PLACE.format(edit.subject) + ': ' + entering if made else asking}",
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,7 +250,12 @@ class _Recorder:
         try:
             return append(self.audit, action, at=self.at, who=self.who, subject=self.subject, details=details)
         except OSError as error:
-            raise OutputFailed.of(self.audit, error) from error
+            raise OutputFailed(
+                str(self.audit),
+                found=(error.strerror or type(error).__name__).lower(),
+                expected="an audit log that takes an entry",
+                remedy="nothing was written to the controller; free space or rights",
+            ) from error
 
     def end(self, action: AuditAction, details: Mapping[str, object]) -> AuditEntry | None:
         """Append the last entry about the write; a failure is a warning."""
@@ -236,7 +263,7 @@ class _Recorder:
             return self.begin(action, details)
         except (OutputFailed, AuditUnusable) as error:
             # The write is done, and the first entry has its digests: no reason to call it undone.
-            _LOG.warning("the audit log does not have that it is %s: %s", action.value, error)
+            _LOG.warning("the audit log does not have that it is %s: %s", action.value, evidence(error))
             return None
 
     @contextlib.contextmanager

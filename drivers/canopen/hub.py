@@ -1,8 +1,8 @@
 """A small socketcand-protocol server: a CAN bus between processes of one machine, without any kernel driver.
 
-Every frame of one client goes to all other clients of its channel. The server listens on the loopback interface alone.
-A client that does not read is disconnected when ``BACKLOG_BYTES`` wait for it, so that no frame is lost silently: its
-next call fails.
+Every frame of one client goes to all other clients of its channel; one that no CAN bus carries is refused to its sender
+and reaches nobody. The server listens on the loopback interface alone. A client that does not read is disconnected when
+``BACKLOG_BYTES`` wait for it, so that no frame is lost silently: its next call fails.
 """
 
 from __future__ import annotations
@@ -21,8 +21,11 @@ from drivers.errors import BusError
 
 HOST = "127.0.0.1"
 BACKLOG_BYTES = 8 << 20
-_COMMAND = re.compile(rb"<\s*(?:send ([0-9A-Fa-f]+) ([0-9A-Fa-f]+) ?([0-9A-Fa-f ]*)|([^<>]*?))\s*>")
+# Possessive: each byte is read a bounded number of times, so that no line takes long.
+_COMMAND = re.compile(rb"<\s*+(?:send ([0-9A-Fa-f]++) ([0-9A-Fa-f]++)([0-9A-Fa-f ]*+)|([^<>]*+))>")
 _MAX_COMMAND_BYTES = 256
+_BASE_DIGITS, _EXTENDED_DIGITS = 3, 8  #: Hexadecimal digits of an identifier of 11 and of 29 bits
+_LONGEST_DATA = 8  #: Bytes of a CAN frame
 _REMEDIES = {
     errno.EADDRINUSE: ": another hub runs on this port; use that one, end it, or choose another port (0: a free one)",
     errno.EACCES: ": ports below 1024 are the system's; choose another port (0: a free one)",
@@ -115,8 +118,8 @@ class _Client(asyncio.Protocol):
             identifier, length, payload, command = match.groups()
             if command is not None or not self._raw:
                 self._answer(command)
-            elif (digits := _digits(payload, int(length, 16))) is not None:
-                frames.append(b"< frame %s %s %s >" % (identifier.upper(), stamp, digits))
+            elif len(match[0]) <= _MAX_COMMAND_BYTES and (frame := _frame(identifier, int(length, 16), payload, stamp)):
+                frames.append(frame)
             else:
                 self._write(b"< error malformed frame >")
         self._incoming = buffer[end:]
@@ -129,7 +132,8 @@ class _Client(asyncio.Protocol):
                     other._write(burst)
 
     def _answer(self, command: bytes | None) -> None:
-        word, _, argument = (command or b"send").decode("ascii", "replace").partition(" ")
+        words = b"send" if command is None else command[:_MAX_COMMAND_BYTES]
+        word, _, argument = words.decode("ascii", "replace").strip().partition(" ")
         if word == "open" and argument in self._hub.channels:
             self._channel = argument
             self._write(b"< ok >")
@@ -145,13 +149,25 @@ class _Client(asyncio.Protocol):
             self._write(b"< error unknown command >")
 
 
-def _digits(data: bytes, length: int) -> bytes | None:
-    """Return the hexadecimal digits of a frame, two a byte, or None when they are not ``length`` bytes."""
-    digits = data.replace(b" ", b"")
+def _frame(identifier: bytes, length: int, payload: bytes, stamp: bytes) -> bytes | None:
+    """Return a frame as the other clients receive it, or None where no CAN bus carries it.
+
+    Args:
+        identifier: hexadecimal digits, up to three for a base one (11 bits) and eight for an extended one (29 bits).
+        length: stated number of data bytes.
+        payload: the data, two digits a byte, or one for a small byte between spaces.
+        stamp: seconds since 1970.
+    """
+    extended = len(identifier) > _BASE_DIGITS
+    if length > _LONGEST_DATA or (extended and len(identifier) != _EXTENDED_DIGITS):
+        return None
+    digits = payload.replace(b" ", b"")
     if len(digits) != 2 * length:
         # The protocol allows one digit for a small byte, and python-can writes it so.
-        tokens = data.split()
+        tokens = payload.split()
         if len(tokens) != length or any(len(token) > 2 for token in tokens):
             return None
         digits = b"".join(token.rjust(2, b"0") for token in tokens)
-    return digits if length <= 8 else None
+    if int(identifier, 16) > (0x1FFF_FFFF if extended else 0x7FF):
+        return None
+    return b"< frame %s %s %s >" % (identifier.upper().rjust(_BASE_DIGITS, b"0"), stamp, digits)

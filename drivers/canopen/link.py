@@ -7,7 +7,7 @@ while it waits. See docs/decisions/0002-stream-owns-the-bus.md.
 from __future__ import annotations
 
 import struct
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 from typing import Protocol
@@ -24,7 +24,12 @@ from drivers.stream.sample import CellEvent, EventKind
 SYNC_COB_ID = 0x080
 _NMT_COB_ID = 0x000
 _EMCY, HEARTBEAT = 0x080, 0x700
+LSS = frozenset((0x7E4, 0x7E5))  #: Layer setting services (CiA 305): a device gets another node id or bit rate
 _RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))  #: Set-points of a drive (CiA 301, predefined connection set)
+_LSS_NAME = "a layer setting service, which changes node ids"
+_NAMES = {_NMT_COB_ID: "an NMT command", SYNC_COB_ID: "a SYNC", **dict.fromkeys(LSS, _LSS_NAME)}
+BOOTS_S = 0.5  #: Two boot-up messages in this time are those of two devices
+SURPLUS_BEATS = 2  #: A change of the NMT state may have one of its own
 PUMP_S = 1.0  #: Longest time spent on frames that have already arrived, however fast more arrive
 # linux/can/error.h: classes of an error frame, and the controller's state in its second byte.
 _CONTROLLER, _RESTARTED = 0x004, 0x100
@@ -67,15 +72,16 @@ def nmt_name(state: int | None) -> str:
 
 def command_name(identifier: int, names: Mapping[int, str]) -> str:
     """Describe a frame that only the recorder should send; `names` of the axes are by node id."""
-    if identifier == SYNC_COB_ID:
-        return "a SYNC (080h)"
-    if identifier == _NMT_COB_ID:
-        return "an NMT command (000h)"
-    if identifier < SDO_REQUEST:
-        return f"a set-point of {node_label(identifier & 0x7F, names)} ({identifier:03X}h)"
-    if identifier >= HEARTBEAT:
-        return f"a heartbeat with the recorder's own node id {identifier - HEARTBEAT} ({identifier:03X}h)"
-    return f"an SDO request to {node_label(identifier - SDO_REQUEST, names)} ({identifier:03X}h)"
+    shown, node_id = f"({identifier:03X}h)", identifier & 0x7F
+    if identifier >= HEARTBEAT and identifier not in LSS:
+        name = f"a heartbeat with the recorder's own node id {node_id}"
+    elif identifier >= SDO_REQUEST and identifier not in LSS:
+        name = f"an SDO request to {node_label(node_id, names)}"
+    elif node_id in names:
+        name = f"a set-point of {node_label(node_id, names)}"
+    else:
+        name = _NAMES.get(identifier, f"a frame with the recorder's own node id {node_id}")
+    return f"{name} {shown}"
 
 
 class Link:
@@ -93,11 +99,15 @@ class Link:
         self.policy = policy
         self.nmt: dict[int, int] = {}  #: Last NMT state of each node that sent a heartbeat
         self.heard_ns: dict[int, int] = {}  #: Time of that heartbeat by the clock
-        self.answered: set[int] = set()  #: Nodes that sent any SDO answer
+        self.answered: Counter[int] = Counter()  #: SDO answers of each node
+        self.boots: Counter[int] = Counter()  #: Boot-up messages of each node id right after another
+        self.twice: dict[int, str] = {}  #: Node ids whose request was answered twice, and by what
+        self.asked_by: dict[int, object] = {}  #: Client of the last SDO request to each node; none where it had none
+        self._beats: dict[int, tuple[int, int]] = {}  # number of heartbeats, and since when [ns]
         self.silent: set[int] = set()  #: Nodes that did not answer their last request, and sent nothing since
         self.heard: set[int] = set()  #: Node ids of which any frame arrived since the bus was opened
-        #: Number of frames by identifier that only we should send (NMT, SYNC, SDO request, set-point of one of our
-        #: axes, our own heartbeat) and that we did not send.
+        #: Number of frames by identifier that only we should send (NMT, SYNC, LSS, SDO request, set-point of one of our
+        #: axes, any frame with our own node id) and that we did not send.
         self.foreign: dict[int, int] = {}
         self.own_id: int | None = None  #: Node id of our heartbeat, None before one was chosen
         self.names: Mapping[int, str] = {}  #: Of our axes by node id
@@ -131,6 +141,9 @@ class Link:
 
     def send(self, messages: Sequence[can.Message]) -> None:
         """Send frames in their order."""
+        for message in messages:
+            if SDO_REQUEST < message.arbitration_id < HEARTBEAT:
+                self.asked_by.pop(message.arbitration_id - SDO_REQUEST, None)
         with bus_errors(self.address):
             send_burst(self.bus, messages)
 
@@ -184,7 +197,8 @@ class Link:
         service, node_id = message.arbitration_id & 0x780, message.arbitration_id & 0x7F
         if message.is_extended_id or message.is_remote_frame:
             return False
-        ours = (service in _RPDOS and node_id in self.names) or (service == HEARTBEAT and node_id == self.own_id)
+        ours = (service in _RPDOS and node_id in self.names) or self.is_own(message.arbitration_id)
+        ours = ours or message.arbitration_id in LSS
         if message.arbitration_id in (_NMT_COB_ID, SYNC_COB_ID) or (service == SDO_REQUEST and node_id) or ours:
             if message.arbitration_id != SYNC_COB_ID or self.sync_producer is None:
                 self.note_foreign(message.arbitration_id)
@@ -195,7 +209,11 @@ class Link:
         self.silent.discard(node_id)
         if service == HEARTBEAT and message.data:
             previous, state = self.nmt.get(node_id), message.data[0] & 0x7F
-            self.nmt[node_id], self.heard_ns[node_id] = state, self.clock()
+            now_ns = self.clock()
+            self._note_boot(node_id, state, now_ns)
+            count, since_ns = self._beats.get(node_id, (0, now_ns))
+            self._beats[node_id] = (count + 1, since_ns)
+            self.nmt[node_id], self.heard_ns[node_id] = state, now_ns
             if previous != state:
                 self._events.append((node_id, EventKind.NMT, state, f"NMT {nmt_name(previous)} -> {nmt_name(state)}"))
         elif service == _EMCY and len(message.data) == 8:
@@ -205,7 +223,7 @@ class Link:
             text = f"EMCY {code:04X}h {describe(code)}, error register {register:02X}h, data {data.hex()}"
             self._events.append((node_id, kind, code, text))
         elif service == SDO_ANSWER:
-            self.answered.add(node_id)
+            self.answered[node_id] += 1
             for listener in self._listeners.get(node_id, ()):
                 listener.receive(message.data)
         else:
@@ -227,12 +245,51 @@ class Link:
             description = ", ".join(text for mask, text in states if bits & mask) or f"reports {bits:02X}h"
             self._events.append((0, EventKind.CONTROLLER, bits, f"the CAN controller {description}"))
 
+    def is_own(self, identifier: int) -> bool:
+        """Whether only a device with our own node id sends a frame with this identifier."""
+        service = identifier & 0x780
+        sent_by_it = 0 < service <= HEARTBEAT and service != SDO_REQUEST
+        return self.own_id is not None and sent_by_it and identifier & 0x7F == self.own_id
+
     def note_foreign(self, identifier: int) -> None:
         """Count a command, or a heartbeat with our node id, that neither we nor our SYNC producer sent."""
         self.foreign[identifier] = self.foreign.get(identifier, 0) + 1
         if self.foreign[identifier] == 1:  # once: a master would fill the log
             seen = command_name(identifier, self.names)
             self._events.append((0, EventKind.BUS_BUSY, identifier, f"{seen} that we did not send"))
+
+    def _note_boot(self, node_id: int, state: int, now_ns: int) -> None:
+        again = state == NmtState.BOOT_UP == self.nmt.get(node_id)
+        if again and now_ns - self.heard_ns[node_id] < BOOTS_S * 1e9:
+            self.boots[node_id] += 1
+
+    def note_twice(self, node_id: int, first: bytes, second: bytes) -> None:
+        """Note that a node gave two answers to one request, unless another program asked the same."""
+        if SDO_REQUEST + node_id not in self.foreign:
+            entry = f"{first[2]:02X}{first[1]:02X}h:{first[3]:02X}"
+            values = f"{first[4:].hex(' ')} and {second[4:].hex(' ')}"
+            self.twice.setdefault(node_id, f"two answers to one request for {entry} ({values})")
+
+    def count_beats(self, node_id: int) -> None:
+        """Count the heartbeats of a node from now on: its period has changed."""
+        self._beats[node_id] = (0, self.clock())
+
+    def shared_id(self, node_id: int, period_ms: int) -> str:
+        """Describe the evidence that two devices have a node id; empty without any.
+
+        Args:
+            node_id: of the node.
+            period_ms: of its heartbeat since `count_beats`, or since its first one; 0 where that is unknown.
+        """
+        if node_id in self.twice:
+            return self.twice[node_id]
+        if self.boots[node_id]:
+            return f"{self.boots[node_id] + 1} boot-up messages within {BOOTS_S:g} s"
+        count, since_ns = self._beats.get(node_id, (0, 0))
+        elapsed_ms = (self.clock() - since_ns) * 1e-6
+        if period_ms and count > SURPLUS_BEATS + 1.5 * elapsed_ms / period_ms:
+            return f"{count} heartbeats in {elapsed_ms:.0f} ms, its period is {period_ms} ms"
+        return ""
 
     def take_events(self, time_ns: int, node_ids: Sequence[int]) -> tuple[CellEvent, ...]:
         """Return the events since the last call in their order; axis is None for nodes that are no axes of ours."""

@@ -13,8 +13,9 @@ from typing import Self
 import can
 
 from drivers.canopen.bus import BusAddress
-from drivers.canopen.link import HEARTBEAT, Link, NmtCommand, NmtState, command_name
-from drivers.canopen.pdo import CONTROLWORD, HEARTBEAT_MS, STATUSWORD
+from drivers.canopen.link import Link, NmtCommand, NmtState, command_name
+from drivers.canopen.needs import Profiles
+from drivers.canopen.pdo import CONTROLWORD, HEARTBEAT_MS, STATUSWORD, AxisPdos, wanted_pdos
 from drivers.canopen.scan import FoundNode, answering, free_ids, read_identity, scan_link
 from drivers.canopen.sdo import Clock, SdoPolicy
 from drivers.canopen.setup import AxisSetup, Guard, producer_of, read_consumers
@@ -86,6 +87,7 @@ class CanopenNetwork:
         clock: monotonic time [ns].
         opener: opens the bus of an address, or of several as one.
         block_signals: keeps signals from interrupting the stop of the axes.
+        profiles: those from which one is named that fits a drive, where the configured one does not.
     """
 
     def __init__(
@@ -100,8 +102,10 @@ class CanopenNetwork:
         clock: Clock = time.monotonic_ns,
         opener: Callable[[CellAddress], can.BusABC] = open_cell_bus,
         block_signals: SignalBlocker = nullcontext,
+        profiles: Profiles = tuple,
     ) -> None:
         self.axes = axes
+        self.profiles = profiles
         self.block_signals = block_signals
         self.heartbeat_ms = heartbeat_ms
         self.guard_ms = guard_ms
@@ -154,20 +158,25 @@ class CanopenNetwork:
         if missing := [axis for axis in self.axes if axis.node_id not in answered]:
             raise NodeMissing(missing, answered, self.bounds.answer_s)
         identities = tuple(read_identity(self.link.objects(node_id)) for node_id in self.node_ids)
+        self._require_own_ids(0)
         for axis, found in zip(self.axes, identities, strict=True):
-            expected = axis.identity or found
-            for name, want, have in (
-                ("vendor id 1018h:01", expected.vendor_id, found.vendor_id),
-                ("product code 1018h:02", expected.product_code, found.product_code),
-                ("serial number 1018h:04", expected.serial, found.serial or 0),
-            ):
-                if want is not None and want != have:
-                    raise SetupRefused(
-                        axis,
-                        f"{name} is {have:#x}, the cell configuration expects {want:#x}; was an amplifier exchanged? "
-                        "correct the configuration only after checking the hardware",
-                    )
+            if axis.identity is not None and (differing := axis.identity.differences(found)):
+                raise SetupRefused(
+                    axis,
+                    f"{differing[0]}; was an amplifier exchanged? correct the configuration only after checking the "
+                    "hardware",
+                )
         return identities
+
+    def _require_own_ids(self, period_ms: int) -> None:
+        """Refuse an axis whose node id another device has too; `period_ms` is that of its heartbeat, 0 if unknown."""
+        for axis in self.axes:
+            if shared := self.link.shared_id(axis.node_id, period_ms):
+                raise SetupRefused(
+                    axis,
+                    f"found {shared}; expected one device with this node id; two have it, and both would move: nothing "
+                    "has moved, give one of them another node id",
+                )
 
     def prepare(self) -> None:
         """Set every node up: identity, heartbeats, PRE-OPERATIONAL, mapping, profile position mode, OPERATIONAL.
@@ -183,10 +192,16 @@ class CanopenNetwork:
         consumers = [read_consumers(self.link.objects(node_id)) for node_id in self.node_ids]
         if self.link.own_id is None:
             self._take_recorder_id([value for entries in consumers for _, value in entries or ()])
-        for axis, entries in zip(self.axes, consumers, strict=True):
-            if (setup := self._setups.get(axis.node_id)) is None:
-                guard = Guard(self.link.objects(axis.node_id), entries, self.was_ours)
-                setup = self._setups[axis.node_id] = AxisSetup(self.link, axis, guard)
+        new = {
+            axis.node_id: AxisSetup(self.link, axis, Guard(self.link.objects(axis.node_id), entries, self.was_ours))
+            for axis, entries in zip(self.axes, consumers, strict=True)
+            if axis.node_id not in self._setups
+        }
+        for setup in new.values():
+            setup.check(self.profiles)
+        self._require_own_ids(0)
+        self._setups.update(new)
+        for setup in self._setups.values():
             setup.send_heartbeats(self.heartbeat_ms)
             setup.guard.arm(self.recorder_id, self.guard_ms)
         self._command_all(NmtCommand.ENTER_PRE_OPERATIONAL, NmtState.PRE_OPERATIONAL)
@@ -198,6 +213,13 @@ class CanopenNetwork:
         for axis, identity, scale in zip(self.axes, identities, self.scales(), strict=True):
             self._readback[axis.name] = self._setups[axis.node_id].describe(identity, scale, self.guard_ms)
         self._command_all(NmtCommand.START, NmtState.OPERATIONAL)
+        self._require_own_ids(self.heartbeat_ms)
+
+    @property
+    def pdos(self) -> tuple[AxisPdos, ...]:
+        """PDOs of each axis: as they are mapped, or before `prepare` as they will be on most drives."""
+        setups = ((axis, self._setups.get(axis.node_id)) for axis in self.axes)
+        return tuple(wanted_pdos(axis) if setup is None else setup.pdos for axis, setup in setups)
 
     def _take_recorder_id(self, watched: Sequence[int]) -> None:
         """Choose the highest node id that no device uses, and that no amplifier waits for by its entries of 1016h."""
@@ -251,10 +273,10 @@ class CanopenNetwork:
         """Start our heartbeat: from now on the amplifiers quick stop by themselves when we fall silent.
 
         Raises:
-            BusBusy: a device has come that sends the same heartbeat.
+            BusBusy: a device has come that has the same node id.
         """
-        if HEARTBEAT + self.recorder_id in self.link.foreign:
-            raise BusBusy.by_heartbeat(self.link.address, self.recorder_id)
+        for identifier in filter(self.link.is_own, self.link.foreign):
+            raise BusBusy.by_own_id(self.link.address, identifier)
         self.link.start_heartbeat(self.recorder_id, self.heartbeat_ms)
 
     def unguard(self) -> None:
@@ -273,6 +295,10 @@ class CanopenNetwork:
         """Report the amplifiers of the prepared network that do not stop by themselves when the recorder is killed."""
         setups = [(axis, self._setups[axis.node_id]) for axis in self.axes if axis.node_id in self._setups]
         return tuple(f"{axis.name}: {setup.guard.lack}" for axis, setup in setups if setup.guard.lack)
+
+    def without_guard(self) -> tuple[str, ...]:
+        """Return the names of the axes of the prepared network that go on moving when the recorder is killed."""
+        return tuple(axis.name for axis in self.axes if not self._setups[axis.node_id].guard.watching)
 
     def find_silent(self, axes: Sequence[Axis]) -> NodeMissing | None:
         """Ask all these axes at once for an answer; those without one are skipped from then on."""

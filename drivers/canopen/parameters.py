@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.pdo import PDOS, SETPOINT_PDOS, STATUSWORD, Direction, feedback_entries, pack, read_record, records
+from drivers.canopen.pdo import STATUSWORD, read_record, wanted_pdos
 from drivers.canopen.sdo import SdoPolicy
 from drivers.canopen.setup import CONSUMERS
 from drivers.errors import DriverError, NodeError, ObjectAccessError, ParameterRefused, ParametersMixed
@@ -172,11 +172,10 @@ def recording_leftover(network: CanopenNetwork, axis: Axis) -> str:
         if network.was_ours(value):
             return f"{CONSUMERS.index:04X}h:{sub:02X} = {value:08X}h watches the recorder"
     try:
-        feedback = pack(feedback_entries(axis))[:PDOS]
+        pdos = wanted_pdos(axis)
     except ValueError:
         return ""  # this drive cannot be recorded
-    node_id = axis.node_id
-    for ours in records(Direction.TPDO, node_id, feedback) + records(Direction.RPDO, node_id, SETPOINT_PDOS):
+    for ours in pdos.feedback + pdos.setpoints:
         found = read_record(access, ours.direction, ours.number)
         if found is not None and (found.entries, found.transmission) == (ours.entries, ours.transmission):
             return str(found)

@@ -7,8 +7,8 @@ mapping parameters (count, then index << 16 | subindex << 8 | bits).
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,8 @@ HEARTBEAT_MS = 100  #: Period of the heartbeats of every node, and of the record
 PDO_BYTES = 8
 PDOS = 4  #: PDOs of the predefined connection set, in each direction
 NOT_VALID = 1 << 31
+READ_ONLY = 0x0601_0002  #: Abort of a write to an object that a drive keeps fixed (CiA 301)
+_EXTENDED = 1 << 29  #: COB-ID of 29 bits
 _COB_ID_BITS = NOT_VALID | 0x1FFF_FFFF  # bit 30 (RTR) is set by some drives on their own
 SYNCHRONOUS = 1  #: Transmission type: sent, or acted upon, at every SYNC
 
@@ -67,8 +69,8 @@ def word(entry: ObjectEntry) -> int:
     return entry.index << 16 | entry.subindex << 8 | entry.bits
 
 
-def pack(entries: Sequence[ObjectEntry]) -> tuple[tuple[ObjectEntry, ...], ...]:
-    """Distribute objects over PDOs of at most eight bytes, each into the first that has room.
+def pack(entries: Sequence[ObjectEntry], most_bytes: int = PDO_BYTES) -> tuple[tuple[ObjectEntry, ...], ...]:
+    """Distribute objects over PDOs of at most so many bytes, each into the first that has room.
 
     Raises:
         ValueError: an object is no integer of 8, 16 or 32 bits, or more than four PDOs are needed.
@@ -78,7 +80,7 @@ def pack(entries: Sequence[ObjectEntry]) -> tuple[tuple[ObjectEntry, ...], ...]:
         if (entry.bits, entry.signed) not in _CODES:
             raise ValueError(f"object {entry} has {entry.bits} bits; only 8, 16 and 32 can be decoded")
         for pdo in pdos:
-            if sum(other.bits for other in pdo) + entry.bits <= 8 * PDO_BYTES:
+            if sum(other.bits for other in pdo) + entry.bits <= 8 * most_bytes:
                 pdo.append(entry)
                 break
         else:
@@ -93,11 +95,22 @@ def layout(entries: Sequence[ObjectEntry]) -> struct.Struct:
     return struct.Struct("<" + "".join(_CODES[entry.bits, entry.signed] for entry in entries))
 
 
-def records(direction: Direction, node_id: int, pdos: Sequence[Sequence[ObjectEntry]]) -> tuple[PdoRecord, ...]:
-    """Return synchronous PDOs with the predefined COB-IDs of a node."""
+def records(
+    direction: Direction,
+    node_id: int,
+    pdos: Sequence[Sequence[ObjectEntry]],
+    numbers: Sequence[int] = range(PDOS),
+) -> tuple[PdoRecord, ...]:
+    """Return synchronous PDOs with the predefined COB-IDs of a node; `numbers` are those of the PDOs that it has.
+
+    Raises:
+        ValueError: it has too few.
+    """
+    if len(pdos) > len(numbers):
+        raise ValueError(f"found {len(numbers)} {direction.name}s in the drive; expected {len(pdos)}")
     return tuple(
         PdoRecord(direction, number, direction.value[2] + 0x100 * number + node_id, SYNCHRONOUS, tuple(map(word, pdo)))
-        for number, pdo in enumerate(pdos)
+        for number, pdo in zip(numbers, pdos, strict=False)
     )
 
 
@@ -106,12 +119,92 @@ def feedback_entries(axis: Axis) -> tuple[ObjectEntry, ...]:
     return (axis.profile.position, axis.profile.current, STATUSWORD)
 
 
-SETPOINT_PDOS = (
-    (CONTROLWORD, TARGET_POSITION),
-    (PROFILE_VELOCITY, PROFILE_ACCELERATION),
-    (PROFILE_DECELERATION,),
-)
-"""Set-points of an axis. Only the first PDO is sent in the cycle in which all axes start."""
+COMMAND = (TARGET_POSITION, CONTROLWORD)
+"""Set-point that starts a move. The target comes first: a drive may act as soon as it has read the controlword."""
+MOTION_PROFILE = (PROFILE_VELOCITY, PROFILE_ACCELERATION, PROFILE_DECELERATION)
+SETPOINT_PDOS = (*pack(COMMAND), *pack(MOTION_PROFILE))
+"""Set-points of an axis. Only those of the command are sent in the cycle in which all axes start."""
+
+
+@dataclass(frozen=True, slots=True)
+class AxisPdos:
+    """PDOs of one axis in a recording."""
+
+    feedback: tuple[PdoRecord, ...]  #: TPDOs with the objects of a Sample
+    setpoints: tuple[PdoRecord, ...]  #: RPDOs with those of a set-point
+
+    def payloads(self, values: Mapping[ObjectEntry, int]) -> Iterator[tuple[int, bytes]]:
+        """Yield COB-ID and payload of each RPDO all of whose objects have a value, in the order of their numbers."""
+        entries = {word(entry): entry for entry in values}
+        for record in self.setpoints:
+            if all(mapped in entries for mapped in record.entries):
+                pdo = [entries[mapped] for mapped in record.entries]
+                yield record.cob_id & 0x7FF, layout(pdo).pack(*(values[entry] for entry in pdo))
+
+
+def wanted_pdos(
+    axis: Axis,
+    numbers: Mapping[Direction, Sequence[int]] | None = None,
+    absent: Sequence[ObjectEntry] = (),
+    most_bytes: int = PDO_BYTES,
+) -> AxisPdos:
+    """Return the PDOs of an axis as a recording maps them.
+
+    Args:
+        axis: with its profile.
+        numbers: of the PDOs that the drive has, from 0; None for the four of the predefined connection set.
+        absent: objects of `MOTION_PROFILE` that the drive does not have.
+        most_bytes: in one PDO.
+
+    Raises:
+        ValueError: the drive has too few PDOs, or an object is no integer.
+    """
+    have = dict.fromkeys(Direction, range(PDOS)) if numbers is None else numbers
+    setpoints = pack(COMMAND, most_bytes) + pack([entry for entry in MOTION_PROFILE if entry not in absent], most_bytes)
+    return AxisPdos(
+        records(Direction.TPDO, axis.node_id, pack(feedback_entries(axis), most_bytes), have[Direction.TPDO]),
+        records(Direction.RPDO, axis.node_id, setpoints, have[Direction.RPDO]),
+    )
+
+
+def fixed_feedback(axis: Axis, found: Sequence[PdoRecord]) -> tuple[PdoRecord, ...]:
+    """Return those of a drive's own TPDOs that carry every object of a Sample, synchronous; empty where they do not."""
+    needed = set(map(word, feedback_entries(axis)))
+    return _carrying(needed, found)
+
+
+def fixed_setpoints(found: Sequence[PdoRecord], absent: Sequence[ObjectEntry] = ()) -> tuple[PdoRecord, ...]:
+    """Return those of a drive's own RPDOs that carry every object of a set-point and no other, synchronous.
+
+    Empty where they do not, or where a controlword comes before its target.
+    """
+    command, profile = (
+        {word(entry) for entry in entries if entry not in absent} for entries in (COMMAND, MOTION_PROFILE)
+    )
+    used = _carrying(command | profile, found)
+    if any(not (set(record.entries) <= command or set(record.entries) <= profile) for record in used):
+        return ()
+    order = [mapped for record in used for mapped in record.entries if mapped in command]
+    return used if order == list(map(word, COMMAND)) else ()
+
+
+def _carrying(needed: set[int], found: Sequence[PdoRecord]) -> tuple[PdoRecord, ...]:
+    used = [record for record in found if needed & set(record.entries) and not record.cob_id & (NOT_VALID | _EXTENDED)]
+    carried = [mapped for record in used for mapped in record.entries if mapped in needed]
+    whole_bytes = all((mapped & 0xFF) % 8 == 0 for record in used for mapped in record.entries)
+    if sorted(carried) != sorted(needed) or not whole_bytes:
+        return ()
+    return tuple(replace(record, transmission=SYNCHRONOUS) for record in used)
+
+
+def payload_of(record: PdoRecord, entries: Sequence[ObjectEntry]) -> tuple[struct.Struct, tuple[ObjectEntry, ...]]:
+    """Return the layout of a TPDO, and those of the given objects that it carries, in its order; it skips others."""
+    known = {word(entry): entry for entry in entries}
+    codes = [
+        _CODES[known[mapped].bits, known[mapped].signed] if mapped in known else f"{(mapped & 0xFF) // 8}x"
+        for mapped in record.entries
+    ]
+    return struct.Struct("<" + "".join(codes)), tuple(known[mapped] for mapped in record.entries if mapped in known)
 
 
 def _parameters(direction: Direction, number: int) -> tuple[ObjectEntry, ObjectEntry, ObjectEntry]:
@@ -131,9 +224,9 @@ def read_record(access: ObjectAccess, direction: Direction, number: int) -> PdoR
     """Read one PDO of a drive; None when the drive has no such PDO."""
     cob_id, transmission, count = _parameters(direction, number)
     identifier = access.read_optional(cob_id)
-    if identifier is None:
+    mapped = None if identifier is None else access.read_optional(count)
+    if identifier is None or mapped is None:
         return None
-    mapped = access.read(count)
     entries = tuple(access.read(_entry(count, sub)) for sub in range(1, mapped + 1))
     return PdoRecord(direction, number, identifier, access.read(transmission), entries)
 
@@ -141,7 +234,8 @@ def read_record(access: ObjectAccess, direction: Direction, number: int) -> PdoR
 def write_record(access: ObjectAccess, record: PdoRecord) -> None:
     """Write what differs of one PDO, read it back and compare.
 
-    Drives accept only this order: COB-ID not valid, count 0, entries, transmission type, count, COB-ID valid.
+    Drives accept only this order: COB-ID not valid, count 0, entries, transmission type, count, COB-ID valid. A drive
+    with a fixed COB-ID gets the rest.
 
     Raises:
         SetupRefused: a step was aborted, or the PDO reads back differently.
@@ -151,17 +245,27 @@ def write_record(access: ObjectAccess, record: PdoRecord) -> None:
     if before == record:
         return
     off = (record.cob_id if before is None else before.cob_id) | NOT_VALID
+    as_before = before is not None and not (before.cob_id ^ record.cob_id) & _COB_ID_BITS
+    mapped = before is not None and before.entries == record.entries
+    fixed = False
     steps = [(cob_id, off)]
-    if before is None or (before.entries, before.transmission) != (record.entries, record.transmission):
+    if not mapped:
         steps += [(count, 0), *((_entry(count, sub), word) for sub, word in enumerate(record.entries, start=1))]
-        steps += [(transmission, record.transmission), (count, len(record.entries))]
+    if before is None or before.transmission != record.transmission:
+        steps.append((transmission, record.transmission))
+    if not mapped:
+        steps.append((count, len(record.entries)))
     if record.cob_id != off:
         steps.append((cob_id, record.cob_id))
     for entry, value in steps:
+        if fixed and entry == cob_id:
+            continue
         try:
             access.write(entry, value)
         except ObjectAccessError as error:
-            raise SetupRefused(access, f"{record.name}: writing {value:#x} to {entry}: {error.reason}") from error
+            fixed = entry == cob_id and error.abort_code == READ_ONLY and as_before
+            if not fixed:
+                raise SetupRefused(access, f"{record.name}: writing {value:#x} to {entry}: {error.reason}") from error
     found = read_record(access, record.direction, record.number)
     if (
         found is None
@@ -169,3 +273,18 @@ def write_record(access: ObjectAccess, record: PdoRecord) -> None:
         or (found.cob_id ^ record.cob_id) & _COB_ID_BITS
     ):
         raise SetupRefused(access, f"{record.name}: reads back as '{found}', written was '{record}'")
+
+
+def turn_off(access: ObjectAccess, record: PdoRecord) -> None:
+    """Set a PDO of a drive, as it was read, to not valid; where its COB-ID is fixed, leave it without objects.
+
+    Raises:
+        SetupRefused: the drive refuses both.
+    """
+    try:
+        write_record(access, replace(record, cob_id=record.cob_id | NOT_VALID))
+    except SetupRefused as refused:
+        try:
+            write_record(access, replace(record, entries=()))
+        except SetupRefused:
+            raise refused from refused.__cause__

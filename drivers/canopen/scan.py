@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeVar
 
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import Link
+from drivers.canopen.needs import HEARTBEAT_TIME
 from drivers.canopen.pdo import STATUSWORD
-from drivers.canopen.sdo import ObjectAccess, SdoPolicy, upload_request
+from drivers.canopen.sdo import SDO_REQUEST, ObjectAccess, SdoPolicy, upload_request
 from drivers.canopen.split_bus import CellAddress
 from drivers.errors import ObjectAccessError
 from drivers.profiles.cia402 import State, decode
@@ -20,6 +22,10 @@ VENDOR_ID = ObjectEntry(0x1018, 1, 32, signed=False)
 PRODUCT_CODE = ObjectEntry(0x1018, 2, 32, signed=False)
 REVISION = ObjectEntry(0x1018, 3, 32, signed=False)
 SERIAL = ObjectEntry(0x1018, 4, 32, signed=False)
+T = TypeVar("T")
+SCAN_POLICY = SdoPolicy(attempts=2, transfer_s=1.0, most_bytes=256)
+"""One node that never ends must not keep the others from being found."""
+NODE_S = 3.0  #: After this time, nothing more is asked of a node
 _DEVICE_TYPE = ObjectEntry(0x1000, 0, 32, signed=False)
 
 
@@ -33,6 +39,8 @@ class FoundNode:
     device_name: str | None  #: 1008h, or None
     nmt: int | None  #: NMT state of its last heartbeat, or None when it sends none
     statusword: int | None  #: 6041h, or None when it is no CiA 402 drive
+    shared: str = ""  #: evidence that two devices have this node id
+    problems: tuple[str, ...] = ()  #: objects that it reports badly, with the reason
 
     @property
     def state(self) -> State | None:
@@ -65,22 +73,44 @@ def scan(
 def scan_link(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[FoundNode, ...]:
     """Find all nodes that answer an SDO request or send a heartbeat within a time."""
     answered = answering(link, node_ids, wait_s)
+    several = {n for n in answered if link.answered[n] > 1 and SDO_REQUEST + n not in link.foreign}
     alive = sorted(set(answered) | (set(link.nmt) & set(node_ids)))
     found = []
     for node_id in alive:
-        nmt = link.nmt.get(node_id)
         if node_id not in answered:
-            found.append(FoundNode(node_id, None, None, None, nmt, None))
+            shared = link.shared_id(node_id, 0)
+            found.append(FoundNode(node_id, None, None, None, link.nmt.get(node_id), None, shared))
             continue
-        access = link.objects(node_id)
-        identity = name = None
-        with suppress(ObjectAccessError):
-            identity = read_identity(access)
-        with suppress(ObjectAccessError):
-            name = access.read_bytes(0x1008, 0).rstrip(b"\0 ").decode("utf-8", "replace")
-        revision, statusword = (access.read_optional(entry, any_abort=True) for entry in (REVISION, STATUSWORD))
-        found.append(FoundNode(node_id, identity, revision, name, nmt, statusword))
+        node = _describe(link, node_id)
+        if node_id in several and not node.shared:
+            node = replace(node, shared="two answers to one request for 1000h:00")
+        found.append(node)
     return tuple(found)
+
+
+def _describe(link: Link, node_id: int) -> FoundNode:
+    """Read what a node reports of itself; an object that it reports badly does not keep the others from it."""
+    access, problems = link.objects(node_id, SCAN_POLICY), list[str]()
+    end_ns = link.clock() + round(NODE_S * 1e9)
+
+    def reported(read: Callable[[], T]) -> T | None:
+        if link.clock() >= end_ns:
+            return None
+        try:
+            return read()
+        except ObjectAccessError as error:
+            if error.abort_code is None:
+                problems.append(f"object {error.entry}: {error.reason}")
+        return None
+
+    identity = reported(partial(read_identity, access))
+    data = reported(partial(access.read_bytes, 0x1008, 0))
+    name = None if data is None else data.rstrip(b"\0 ").decode("utf-8", "replace")
+    revision, statusword, period_ms = (
+        reported(partial(access.read, entry)) for entry in (REVISION, STATUSWORD, HEARTBEAT_TIME)
+    )
+    shared = link.shared_id(node_id, period_ms or 0)
+    return FoundNode(node_id, identity, revision, name, link.nmt.get(node_id), statusword, shared, tuple(problems))
 
 
 def read_identity(access: ObjectAccess) -> Identity:
@@ -93,8 +123,8 @@ def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, 
     asked = set(node_ids)
     link.answered.clear()
     _ask(link, node_ids)
-    link.wait(wait_s, lambda: asked <= link.answered)
-    return tuple(sorted(asked & link.answered))
+    link.wait(wait_s, lambda: asked <= link.answered.keys())
+    return tuple(sorted(asked & link.answered.keys()))
 
 
 def free_ids(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:

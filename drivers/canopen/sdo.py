@@ -5,11 +5,11 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, cast
 
 import can
 from canopen import ObjectDictionary
-from canopen.sdo.client import SdoClient
+from canopen.sdo.client import BlockUploadStream, ReadableStream, SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from drivers.errors import ObjectAccessError
@@ -18,9 +18,11 @@ from drivers.profiles.profile import ObjectEntry
 NO_SUCH_OBJECT = frozenset((0x0602_0000, 0x0609_0011))
 """Aborts of a drive that lacks the object or its sub-index (CiA 301); any other may be gone at the next request."""
 SDO_REQUEST, SDO_ANSWER = 0x600, 0x580  #: COB-IDs, to which the node id is added (CiA 301)
-_ABORT_TIMED_OUT = 0x0504_0000
+_ABORT_TIMED_OUT, _ABORT_UNKNOWN_COMMAND, _ABORT_OUT_OF_MEMORY = 0x0504_0000, 0x0504_0001, 0x0504_0005
 _ABORT = 0x80
-_INITIATE_DOWNLOAD, _INITIATE_UPLOAD = 1, 2
+_SEGMENT_BYTES = 7
+MOST_SURPLUS = 64  #: Answers to other requests that are skipped, before a node counts as one that does not answer
+_INITIATE_DOWNLOAD, _INITIATE_UPLOAD, _INITIATE_BLOCK_UPLOAD = 1, 2, 5
 _UPLOAD_REQUEST = _INITIATE_UPLOAD << 5
 _EXPEDITED, _SIZE_INDICATED = 0x42, 0x01  #: Bits of an upload answer with its data, and of one that says their size
 _HEAD = struct.Struct("<BHB")
@@ -66,10 +68,16 @@ def upload_answer(data: bytes, entry: ObjectEntry) -> UploadAnswer | None:
 
 @dataclass(frozen=True, slots=True)
 class SdoPolicy:
-    """Time to wait for an answer [s], and number of attempts; answers do get lost near SYNC traffic."""
+    """Limits of a transfer; answers do get lost near SYNC traffic."""
 
-    timeout_s: float = 0.5
-    attempts: int = 3
+    timeout_s: float = 0.5  #: until an answer
+    attempts: int = 3  #: where no answer comes
+    transfer_s: float = 2.0  #: until the end of an object of several frames
+    most_bytes: int = 4096  #: of one object
+
+
+class TransferUnboundedError(Exception):
+    """A node sends an object without end; nothing is gained by another attempt."""
 
 
 class ObjectAccess:
@@ -127,6 +135,8 @@ class ObjectAccess:
             except SdoAbortedError as error:
                 # An abort is an answer: another attempt would get it again.
                 raise ObjectAccessError(self, name, f"aborted, {error}", error.code) from error
+            except TransferUnboundedError as error:
+                raise ObjectAccessError(self, name, str(error)) from error
             except SdoCommunicationError as error:
                 reason = str(error)
         raise ObjectAccessError(self, name, f"{reason}, asked {self._policy.attempts} times")
@@ -136,10 +146,13 @@ class _Bus(Protocol):
     """The reader of the bus (drivers/canopen/link.py)."""
 
     clock: Clock
+    asked_by: dict[int, object]
 
     def send(self, messages: Sequence[can.Message]) -> None: ...
 
     def pump(self, timeout_s: float) -> None: ...
+
+    def note_twice(self, node_id: int, first: bytes, second: bytes) -> None: ...
 
 
 class SynchronousSdoClient(SdoClient):
@@ -153,6 +166,42 @@ class SynchronousSdoClient(SdoClient):
         SdoClient.__init__(self, SDO_REQUEST + node_id, SDO_ANSWER + node_id, ObjectDictionary())
         self._bus = bus
         self._policy = policy
+        self._answered = b""  # the last answer, if only one can have been sent for it
+        self._unanswered: set[bytes] = set()  # objects whose request was given up: its answer may still come
+
+    def upload(self, index: int, subindex: int) -> bytes:
+        """Read an object; by block transfer where the node has it that way alone.
+
+        Raises:
+            TransferUnboundedError: it is longer, or takes longer, than the policy allows; the transfer was aborted.
+            SdoAbortedError, SdoCommunicationError: the node refuses, or does not answer.
+        """
+        try:
+            return self._read_whole(index, subindex, block=False)
+        except SdoAbortedError as error:
+            if error.code != _ABORT_UNKNOWN_COMMAND:
+                raise
+        return self._read_whole(index, subindex, block=True)
+
+    def _read_whole(self, index: int, subindex: int, *, block: bool) -> bytes:
+        deadline = self._bus.clock() + round(self._policy.transfer_s * 1e9)
+        most, data = self._policy.most_bytes, bytearray()
+        try:
+            with BlockUploadStream(self, index, subindex) if block else ReadableStream(self, index, subindex) as stream:
+                size, read = stream.size or 0, cast("Callable[[int], bytes]", stream.read)
+                while size <= most and (segment := read(_SEGMENT_BYTES)):
+                    data += segment
+                    size = max(size, len(data))
+                    if self._bus.clock() >= deadline:
+                        break
+                else:
+                    if size <= most:
+                        return bytes(data)
+        except AttributeError as error:  # canopen's block transfer, where its end does not come
+            raise SdoCommunicationError("the block transfer was not ended") from error
+        self.abort(_ABORT_OUT_OF_MEMORY)
+        limits = f"at most {most} bytes within {self._policy.transfer_s:g} s"
+        raise TransferUnboundedError(f"found {size} bytes and no end, expected {limits}; the transfer was aborted")
 
     def receive(self, data: bytearray) -> None:
         """Accept an answer that was read from the bus; CiA 301: an SDO always has eight bytes."""
@@ -162,6 +211,7 @@ class SynchronousSdoClient(SdoClient):
     def send_request(self, request: bytes) -> None:
         """Send a request; a failing bus raises BusError."""
         self._bus.send((can.Message(arbitration_id=self.rx_cobid, is_extended_id=False, data=request),))
+        self._bus.asked_by[self.rx_cobid - SDO_REQUEST] = self
 
     def abort(self, abort_code: int = _ABORT_TIMED_OUT) -> None:
         """Abort the transfer on the node's side."""
@@ -169,7 +219,15 @@ class SynchronousSdoClient(SdoClient):
 
     def read_response(self) -> bytes:
         """Wait for the next answer of the node; SdoCommunicationError where none comes in time."""
-        deadline = self._bus.clock() + round(self._policy.timeout_s * 1e9)
+        response = self._read_until(self._deadline())
+        if response[0] == _ABORT:
+            raise SdoAbortedError(struct.unpack_from("<L", response, 4)[0])
+        return response
+
+    def _deadline(self) -> int:
+        return self._bus.clock() + round(self._policy.timeout_s * 1e9)
+
+    def _read_until(self, deadline: int) -> bytes:
         while self.responses.empty():
             left_s = (deadline - self._bus.clock()) * 1e-9
             if left_s <= 0:
@@ -181,19 +239,37 @@ class SynchronousSdoClient(SdoClient):
     def request_response(self, sdo_request: bytes) -> bytes:
         """Send a request and return the answer that belongs to it, or raise SdoAbortedError, SdoCommunicationError."""
         self._bus.pump(0.0)
-        self.responses.queue.clear()
+        while not self.responses.empty():
+            self._note_surplus(self.responses.get_nowait())
         self.send_request(sdo_request)
         requested = bytes(sdo_request[1:4])
-        names_object = sdo_request[0] >> 5 in (_INITIATE_DOWNLOAD, _INITIATE_UPLOAD)
-        while True:
+        names_object = sdo_request[0] >> 5 in (_INITIATE_DOWNLOAD, _INITIATE_UPLOAD, _INITIATE_BLOCK_UPLOAD)
+        deadline = self._deadline()
+        for _ in range(MOST_SURPLUS):
             try:
-                response = self.read_response()
+                response = self._read_until(deadline)
             except SdoCommunicationError:
-                self.abort()
+                self._give_up(requested)
                 raise
             about = response[1:4]
             if names_object and about != requested and not (response[0] == _ABORT and about == b"\0\0\0"):
-                continue  # a late answer to an earlier request
+                self._note_surplus(response)  # or a late answer to an earlier request
+                continue
+            self._answered = response if names_object and requested not in self._unanswered else b""
+            self._unanswered.discard(requested)
             if response[0] == _ABORT:
                 raise SdoAbortedError(struct.unpack_from("<L", response, 4)[0])
             return response
+        self._give_up(requested)
+        raise SdoCommunicationError(f"{MOST_SURPLUS} answers to other requests")
+
+    def _give_up(self, requested: bytes) -> None:
+        self._answered = b""
+        self._unanswered.add(requested)
+        self.abort()
+
+    def _note_surplus(self, response: bytes) -> None:
+        """Report a second answer to one request: two devices have the node id."""
+        node_id = self.tx_cobid - SDO_ANSWER
+        if self._answered and response[1:4] == self._answered[1:4] and self._bus.asked_by.get(node_id) is self:
+            self._bus.note_twice(node_id, self._answered, response)

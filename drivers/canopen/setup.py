@@ -12,22 +12,27 @@ fault. The watch raises ObjectAccessError only when the amplifier does not answe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict
 from functools import partial
 
 from drivers.canopen.link import Link
+from drivers.canopen.needs import HEARTBEAT_TIME, MODE_DISPLAY, MODE_OF_OPERATION, Profiles, misfit
 from drivers.canopen.pdo import (
     NOT_VALID,
+    PDO_BYTES,
     PDOS,
-    SETPOINT_PDOS,
+    PROFILE_DECELERATION,
     STATUSWORD,
+    AxisPdos,
     Direction,
     PdoRecord,
-    feedback_entries,
-    pack,
+    fixed_feedback,
+    fixed_setpoints,
     read_record,
-    records,
+    turn_off,
+    wanted_pdos,
     write_record,
 )
 from drivers.canopen.sdo import ObjectAccess
@@ -35,13 +40,11 @@ from drivers.errors import ObjectAccessError, SetupRefused, StateRefused
 from drivers.profiles.profile import Axis, Identity, ObjectEntry
 from drivers.profiles.scale import ScaleReading
 
-HEARTBEAT_TIME = ObjectEntry(0x1017, 0, 16, signed=False)
-MODE_OF_OPERATION = ObjectEntry(0x6060, 0, 8, signed=True)
-MODE_DISPLAY = ObjectEntry(0x6061, 0, 8, signed=True)
 PROFILE_POSITION_MODE = 1
 CONSUMERS = ObjectEntry(0x1016, 0, 8, signed=False)
 ABORT_CONNECTION = ObjectEntry(0x6007, 0, 16, signed=True)
 QUICK_STOP_ON_LOSS = 3
+SMALL_PDO_BYTES = 6  #: Tried where a drive refuses PDOs of eight bytes
 MOST_CONSUMERS = 127  #: Entries that 1016h can have (CiA 301)
 
 Consumers = tuple[tuple[ObjectEntry, int], ...]
@@ -90,6 +93,11 @@ class Guard:
         self._option_before = access.read_optional(ABORT_CONNECTION, any_abort=True)
         if self._option_before is None:
             self.lack = "no 6007h: when the recorder is killed it stops in the way that its maker decided"
+
+    @property
+    def watching(self) -> bool:
+        """Whether the amplifier stops by itself when the recorder is killed."""
+        return self._consumer is not None
 
     def describe(self, silence_ms: int) -> str:
         """Describe the guard in words, for the log."""
@@ -140,44 +148,84 @@ class AxisSetup:
         self._access = link.objects(axis.node_id)
         self._heartbeat_ms: int | None = None
         self._mode: int | None = None
+        self.pdos = AxisPdos((), ())  #: As they are mapped
+        self._absent: tuple[ObjectEntry, ...] = ()
+        self._found: dict[Direction, tuple[PdoRecord, ...]] = {}
         self._pdos_before: dict[str, PdoRecord] = {}
-        self._pdos: tuple[PdoRecord, ...] = ()
+
+    def check(self, profiles: Profiles) -> None:
+        """Check, before anything is written, that the drive has the objects and the PDOs that its profile needs.
+
+        Raises:
+            SetupRefused: it does not; `profiles` are those from which one that fits is named.
+            ObjectAccessError: the drive does not answer.
+        """
+        access, axis = self._access, self._axis
+        if found := misfit(access, axis.profile, profiles):
+            raise SetupRefused(axis, found)
+        if access.read_optional(PROFILE_DECELERATION) is None:
+            self._absent = (PROFILE_DECELERATION,)  # such a drive brakes with its profile acceleration
+        for direction in Direction:
+            read = (read_record(access, direction, number) for number in range(PDOS))
+            self._found[direction] = tuple(record for record in read if record is not None)
+        self.pdos = self._wanted(PDO_BYTES)
+
+    def _wanted(self, most_bytes: int) -> AxisPdos:
+        numbers = {direction: [record.number for record in found] for direction, found in self._found.items()}
+        try:
+            return wanted_pdos(self._axis, numbers, self._absent, most_bytes)
+        except ValueError as error:
+            raise SetupRefused(self._axis, f"PDO: profile {self._axis.profile.name}: {error}") from error
 
     def send_heartbeats(self, period_ms: int) -> None:
         """Let the amplifier send heartbeats."""
         if self._heartbeat_ms is None:
             self._heartbeat_ms = self._access.read(HEARTBEAT_TIME)
         self._access.write(HEARTBEAT_TIME, period_ms)
+        self._link.count_beats(self._axis.node_id)
 
     def map_pdos(self) -> None:
         """Map position, current and statusword into TPDOs and the set-points into RPDOs; all other PDOs go off.
 
+        Where the drive refuses that, PDOs of six bytes are tried, and its own PDOs are used if they carry the same.
+
         Raises:
             SetupRefused: a mapping is impossible, was refused, or reads back differently.
         """
-        axis, node_id = self._axis, self._axis.node_id
+        tpdos, rpdos = (self._found[direction] for direction in (Direction.TPDO, Direction.RPDO))
+        self.pdos = AxisPdos(
+            self._map(lambda pdos: pdos.feedback, tpdos, fixed_feedback(self._axis, tpdos)),
+            self._map(lambda pdos: pdos.setpoints, rpdos, fixed_setpoints(rpdos, self._absent)),
+        )
+
+    def _map(
+        self,
+        used: Callable[[AxisPdos], tuple[PdoRecord, ...]],
+        found: Sequence[PdoRecord],
+        own: tuple[PdoRecord, ...],
+    ) -> tuple[PdoRecord, ...]:
+        """Map the PDOs of one direction; returns those of its own where the drive refuses others."""
         try:
-            feedback = pack(feedback_entries(axis))
-        except ValueError as error:
-            raise SetupRefused(axis, f"TPDO: profile {axis.profile.name}: {error}") from error
-        wanted = {
-            Direction.TPDO: records(Direction.TPDO, node_id, feedback),
-            Direction.RPDO: records(Direction.RPDO, node_id, SETPOINT_PDOS),
-        }
-        for direction, pdos in wanted.items():
-            for number in range(PDOS):
-                found = read_record(self._access, direction, number)
-                if found is None:
-                    if number < len(pdos):
-                        raise SetupRefused(axis, f"{pdos[number].name}: the drive has no such PDO")
-                elif number < len(pdos):
-                    self._pdos_before.setdefault(found.name, found)
-                    write_record(self._access, pdos[number])
-                elif not found.cob_id & NOT_VALID:
-                    self._pdos_before.setdefault(found.name, found)
-                    # A drive's default PDOs would come between ours.
-                    write_record(self._access, replace(found, cob_id=found.cob_id | NOT_VALID))
-        self._pdos = wanted[Direction.TPDO] + wanted[Direction.RPDO]
+            return self._write(used(self._wanted(PDO_BYTES)), found)
+        except SetupRefused as refused:
+            if getattr(refused.__cause__, "abort_code", None) is None:
+                raise
+            for most_bytes in (SMALL_PDO_BYTES, None):
+                with suppress(SetupRefused):
+                    if pdos := own if most_bytes is None else used(self._wanted(most_bytes)):
+                        return self._write(pdos, found)
+            raise
+
+    def _write(self, pdos: tuple[PdoRecord, ...], found: Sequence[PdoRecord]) -> tuple[PdoRecord, ...]:
+        wanted = {record.number: record for record in pdos}
+        for before in found:
+            if before.number in wanted:
+                self._pdos_before.setdefault(before.name, before)
+                write_record(self._access, wanted[before.number])
+            elif not before.cob_id & NOT_VALID:
+                self._pdos_before.setdefault(before.name, before)
+                turn_off(self._access, before)  # a drive's default PDOs would come between ours
+        return pdos
 
     def set_mode(self, within_s: float) -> None:
         """Select profile position mode, and wait until 6061h shows it; StateRefused where it does not in time."""
@@ -220,6 +268,6 @@ class AxisSetup:
             "scale_warnings": list(scale.warnings),
             "guard": self.guard.describe(silence_ms),
             "mode_before": self._mode,
-            "mapping": [str(record) for record in self._pdos],
+            "mapping": [str(record) for record in self.pdos.feedback + self.pdos.setpoints],
             "mapping_before": [str(record) for record in self._pdos_before.values()],
         }

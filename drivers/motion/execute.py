@@ -6,13 +6,19 @@ statusword bit 12, and reached at bit 10. Set-points go by synchronous RPDOs, so
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import can
 
 from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.pdo import SETPOINT_PDOS, Direction, layout
+from drivers.canopen.pdo import (
+    CONTROLWORD,
+    PROFILE_ACCELERATION,
+    PROFILE_DECELERATION,
+    PROFILE_VELOCITY,
+    TARGET_POSITION,
+)
 from drivers.errors import WHILE, DriveFault, DriverError, MotionRefused, MotionTimeout, StateRefused, node_label
 from drivers.motion.move import MotionPermission, Move, check_moves
 from drivers.motion.watch import FrozenData
@@ -28,11 +34,11 @@ from drivers.profiles.cia402 import (
     decode,
     next_command,
 )
+from drivers.profiles.profile import ObjectEntry
 from drivers.stream.sample import CellEvent, EventKind, Sample
 from drivers.stream.stream import SyncStream, nothing_to_send
 from drivers.stream.sync import LockstepSync
 
-_LAYOUTS = tuple(map(layout, SETPOINT_PDOS))
 _NEW_SETPOINT = Command.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
 
 
@@ -125,7 +131,7 @@ class _Execution:
     def __init__(self, network: CanopenNetwork, stream: SyncStream, bounds: MotionBounds, first: Sample) -> None:
         self.problems: list[DriverError] = []  #: Failures to confirm the last stop
         self._network, self._stream = network, stream
-        self._bounds, self._sample = bounds, first
+        self._bounds, self._sample, self._pdos = bounds, first, network.pdos
         self._nodes, self._axes = network.axes, range(len(network.axes))
         self._targets = list(first.position_counts)
         self._sent: list[tuple[int, int] | None] = [None] * len(network.axes)
@@ -141,7 +147,14 @@ class _Execution:
         command = (controlword, self._targets[axis])
         if repeat or self._sent[axis] != command:
             self._sent[axis] = command
-            self._stream.outgoing.append(_frame(self._nodes[axis].node_id, 0, *command))
+            self._send(axis, {TARGET_POSITION: self._targets[axis], CONTROLWORD: controlword})
+
+    def _send(self, axis: int, values: Mapping[ObjectEntry, int]) -> None:
+        """Send values of one axis with the next SYNC, in its RPDOs; those of objects that it does not have are left."""
+        self._stream.outgoing.extend(
+            can.Message(arbitration_id=cob_id, is_extended_id=False, data=data)
+            for cob_id, data in self._pdos[axis].payloads(values)
+        )
 
     def emit(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
         self._stream.emit(CellEvent(self._stream.time_ns, axis, kind, code, text))
@@ -178,8 +191,8 @@ class _Execution:
         for axis in moving:
             # One axis a cycle: a whole set would not fit between two SYNCs of a classic bus.
             velocity, acceleration = move.velocity_counts_s[axis], move.acceleration_counts_s2[axis]
-            node_id = self._nodes[axis].node_id
-            self._stream.outgoing.extend((_frame(node_id, 1, velocity, acceleration), _frame(node_id, 2, acceleration)))
+            ramps = {PROFILE_ACCELERATION: acceleration, PROFILE_DECELERATION: acceleration}
+            self._send(axis, {PROFILE_VELOCITY: velocity, **ramps})
             yield self._checked()
         for axis in moving:
             self._targets[axis] = move.target_counts[axis]
@@ -225,10 +238,13 @@ class _Execution:
                 yield self._checked()
                 waiting = [axis for axis in moving if self._sample.statusword[axis] & bit != wanted]
             if waiting:
-                raise self._timeout(number, tuple(waiting), self._bounds.acknowledge_s)
+                acknowledge = int(bool(wanted))
+                raise self._timeout(number, tuple(waiting), self._bounds.acknowledge_s, acknowledge)
 
-    def _timeout(self, number: int, late: tuple[int, ...], waited_s: float) -> MotionTimeout:
-        return MotionTimeout(number, late, [self._nodes[axis].name for axis in late], waited_s)
+    def _timeout(
+        self, number: int, late: tuple[int, ...], waited_s: float, acknowledge: int | None = None
+    ) -> MotionTimeout:
+        return MotionTimeout(number, late, [self._nodes[axis] for axis in late], waited_s, acknowledge)
 
     def _arrived(self, axis: int, start: int) -> bool:
         """Return whether bit 10 is set near the target; on a short way it may be that of the move before."""
@@ -308,9 +324,3 @@ class _Execution:
             if not powered or silent > (0 if lockstep_silent else self._stream.max_missing_cycles):
                 break
         return tuple(powered)
-
-
-def _frame(node_id: int, pdo: int, *values: int) -> can.Message:
-    """Return one RPDO of the set-point mapping."""
-    cob_id = Direction.RPDO.value[2] + 0x100 * pdo + node_id
-    return can.Message(arbitration_id=cob_id, is_extended_id=False, data=_LAYOUTS[pdo].pack(*values))

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from drivers.canopen.link import HEARTBEAT, NmtState, command_name, nmt_name
+from drivers.canopen.link import LSS, NmtState, command_name, nmt_name
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.sdo import SDO_REQUEST
 from drivers.errors import BusBusy, DriveFault, DriverError, node_label
@@ -168,12 +168,12 @@ class Watch:
         """Report the events of the nodes since the last cycle, at a time of the samples."""
         for event in self._link.take_events(time_ns, self._network.node_ids):
             self._on_event(event)
-            if event.kind is EventKind.BUS_BUSY and event.code < SDO_REQUEST:
+            if event.kind is EventKind.BUS_BUSY and self._link.is_own(event.code):
+                self.faults.append(BusBusy.by_own_id(self._link.address, event.code))
+            elif event.kind is EventKind.BUS_BUSY and (event.code < SDO_REQUEST or event.code in LSS):
                 # A reader only disturbs, and is reported; a device that sends commands could move the robot.
                 seen = command_name(event.code, self._link.names)
                 self.faults.append(BusBusy.by_master(self._link.address, seen))
-            elif event.kind is EventKind.BUS_BUSY and event.code >= HEARTBEAT:
-                self.faults.append(BusBusy.by_heartbeat(self._link.address, event.code - HEARTBEAT))
             if event.axis is None:
                 continue
             node = self._network.axes[event.axis]

@@ -199,6 +199,19 @@ class Identity:
     product_code: int
     serial: int | None = None
 
+    def differences(self, found: Identity) -> tuple[str, ...]:
+        """Describe each field in which a drive differs from this configuration."""
+        fields = (
+            ("vendor id 1018h:01", self.vendor_id, found.vendor_id),
+            ("product code 1018h:02", self.product_code, found.product_code),
+            ("serial number 1018h:04", self.serial, found.serial or 0),
+        )
+        return tuple(
+            f"{name} is {have:#x}, the cell configuration expects {want:#x}"
+            for name, want, have in fields
+            if want is not None and want != have
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Axis:

@@ -55,6 +55,7 @@ class Tree(NamedTuple):
     frame_rotation: FloatArray  #: placement of each frame in that joint's, shape (k, 2, 3, 3)
     frame_offset: FloatArray  #: the same, its origin [m], shape (k, 2, 3)
     closed: NDArray[np.bool_]  #: whether each of x, y, z, rx, ry, rz of the first frame is closed, shape (k, 6)
+    first_row: NDArray[np.int64]  #: of each closure among the c closed directions, and c, shape (k + 1,)
 
 
 @compiled
@@ -67,27 +68,27 @@ def evaluate(constants: tuple[Any, ...], position: FloatArray, error: FloatArray
         _place_joint(tree, i, position[i], rotation, origin, axis)
     r, p, spin = np.empty((2, 3, 3)), np.empty((2, 3)), np.empty((3, 3))
     jacobian[:] = 0.0
-    row = 0
+    arm = np.empty(3)
     for k in range(len(tree.closed)):
+        row = tree.first_row[k]
         for side in range(2):
             _place_frame(tree, k, side, rotation, origin, r, p)
-        after = _close(tree.closed[k], row, r, p, error, spin)
+        _close(tree.closed[k], row, r, p, error, spin)
         for side in range(2):
             j = tree.frame_joint[k, side]
             while j >= 0:
                 # Seen from the first frame, so that its own turning moves the second frame's origin as well.
-                _add_joint(
-                    tree.closed[k], row, side, tree.sliding[j], axis[j], p[1] - origin[j], r, spin, jacobian[:, j]
-                )
+                for a in range(3):
+                    arm[a] = p[1, a] - origin[j, a]
+                _add_joint(tree.closed[k], row, side, tree.sliding[j], axis[j], arm, r, spin, jacobian[:, j])
                 j = tree.parent[j]
-        row = after
 
 
 @compiled
 def _close(
     closed: NDArray[np.bool_], row: int, r: FloatArray, p: FloatArray, error: FloatArray, spin: FloatArray
-) -> int:
-    """Fill φ of one closure from a row on; return the row after it.
+) -> None:
+    """Fill φ of one closure from a row on.
 
     With Ṙ = [ω] R the second part of φ changes by ½ (tr(R) I − R) ω, ω in the first frame: `spin`, output.
     """
@@ -110,7 +111,6 @@ def _close(
             b, c = (a + 1) % 3, (a + 2) % 3
             error[row] = 0.5 * (turn[c, b] - turn[b, c])
             row += 1
-    return row
 
 
 @compiled
@@ -138,8 +138,8 @@ def _add_joint(
         column: changed in place, shape (c,).
     """
     sign = 1.0 if side == 1 else -1.0
-    x, y, z = axis
-    u, v, w = arm
+    x, y, z = axis[0], axis[1], axis[2]
+    u, v, w = arm[0], arm[1], arm[2]
     if sliding:
         u, v, w, x, y, z = x, y, z, 0.0, 0.0, 0.0
     else:
@@ -162,20 +162,20 @@ def _place_joint(
 ) -> None:
     """Place joint i in the base behind its parent: rotation, origin and axis, each indexed by the joint."""
     parent = tree.parent[i]
-    x, y, z = tree.axis[i]
-    s, c = (0.0, 1.0) if tree.sliding[i] else (np.sin(position), np.cos(position))
-    own = np.array(
-        [
-            [c + x * x * (1 - c), x * y * (1 - c) - z * s, x * z * (1 - c) + y * s],
-            [x * y * (1 - c) + z * s, c + y * y * (1 - c), y * z * (1 - c) - x * s],
-            [x * z * (1 - c) - y * s, y * z * (1 - c) + x * s, c + z * z * (1 - c)],
-        ]
-    )
+    x, y, z = tree.axis[i, 0], tree.axis[i, 1], tree.axis[i, 2]
+    s, c = 0.0, 1.0
+    if not tree.sliding[i]:
+        s, c = np.sin(position), np.cos(position)
+    own = np.empty((3, 3))
+    own[0, 0], own[0, 1], own[0, 2] = c + x * x * (1 - c), x * y * (1 - c) - z * s, x * z * (1 - c) + y * s
+    own[1, 0], own[1, 1], own[1, 2] = x * y * (1 - c) + z * s, c + y * y * (1 - c), y * z * (1 - c) - x * s
+    own[2, 0], own[2, 1], own[2, 2] = x * z * (1 - c) - y * s, y * z * (1 - c) + x * s, c + z * z * (1 - c)
     placed = np.zeros((3, 3))
     for a in range(3):
         if parent < 0:
             origin[i, a] = tree.offset[i, a]
-            placed[a] = tree.rotation[i, a]
+            for e in range(3):
+                placed[a, e] = tree.rotation[i, a, e]
         else:
             origin[i, a] = origin[parent, a]
             for b in range(3):
@@ -222,10 +222,12 @@ def eliminate(matrix: FloatArray, rank: int, held: NDArray[np.bool_], pivots: ND
         the smallest pivot over the largest.
     """
     n = matrix.shape[1] - 1
-    used = np.zeros(n, dtype=np.bool_)
+    used, barred = np.zeros(n, dtype=np.bool_), np.empty(n, dtype=np.bool_)
     largest, smallest = 0.0, np.inf
     for i in range(rank):
-        best, at_row, column = _find_pivot(matrix, i, used | held)
+        for j in range(n):
+            barred[j] = used[j] or held[j]
+        best, at_row, column = _find_pivot(matrix, i, barred)
         if not best > SINGULAR * largest:
             best, at_row, column = _find_pivot(matrix, i, used)
         if not best > 0.0:
@@ -235,7 +237,9 @@ def eliminate(matrix: FloatArray, rank: int, held: NDArray[np.bool_], pivots: ND
         pivots[i] = column
         for j in range(n + 1):
             matrix[i, j], matrix[at_row, j] = matrix[at_row, j], matrix[i, j]
-        matrix[i] /= matrix[i, column]
+        pivot = matrix[i, column]
+        for j in range(n + 1):
+            matrix[i, j] /= pivot
         for k in range(len(matrix)):
             factor = matrix[k, column]
             if k != i and factor != 0.0:
@@ -278,16 +282,21 @@ def settle(
         the largest |φ| that is left, and the smallest pivot over the largest.
     """
     n, d = basis.shape
-    rank, rows = n - d, int(Tree(*constants).closed.sum())
+    tree = Tree(*constants)
+    rank, rows = n - d, tree.first_row[len(tree.closed)]
     matrix, error, jacobian = np.empty((rows, n + 1)), np.empty(rows), np.empty((rows, n))
     pivots = np.zeros(rank, dtype=np.int64)
     worst, ratio = np.inf, 1.0
     for _ in range(MAX_NEWTON):
         evaluate(constants, position, error, jacobian)
-        worst = np.abs(error).max()
-        if not np.isfinite(worst):
-            return np.inf, 0.0
-        matrix[:, :n], matrix[:, n] = jacobian, error
+        worst = 0.0
+        for k in range(rows):
+            if not np.isfinite(error[k]):
+                return np.inf, 0.0
+            worst = max(worst, abs(error[k]))
+            for j in range(n):
+                matrix[k, j] = jacobian[k, j]
+            matrix[k, n] = error[k]
         ratio = eliminate(matrix, rank, resting[:n], pivots)
         if worst <= CLOSED or ratio < SINGULAR:
             break
@@ -295,7 +304,9 @@ def settle(
             position[pivots[i]] -= matrix[i, n]
     _span(matrix, pivots, basis)
     for i in range(len(motor_rad)):
-        motor_rad[i] = (rotor_direction[i] * position).sum()
+        motor_rad[i] = 0.0
+        for j in range(len(position)):
+            motor_rad[i] += rotor_direction[i, j] * position[j]
     return worst, ratio
 
 
@@ -448,6 +459,7 @@ def _tree(model: pin.Model, ids: Sequence[int], spec: CellSpec) -> Tree:
     sliding = np.linalg.norm(moves[:, :3], axis=1) > 0.5
     placements = [model.jointPlacements[i] for i in ids]
     frames = [[link_frame(model, name) for name in (c.first, c.second)] for c in spec.closures]
+    closed = np.array([[d in c.directions for d in DIRECTIONS] for c in spec.closures])
     return Tree(
         parent=np.array([place[model.parents[i]] for i in ids], dtype=np.int64),
         # Pinocchio numbers a joint after its parent.
@@ -459,7 +471,8 @@ def _tree(model: pin.Model, ids: Sequence[int], spec: CellSpec) -> Tree:
         frame_joint=np.array([[place[f.parentJoint] for f in pair] for pair in frames], dtype=np.int64),
         frame_rotation=np.array([[f.placement.rotation for f in pair] for pair in frames]),
         frame_offset=np.array([[f.placement.translation for f in pair] for pair in frames]),
-        closed=np.array([[d in c.directions for d in DIRECTIONS] for c in spec.closures]),
+        closed=closed,
+        first_row=np.concatenate(([0], np.cumsum(closed.sum(axis=1)))),
     )
 
 

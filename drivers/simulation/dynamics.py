@@ -39,24 +39,20 @@ def compiled(function: F) -> F:
 
     numba invalidates a cached function when its own file changes, not when a function it calls in another file does:
     so compiled functions call only compiled functions of their own file.
+
+    They loop over numbers instead of arrays, and take no optional arguments: an expression of arrays compiles numba's
+    own functions with it, each second of which a new machine waits for at its first simulated cell.
     """
     return cast(F, numba.njit(cache=True)(function))
 
 
 TOLERANCE_RAD_S = 1e-10  #: Largest speed that a direction may keep while its friction is inside its bound [rad/s]
-
 MAX_SWEEPS = 2_000
-
 SWEEPS_A_ROUND = 10  #: Sweeps that find which directions stick, before these are solved for directly
-
 DEPENDENT = 1e-9  #: Relative pivot below which a sticking direction depends on those before it
-
 DEPENDENT_CLOSED = 1e-13  #: The same in a closed chain, where joints turn nearly alike close to a symmetric pose
-
 TOLERANCE_CLOSED = 1e-6  #: Speed that a direction of a closed chain may keep in addition, over the largest speed
-
 IMMOBILE = 1e-14  #: Relative mobility below which the closures of a closed chain hold a direction
-
 SPANNED = 1e-6  #: Sine of the angle below which a direction lies in the span of others
 
 
@@ -114,7 +110,7 @@ def advance(
     _factorise(inertia)
     _substitute(inertia, free_velocity)
     response, free_speed, delassus = _respond(inertia, free_velocity, directions)
-    residual = solve(delassus, free_speed, bound, impulse, TOLERANCE_RAD_S, MAX_SWEEPS)
+    residual = solve(delassus, free_speed, bound, impulse, TOLERANCE_RAD_S, MAX_SWEEPS, DEPENDENT)
     if not residual <= TOLERANCE_RAD_S:
         return residual
     change = np.empty(total)
@@ -183,7 +179,9 @@ def advance_closed(
             ordered_mass[i, j] = mass[order[i], order[j]]
     inertia, momentum = _assemble(mechanics, ordered_mass, ordered_bias, viscous, motor_torque, torque, velocity)
     whole = np.zeros((total, d + total - n))
-    whole[:n, :d] = basis
+    for i in range(n):
+        for j in range(d):
+            whole[i, j] = basis[i, j]
     for i in range(total - n):
         whole[n + i, d + i] = 1.0
     reduced = _product(whole.T, _product(inertia, whole))
@@ -194,11 +192,17 @@ def advance_closed(
     response, free_speed, delassus = _respond(reduced, free, directions)
     _leave_out_immobile(delassus, free_speed, impulse, directions, response)
     # Of two joints that turn alike but for 1e-8, one may slide while the other still sticks: too fine to solve for.
-    tolerance = TOLERANCE_RAD_S + TOLERANCE_CLOSED * np.abs(free_speed).max()
+    largest = 0.0
+    for k in range(len(free_speed)):
+        largest = max(largest, abs(free_speed[k]))
+    tolerance = TOLERANCE_RAD_S + TOLERANCE_CLOSED * largest
     residual = solve(delassus, free_speed, bound, impulse, tolerance, MAX_SWEEPS, DEPENDENT_CLOSED)
     if not residual <= tolerance:
         return residual
-    after = _times(whole, free + _times(response, impulse))
+    change = _times(response, impulse)
+    for i in range(len(free)):
+        free[i] += change[i]
+    after = _times(whole, free)
     _resting_closed(impulse, bound, directions, mechanics.lone, resting)
     for i in range(total):
         if resting[i]:
@@ -287,26 +291,43 @@ def _resting_closed(
     """Find the coordinates at rest: all where the sticking directions span the speeds, else those that stick alone."""
     size = directions.shape[1]
     span = np.zeros((size, size))
+    rest = np.empty(size)
     rank = 0
     resting[:] = False
     for k in range(len(impulse)):
-        if abs(impulse[k]) >= bound[k] or not directions[k].any():
+        length = _length(directions[k])
+        if abs(impulse[k]) >= bound[k] or length == 0.0:
             continue
         if lone[k] >= 0:
             resting[lone[k]] = True
         if rank == size:
             continue
+        for j in range(size):
+            rest[j] = directions[k, j] / length
         # Gram-Schmidt, twice for rounding.
-        rest = directions[k] / np.sqrt((directions[k] ** 2).sum())
         for _ in range(2):
             for i in range(rank):
-                rest -= (span[i] * rest).sum() * span[i]
-        length = np.sqrt((rest**2).sum())
+                along = 0.0
+                for j in range(size):
+                    along += span[i, j] * rest[j]
+                for j in range(size):
+                    rest[j] -= along * span[i, j]
+        length = _length(rest)
         if length > SPANNED:
-            span[rank] = rest / length
+            for j in range(size):
+                span[rank, j] = rest[j] / length
             rank += 1
     if rank == size:
         resting[:] = True
+
+
+@compiled
+def _length(vector: FloatArray) -> float:
+    """Return the Euclidean length."""
+    s = 0.0
+    for j in range(len(vector)):
+        s += vector[j] * vector[j]
+    return float(np.sqrt(s))
 
 
 @compiled
@@ -358,9 +379,11 @@ def _respond(
     delassus = np.empty((m, m))
     column = np.empty(total)
     for k in range(m):
-        column[:] = directions[k]
+        for i in range(total):
+            column[i] = directions[k, i]
         _substitute(lower, column)
-        response[:, k] = column
+        for i in range(total):
+            response[i, k] = column[i]
         s = 0.0
         for i in range(total):
             s += directions[k, i] * free_velocity[i]
@@ -432,7 +455,7 @@ def solve(
     impulse: FloatArray,
     tolerance: float,
     sweeps: int,
-    dependent: float = DEPENDENT,
+    dependent: float,
 ) -> float:
     """Solve for the impulses in place, starting from those of the step before.
 
@@ -491,10 +514,11 @@ def _stick(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: F
     m = len(free)
     lower = np.zeros((m, m))
     step = np.zeros(m)
+    inside = np.zeros(m, dtype=np.bool_)
     for _ in range(m):
         # Factorise W over the free directions; a dependent one keeps its impulse, the others can stop it as well.
-        inside = np.abs(impulse) < bound
         for i in range(m):
+            inside[i] = abs(impulse[i]) < bound[i]
             step[i] = 0.0
             if not inside[i]:
                 continue

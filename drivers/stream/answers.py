@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from struct import Struct
 
-from drivers.canopen.pdo import Direction, feedback_entries, layout, pack, records
+from drivers.canopen.pdo import AxisPdos, feedback_entries, payload_of, wanted_pdos
 from drivers.profiles.profile import Axis
 
 
@@ -44,24 +44,23 @@ class Slot:
     columns: tuple[int, ...]
 
 
-def slots_of(axes: Sequence[Axis]) -> dict[int, Slot]:
-    """Return the slot of each COB-ID."""
+def slots_of(axes: Sequence[Axis], pdos: Sequence[AxisPdos] | None = None) -> dict[int, Slot]:
+    """Return the slot of each COB-ID; `pdos` are those of each axis, None for those that a recording maps."""
     slots: dict[int, Slot] = {}
-    for number, axis in enumerate(axes):
+    for number, (axis, used) in enumerate(zip(axes, pdos or tuple(map(wanted_pdos, axes)), strict=True)):
         entries = feedback_entries(axis)
-        pdos = pack(entries)
-        for pdo, record in zip(pdos, records(Direction.TPDO, axis.node_id, pdos), strict=True):
-            form = layout(pdo)
-            columns = tuple(entries.index(entry) * len(axes) + number for entry in pdo)
-            slots[record.cob_id] = Slot(number, 1 << len(slots), form.size, form, columns)
+        for record in used.feedback:
+            form, carried = payload_of(record, entries)
+            columns = tuple(entries.index(entry) * len(axes) + number for entry in carried)
+            slots[record.cob_id & 0x7FF] = Slot(number, 1 << len(slots), form.size, form, columns)
     return slots
 
 
 class Answers:
     """Assigns answers to cycles and counts them."""
 
-    def __init__(self, axes: Sequence[Axis]) -> None:
-        self.slots = slots_of(axes)  #: By COB-ID
+    def __init__(self, axes: Sequence[Axis], pdos: Sequence[AxisPdos] | None = None) -> None:
+        self.slots = slots_of(axes, pdos)  #: By COB-ID
         self.values = [0] * (3 * len(axes))  #: Last value of each column
         self.counts: Counter[str] = Counter()  #: By their names in StreamStatistics
         self._all = (1 << len(self.slots)) - 1

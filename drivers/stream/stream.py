@@ -80,7 +80,7 @@ class SyncStream:
         #: Returns frames that may wait, for a cycle that has no others to send; receives the last SYNC's time [ns].
         self.spare: Callable[[int], Sequence[can.Message]] = nothing_to_send
         self._link = network.link
-        self._answers = Answers(network.axes)
+        self._answers = Answers(network.axes, network.pdos)
         self._sync = can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False)
         self._last_wrong_length: dict[int, int] = {}  # cycle, by COB-ID
         self._answered_ns = self._next_sync_ns = self._first_sync_ns = self._last_sync_ns = 0
@@ -365,7 +365,7 @@ class SyncStream:
         self._incomplete_cycles = self._incomplete_cycles + 1 if missing else 0
         if missing:
             silent = tuple(axis for axis in range(axes) if missing >> axis & 1)
-            names = [self.network.axes[axis].name for axis in silent]
+            names = [node_label(self.network.axes[axis]) for axis in silent]
             for axis, name in zip(silent, names, strict=True):
                 text = f"no complete answer from {name} to cycle {cycle}"
                 self.emit(CellEvent(self.time_ns, axis, EventKind.SAMPLE_LOST, cycle, text))

@@ -1,8 +1,8 @@
 """Runs, one after the other, reduced to triangles: the observation matrix is never held whole (TSQR).
 
 Rows are reduced in the standard columns [V | W_st], separately for each payload mounting. The same triangles serve
-every choice of base parameters and of known payload parameters, because a payload has the columns of the last link, in
-the rows in which it was mounted.
+every choice of base parameters and of known payload parameters, because a payload has the columns of the link that
+carries it, in the rows in which it was mounted.
 """
 
 from __future__ import annotations

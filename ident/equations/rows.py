@@ -16,7 +16,7 @@ from ident.data.dataset import Dataset
 from ident.equations.system import Equations, System
 from ident.equations.triangles import Triangles, triangle_of
 from ident.errors import DataUnfit
-from ident.model.model import Column, DriveTrain, Model, spread
+from ident.model.model import Column, Model, preload_directions, spread
 from ident.model.robot import Motion
 
 CHUNK_ROWS = 256  #: Decimated rows built at once: the regressor of their samples stays in the cache's reach
@@ -43,8 +43,12 @@ def decimate_rows(data: Dataset, conditioning: Conditioning, columns: FloatArray
     return decimator(data.rate_hz, conditioning.decimation_cutoff_hz)(columns)
 
 
-def row_masks(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning) -> tuple[BoolArray, BoolArray]:
-    """Rows of each joint, and of each motor, that count (Observation.use, .motor_use), both of shape (n, r)."""
+def row_masks(model: Model, data: Dataset, conditioning: Conditioning) -> tuple[BoolArray, BoolArray]:
+    """Rows of each axis, and of each motor, that count (Observation.use, .motor_use), both of shape (m, r).
+
+    Preload joins the equations of all motors: of a redundant drive, rows count in which all of them move.
+    """
+    drive_train = model.drive_train
     filter_ = decimator(data.rate_hz, conditioning.decimation_cutoff_hz)
     # A row's share of standstill is weighted as the filter weights its samples.
     window = Decimator(np.abs(filter_.taps) / np.abs(filter_.taps).sum(), filter_.factor)
@@ -58,6 +62,8 @@ def row_masks(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning
     # A coupled motor that sticks leaves an undetermined torque in the equations of all joints it turns with.
     for motor in drive_train.coupled:
         use &= ~(turned[motor][:, None] & motor_still[motor][None, :])
+    if model.is_redundant:
+        use[:] = motor_use[:] = use.all(axis=0) & motor_use.all(axis=0)
     return use, motor_use
 
 
@@ -102,9 +108,7 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
         DataUnfit: the run is too short for the filter, or no row of it counts.
     """
     filter_ = row_filter(data, conditioning)
-    use, motor_use = row_masks(model.drive_train, data, conditioning)
-    if model.is_redundant:  # preload joins the equations of all motors
-        use[:] = motor_use[:] = use.all(axis=0) & motor_use.all(axis=0)
+    use, motor_use = row_masks(model, data, conditioning)
     if not use.any():
         raise DataUnfit(data.name, "no row is left after the standstill and validity masks; did the robot move?")
     centres = filter_.centres(len(data.time_s))
@@ -147,8 +151,7 @@ def _balanced(
     slow = filter_(to_motors)
     standard = spread(filter_(columns), slow)
     drive = spread(filter_(to_motors * currents), slow)
-    whole, _ = np.linalg.qr(slow.transpose(2, 1, 0), mode="complete")
-    return standard, drive, np.ascontiguousarray(whole[:, :, slow.shape[0] :].transpose(1, 2, 0))
+    return standard, drive, np.ascontiguousarray(preload_directions(slow).transpose(1, 2, 0))
 
 
 def _decimated(demanded: Motion, filter_: Decimator) -> Motion:
@@ -192,7 +195,7 @@ class Observation(Equations):
     current: FloatArray  #: decimated current references of the motors [A], shape (n, r)
     regressor: FloatArray  #: torque at each joint per unit of each base parameter: W without effects, shape (n, b, r)
     effects: FloatArray  #: the same of each effect, the other columns of W, shape (n, e, r)
-    flange: FloatArray  #: the last link's ten columns, also a payload's while it was mounted, shape (n, 10, r)
+    flange: FloatArray  #: columns of the payload's link, also of the payload while it was mounted, shape (n, 10, r)
     use: BoolArray  #: rows of each joint that count: moving and valid, shape (n, r)
     motor_use: BoolArray  #: rows of each motor that count: all joints it turns with, and itself, moving, shape (n, r)
     time_s: FloatArray  #: of each row, since the start of its run, shape (r,)

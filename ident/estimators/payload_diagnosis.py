@@ -72,7 +72,7 @@ def payload_differences(
 ) -> list[PayloadDifference]:
     """Estimate what each run carries beside what it should, with all other unknowns, and return what is not chance.
 
-    A payload has the columns of the last link. With δ for one run alone and all unknowns x,
+    A payload has the columns of the link that carries it. With δ for one run alone and all unknowns x,
 
         e = J x + X δ,    X = J_flange in the rows of this run,
 

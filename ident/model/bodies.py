@@ -37,8 +37,8 @@ class Payload:
 
     name: str  #: of the body
     mounting: str  #: names one way of mounting it; runs that share it share their unknown parameters
-    #: Known inertial parameters by their names in LINK_PARAMETERS, in the last joint's frame (paper eq. 5, χ_kL); the
-    #: weighed mass alone is {"m": 4.59}.
+    #: Known inertial parameters by their names in LINK_PARAMETERS, in the frame of the joint that carries it (paper
+    #: eq. 5, χ_kL); the weighed mass alone is {"m": 4.59}.
     known: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

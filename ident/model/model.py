@@ -11,6 +11,7 @@ internal preload, moves nothing and is in no equation: the columns are then thos
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from hashlib import blake2b
 
 import numpy as np
 
@@ -23,6 +24,8 @@ from ident.model.robot import JointKind, Motion, Robot
 
 DRIVE_UNITS = {JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"), JointKind.PRISMATIC: ("N", "m/s", "kg")}
 """Units of torque or force along a joint, of its speed, and of a rotor's inertia seen there."""
+REMEMBERED_BYTES = 2**28
+"""Largest size of the motions of closed chains that a model keeps: a fit asks for those of the same few runs again."""
 JOINT_COLUMNS = 14  #: Standard parameters of a joint: ten of its link (LINK_PARAMETERS), then Ia, fv, fs, off
 
 
@@ -97,6 +100,8 @@ class Model:
     robot: Robot
     drive_train: DriveTrain  #: between motors and the joints of the axes
     assembly: Assembly = field(init=False, compare=False, repr=False)  #: which joints are free, and how the loops close
+    #: Followed motions by the digest of what was asked, the last one first.
+    _followed: tuple[tuple[bytes, TreeMotion], ...] = field(default=(), init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         require_kind("robot", self.robot, Robot, "read it from a URDF: robot_from_urdf(urdf_text)")
@@ -209,11 +214,30 @@ class Model:
     def follow(self, motion: Motion) -> TreeMotion:
         """Motion of all joints from that of the axes; see `ident.model.closed_chain.follow`.
 
+        In a closed chain its arrays are read-only, because the last few motions are kept.
+
         Raises:
             ModelError: the motion is not one of m axes, or the loops cannot be closed.
         """
-        self._joint_first(motion)
-        return follow(self.robot, self.assembly, motion)
+        states = self._joint_first(motion)
+        if not self.robot.closures:
+            return follow(self.robot, self.assembly, motion)
+        digest = blake2b(b"".join(state.tobytes() for state in states)).digest()
+        # Replaced as a whole: of two threads, one may lose what the other has added, but neither finds half of it.
+        others = tuple(one for one in self._followed if one[0] != digest)
+        found = next((followed for key, followed in self._followed if key == digest), None)
+        if found is None:
+            found = follow(self.robot, self.assembly, motion)
+            for array in _arrays(found):
+                array.flags.writeable = False
+        kept, size = list[tuple[bytes, TreeMotion]](), 0
+        for key, followed in ((digest, found), *others):
+            size += sum(array.nbytes for array in _arrays(followed))
+            if size > REMEMBERED_BYTES:
+                break
+            kept.append((key, followed))
+        object.__setattr__(self, "_followed", tuple(kept))
+        return found
 
     def _tree_regressor(self, position: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> FloatArray:
         count, samples = position.shape
@@ -317,6 +341,12 @@ class Model:
         return [np.ascontiguousarray(np.transpose(state)) for state in states]
 
 
+def _arrays(followed: TreeMotion) -> tuple[FloatArray, ...]:
+    """All arrays of a motion."""
+    states = followed.joints.position_rad, followed.joints.velocity_rad_s, followed.joints.acceleration_rad_s2
+    return *states, followed.to_joints, followed.to_motors, followed.condition
+
+
 def spread(columns: FloatArray, to_motors: FloatArray) -> FloatArray:
     """The least torques of the axes that do what columns of the d equations ask, B y.
 
@@ -330,6 +360,19 @@ def spread(columns: FloatArray, to_motors: FloatArray) -> FloatArray:
     a = np.transpose(to_motors, (2, 1, 0))
     back = a @ np.linalg.inv(np.swapaxes(a, 1, 2) @ a)
     return np.asarray(np.einsum("kmd,d...k->m...k", back, columns, optimize=True))
+
+
+def preload_directions(to_motors: FloatArray) -> FloatArray:
+    """N, torques of the axes that move nothing: an orthonormal basis of the null space of Aᵀ.
+
+    Args:
+        to_motors: Aᵀ, shape (d, m, k).
+
+    Returns:
+        shape (k, m, m − d).
+    """
+    whole, _ = np.linalg.qr(np.transpose(to_motors, (2, 1, 0)), mode="complete")
+    return np.asarray(whole[:, :, len(to_motors) :])
 
 
 def without_preload(followed: TreeMotion, torque: FloatArray) -> FloatArray:

@@ -65,7 +65,7 @@ class Robot:
     motors: tuple[int, ...] = ()  #: joint that each axis drives, in the order of the axes; empty: every joint is driven
     #: Positions of all joints at which the closures hold: which of several ways of assembly is meant. Shape (n,).
     assembly_rad: FloatArray | None = None
-    platform: int = -1  #: joint whose link carries the payload; -1: the last one, see `carrier`
+    platform: Place | None = None  #: frame of the link that carries the payload; None: that of the last joint
 
     @property
     def joint_count(self) -> int:
@@ -75,7 +75,12 @@ class Robot:
     @property
     def carrier(self) -> int:
         """Index of the joint whose link carries the payload."""
-        return self.platform % len(self.joints)
+        return self.joint_count - 1 if self.platform is None else self.platform.joint
+
+    @property
+    def mounting_m(self) -> FloatArray:
+        """Where the payload is mounted, in the frame of the joint that carries it, shape (3,)."""
+        return np.zeros(3) if self.platform is None else self.platform.translation_m
 
     @property
     def axis_joints(self) -> tuple[int, ...]:

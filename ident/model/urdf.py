@@ -90,8 +90,8 @@ def robot_from_urdf(
             given = ", ".join(pair.directions) or "none"
             raise ModelError(f"{what} has the directions {given}; expected some of {', '.join(DIRECTIONS)}, each once")
         closed.append(Closure(pair.name, link(pair.first, what), link(pair.second, what), tuple(pair.directions)))
-    carrier = -1 if platform is None else link(platform, "the platform").joint
-    if platform is not None and carrier < 0:
+    carrier = None if platform is None else link(platform, "the platform")
+    if carrier is not None and carrier.joint < 0:
         raise ModelError(f"the platform {platform!r} does not move; expected the link that carries the payload")
     pose = np.array([(assembly_rad or {}).get(joint.name, 0.0) for joint in found.joints])
     return Robot(

@@ -26,7 +26,7 @@ from ident.equations.currents import without_preload
 from ident.equations.rows import row_filter, row_masks
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, Body, Payload
-from ident.model.model import DriveTrain, Model
+from ident.model.model import Model, preload_directions
 from ident.model.robot import Motion, Robot
 from ident.model.urdf import read_urdf
 
@@ -81,11 +81,11 @@ class Excitation:
     use: BoolArray  #: rows of each motor that count, shape (n, k); standstill does not (see ident/equations/rows.py)
 
 
-def recorded(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning) -> Excitation:
+def recorded(model: Model, data: Dataset, conditioning: Conditioning) -> Excitation:
     """Return the rows of a recorded run: its motion at their centres, and which of them the fit uses."""
     centres = row_filter(data, conditioning).centres(len(data.time_s))
     motion = Motion(data.position_rad[centres], data.velocity_rad_s[centres], data.acceleration_rad_s2[centres])
-    return Excitation(motion, row_masks(drive_train, data, conditioning)[1])
+    return Excitation(motion, row_masks(model, data, conditioning)[1])
 
 
 def effective_noise(noise_a: FloatArray, lag_one: float) -> FloatArray:
@@ -158,8 +158,7 @@ class Design:
         """
         expected = self.expectation
         _, to_motors = expected.model.balance(excitation.motion)
-        whole, _ = np.linalg.qr(to_motors.transpose(2, 1, 0), mode="complete")
-        transform = without_preload(whole[:, :, len(to_motors) :], expected.gains, expected.noise_a)
+        transform = without_preload(preload_directions(to_motors), expected.gains, expected.noise_a)
         transform *= np.all(excitation.use, axis=0).astype(np.float64)[:, None, None]
         columns = np.einsum("kij,jak->iak", transform, torque, optimize=True)
         return np.concatenate((columns, torque, transform.transpose(1, 2, 0)), axis=1)
@@ -323,16 +322,17 @@ def side_of_cube(mass_kg: float) -> float:
 
 
 def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
-    """Return a steel cube of the weighed mass, one side away from the last joint's frame; known parameters are kept.
+    """Return a steel cube of the weighed mass, one side away from where it is mounted; known parameters are kept.
 
-    It is off the last axis, as the technician is asked to mount it: on the axis, gravity would have no lever.
+    It is off the axis of the joint that carries it, as the technician is asked to mount it: on the axis, gravity would
+    have no lever.
     """
     mass = payload.known.get("m", LINK_MASS_KG)
     side = side_of_cube(mass)
     axis = robot.joints[robot.carrier].axis
     across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     across /= np.linalg.norm(across)
-    centre = side * (axis + 0.7 * across + 0.7 * np.cross(axis, across))
+    centre = robot.mounting_m + side * (axis + 0.7 * across + 0.7 * np.cross(axis, across))
     cube = Body(mass, centre, mass * side**2 / 6.0 * np.eye(3))
     guess = dict(zip(LINK_PARAMETERS, cube.parameters, strict=True))
     parameters = np.array([payload.known.get(name, guess[name]) for name in LINK_PARAMETERS])

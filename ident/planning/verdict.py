@@ -81,7 +81,7 @@ class GainVerdict:
     #: The same if internal preload were known; None of a drive without redundant motors, which has none [%].
     known_preload_percent: float | None
     alone_percent: dict[GainSource, float]  #: standard deviation that each source would give alone [%]
-    gravity_acts: bool  #: whether gravity of any body on the last link acts on this axis
+    gravity_acts: bool  #: whether gravity of any payload acts on this axis
     verdict: Verdict  #: good, weak or unseen
     advice: Advice | None  #: for a gain that is not good; None where no extra moves were offered or none helps
 
@@ -226,7 +226,7 @@ def _own_rows(
     """Judge gravity and inertia in each motor's own rows.
 
     Return for each motor the deviations that gravity and inertia of the known payload give alone [%], and whether
-    gravity of any body on the last link acts there.
+    gravity of any payload acts there.
     """
     count = len(design.expectation.gains)
     others: list[list[FloatArray]] = [[] for _ in range(count)]

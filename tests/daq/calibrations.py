@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
 
 from hypothesis import strategies as st
 
+from daq.config.cell_file import load_cell
+from daq.workflow.calibration_file import save_calibration
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
 from ident.data.run import Recording
 from ident.estimators.estimate import RelativeError
@@ -48,6 +52,22 @@ def demo_calibration() -> Calibration:
         recording_configuration_sha256=None,
         current_residual=(0.03, 0.05, 0.02, 0.02, 0.01, 0.01),
     )
+
+
+def calibration_for(cell_file: Path, factor: float = 1.0, **changes: Any) -> Path:
+    """A calibration that every gate of the demo cell lets through, its gains times a factor; its file."""
+    declared, now = load_cell(cell_file), datetime.now(UTC)
+    calibration = recorded(demo_calibration(), now - timedelta(hours=1))
+    calibration = replace(
+        calibration,
+        created=now.isoformat(),
+        configuration_sha256=declared.digest,
+        recording_configuration_sha256=declared.recording_digest,
+        gains=tuple(replace(gain, value=gain.value * factor) for gain in calibration.gains),
+    )
+    path = cell_file.parent / f"calibration-{factor:g}.yaml"
+    save_calibration(replace(calibration, **changes), path)
+    return path
 
 
 def demo_recording(entered_kg: float | None = None, at: datetime = RECORDED) -> Recording:
@@ -92,11 +112,11 @@ def of_first_axes(calibration: Calibration, count: int) -> Calibration:
     )
 
 
-_numbers = st.floats(allow_nan=False, allow_infinity=False)
-_deviations = st.floats(min_value=0.0, allow_nan=False, allow_infinity=False)
+_numbers = st.floats(-1e30, 1e30)
+_deviations = st.floats(0.0, 1e30)
 _texts = st.text(max_size=12)
 _parameters = st.builds(Parameter, _texts, _numbers, _deviations, _texts)
-_errors = st.builds(RelativeError, st.lists(_numbers, max_size=3).map(tuple), _numbers)
+_errors = st.builds(RelativeError, st.lists(_deviations, max_size=3).map(tuple), _deviations)
 _percents = st.lists(st.floats(0.0, 100.0), max_size=3).map(tuple)
 _recordings = st.builds(
     Recording,
@@ -124,8 +144,8 @@ _effects = st.builds(
     axis=_texts,
     settings=st.dictionaries(_texts, _numbers, max_size=3),
     coefficients=st.lists(_parameters, max_size=2).map(tuple),
-    error_before_percent=_numbers,
-    error_after_percent=_numbers,
+    error_before_percent=_deviations,
+    error_after_percent=_deviations,
     ambiguity=st.lists(_texts, max_size=2).map(tuple),
 )
 calibrations = st.builds(
@@ -138,7 +158,7 @@ calibrations = st.builds(
     covariance_factor=st.none() | st.lists(_numbers, max_size=3).map(lambda row: (tuple(row),)),
     relative_error_percent=_errors,
     holdout_error_percent=st.none() | _errors,
-    condition=_numbers,
+    condition=_deviations,
     rows=st.integers(min_value=0, max_value=10**9),
     filter=st.dictionaries(_texts, _numbers | st.lists(_numbers, max_size=3), max_size=3),
     sources=st.lists(_sources, max_size=2).map(tuple),
@@ -147,5 +167,5 @@ calibrations = st.builds(
     software=_texts,
     nameplate_holdout_error_percent=st.none() | _errors,
     recording_configuration_sha256=st.none() | _texts,
-    current_residual=st.none() | st.lists(_numbers, max_size=3).map(tuple),
+    current_residual=st.none() | st.lists(_deviations, max_size=3).map(tuple),
 )

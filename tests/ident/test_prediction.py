@@ -134,7 +134,7 @@ def test_the_true_parameters_predict_the_recorded_current(
     calibration = a_calibration(GAINS, parameters)
     for run in clean_runs:
         data = differentiate(run, truth.model.drive_train, CONDITIONING)
-        _, use = row_masks(truth.model.drive_train, data, CONDITIONING)  # at standstill dry friction is undetermined
+        _, use = row_masks(truth.model, data, CONDITIONING)  # at standstill dry friction is undetermined
         recorded = decimate_rows(data, CONDITIONING, data.current_a.T)[use]
         predicted = decimate_rows(data, CONDITIONING, predict_current(calibration, truth.model, data).T)[use]
         assert np.linalg.norm(predicted - recorded) < 2e-3 * np.linalg.norm(recorded)

@@ -26,10 +26,11 @@ from daq.log.conversion import SiScaling, moves, scaling
 from daq.log.metadata import AxisReadback, Readback
 from daq.workflow.plan import Plan
 from daq.workflow.record import motor_limits, motor_moves
+from drivers.canopen.needs import MODE_OF_OPERATION
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.pdo import SETPOINT_PDOS, Direction, records, write_record
 from drivers.canopen.sdo import ObjectAccess
-from drivers.canopen.setup import MODE_OF_OPERATION, PROFILE_POSITION_MODE
+from drivers.canopen.setup import PROFILE_POSITION_MODE
 from drivers.motion.execute import execute
 from drivers.motion.move import MotionPermission
 from drivers.profiles.profile import ObjectEntry

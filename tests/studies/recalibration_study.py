@@ -2,6 +2,7 @@
 
     python -m tests.studies.recalibration_study [--weeks 8] [--seconds 12]
     python -m tests.studies.recalibration_study --kills
+    python -m tests.studies.recalibration_study --moments 60
     python -m tests.studies.recalibration_study --years 300
 
 Each week the timer calls the job, and where it was ended calls it again the next day. J4 loses 6 % in the middle of the
@@ -9,13 +10,16 @@ time; in one week a drive fails, in another the door is open. What is printed: o
 what the controller has.
 
 `--kills` kills a job (-9) before and behind every call to another room and lets the next one finish it; the tests do
-the same at some of them. `--years` draws years of weekly jobs in which nothing changes, and counts those in which a
-gain was changed all the same.
+the same at some of them. `--moments` kills at random moments instead, and checks that the controller's file is the old
+or the new one, that `history --verify` reports exactly the writes that the history lacks, and that the next job ends
+with exit code 0. `--years` draws years of weekly jobs in which nothing changes, and counts those in which a gain was
+changed all the same.
 """
 
 from __future__ import annotations
 
 import argparse
+import random
 import shutil
 import sys
 import tempfile
@@ -40,7 +44,7 @@ from ident.drift.change import DISPERSION, decide
 from ident.errors import IdentificationError
 from tests.daq.jobs.made import made_rig, whole_job
 from tests.daq.jobs.rig import RUNS, Rig, make_plan, make_rig
-from tests.daq.jobs.test_killed import Kill, finished_by_the_next
+from tests.daq.jobs.test_killed import Kill, finished_by_the_next, finished_from_any_moment, job_duration_s
 
 AXIS, LOSS = 3, 0.94
 FAULT = FaultSpec(FaultKind.EMERGENCY, 2, 2000, None, 0x7305)
@@ -129,6 +133,24 @@ def kills(folder: Path) -> int:
     return 0
 
 
+def moments(folder: Path, count: int, seed: int = 1) -> int:
+    """Kills at so many random moments; an AssertionError where the next job does not finish it as it should."""
+    (folder / "whole").mkdir()
+    _, made = whole_job(folder / "whole")
+    whole_s, chance = job_duration_s(made_rig(new(folder / "timed"), made, metrics=None)), random.Random(seed)
+    done = killed = written = 0
+    while killed < count and done < 4 * count:
+        rig = made_rig(new(folder / f"{done}"), made, metrics=None)
+        was_killed, was_written = finished_from_any_moment(rig, chance.uniform(0.0, whole_s))
+        shutil.rmtree(rig.folder)
+        done, killed, written = done + 1, killed + was_killed, written + (was_killed and was_written)
+    print(  # noqa: T201
+        f"{killed} jobs killed within {whole_s:.1f} s, {written} of them after their write; every next job ended "
+        "with 0, every file was the old or the new one, every --verify was right"
+    )
+    return int(killed < count)
+
+
 def new(folder: Path) -> Path:
     """An empty folder."""
     folder.mkdir()
@@ -159,11 +181,14 @@ def main() -> int:
     parser.add_argument("--weeks", type=int, default=8)
     parser.add_argument("--seconds", type=float, default=12.0)
     parser.add_argument("--kills", action="store_true")
+    parser.add_argument("--moments", type=int)
     parser.add_argument("--years", type=int)
     chosen = parser.parse_args()
     if chosen.years is not None:
         return unchanged_years(chosen.years)
     with tempfile.TemporaryDirectory() as folder:
+        if chosen.moments is not None:
+            return moments(Path(folder), chosen.moments)
         return kills(Path(folder)) if chosen.kills else study(chosen.weeks, chosen.seconds, Path(folder))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections import Counter
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from daq.errors import ControllerUnfit
 from daq.writeback.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPath, Leaves, Scalar, unfit, utf8
 
+MAX_BYTES, MAX_VALUES, MAX_DEPTH = 2**19, 15_000, 100  #: Of a file: two parsers in Python read it before and after
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 _OCTAL = re.compile(r"[-+]?0[0-9]+")  #: To YAML 1.1; a decimal number to YAML 1.2
 _MERGE = "<<"
@@ -95,9 +97,31 @@ def yaml_document(content: bytes, name: str) -> YamlDocument:
     """Parse a YAML document.
 
     Raises:
-        ControllerUnfit: the bytes are not UTF-8.
+        ControllerUnfit: the bytes are not UTF-8, or too many for the two parsers.
     """
+    _check_size(content, name)
     return YamlDocument(name, utf8(content, name, "YAML"))
+
+
+def _check_size(content: bytes, name: str) -> None:
+    """Refuse at once what the two parsers would take minutes for: libyaml counts in a fraction of a second."""
+    depth = values = 0
+    found = f"{len(content)} bytes" if len(content) > MAX_BYTES else ""
+    if not found:
+        with contextlib.suppress(yaml.YAMLError, ValueError):  # explained by the parsers
+            for event in yaml.parse(content, Loader=yaml.CSafeLoader):
+                depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+                values += isinstance(event, yaml.NodeEvent)
+                if values > MAX_VALUES or depth > MAX_DEPTH:
+                    found = f"more than {MAX_VALUES} values, or lists in lists deeper than {MAX_DEPTH}"
+                    break
+    if found:
+        raise ControllerUnfit(
+            name,
+            found=f"YAML with {found}",
+            expected=f"at most {MAX_BYTES} bytes, {MAX_VALUES} values, {MAX_DEPTH} lists in lists",
+            remedy="is this the controller's file? then keep its gains in a file of their own; nothing was written",
+        )
 
 
 @lru_cache(maxsize=8)  # composing is expensive, and a write reads each of its two texts several times

@@ -363,7 +363,7 @@ def test_a_history_that_is_none_does_not_make_a_write_undone(
 ) -> None:
     bench.cell.with_name("cell.history.sqlite").write_text("not a history, " * 100)
     assert bench.apply("--yes") == ExitCode.OK
-    assert "the history does not know of this" in caplog.text + capsys.readouterr().err
+    assert "the history does not have this write" in caplog.text + capsys.readouterr().err
     assert b"-9.2100" in bench.controller.read_bytes()
 
 
@@ -519,7 +519,7 @@ def test_whatever_the_history_does_a_write_is_not_called_undone(
 
     monkeypatch.setattr(HistoryStore, "add", broken)
     assert bench.apply("--yes") == ExitCode.OK
-    assert "the history does not know of this" in caplog.text + capsys.readouterr().err
+    assert "the history does not have this write" in caplog.text + capsys.readouterr().err
     assert b"-9.2100" in bench.controller.read_bytes()
 
 

@@ -89,11 +89,24 @@ def test_a_failed_recording_says_what_it_left_and_the_next_one_what_is_in_its_wa
         assert "choose another --out" in run
 
 
+def test_a_lost_sample_of_a_real_cell_does_not_name_lockstep(
+    cells: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = Path(cells["timed"]).with_name("real.yaml")
+    real.write_text(Path(cells["timed"]).read_text().replace("interface: virtual", "interface: socketcan"))
+    error = SampleLost(7, (0,), ("J1 (node 1)",))
+    monkeypatch.setattr("daq.workflow.record.record", _failing(error, None))
+    assert main(["record", str(real), "plan.yaml", "--out", str(tmp_path / "run.mcap")]) == ExitCode.DEVICE_FAULT
+    output = " ".join(capsys.readouterr().err.split())
+    assert "hint: check the load of bus and computer" in output
+    assert "lockstep" not in output
+
+
 @pytest.mark.parametrize(
     ("pacing", "error", "hinted"),
     [
-        ("timed", SampleLost(7, (0,), ("J1",)), True),
-        ("lockstep", SampleLost(7, (0,), ("J1",)), False),
+        ("timed", SampleLost(7, (0,), ("J1 (node 1)",)), True),
+        ("lockstep", SampleLost(7, (0,), ("J1 (node 1)",)), False),
         ("timed", DriveFault(3, "no heartbeat for 0.5 s"), False),
     ],
 )

@@ -91,12 +91,28 @@ def test_a_message_names_the_axis_first(cell: Cell) -> None:
 
 def test_identity_and_power_are_distinguished(cell: Cell) -> None:
     (row, *_) = scan_rows(cell, (_node(1, 0x237, serial=9),), "demo")
-    assert (row["verdict"], row["enabled"]) == ("other identity", True)
+    assert (row["verdict"], row["enabled"]) == ("other serial number", True)
+    assert row["remarks"] == ["serial number 1018h:04 is 0x9, the cell configuration expects 0x3e9"]
+
+
+def test_a_cell_without_serial_does_not_compare_it(cell: Cell) -> None:
+    axes = tuple(replace(axis, identity=axis.identity and replace(axis.identity, serial=None)) for axis in cell.axes)
+    (row, *_) = scan_rows(replace(cell, axes=axes), (_node(1, 0x250, serial=9),), "demo")
+    assert (row["verdict"], row["remarks"]) == ("ok", [])
+
+
+def test_two_devices_and_a_profile_that_does_not_fit_are_said(cell: Cell) -> None:
+    shared = replace(_node(1, 0x250), shared="two answers to one request")
+    rows = scan_rows(cell, (shared, _node(2, 0x250)), "demo", {"J2": "found no object 6074h:00"})
+    assert [row["verdict"] for row in rows[:2]] == ["two devices", "profile does not fit"]
+    said = [str(part) for part in scan_view(rows, {})]
+    assert said[1].startswith("J1 (node 1): found two answers to one request; two devices have this node id")
+    assert said[2] == "J2 (node 2): found no object 6074h:00"
 
 
 def test_a_fault_is_named_beside_what_else_is_wrong(cell: Cell) -> None:
     (row, *_) = scan_rows(cell, (_node(1, 0x208, serial=9),), "demo")
-    assert row["verdict"] == "other identity, in fault"
+    assert row["verdict"] == "other serial number, in fault"
 
 
 def test_a_fault_is_reset_when_a_person_says_so_and_nothing_gets_power(

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
+import can
 import pytest
 import yaml
 
 import daq.simulation.simulation_file
 from daq.cli.app import main
-from daq.cli.simulate import how_to_reach, nodes_on_buses
-from daq.errors import UsageError
+from daq.cli.simulate import MountedFile, how_to_reach, nodes_on_buses
+from daq.errors import ExitCode, UsageError
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.split_bus import BusPart
+from drivers.simulation.spec import CellSpec
+from tests.drivers.simulation.cells import clean_cell
 
 
 def test_each_bus_has_its_nodes() -> None:
@@ -76,6 +80,36 @@ def test_a_mechanism_that_does_not_close_is_refused_with_its_file(
     said = capsys.readouterr().err
     assert "five-bar.yaml" in said
     assert "tip stays open" in said
+
+
+def test_a_bus_that_fails_is_an_error_with_a_remedy(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Cell:
+        def __init__(self, *_: object, **__: object) -> None:
+            pass
+
+        def serve_forever(self) -> None:
+            raise can.CanOperationError("the server closed the connection")
+
+    monkeypatch.setattr("drivers.simulation.cell.SimulatedCell", Cell)
+    assert main(["simulate", "clean", "--interface", "virtual", "--channel", "failing"]) == ExitCode.DEVICE_FAULT
+    said = capsys.readouterr().err
+    assert "virtual:failing" in said
+    assert "the server closed the connection" in said
+
+
+def test_a_pipe_names_no_body(tmp_path: Path) -> None:
+    """Reading it would hold up the simulated cell until something is written to it."""
+    os.mkfifo(tmp_path / "body")
+    named: list[str | None] = []
+
+    def load(name: str | None) -> CellSpec:
+        named.append(name)
+        return clean_cell()
+
+    MountedFile(tmp_path / "body", load, lambda error: pytest.fail(str(error))).at_power_on()
+    assert named == [None]
 
 
 @pytest.mark.parametrize("verb", [["simulate", "demo"], ["demo", "--out", "made"]])

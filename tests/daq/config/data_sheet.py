@@ -1,4 +1,4 @@
-"""Compare a drive profile with the maker's electronic data sheet (EDS or DCF, CiA 306).
+"""Compare a drive profile, and the PDOs of a recording with it, with the maker's data sheet (EDS or DCF, CiA 306).
 
 No verb needs data sheets. They serve the author of a profile, through the tests of the shipped profiles.
 """
@@ -13,7 +13,9 @@ from canopen.objectdictionary import ObjectDictionary, ODVariable
 from canopen.objectdictionary.datatypes import INTEGER_TYPES, SIGNED_TYPES
 from canopen.objectdictionary.eds import import_eds
 
-from drivers.profiles.profile import DriveProfile, ObjectEntry
+from drivers.canopen.needs import needs_of
+from drivers.canopen.pdo import MOTION_PROFILE, PROFILE_DECELERATION, Direction, wanted_pdos
+from drivers.profiles.profile import Axis, DriveProfile, ObjectEntry
 
 LARGEST_BYTES = 4 * 2**20
 _READABLE = {"ro", "rw", "rwr", "rww", "const"}
@@ -45,18 +47,26 @@ def data_sheet(text: bytes, name: str) -> ObjectDictionary:
 
 def disagreements(profile: DriveProfile, sheet: ObjectDictionary) -> tuple[str, ...]:
     """List the statements of a profile that the drive's data sheet contradicts; empty if the two agree."""
-    scale, rated = profile.current_scale, profile.rated
-    read = [*scale.objects, *(() if scale.switch is None else (scale.switch,))]
+    needs, rated = needs_of(profile), profile.rated
+    read = [need.entry for need in needs]
     if rated is not None:
         read += [rated.current, *(() if rated.torque is None else (rated.torque,))]
     if profile.torque is not None:
         read.append(profile.torque)
     if profile.save is not None:
         read.append(profile.save.command)
-    mapped = (profile.position, profile.current)
-    return tuple(
-        fault for entry in dict.fromkeys((*mapped, *read)) for fault in _faults(entry, sheet, mapped=entry in mapped)
-    )
+    mapped = {need.entry for need in needs if need.mapped}
+    lacks_deceleration = sheet.get_variable(PROFILE_DECELERATION.index, 0) is None
+    if not lacks_deceleration:
+        mapped.add(PROFILE_DECELERATION)
+        read.append(PROFILE_DECELERATION)
+    faults = [fault for entry in dict.fromkeys(read) for fault in _faults(entry, sheet, mapped=entry in mapped)]
+    numbers = {way: [n for n in range(4) if way.value[0] + n in sheet] for way in Direction}
+    try:
+        wanted_pdos(Axis("any", 1, profile), numbers, MOTION_PROFILE[2:] if lacks_deceleration else ())
+    except ValueError as error:
+        faults.append(str(error))
+    return tuple(faults)
 
 
 def _faults(entry: ObjectEntry, sheet: ObjectDictionary, *, mapped: bool) -> Iterator[str]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import random
 import shutil
 import signal
+import time
 import warnings
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -17,6 +19,7 @@ from daq.errors import ExitCode
 from daq.jobs.context import Tools
 from daq.jobs.session import Outcome
 from daq.ledger.audit import AuditAction
+from daq.ledger.ledger import Ledger, Verification
 from daq.ledger.store import HistoryStore
 from daq.writeback.file_target import FileTarget
 from daq.writeback.target import rollback
@@ -131,6 +134,68 @@ def finished_by_the_next(rig: Rig, kill: Kill) -> None:
     if whole != before:
         assert rig.controller.read_bytes() == whole
     applied_once(rig)
+
+
+def killed_after(rig: Rig, wait_s: float) -> bool:
+    """Run the job in a process of its own, and kill that after so long; return whether it was not done before."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        child = os.fork()
+    if child == 0:
+        try:
+            rig.job()
+        finally:
+            os._exit(0)
+    time.sleep(wait_s)
+    os.kill(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    return os.WIFSIGNALED(status)
+
+
+def finished_from_any_moment(rig: Rig, wait_s: float) -> tuple[bool, bool]:
+    """Kill a job after so long, judge what it left, and let the next one finish it.
+
+    Returns:
+        whether it was killed before its end, and whether the controller had the new gains by then.
+    """
+    before = rig.controller.read_bytes()
+    killed = killed_after(rig, wait_s)
+    left = rig.controller.read_bytes()
+    with HistoryStore(rig.cells / "demo.history.sqlite") as store:
+        entered = bool(store.events())
+    assert _verified(rig).complete == (left == before or entered)
+    rig.clock.go_on(minutes=10)
+    assert rig.job().exit_code == ExitCode.OK
+    after = rig.controller.read_bytes()
+    assert after != before
+    assert left in (before, after)
+    assert len(rig.backups) == 1
+    assert _verified(rig).complete
+    return killed, left == after
+
+
+def _verified(rig: Rig) -> Verification:
+    """`drivegain history --verify`, whose audit holds and whose history has no flaw, whatever it lacks."""
+    assert rig.cell.history is not None
+    with Ledger(rig.cell, rig.cell.history, "a test") as ledger:
+        found = ledger.verify()
+    assert found.verdict.holds
+    assert found.broken == ()
+    return found
+
+
+def test_a_job_that_is_killed_at_a_random_moment_is_finished_by_the_next(tmp_path: Path, made: Made) -> None:
+    """A few moments; `tests.studies.recalibration_study --moments 60` takes more."""
+    whole_s, chance = job_duration_s(made_rig(tmp_path / "whole", made, metrics=None)), random.Random(1)
+    for number in range(4):
+        finished_from_any_moment(made_rig(tmp_path / str(number), made, metrics=None), chance.uniform(0.0, whole_s))
+
+
+def job_duration_s(rig: Rig) -> float:
+    """Duration of a whole job [s]."""
+    began_s = time.monotonic()
+    assert rig.job().outcome is Outcome.APPLIED
+    return time.monotonic() - began_s
 
 
 @pytest.mark.parametrize("way", ["rollback", "cp", "edited"])

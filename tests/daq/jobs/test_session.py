@@ -13,8 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from daq.cli.app import main
 from daq.config.cell_file import load_cell
-from daq.errors import JobHeld
+from daq.errors import ExitCode, JobHeld
 from daq.jobs.context import CLOCK_SLACK, require_clock
 from daq.jobs.recording import calibration_of_session
 from daq.jobs.reporting import file_stem
@@ -59,6 +60,31 @@ def test_no_one_waits_for_a_pipe_in_the_place_of_a_state(tmp_path: Path) -> None
     session = begin(tmp_path, BASIS, BEGAN)
     (session.folder / STATE).unlink()
     os.mkfifo(session.folder / STATE)
+    assert sessions(tmp_path) == ()
+
+
+def test_a_file_in_the_place_of_the_folder_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = make_rig(tmp_path / "cell", tmp_path / "plan.yaml")
+    (rig.cells / "demo.recalibration").write_text("no folder")
+    for verb in (["history", str(rig.cell_file), "--verify", "--json"], ["recalibrate", str(rig.cell_file), "--json"]):
+        assert main(verb) == ExitCode.CONFIGURATION
+        output = capsys.readouterr()
+        assert output.out == ""
+        (line,) = output.err.splitlines()
+        assert "demo.recalibration" in json.dumps(json.loads(line))
+        assert "not a directory" in line
+
+
+@pytest.mark.parametrize("key", ["attempts", "samples", "lost_cycles"])
+@pytest.mark.parametrize("number", ["-1", "1" + 400 * "0", "NaN"])
+def test_a_state_with_a_count_that_is_none_is_no_session(tmp_path: Path, key: str, number: str) -> None:
+    run = {"name": "a", "sha256": "0" * 64, "attempts": 1, "samples": 2, "lost_cycles": 0, "missing": [0]}
+    session = begin(tmp_path, BASIS, BEGAN)
+    state = json.loads((session.folder / STATE).read_text())
+    (session.folder / STATE).write_text(json.dumps({**state, "runs": [run]}))
+    assert len(sessions(tmp_path)) == 1
+    text = json.dumps({**state, "runs": [{**run, key: 0}]}).replace(f'"{key}": 0', f'"{key}": {number}')
+    (session.folder / STATE).write_text(text)
     assert sessions(tmp_path) == ()
 
 

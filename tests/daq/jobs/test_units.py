@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import configparser
 import os
+import re
 import shutil
 import subprocess
 from dataclasses import replace
@@ -61,6 +62,23 @@ def test_what_is_written_through_a_link_is_writable_to_the_service(rig: Rig, tmp
     assert section is not None
     service = units_of(rig.cell, section, installation(rig))[0].text
     assert f'ReadWritePaths="-{elsewhere}"' in service.splitlines()
+
+
+@pytest.mark.parametrize(("owner", "bound"), [("robot", 3.0), ("root", 3.5)])
+def test_the_service_is_little_exposed(rig: Rig, tmp_path: Path, owner: str, bound: float) -> None:
+    """A service of root keeps what it needs to replace another user's file and to lose no frame."""
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("no systemd-analyze on this machine")
+    section = rig.cell.recalibration
+    assert section is not None
+    service, _ = units_of(rig.cell, section, replace(installation(rig), owner=owner))
+    (tmp_path / service.name).write_text(service.text, encoding="utf-8")
+    command = ["systemd-analyze", "security", "--offline=yes", "--no-pager", str(tmp_path / service.name)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    found = re.search(r"exposure level for \S+: ([0-9.]+)", done.stdout)
+    if found is None:
+        pytest.skip(f"systemd-analyze cannot judge a file here: {done.stderr.strip()}")
+    assert float(found[1]) <= bound, done.stdout
 
 
 @pytest.mark.parametrize("user", [False, True], ids=["system", "user"])

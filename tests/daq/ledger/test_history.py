@@ -720,7 +720,8 @@ def test_a_write_that_another_command_entered_later_is_no_flaw(cell: Path, capsy
     ended = _write_down(cell, digest)
     begun, later = read(_place(cell).audit)[0], BEGIN + timedelta(hours=1)
     with HistoryStore(_place(cell).store) as store:
-        store.applied(digest, at=later, who="kim", target=ended.subject, audit=begun.sha256)
+        after = digest[::-1]
+        store.applied(digest, at=later, who="kim", target=ended.subject, audit=begun.sha256, sha256_after=after)
     assert "found who 'kim', expected 'anna'" in _verified(cell, capsys)
     append(_place(cell).audit, AuditAction.NOTHING_TO_DO, at=later, who="kim", subject=ended.subject, details={})
     assert _verified(cell, capsys) == ""
@@ -737,7 +738,8 @@ def test_a_write_that_a_job_entered_holds_within_the_job(cell: Path, capsys: pyt
     ended = _write_down(cell, digest)
     begun = read(audit)[1]
     with HistoryStore(_place(cell).store) as store:
-        store.applied(digest, at=BEGIN + timedelta(hours=1), who="job", target=ended.subject, audit=begun.sha256)
+        at, after = BEGIN + timedelta(hours=1), digest[::-1]
+        store.applied(digest, at=at, who="job", target=ended.subject, audit=begun.sha256, sha256_after=after)
     assert _verified(cell, capsys) == ""
     job(AuditAction.RECALIBRATION_BEGUN, 2)
     job(AuditAction.RECALIBRATION_ENDED, 3)

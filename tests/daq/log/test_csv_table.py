@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from daq.config.import_description import (
     CsvLayout,
@@ -81,6 +83,37 @@ def test_a_decimal_comma_has_to_be_declared(tmp_path: Path) -> None:
     with pytest.raises(TableUnfit, match=r"run\.csv:2, column q") as caught:
         _read(tmp_path, data, ("q", "i"), delimiter=";")
     assert 'write `decimal: ","`' in caught.value.remedy
+
+
+def test_a_point_under_a_decimal_comma_is_refused(tmp_path: Path) -> None:
+    """Whole mA as 1.234 would be 1.234 A."""
+    rows = [f"{0.5 * k};{1000 + k:,}".replace(".", "_").replace(",", ".").replace("_", ",") for k in range(20)]
+    data = _text(*rows, header="q;i").encode()
+    with pytest.raises(TableUnfit, match=r"run\.csv:2, column i: found '1\.000', with a point") as caught:
+        _read(tmp_path, data, ("q", "i"), delimiter=";", decimal=",")
+    assert "without them" in caught.value.remedy
+    assert len(_read(tmp_path, data, ("q",), delimiter=";", decimal=",").values) == 20  # another column may have points
+
+
+@pytest.mark.parametrize("decimal", [".", ","])
+def test_thousands_that_are_grouped_by_the_decimal_sign_are_refused(decimal: str, tmp_path: Path) -> None:
+    grouped = [f"{value:,}".replace(",", decimal) for value in range(-1500, 1500, 37)]
+    data = _text(*(f"0{decimal}5;{text}" for text in grouped), header="q;i").encode()
+    with pytest.raises(TableUnfit, match=r"column i: found '-1[.,]500' beside '-982': three digits behind every"):
+        _read(tmp_path, data, ("q", "i"), delimiter=";", decimal=decimal)
+
+
+@given(st.lists(st.integers(-9999, 9999), min_size=2, max_size=50))
+def test_decimals_of_one_width_are_no_groups(tmp_path_factory: pytest.TempPathFactory, values: list[int]) -> None:
+    data = _text(*(f"0.5;{value / 1000:.3f}" for value in values), header="q;i").encode()
+    read = _read(tmp_path_factory.mktemp("csv"), data, ("i",), delimiter=";").values[:, 0]
+    assert np.array_equal(read, np.array(values) / 1000)
+
+
+def test_a_comma_under_a_decimal_point_may_group_thousands(tmp_path: Path) -> None:
+    with pytest.raises(TableUnfit, match=r"run\.csv:2, column i") as caught:
+        _read(tmp_path, _text("0.5;1,234", header="q;i").encode(), ("q", "i"), delimiter=";")
+    assert "if commas group thousands" in caught.value.remedy
 
 
 def test_a_file_without_a_header(tmp_path: Path) -> None:

@@ -6,6 +6,8 @@ import json
 import os
 import re
 import shutil
+import subprocess
+import sys
 from dataclasses import fields
 from math import pi
 from pathlib import Path
@@ -20,7 +22,7 @@ from hypothesis.extra.numpy import arrays
 from daq.cli import main
 from daq.config.import_description import ImportDescription
 from daq.config.yaml_file import parse_yaml, read_model
-from daq.errors import ConfigurationInconsistent, OutputFailed, TableUnfit, UsageError
+from daq.errors import ConfigurationInconsistent, ExitCode, OutputFailed, TableUnfit, UsageError
 from daq.log.conversion import load_run
 from daq.log.importing import import_recording, quantise
 from daq.log.reader import read_log
@@ -311,7 +313,7 @@ def test_a_rate_that_is_ten_times_off_is_noticed(
     seconds = np.arange(1000)[:, None] / 1000.0
     bench.joint_deg = 30.0 * np.sin(2.0 * np.pi * seconds + np.arange(6))
     bench.current_a = np.cos(seconds * 140.0 + np.arange(6))
-    bench.joint_deg[500, 2] += 1.0  # one outlier is not taken for a wrong rate
+    bench.joint_deg[500, 2] += 0.5  # one outlier is not taken for a wrong rate
     bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
     bench.describe(rate_hz=1000.0 * wrong)
     if wrong > 1.0:
@@ -319,6 +321,90 @@ def test_a_rate_that_is_ten_times_off_is_noticed(
     else:
         assert bench.run() == 0
     assert ("no joint is faster than" in caplog.text) is (wrong < 1.0)
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_a_step_that_no_motor_makes(bench: Bench, capsys: pytest.CaptureFixture[str], back: bool) -> None:
+    """Of 0.5 rad in one sample: the speeds over many samples do not show it."""
+    bench.joint_deg[120 : 121 if back else None, 2] += np.degrees(0.5)
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    _refused(
+        bench, capsys, 4, "run.csv:122, column q3, axis J3", "in one sample", "the limit in the cell configuration"
+    )
+
+
+def test_a_step_is_found_in_resampled_samples_too(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.joint_deg = 20.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))
+    bench.joint_deg[150:, 3] += np.degrees(0.5)
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    _with_time(bench, UNEVEN_MS)
+    _refused(bench, capsys, 4, "column q4, axis J4", "in one sample")
+
+
+def test_noise_and_a_coarse_encoder_are_no_steps(bench: Bench) -> None:
+    noise = np.random.default_rng(2).normal(scale=0.2, size=(300, 6))
+    bench.write_csv(np.hstack((np.round((bench.joint_deg + noise) / 0.1) * 0.1, bench.current_a)))
+    assert bench.run() == 0
+
+
+@pytest.mark.parametrize(("bits", "signed"), [(16, False), (16, True), (20, False), (14, True)])
+def test_a_counter_of_fewer_than_32_bits_that_wraps(
+    bench: Bench, capsys: pytest.CaptureFixture[str], bits: int, signed: bool
+) -> None:
+    counts = np.rint(np.radians(bench.joint_deg) @ load_run_of(bench).T / (2 * pi) * 65536)
+    least = -(2 ** (bits - 1)) if signed else 0
+    wrapped = (counts[:, 0] - least) % 2**bits + least
+    assert np.abs(np.diff(wrapped)).max() > 2 ** (bits - 1)
+    counts[:, 0] = wrapped
+    bench.write_csv(np.hstack((counts, bench.current_a)))
+    bench.describe(position={"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"})
+    _refused(bench, capsys, 4, "column q1", f"within {bits} bits: a counter that wraps", "unwrap the column")
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+@pytest.mark.parametrize("timed", [False, True])
+def test_a_row_or_two_are_no_recording(
+    bench: Bench, capsys: pytest.CaptureFixture[str], rows: int, timed: bool
+) -> None:
+    if timed:
+        _with_time(bench, np.arange(300.0))
+    path = bench.data / "run.csv"
+    path.write_text("".join(path.read_text(encoding="utf-8").splitlines(keepends=True)[: rows + 1]), encoding="utf-8")
+    _refused(bench, capsys, 4, f"{rows} rows of numbers", "was the export interrupted?")
+
+
+@pytest.mark.parametrize("change", [0.2, 0.4, -0.3])
+@pytest.mark.parametrize("sudden", [False, True])
+def test_a_rate_that_drifts(bench: Bench, capsys: pytest.CaptureFixture[str], change: float, sudden: bool) -> None:
+    """The drift scales velocities, and gains by up to 17 %, while every single step looks right."""
+    share = (np.arange(299) > 150) if sudden else np.linspace(0.0, 1.0, 299)
+    _with_time(bench, np.concatenate(([0.0], np.cumsum(4.0 * (1.0 + change * share)))))
+    _refused(bench, capsys, 4, "run.csv, column t", "Hz in parts of the recording", "give rate_hz instead of time")
+
+
+def test_an_import_that_is_terminated_leaves_nothing(bench: Bench) -> None:
+    """SIGTERM ends a process at once, unless the verb asks for an interrupt instead."""
+    script = (
+        "import os, signal, sys\n"
+        "from daq.cli.app import main\n"
+        "from daq.log.writer import LogWriter\n"
+        "write = LogWriter.write\n"
+        "def terminate(log, sample):\n"
+        "    write(log, sample)\n"
+        "    if sample.cycle == 200:\n"
+        "        assert log.part.exists()\n"
+        "        os.kill(os.getpid(), signal.SIGTERM)\n"
+        "LogWriter.write = terminate\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    words = ["import", str(bench.description), "--data", str(bench.data), "--out", str(bench.out)]
+    done = subprocess.run(
+        [sys.executable, "-c", script, *words], cwd=bench.checkout, check=False, capture_output=True, text=True
+    )
+    assert done.returncode == ExitCode.INTERRUPTED
+    assert bench.left == []
+    assert "Traceback" not in done.stderr
+    assert "no file was written" in done.stderr
 
 
 def test_a_number_that_is_no_current(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,22 +7,28 @@ messages inside. Bounded in time by the number of examples; derandomised, so tha
 from __future__ import annotations
 
 import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
-import zstandard
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
 from daq.errors import LogUnreadable
-from daq.log.container import MAGIC
-from daq.log.message import DEFINITIONS, EVENTS_SCHEMA, EVENTS_TOPIC, SAMPLES_SCHEMA, SAMPLES_TOPIC, sample_dtype
+from daq.log.message import sample_dtype
 from daq.log.metadata import READBACK, RUN, STATISTICS, run_record, sealed, statistics_record
 from daq.log.reader import Log, LogReader, SampleBlock, read_log
 from drivers.stream.sample import CellEvent, EventKind
+from tests.daq.log.records import (
+    HEADER,
+    TOPICS,
+    attachment_record,
+    chunk_record,
+    finished_file,
+    metadata_record,
+    raw_record,
+)
 from tests.daq.logs import START_NS, content, samples, write
 
 FUZZ = settings(
@@ -109,48 +115,6 @@ def test_no_damage_gives_other_numbers(
     _attack(path, original)
 
 
-def _record(opcode: int, body: bytes, length: int | None = None) -> bytes:
-    return struct.pack("<BQ", opcode, len(body) if length is None else length) + body
-
-
-def _text(text: str) -> bytes:
-    return struct.pack("<I", len(text.encode())) + text.encode()
-
-
-def _finished(path: Path, records: list[bytes]) -> Path:
-    data = MAGIC + b"".join(records)
-    data += _record(Opcode.DATA_END, struct.pack("<I", zlib.crc32(data)))
-    footer = _record(Opcode.FOOTER, struct.pack("<QQ", 0, 0))[:9].replace(b"\x10", b"\x14", 1) + struct.pack(
-        "<QQ", 0, 0
-    )
-    path.write_bytes(data + footer + struct.pack("<I", zlib.crc32(footer)) + MAGIC)
-    return path
-
-
-def _metadata(name: str, entries: dict[str, str]) -> bytes:
-    pairs = b"".join(_text(key) + _text(value) for key, value in entries.items())
-    return _record(Opcode.METADATA, _text(name) + struct.pack("<I", len(pairs)) + pairs)
-
-
-def _attachment(name: str, data: bytes) -> bytes:
-    body = struct.pack("<QQ", 0, 0) + _text(name) + _text("") + struct.pack("<Q", len(data)) + data
-    return _record(Opcode.ATTACHMENT, body + struct.pack("<I", zlib.crc32(body)))
-
-
-def _chunk(data: bytes, size: int | None = None, compression: str = "zstd") -> bytes:
-    packed = zstandard.compress(data) if compression == "zstd" else data
-    head = struct.pack("<QQQI", 0, 0, len(data) if size is None else size, zlib.crc32(data)) + _text(compression)
-    return _record(Opcode.CHUNK, head + struct.pack("<Q", len(packed)) + packed)
-
-
-def _definitions(topic: str, schema: str, number: int) -> bytes:
-    described = struct.pack("<H", number) + _text(schema) + _text("ros2msg") + _text(DEFINITIONS[schema])
-    channel = struct.pack("<HH", number, number) + _text(topic) + _text("cdr") + struct.pack("<I", 0)
-    return _record(Opcode.SCHEMA, described) + _record(Opcode.CHANNEL, channel)
-
-
-HEADER = _record(Opcode.HEADER, _text("ros2") + _text("test"))
-TOPICS = _definitions(SAMPLES_TOPIC, SAMPLES_SCHEMA, 1) + _definitions(EVENTS_TOPIC, EVENTS_SCHEMA, 2)
 TEXTS = st.text(max_size=12) | st.sampled_from(
     ("0", "-1", "nan", "1e999", "{}", "[]", "[[", "true", "null", "9" * 5000)
 )
@@ -160,26 +124,26 @@ TEXTS = st.text(max_size=12) | st.sampled_from(
 def _records(draw: st.DrawFn) -> bytes:
     kind = draw(st.sampled_from(("any", "metadata", "attachment", "chunk", "length")))
     if kind == "any":
-        return _record(draw(st.integers(0, 255)), draw(st.binary(max_size=60)))
+        return raw_record(draw(st.integers(0, 255)), draw(st.binary(max_size=60)))
     if kind == "length":
-        return _record(draw(st.integers(1, 15)), draw(st.binary(max_size=20)), draw(BITS64))
+        return raw_record(draw(st.integers(1, 15)), draw(st.binary(max_size=20)), draw(BITS64))
     if kind == "metadata":
         start = content(2)
         base = run_record(start.run) if draw(st.booleans()) else {"samples": "1", "missing": "[0, 0]", "valid": "true"}
         entries = base | draw(st.dictionaries(st.sampled_from(sorted(base)), TEXTS, max_size=3))
         entries = sealed(entries) if draw(st.booleans()) else entries
-        return _metadata(draw(st.sampled_from((RUN, STATISTICS))), entries)
+        return metadata_record(draw(st.sampled_from((RUN, STATISTICS))), entries)
     if kind == "attachment":
         data = draw(st.binary(max_size=50) | TEXTS.map(str.encode) | st.just(b"[" * 100_000))
-        return _attachment(draw(st.sampled_from((READBACK, "cell.yaml", ""))), data)
+        return attachment_record(draw(st.sampled_from((READBACK, "cell.yaml", ""))), data)
     size = draw(st.none() | BITS64)
-    return _chunk(draw(st.binary(max_size=80)), size, draw(st.sampled_from(("zstd", "", "lz4", "\0"))))
+    return chunk_record(draw(st.binary(max_size=80)), size, draw(st.sampled_from(("zstd", "", "lz4", "\0"))))
 
 
 @settings(FUZZ, max_examples=400)
 @given(st.lists(_records(), max_size=5))
 def test_records_made_up_with_right_checksums_are_read_or_named(tmp_path: Path, records: list[bytes]) -> None:
-    path = _finished(tmp_path / "made.mcap", [HEADER, *records])
+    path = finished_file(tmp_path / "made.mcap", [HEADER, *records])
     _attack(path, None)
 
 
@@ -205,7 +169,7 @@ def _messages(draw: st.DrawFn) -> bytes:
     else:
         data = draw(st.binary(max_size=60))
     head = struct.pack("<HIQQ", channel, 0, draw(BITS64), draw(BITS64))
-    return _record(Opcode.MESSAGE, head + data, draw(st.none() | st.none() | BITS16))
+    return raw_record(Opcode.MESSAGE, head + data, draw(st.none() | st.none() | BITS16))
 
 
 @settings(FUZZ, max_examples=400)
@@ -217,9 +181,9 @@ def test_messages_made_up_in_genuine_chunks_are_read_or_named(
     start = content(2)
     readback = b'{"axes": [{"name": "J1", "current_per_unit": 1}, {"name": "J2", "current_per_unit": 1}]}'
     statistics = {"samples": count, "lost_cycles": "0", "missing": "[0, 0]", "valid": "true", "reason": ""}
-    before = [HEADER, _attachment(READBACK, readback), _metadata(RUN, sealed(run_record(start.run)))]
-    chunk = _chunk((TOPICS if defined else b"") + b"".join(messages))
-    path = _finished(tmp_path / "made.mcap", [*before, chunk, _metadata(STATISTICS, sealed(statistics))])
+    before = [HEADER, attachment_record(READBACK, readback), metadata_record(RUN, sealed(run_record(start.run)))]
+    chunk = chunk_record((TOPICS if defined else b"") + b"".join(messages))
+    path = finished_file(tmp_path / "made.mcap", [*before, chunk, metadata_record(STATISTICS, sealed(statistics))])
     _attack(path, None)
 
 
@@ -234,9 +198,9 @@ def test_the_made_up_files_are_ones_that_a_reader_takes(good: Path, tmp_path: Pa
         record[name] = 2
     statistics = sealed({**statistics_record(log.statistics), "samples": "1", "missing": "[0, 0]"})
     readback = b'{"axes": [{"name": "J1", "current_per_unit": 1}, {"name": "J2", "current_per_unit": 1}]}'
-    before = [HEADER, _attachment(READBACK, readback), _metadata(RUN, sealed(run_record(start.run)))]
-    made = [*before, _chunk(TOPICS + record.tobytes()), _metadata(STATISTICS, statistics)]
-    assert len(read_log(_finished(tmp_path / "made.mcap", made)).samples.cycle) == 1
+    before = [HEADER, attachment_record(READBACK, readback), metadata_record(RUN, sealed(run_record(start.run)))]
+    made = [*before, chunk_record(TOPICS + record.tobytes()), metadata_record(STATISTICS, statistics)]
+    assert len(read_log(finished_file(tmp_path / "made.mcap", made)).samples.cycle) == 1
 
 
 def test_a_small_file_cannot_take_much_memory(tmp_path: Path) -> None:
@@ -247,9 +211,9 @@ def test_a_small_file_cannot_take_much_memory(tmp_path: Path) -> None:
     record["encapsulation"] = 0x100
     for name in ("positions", "currents", "statuswords"):
         record[name] = 2
-    chunk = _chunk(record.tobytes())
+    chunk = chunk_record(record.tobytes())
     assert len(chunk) * 200 < record.nbytes
-    path = _finished(tmp_path / "bomb.mcap", [HEADER, _chunk(TOPICS + record[:1].tobytes()), *[chunk] * 8])
+    path = finished_file(tmp_path / "bomb.mcap", [HEADER, chunk_record(TOPICS + record[:1].tobytes()), *[chunk] * 8])
     taken = 0
     with pytest.raises(LogUnreadable, match="times the file"):
         for block in LogReader(path):

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import socket
 import struct
 import threading
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +148,49 @@ def test_silent_clients_delay_no_stop(cell_file: Path) -> None:
             asking.sendall(STOP)
             assert asking.recv(len(ACCEPTED)) == ACCEPTED
             assert stopped.wait(10)
+
+
+@contextmanager
+def _without_descriptors() -> Iterator[None]:
+    """Leave this process no free file descriptor, as one that leaks them."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    held: list[int] = []
+    with suppress(OSError):
+        while len(held) < 10_000:
+            held.append(os.dup(0))
+            if len(held) == 64:
+                resource.setrlimit(resource.RLIMIT_NOFILE, (held[-1] + 1, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        for descriptor in held:
+            os.close(descriptor)
+
+
+def test_a_process_without_descriptors_serves_a_stop_once_it_has_one(cell_file: Path) -> None:
+    stopped, name = threading.Event(), socket_names(cell_file).stop
+    with Feed(cell_file, stopped.set), socket.socket(socket.AF_UNIX) as asking:
+        asking.settimeout(10)
+        with _without_descriptors():
+            assert connected(name, socket.SOCK_STREAM, 1.0) is None  # no console of this process either
+            asking.connect(name)
+            asking.sendall(STOP)
+            assert not stopped.wait(3 * feeds.ACCEPT_AGAIN_S)
+        assert asking.recv(len(ACCEPTED)) == ACCEPTED
+        assert stopped.wait(10)
+
+
+def test_a_feed_without_descriptors_says_so_and_one_that_ends_without_them_ends(cell_file: Path) -> None:
+    with _without_descriptors(), Feed(cell_file) as feed:
+        assert "too many open files" in feed.remark.lower()
+    feed = Feed(cell_file)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as console:
+        feed.__enter__()
+        with _without_descriptors():
+            console.connect(socket_names(cell_file).feed)  # waits in vain
+            feed.__exit__(None, None, None)
+            assert not any(thread.name == "drivegain feed" for thread in threading.enumerate())
 
 
 def test_another_word_stops_nothing(cell_file: Path) -> None:

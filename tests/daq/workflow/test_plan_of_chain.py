@@ -17,7 +17,7 @@ from daq.workflow.experiment import RUNS, Experiment, experiment_of, paths_of
 from daq.workflow.plan import Plan, plan
 from ident.planning.verdict import Hidden, verdicts
 
-SECONDS = 8.0
+SECONDS = 12.0
 
 
 @pytest.fixture(scope="module")
@@ -30,6 +30,17 @@ def cell() -> Cell:
 def experiment(cell: Cell) -> Experiment:
     """With its payload."""
     return experiment_of(cell)
+
+
+def test_the_payload_is_expected_at_the_platform() -> None:
+    five_bar = load_cell(shipped_configurations() / "cells" / "five-bar.yaml")
+    expected = experiment_of(five_bar)
+    (payload,) = expected.design.expectation.payloads
+    centre = payload.parameters[6:9] / payload.parameters[9]
+    # The plate is at the end of the rod, 0.45 m from the joint that moves it.
+    assert centre == pytest.approx([0.45, 0.0, 0.0], abs=0.15)
+    (body,) = (capsule for capsule in expected.scene.checker.scene.capsules if capsule.name == "payload")
+    assert body.start_m == pytest.approx((0.45, 0.0, 0.0), abs=0.15)
 
 
 @pytest.fixture(scope="module")

@@ -72,7 +72,7 @@ def test_rows_are_those_of_the_whole_run(cell: Cell, block: int) -> None:
         assert predicted[on_grid, motor] == pytest.approx(expected[motor, rows], abs=2e-4)
         assert residual[on_grid, motor] == pytest.approx(left[motor, rows], abs=2e-4)
     # Standstill is that of the fit, row by row.
-    _, use = row_masks(model.drive_train, data, conditioning)
+    _, use = row_masks(model, data, conditioning)
     rows = at_row[at_row == np.floor(at_row)].astype(int)
     assert not use[:, rows].all() and use[:, rows].any()
     assert (np.isfinite(predicted)[at_row == np.floor(at_row)] == use[:, rows].T).all()

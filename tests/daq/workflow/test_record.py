@@ -74,6 +74,7 @@ class Rig:
             granted_by="the test",
             run_id="1",
             clocks=clocks,
+            unguarded=True,  # the scripted drives have no 1016h
         )
 
     def profiles(self) -> list[bytes]:

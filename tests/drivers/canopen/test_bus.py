@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 
 import can
 import pytest
 from can.interfaces.socketcand import SocketCanDaemonBus
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from drivers.canopen.bus import BusAddress, SocketcandBus, open_bus
 from drivers.canopen.hub import HOST, Hub
@@ -150,6 +153,94 @@ def test_the_hub_hangs_up_on_what_is_no_socketcand() -> None:
         while chunk := client.recv(256):
             heard += chunk
         assert heard == b"< hi >"
+
+
+HOSTILE_FRAMES = (
+    b"< send FFFFFFFFFFFFFFFF 1 00 >",
+    b"< send FFFFFFFF 1 00 >",
+    b"< send 20000000 1 00 >",
+    b"< send 800 1 00 >",
+    b"< send 12345 1 00 >",
+    b"< send %s 1 00 >" % (b"1" * 100),
+    b"< send %s 1 00 >" % (b"0" * 50_000),
+    b"< send 123 %s 00 >" % (b"F" * 50_000),
+    b"< send 123 FFFFFFFFFFFFFFFFFFFF 00 >",
+    b"< send 123 9 00 00 00 00 00 00 00 00 00 >",
+    b"< send 123 1 %s >" % (b"00" * 50_000),
+    b"< send 123 >",
+    b"< send >",
+    b"< \xff\xfe\0 >",
+    b"< open %s >" % (b"x" * 50_000),
+    b"<" + b" " * 60_000 + b">",
+    b"<" * 60_000 + b">",
+)
+"""Lines of any length and of any content, whole messages of the protocol all of them."""
+
+
+@contextmanager
+def _raw_client(hub: Hub) -> Iterator[socket.socket]:
+    """Open a connection in raw mode that sends what a test writes."""
+    with socket.create_connection((HOST, hub.address().port), timeout=WAIT_S) as client:
+        client.sendall(b"< open can0 >< rawmode >")
+        heard = b""
+        while heard != b"< hi >< ok >< ok >":
+            heard += client.recv(256)
+        yield client
+
+
+def _arrives_alone(hub: Hub, ends: Sequence[can.BusABC]) -> None:
+    """Send a frame from the first end to the second: it is the next one, and the hub answers in time."""
+    frame = can.Message(arbitration_id=0x123, is_extended_id=False, data=b"\x2a")
+    ends[0].send(frame)
+    assert same(ends[1].recv(WAIT_S), frame)
+
+
+@pytest.mark.parametrize("line", HOSTILE_FRAMES, ids=range(len(HOSTILE_FRAMES)))
+def test_no_line_of_one_client_reaches_or_ends_another(line: bytes) -> None:
+    with Hub(("can0",)) as hub:
+        ends = [open_bus(hub.address()) for _ in range(2)]
+        with _raw_client(hub) as hostile:
+            hostile.sendall(line)
+            hostile.settimeout(WAIT_S)
+            with suppress(ConnectionResetError):  # the hub may hang up on it, and on nobody else
+                assert hostile.recv(256)[:8] in (b"< error ", b"")
+            _arrives_alone(hub, ends)
+        for end in ends:
+            end.shutdown()
+
+
+@settings(
+    max_examples=150, deadline=None, database=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+)
+@given(lines=st.lists(st.one_of(
+    st.binary(max_size=40),
+    st.from_regex(rb"< ?send [0-9A-Fa-f]{1,20} [0-9A-Fa-f]{1,3} ([0-9A-Fa-f]{1,2} ){0,10}>", fullmatch=True),
+), max_size=8))  # fmt: skip
+def test_a_frame_that_arrives_is_one_that_a_bus_carries(lines: list[bytes]) -> None:
+    with Hub(("can0",)) as hub:
+        listening = open_bus(hub.address())
+        with _raw_client(hub) as hostile:
+            hostile.sendall(b"".join(lines) + b"><>< echo >")
+            heard = b""
+            while not heard.endswith(b"< echo >") and (chunk := hostile.recv(4096)):
+                heard += chunk
+        while (frame := listening.recv(0.0)) is not None:
+            assert frame.arbitration_id <= (0x1FFF_FFFF if frame.is_extended_id else 0x7FF)
+        listening.shutdown()
+
+
+@pytest.mark.parametrize("unfinished", [b"<" + b" " * 200_000, b"< send " + b"1" * 200_000, b"<\t " * 60_000])
+def test_an_unfinished_line_holds_up_nobody(unfinished: bytes) -> None:
+    """The hub reads each byte a bounded number of times: these took it minutes, and nobody else was served."""
+    with Hub(("can0",)) as hub:
+        ends = [open_bus(hub.address()) for _ in range(2)]
+        with _raw_client(hub) as hostile, suppress(ConnectionResetError, BrokenPipeError):
+            hostile.sendall(unfinished)
+            while hostile.recv(4096):
+                pass
+        _arrives_alone(hub, ends)
+        for end in ends:
+            end.shutdown()
 
 
 def test_a_server_that_takes_nothing_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -56,4 +56,4 @@ def test_what_cannot_be_packed_is_refused() -> None:
 
 def test_setpoints_have_the_predefined_cob_ids() -> None:
     assert [record.cob_id for record in records(Direction.RPDO, 5, SETPOINT_PDOS)] == [0x205, 0x305, 0x405]
-    assert records(Direction.RPDO, 5, SETPOINT_PDOS)[0].entries == (0x60400010, 0x607A0020)
+    assert records(Direction.RPDO, 5, SETPOINT_PDOS)[0].entries == (0x607A0020, 0x60400010)  # the target first

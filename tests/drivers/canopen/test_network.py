@@ -158,7 +158,7 @@ def test_a_mapping_that_reads_back_differently_is_refused() -> None:
     [
         ((0x1A00, 2), 0x06040041, "60740010 to 1A00h:02.*cannot be mapped"),
         ((0x1A00, 0), 0x06040042, "1A00h:00.*length exceeded"),
-        ((0x1801, 1), 0x06010002, "TPDO2.*read only"),
+        ((0x1600, 0), 0x06010002, "RPDO1: writing 0x0 to 1600h:00.*read only"),
     ],
 )
 def test_aborts_of_the_mapping_are_shown(where: tuple[int, int], code: int, words: str) -> None:
@@ -166,6 +166,37 @@ def test_aborts_of_the_mapping_are_shown(where: tuple[int, int], code: int, word
     bus.nodes[0].aborts[where] = code
     with pytest.raises(SetupRefused, match=words), network:
         network.prepare()
+
+
+def test_a_pdo_whose_cob_id_is_fixed_gets_the_rest() -> None:
+    network, bus = cell(1)
+    bus.nodes[0].aborts[0x1801, 1] = 0x06010002
+    before = copy.deepcopy(bus.nodes[0].objects)
+    with network:
+        network.prepare()  # TPDO2 carries the statusword by default: it cannot be switched off, but it can be used
+        assert [record.entries for record in network.pdos[0].feedback] == [(0x60640020, 0x60740010), (0x60410010,)]
+        assert bus.nodes[0].value(0x1801, 2) == 1
+    for key in ((0x1800, 1), (0x1800, 2), (0x1801, 1), (0x1801, 2), (0x1A00, 0), (0x1A00, 1), (0x1A01, 0)):
+        assert bus.nodes[0].objects[key] == before[key]
+
+
+def test_a_drive_with_small_pdos_gets_more_of_them() -> None:
+    network, bus = cell(1)
+    write = bus.nodes[0].sdo
+
+    def small(data: bytes) -> bytes | None:
+        index = int.from_bytes(data[1:3], "little")
+        if data[0] >> 5 == 1 and index & 0xFF00 in (0x1600, 0x1A00) and data[3] == 0:
+            mapped = [bus.nodes[0].value(index, sub + 1) & 0xFF for sub in range(data[4])]
+            if sum(mapped) > 48:
+                return bytes((0x80, *data[1:4])) + (0x06040042).to_bytes(4, "little")
+        return write(data)
+
+    bus.nodes[0].sdo = small  # type: ignore[method-assign]
+    with network:
+        network.prepare()
+        assert [len(record.entries) for record in network.pdos[0].feedback] == [2, 1]
+        assert [len(record.entries) for record in network.pdos[0].setpoints] == [2, 1, 1, 1]
 
 
 def test_a_mode_that_is_not_taken_is_refused() -> None:

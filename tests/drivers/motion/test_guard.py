@@ -7,7 +7,7 @@ from itertools import pairwise
 import can
 import pytest
 
-from drivers.errors import BusBusy
+from drivers.errors import BusBusy, SetupRefused
 from drivers.motion.execute import execute
 from drivers.motion.move import Move
 from drivers.stream.sample import CellEvent, EventKind
@@ -16,6 +16,7 @@ from drivers.stream.sync import LockstepSync
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, ScriptedNode, cell, permission
 
 RECORDER = 127
+MOVE = Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000))
 
 
 def give_guard(node: ScriptedNode, entry: int = 0, option: int | None = 1) -> None:
@@ -174,6 +175,22 @@ def test_what_a_killed_recorder_left_under_another_id_is_used_again() -> None:
     assert bus.nodes[0].value(0x1016, 1) == 0
 
 
+def test_a_device_with_any_node_id_leaves_the_recorder_an_id_of_its_own_or_the_run_is_refused() -> None:
+    for node_id in range(1, 128):
+        network, bus = cell(2)
+        for node in bus.nodes:
+            give_guard(node)
+        join(bus, node_id, beat_ms=100)
+        if node_id <= 2:
+            with pytest.raises(SetupRefused, match=f"J{node_id} .*two have it"), network:
+                network.prepare()
+            continue
+        with network:
+            network.prepare()
+            assert network.recorder_id == (126 if node_id == 127 else 127)
+            assert [node.value(0x1016, 1) >> 16 for node in bus.nodes[:2]] == [network.recorder_id] * 2
+
+
 def test_a_bus_without_a_free_node_id_is_refused_before_anything_is_set_up() -> None:
     network, bus = cell(2)
     for node in bus.nodes:
@@ -198,6 +215,46 @@ def test_a_device_with_our_node_id_that_comes_before_the_run_refuses_it(frame: c
                 execute(network, stream, (Move((50_000, 0), (100_000, 100_000), (1_000_000, 1_000_000)),), permission())
             )
     assert all(node.powered_cycles == 0 for node in bus.nodes)
+
+
+def frame_of_another(identifier: int) -> can.Message:
+    return can.Message(arbitration_id=identifier, is_extended_id=False, data=bytes(8))
+
+
+EVERY_FRAME_OF_OUR_ID = [frame_of_another(service + RECORDER) for service in range(0x80, 0x600, 0x80)]
+LSS_FRAMES = [frame_of_another(0x7E4), frame_of_another(0x7E5)]
+
+
+@pytest.mark.parametrize(
+    ("frame", "words"),
+    [
+        *((frame, f"a frame {frame.arbitration_id:03X}h of another device, which has node id 127 too")
+          for frame in EVERY_FRAME_OF_OUR_ID),
+        *((frame, f"a layer setting service, which changes node ids .{frame.arbitration_id:03X}h.")
+          for frame in LSS_FRAMES),
+    ],
+)  # fmt: skip
+def test_any_frame_with_our_node_id_and_any_lss_frame_stops_the_axes(frame: can.Message, words: str) -> None:
+    network, bus = cell(2)
+    for node in bus.nodes:
+        give_guard(node)
+    with network:
+        network.prepare()
+        bus.cycle = -1
+        bus.on_cycle = lambda cycle: bus.inject(frame) if cycle == 60 else None
+        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock))
+        with pytest.raises(BusBusy, match=words):
+            list(execute(network, stream, (MOVE,), permission()))
+        assert bus.cycle < 70
+    assert [node.statusword & 0x6F for node in bus.nodes] == [0x40, 0x40]
+
+
+def test_axes_without_guard_are_named() -> None:
+    network, bus = cell(2)
+    give_guard(bus.nodes[0], option=None)
+    with network:
+        network.prepare()
+        assert network.without_guard() == ("J2",)
 
 
 @pytest.mark.parametrize("frame", [HEARTBEAT_OF_ANOTHER, BOOT_UP_OF_ANOTHER], ids=["heartbeat", "boot-up"])

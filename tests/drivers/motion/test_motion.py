@@ -105,7 +105,7 @@ def test_nothing_is_sent_to_an_axis_whose_position_is_unknown(moving: Moving) ->
     bus.tamper = lambda m: () if m.arbitration_id == 0x182 and bus.cycle < 2 else (m,)
     run(moving, Move((30_000, 20_000), (100_000, 100_000), (1_000_000, 1_000_000)))
     targets = [
-        int.from_bytes(frame.data[2:], "little", signed=True) for frame in bus.sent if frame.arbitration_id == 0x202
+        int.from_bytes(frame.data[:4], "little", signed=True) for frame in bus.sent if frame.arbitration_id == 0x202
     ]
     assert min(targets) == 20_000
 
@@ -221,7 +221,7 @@ def test_a_fault_during_the_last_stop_is_not_forgotten(moving: Moving) -> None:
 def test_a_setpoint_that_is_never_acknowledged_ends_in_a_timeout(moving: Moving) -> None:
     _, _, bus, _ = moving
     bus.nodes[1].ignores_setpoint = True
-    with pytest.raises(MotionTimeout, match="move 0: J2 did not"):
+    with pytest.raises(MotionTimeout, match=r"move 0: J2 \(node 2\) did not set statusword bit 12"):
         run(moving, FAR)
     assert powerless(bus)
 
@@ -276,7 +276,7 @@ def test_a_setpoint_that_still_waits_is_dropped_by_the_stop(moving: Moving, monk
     with pytest.raises(KeyboardInterrupt):
         run(moving, FAR)
     assert last_profile in [frame.arbitration_id for frame in bus.sent]
-    controlwords = [frame.data[0] for frame in bus.sent if frame.arbitration_id in (0x201, 0x202)]
+    controlwords = [frame.data[4] for frame in bus.sent if frame.arbitration_id in (0x201, 0x202)]
     assert not any(word & 0x10 for word in controlwords)
     assert [node.setpoint_cycles for node in bus.nodes] == [[], []]
     assert powerless(bus)
@@ -354,7 +354,7 @@ def test_why_the_moves_end_is_in_the_log(moving: Moving) -> None:
         run(moving, FAR)
     kinds = [event.kind for event in events]
     (ended,) = [event for event in events if event.kind is EventKind.ENDED]
-    assert ended.text.startswith("MotionTimeout: move 0: J2 did not")
+    assert ended.text.startswith("MotionTimeout: move 0: J2 (node 2) did not")
     assert kinds.index(EventKind.ENDED) < kinds.index(EventKind.STOP)
 
 

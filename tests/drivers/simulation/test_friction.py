@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from drivers.simulation.dynamics import MAX_SWEEPS, TOLERANCE_RAD_S, solve
+from drivers.simulation.dynamics import DEPENDENT, MAX_SWEEPS, TOLERANCE_RAD_S, solve
 
 
 def problem(seed: int, joints: int, extra: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -28,7 +28,7 @@ def problem(seed: int, joints: int, extra: int) -> tuple[np.ndarray, np.ndarray,
 def test_solution_meets_its_conditions_and_only_dissipates(seed: int, joints: int, extra: int) -> None:
     delassus, free, bound = problem(seed, joints, min(extra, joints))
     impulse = np.zeros(len(free))
-    certificate = solve(delassus, free, bound, impulse, TOLERANCE_RAD_S, MAX_SWEEPS)
+    certificate = solve(delassus, free, bound, impulse, TOLERANCE_RAD_S, MAX_SWEEPS, DEPENDENT)
     speed = free + delassus @ impulse
     assert certificate <= TOLERANCE_RAD_S
     assert (np.abs(impulse) <= bound).all()
@@ -45,7 +45,7 @@ def test_solution_agrees_with_bounded_least_squares(seed: int, joints: int) -> N
     delassus, free, bound = problem(seed, joints, 0)
     bound += 0.01
     impulse = np.zeros(joints)
-    solve(delassus, free, bound, impulse, TOLERANCE_RAD_S, MAX_SWEEPS)
+    solve(delassus, free, bound, impulse, TOLERANCE_RAD_S, MAX_SWEEPS, DEPENDENT)
     lower = np.linalg.cholesky(delassus)
     # min ½ λᵀ W λ + w_freeᵀ λ = min ½ ‖Lᵀ λ + L⁻¹ w_free‖² up to a constant.
     box = (-bound, bound)
@@ -57,20 +57,20 @@ def test_solution_agrees_with_bounded_least_squares(seed: int, joints: int) -> N
 def test_the_start_value_does_not_change_the_speeds() -> None:
     delassus, free, bound = problem(7, 5, 2)
     cold, warm = np.zeros(7), np.full(7, 3.0)
-    solve(delassus, free, bound, cold, TOLERANCE_RAD_S, MAX_SWEEPS)
-    solve(delassus, free, bound, warm, TOLERANCE_RAD_S, MAX_SWEEPS)
+    solve(delassus, free, bound, cold, TOLERANCE_RAD_S, MAX_SWEEPS, DEPENDENT)
+    solve(delassus, free, bound, warm, TOLERANCE_RAD_S, MAX_SWEEPS, DEPENDENT)
     np.testing.assert_allclose(delassus @ cold, delassus @ warm, atol=1e-8)
 
 
 def test_an_unfinished_solution_says_so() -> None:
     delassus, free = np.array([[1.0, 0.999], [0.999, 1.0]]), np.array([1.0, -1.0])
     impulse = np.zeros(2)
-    assert solve(delassus, free, np.full(2, 1e6), impulse, TOLERANCE_RAD_S, 3) > TOLERANCE_RAD_S
+    assert solve(delassus, free, np.full(2, 1e6), impulse, TOLERANCE_RAD_S, 3, DEPENDENT) > TOLERANCE_RAD_S
 
 
 def test_known_case() -> None:
     impulse = np.zeros(1)
-    solve(np.array([[2.0]]), np.array([3.0]), np.array([1.0]), impulse, TOLERANCE_RAD_S, MAX_SWEEPS)
+    solve(np.array([[2.0]]), np.array([3.0]), np.array([1.0]), impulse, TOLERANCE_RAD_S, MAX_SWEEPS, DEPENDENT)
     assert impulse[0] == pytest.approx(-1.0)  # slides: 3 − 2·1 > 0
-    solve(np.array([[2.0]]), np.array([3.0]), np.array([9.0]), impulse, TOLERANCE_RAD_S, MAX_SWEEPS)
+    solve(np.array([[2.0]]), np.array([3.0]), np.array([9.0]), impulse, TOLERANCE_RAD_S, MAX_SWEEPS, DEPENDENT)
     assert impulse[0] == pytest.approx(-1.5)  # sticks: exactly what stops it

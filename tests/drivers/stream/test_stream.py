@@ -541,7 +541,7 @@ def test_a_schedule_that_slips_by_more_than_a_second_is_a_fault(timed: Prepared)
 def test_set_points_of_another_master_are_a_fault(lockstep: Prepared) -> None:
     stream, bus, events = lockstep
     next(stream)
-    bus.inject(can.Message(arbitration_id=0x27F, is_extended_id=False, data=bytes(6)))  # of a node that is no axis
+    bus.inject(can.Message(arbitration_id=0x27E, is_extended_id=False, data=bytes(6)))  # of a node that is no axis
     own = can.Message(arbitration_id=0x201, is_extended_id=False, data=bytes(6), is_rx=False)
     bus.inject(own)
     next(stream)

@@ -15,13 +15,13 @@ from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.discovery.evidence import gather
 from ident.discovery.loop import find_effects
-from ident.equations.rows import row_filter
+from ident.equations.rows import row_filter, row_masks
 from ident.errors import CurrentReversed
 from ident.estimators.diagnosis import diagnose, exchanged_channels
 from ident.estimators.estimate import relative_error
 from ident.estimators.identify import identify
 from ident.model.closed_chain import TreeMotion
-from ident.prediction import measured_current, measured_torque, placed_effect, predict_torque, predicted_rows
+from ident.prediction import measured_current, measured_torque, placed_effect, predict_torque
 from tests.ident.closed_recordings import Made, recorded
 from tests.ident.mechanisms import FIVE_BAR, PLANAR, THREE_LEGS, Mechanism
 
@@ -102,7 +102,7 @@ def test_an_effect_is_named_on_its_joint(mechanism: Mechanism, joint: str, torqu
 def _error(calibration: Calibration, made: Made, run: Run) -> float:
     """Share of the torque of all axes that a calibration leaves."""
     data = differentiate(run, made.model.drive_train, made.conditioning)
-    use = predicted_rows(made.model, data, made.conditioning)[0]
+    use = row_masks(made.model, data, made.conditioning)[0]
     filter_ = row_filter(data, made.conditioning)
     measured = filter_(measured_torque(calibration, made.model, data.current_a, data.motion()).T)
     return relative_error(measured, filter_(predict_torque(calibration, made.model, data).T), use).total

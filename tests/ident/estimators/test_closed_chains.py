@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
+from ident.arrays import FloatArray
 from ident.data.dataset import differentiate
 from ident.equations.currents import PreloadedCurrents, without_preload
 from ident.equations.linearisation import linearise
-from ident.equations.rows import observe
+from ident.equations.rows import decimate_rows, observe
 from ident.errors import DataUnfit
 from ident.estimators.identify import Identification, identify
 from ident.estimators.maximum_likelihood import iv
 from ident.estimators.method import Method
+from ident.model.model import Column
 from tests.ident.closed_recordings import Made, recorded
 from tests.ident.mechanisms import FIVE_BAR, MECHANISMS, PLANAR, Mechanism
 
@@ -128,6 +131,33 @@ def test_rows_and_triangles_are_the_same_equations(mechanism: Mechanism) -> None
         direct[held, problem.rows_of(motor)] = part
     assert seen == pytest.approx((direct[first : first + 2] / problem.scale[first : first + 2, None]).T, abs=1e-9)
     assert len(datasets) == 2
+
+
+def test_what_preload_hides_of_an_effect_is_in_no_row() -> None:
+    """A torque of one motor alone is seen at all of them: the part that works against the others is not."""
+    found, made = _fitted(PLANAR.name), _made(PLANAR.name)
+    assert found.gathered is not None
+    data, _ = found.gathered
+    per_unit = [decimate_rows(one, made.conditioning, np.abs(one.velocity_rad_s[:, 1])) for one in data]
+    alone = np.zeros((4, 1, sum(map(len, per_unit))))
+    alone[1, 0] = np.concatenate(per_unit)
+    with_effect = [
+        replace(run, current_a=run.current_a + _padded(np.abs(one.velocity_rad_s) * [0, 1, 0, 0] / PLANAR.gains))
+        for run, one in zip(made.runs, data, strict=True)
+    ]
+    again = [differentiate(run, made.model.drive_train, made.conditioning) for run in with_effect]
+    rows = observe(made.model, again, made.conditioning, found.system)
+    seen = rows.extended((Column("effect", "Nm"),), alone).effects
+    added = rows.torque(PLANAR.gains) - found.gathered[1].torque(PLANAR.gains)
+    used = rows.use[0]
+    # A turns within a row's window, so that the filter leaves a little.
+    assert np.linalg.norm((added - seen[:, 0])[:, used]) < 0.02 * np.linalg.norm(added[:, used])
+    assert np.linalg.norm((added - alone[:, 0])[:, used]) > 0.3 * np.linalg.norm(added[:, used])
+
+
+def _padded(inner: FloatArray) -> FloatArray:
+    """At all samples of a run: differences leave out the first and the last."""
+    return np.pad(inner, ((1, 1), (0, 0)))
 
 
 def test_instruments_need_an_equation_a_motor() -> None:

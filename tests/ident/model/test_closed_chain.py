@@ -118,6 +118,23 @@ def test_a_pose_does_not_depend_on_what_was_asked_before() -> None:
     assert np.max(np.abs(follow(robot, assembly, part).joints.position_rad - whole[77:201])) < 1e-11
 
 
+def test_a_model_keeps_a_motion_as_long_as_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, motion = FIVE_BAR.model, _axes_motion(FIVE_BAR, 50)
+    first = model.follow(motion)
+    assert model.follow(replace(motion)) is first
+    faster = Motion(motion.position_rad, 2.0 * motion.velocity_rad_s, motion.acceleration_rad_s2)
+    assert model.follow(faster).joints.velocity_rad_s == pytest.approx(2.0 * first.joints.velocity_rad_s)
+    assert model.follow(motion) is first
+    with pytest.raises(ValueError, match="read-only"):
+        first.to_joints[0] = 0.0
+    motion.position_rad[7] += 1e-9  # what was followed is not what the array holds now
+    moved = model.follow(motion).joints.position_rad
+    assert moved == pytest.approx(first.joints.position_rad, abs=1e-8)
+    assert not np.array_equal(moved[7], first.joints.position_rad[7])
+    monkeypatch.setattr("ident.model.model.REMEMBERED_BYTES", 1000)
+    assert model.follow(faster) is not model.follow(faster)
+
+
 def test_five_bar_against_the_circles_that_its_rods_describe() -> None:
     found = follow(FIVE_BAR.robot, assemble(FIVE_BAR.robot), _axes_motion(FIVE_BAR)).joints.position_rad
     index = {joint.name: number for number, joint in enumerate(FIVE_BAR.robot.joints)}

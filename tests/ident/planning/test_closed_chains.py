@@ -49,7 +49,7 @@ def test_the_predicted_deviation_is_that_of_a_fit(mechanism: Mechanism) -> None:
     information = np.zeros((design.size, design.size))
     for run, payload in zip(made.runs, (None, 0), strict=True):
         data = differentiate(run, made.model.drive_train, made.conditioning)
-        information += design.information(recorded(made.model.drive_train, data, made.conditioning), (payload,))
+        information += design.information(recorded(made.model, data, made.conditioning), (payload,))
     expected = 100.0 * fitted.gains_std / np.abs(fitted.gains)
     ratio = design.std_percent(information) / expected
     assert np.all((ratio > 0.5) & (ratio < 2.0))
@@ -59,7 +59,7 @@ def test_moves_show_every_gain_of_a_redundant_drive_and_rest_shows_none() -> Non
     made = made_of(PLANAR, 3, seconds=18.0, preload_nm=0.0)
     design = _design(PLANAR, made, np.full(4, 0.01))
     data = differentiate(made.runs[1], made.model.drive_train, made.conditioning)
-    moves = recorded(made.model.drive_train, data, made.conditioning)
+    moves = recorded(made.model, data, made.conditioning)
     still = np.repeat(data.position_rad[:1], 60, axis=0)
     rest = Excitation(Motion(still, np.zeros_like(still), np.zeros_like(still)), np.ones((4, 60), dtype=np.bool_))
     runs: tuple[int | None, ...] = (None, 0)
@@ -78,7 +78,7 @@ def _judged(made: Made, design: Design) -> Identifiability:
     runs = []
     for run, payload in zip(made.runs, (None, 0), strict=True):
         data = differentiate(run, made.model.drive_train, made.conditioning)
-        runs.append((recorded(made.model.drive_train, data, made.conditioning), (payload,)))
+        runs.append((recorded(made.model, data, made.conditioning), (payload,)))
     return verdicts(design, runs)
 
 

@@ -74,7 +74,7 @@ def test_predicted_deviations_are_those_of_the_estimator(truth: Truth) -> None:
         for name, load in (("bare", None), ("loaded", MOUNTED))
     )
     design = _design(truth)
-    excitations = [recorded(truth.model.drive_train, data, CONDITIONING) for data in _data(truth, clean)]
+    excitations = [recorded(truth.model, data, CONDITIONING) for data in _data(truth, clean)]
     informations = [design.information(e, (p,)) for e, p in zip(excitations, (None, 0), strict=True)]
     predicted = design.std_percent(np.sum(informations, axis=0))
     errors = []

@@ -1,0 +1,111 @@
+"""No verb waits for a pipe, a device or a socket: each file that it reads is refused unless it is a regular one."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import pytest
+
+from daq.cli.app import VERBS, main
+from daq.cli.verb import Verb
+from daq.errors import ExitCode
+from daq.workflow.calibration_file import save_calibration
+from tests.daq.calibrations import demo_calibration
+from tests.daq.logs import demo_content, samples, write
+
+VALID = {
+    "cell": "configs/cells/demo.yaml",
+    "log": "a.mcap",
+    "logs": "a.mcap",
+    "calibration": "calibration.yaml",
+    "description": "configs/imports/tx40.yaml",
+    "simulation": "clean",
+    "data": ".",
+    "key": "ada.key",
+}
+"""Values of the other arguments, by name; any other is a name of no file."""
+WRITTEN = {"out", "pictures", "plot", "csv", "report", "preview", "folder", "to", "cases", "data", "payload_from"}
+"""Places to write to, which have refusals of their own, folders, and a file that a verb reads again and again."""
+LONGEST_S = 20.0
+
+
+def _command_lines() -> Iterator[tuple[str, list[str]]]:
+    """Yield a name and the words of each command line, with PIPE for one file that it reads."""
+    for listed in VERBS:
+        verb = listed.load()
+        for kind in verb.kinds or (verb,):
+            words = [verb.name, kind.name] if verb.kinds else [verb.name]
+            params = kind.command().params
+            for one in params:
+                if "Path" in str(one.type_descriptor.annotation) and one.name not in WRITTEN:
+                    yield f"{' '.join(words)} {one.name}", [*words, *_arguments(kind, params, one)]
+
+
+def _arguments(kind: Verb, params: list[Any], one: Any) -> Iterator[str]:
+    for param in params:
+        if param is one or param.required:
+            value = "PIPE" if param is one else VALID.get(param.name, "absent")
+            yield from (value,) if param.param_type_name == "argument" else (max(param.opts, key=len), value)
+    if kind.name == "log":
+        yield "--csv"  # one of two kinds of table
+
+
+LINES = dict(_command_lines())
+
+
+@contextmanager
+def _in_time() -> Iterator[None]:
+    """Interrupt what waits, with an error that no verb handles."""
+
+    def late(_number: int, _frame: FrameType | None) -> None:
+        raise AssertionError("it waits for the pipe")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, LONGEST_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.fixture(scope="module")
+def folder(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a cell, a log and a calibration."""
+    made = tmp_path_factory.mktemp("here")
+    shutil.copytree(checkout / "configs", made / "configs")
+    write(made / "a.mcap", demo_content(checkout), samples([[0] * 6] * 50))
+    save_calibration(demo_calibration(), made / "calibration.yaml")
+    os.mkfifo(made / "pipe")
+    return made
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_no_verb_waits_for_a_pipe(
+    line: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(folder)
+    with _in_time():
+        code = main([word.replace("PIPE", "pipe") for word in LINES[line]])
+    assert code != ExitCode.OK
+    assert "Traceback" not in "".join(capsys.readouterr())
+
+
+@pytest.mark.parametrize("verb", [["info"], ["fit"], ["export", "bag"], ["export", "log", "--csv"], ["salvage"]])
+def test_devices_and_sockets_are_refused_like_pipes(
+    verb: list[str], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--out", str(tmp_path / "made")]
+    with socket.socket(socket.AF_UNIX) as bound:
+        bound.bind(str(tmp_path / "socket"))
+        for place in (Path("/dev/zero"), tmp_path / "socket", folder / "pipe"):
+            assert main([*verb, str(place), *(out if verb != ["info"] else ())]) == ExitCode.DATA_UNFIT
+            assert "no regular file" in capsys.readouterr().err

@@ -1,0 +1,77 @@
+"""Records of an MCAP file with right checksums, made up for tests: an attacker can make them too."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import zstandard
+from mcap.opcode import Opcode
+
+from daq.log.container import MAGIC
+from daq.log.message import DEFINITIONS, EVENTS_SCHEMA, EVENTS_TOPIC, SAMPLES_SCHEMA, SAMPLES_TOPIC, sample_dtype
+
+
+def raw_record(opcode: int, body: bytes, length: int | None = None) -> bytes:
+    """Opcode, length and body; another length than the body's if given."""
+    return struct.pack("<BQ", opcode, len(body) if length is None else length) + body
+
+
+def cdr_text(text: str) -> bytes:
+    """Length and characters."""
+    return struct.pack("<I", len(text.encode())) + text.encode()
+
+
+def finished_file(path: Path, records: list[bytes]) -> Path:
+    """A file of these records, with both checksums."""
+    data = MAGIC + b"".join(records)
+    data += raw_record(Opcode.DATA_END, struct.pack("<I", zlib.crc32(data)))
+    footer = raw_record(Opcode.FOOTER, struct.pack("<QQ", 0, 0))[:9].replace(b"\x10", b"\x14", 1) + struct.pack(
+        "<QQ", 0, 0
+    )
+    path.write_bytes(data + footer + struct.pack("<I", zlib.crc32(footer)) + MAGIC)
+    return path
+
+
+def metadata_record(name: str, entries: dict[str, str]) -> bytes:
+    """A metadata record."""
+    pairs = b"".join(cdr_text(key) + cdr_text(value) for key, value in entries.items())
+    return raw_record(Opcode.METADATA, cdr_text(name) + struct.pack("<I", len(pairs)) + pairs)
+
+
+def attachment_record(name: str, data: bytes) -> bytes:
+    """An attachment with its checksum."""
+    body = struct.pack("<QQ", 0, 0) + cdr_text(name) + cdr_text("") + struct.pack("<Q", len(data)) + data
+    return raw_record(Opcode.ATTACHMENT, body + struct.pack("<I", zlib.crc32(body)))
+
+
+def chunk_record(data: bytes, size: int | None = None, compression: str = "zstd") -> bytes:
+    """A chunk with its checksum."""
+    packed = zstandard.compress(data) if compression == "zstd" else data
+    head = struct.pack("<QQQI", 0, 0, len(data) if size is None else size, zlib.crc32(data)) + cdr_text(compression)
+    return raw_record(Opcode.CHUNK, head + struct.pack("<Q", len(packed)) + packed)
+
+
+def definitions(topic: str, schema: str, number: int) -> bytes:
+    """Schema and channel of a topic."""
+    described = struct.pack("<H", number) + cdr_text(schema) + cdr_text("ros2msg") + cdr_text(DEFINITIONS[schema])
+    channel = struct.pack("<HH", number, number) + cdr_text(topic) + cdr_text("cdr") + struct.pack("<I", 0)
+    return raw_record(Opcode.SCHEMA, described) + raw_record(Opcode.CHANNEL, channel)
+
+
+HEADER = raw_record(Opcode.HEADER, cdr_text("ros2") + cdr_text("test"))
+TOPICS = definitions(SAMPLES_TOPIC, SAMPLES_SCHEMA, 1) + definitions(EVENTS_TOPIC, EVENTS_SCHEMA, 2)
+
+
+def sample_records(cycle: Sequence[int], time_ns: Sequence[int], axes: int = 6) -> bytes:
+    """Messages of samples at rest, shape (k,) each; one chunk holds some of them."""
+    made = np.zeros(len(cycle), dtype=sample_dtype(axes))
+    heads = {"opcode": Opcode.MESSAGE, "length": made.itemsize - 9, "channel": 1, "encapsulation": 0x100}
+    for name, value in {**heads, **dict.fromkeys(("positions", "currents", "statuswords"), axes)}.items():
+        made[name] = value
+    made["cycle"] = cycle
+    made["seconds"], made["nanoseconds"] = np.divmod(np.asarray(time_ns, dtype=np.int64), 1_000_000_000)
+    return made.tobytes()

@@ -1,0 +1,319 @@
+"""Every verb judges a log alike, and each is bounded: a log with right checksums may still be made up."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daq.cli.app import main
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.errors import DataError, ExitCode, LogIncomplete, LogUnreadable
+from daq.log.bag_writer import export_bag
+from daq.log.container import RECORDS
+from daq.log.conversion import load_run
+from daq.log.export import TableFormat, column_names, export_log
+from daq.log.message import event_bytes
+from daq.log.metadata import (
+    READBACK,
+    RUN,
+    STATISTICS,
+    RunStatistics,
+    readback_bytes,
+    run_record,
+    sealed,
+    statistics_record,
+)
+from daq.log.reader import LARGEST_ENTRIES, LogReader, read_log
+from daq.log.salvage import salvage
+from daq.report.log import describe_log
+from drivers.stream.sample import CellEvent, EventKind
+from tests.daq.log.records import (
+    HEADER,
+    TOPICS,
+    attachment_record,
+    chunk_record,
+    finished_file,
+    metadata_record,
+    raw_record,
+    sample_records,
+)
+from tests.daq.logs import START_NS, demo_content
+
+CHUNK = 50  #: Samples of a chunk
+ATTACKER_DIGITS = "1" + 400 * "0"
+
+
+@dataclass
+class MadeUp:
+    """A log of the demo cell at rest, 6 chunks of 50 samples at 1 kHz, for a test to change."""
+
+    checkout: Path
+    cycle: list[int] = field(default_factory=lambda: list(range(10, 310)))
+    time_ns: list[int] = field(default_factory=lambda: [START_NS + k * 1_000_000 for k in range(300)])
+    extra: list[bytes] = field(default_factory=list)  #: records before the samples
+    after: list[bytes] = field(default_factory=list)  #: records behind the samples
+    run: dict[str, str] = field(default_factory=dict)  #: entries instead of the genuine ones
+    statistics: dict[str, str] = field(default_factory=dict)
+    readback: bytes | None = None
+
+    def cut(self, first: int, last: int) -> None:
+        """Leave out some samples."""
+        del self.cycle[first:last], self.time_ns[first:last]
+
+    def repeat(self, first: int, last: int) -> None:
+        """Write some samples twice."""
+        for column in (self.cycle, self.time_ns):
+            column[last:last] = column[first:last]
+
+    def counted(self, lost: int = 0) -> None:
+        """Make the recorder's counts fit the samples."""
+        self.statistics |= {"samples": str(len(self.cycle)), "lost_cycles": str(lost)}
+
+    def write(self, path: Path) -> Path:
+        """The file, with right checksums."""
+        start = demo_content(self.checkout)
+        chunks = [
+            chunk_record(TOPICS + sample_records(self.cycle[k : k + CHUNK], self.time_ns[k : k + CHUNK]))
+            for k in range(0, len(self.cycle), CHUNK)
+        ]
+        genuine = statistics_record(RunStatistics(300, 0, (0,) * 6, valid=True))
+        records = [
+            HEADER,
+            *(attachment_record(name, data) for name, data in start.files.items()),
+            attachment_record(READBACK, self.readback or readback_bytes(start.readback)),
+            metadata_record(RUN, sealed(run_record(start.run) | self.run)),
+            *self.extra,
+            *chunks,
+            metadata_record(STATISTICS, sealed(genuine | self.statistics)),
+            *self.after,
+        ]
+        return finished_file(path, records)
+
+
+@pytest.fixture
+def made(checkout: Path) -> MadeUp:
+    """A sound log, not yet written."""
+    return MadeUp(checkout)
+
+
+READERS: dict[str, Callable[[Path, Path], object]] = {
+    "read": lambda log, _: read_log(log),
+    "info": lambda log, _: describe_log(log),
+    "fit and validate": lambda log, _: load_run(log),
+    "export log": lambda log, out: export_log(log, out / "table.csv", TableFormat.CSV),
+    "export bag": lambda log, out: export_bag(log, out / "bag"),
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_the_log_that_the_others_are_made_of_is_sound(reader: str, made: MadeUp, tmp_path: Path) -> None:
+    READERS[reader](made.write(tmp_path / "a.mcap"), tmp_path)
+    assert describe_log(tmp_path / "a.mcap")["valid"]
+
+
+def _renumbered(made: MadeUp) -> None:
+    made.cut(100, 200)
+    made.cycle = list(range(10, 10 + len(made.cycle)))
+
+
+def _cut_and_counted(made: MadeUp) -> None:
+    made.cut(100, 200)
+    made.counted()
+
+
+def _second(record: bytes, *, behind: bool = False) -> Callable[[MadeUp], None]:
+    return lambda made: (made.after if behind else made.extra).append(record)
+
+
+CONTRADICTIONS: dict[str, tuple[Callable[[MadeUp], None], str]] = {
+    "chunks cut out": (lambda made: made.cut(50, 250), "100 samples; expected 300, as its recorder counted"),
+    "chunks cut out and not counted": (
+        _cut_and_counted,
+        "100 lost cycles; expected 0, as its recorder counted",
+    ),
+    "a chunk twice": (lambda made: made.repeat(100, 150), "350 samples; expected 300"),
+    "renumbered cycles": (_renumbered, "200 samples; expected 300"),
+    "answers that were not missing": (
+        lambda made: made.statistics.update(missing="[0, 1, 0, 0, 0, 0]"),
+        r"\[0, 0, 0, 0, 0, 0\] missing answers of its axes; expected \[0, 1",
+    ),
+    "no samples": (lambda made: made.cut(0, 300), "no samples"),
+    "a second readback": (_second(attachment_record(READBACK, b'{"axes": []}')), "a second attachment 'readback.json'"),
+    "a second run": (_second(metadata_record(RUN, sealed({"rate_hz": "1"}))), "a second metadata 'drivegain.run'"),
+    "a second summary": (
+        _second(metadata_record(STATISTICS, sealed({"valid": "true"})), behind=True),
+        "a second metadata 'drivegain.statistics'",
+    ),
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("kind", CONTRADICTIONS)
+def test_a_log_that_contradicts_itself_is_refused_by_all(kind: str, reader: str, made: MadeUp, tmp_path: Path) -> None:
+    change, message = CONTRADICTIONS[kind]
+    change(made)
+    log = made.write(tmp_path / "a.mcap")
+    with pytest.raises(LogUnreadable, match=message):
+        READERS[reader](log, tmp_path)
+    assert list(tmp_path.iterdir()) == [log]
+
+
+@pytest.mark.parametrize("kind", [kind for kind in CONTRADICTIONS if kind != "no samples"])
+def test_a_salvage_of_a_log_that_contradicts_itself_is_not_valid_or_refused(
+    kind: str, made: MadeUp, tmp_path: Path
+) -> None:
+    CONTRADICTIONS[kind][0](made)
+    try:
+        saved = salvage(made.write(tmp_path / "a.mcap"), tmp_path / "saved.mcap")
+    except LogUnreadable as refused:
+        assert "a second" in str(refused)  # nothing of a sound log comes before it
+        return
+    assert saved.damage or not saved.statistics.valid
+    assert read_log(saved.log).partial
+
+
+LOSSES: dict[str, tuple[Callable[[MadeUp], object], int, str]] = {
+    "lost cycles": (lambda made: made.cut(100, 200), 100, "cycle 210 after 109 (1 gaps)"),
+    "a chunk twice, counted": (lambda made: made.repeat(100, 150), 0, "cycle 110 after 159 (1 gaps)"),
+    "renumbered and counted": (_renumbered, 0, "cycle 110 101 ms after cycle 109, its most uneven step"),
+}
+
+
+@pytest.mark.parametrize("kind", LOSSES)
+def test_a_log_that_no_fit_takes_is_called_invalid_by_all(
+    kind: str, made: MadeUp, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change, lost, reason = LOSSES[kind]
+    change(made)
+    made.counted(lost)
+    log = made.write(tmp_path / "a.mcap")
+    with pytest.raises(DataError) as refused:
+        load_run(log)
+    assert refused.value.found == reason
+    described = describe_log(log)
+    assert (described["valid"], described["reason"]) == (False, reason)
+    table, bag = export_log(log, tmp_path / "a.csv", TableFormat.CSV), export_bag(log, tmp_path / "bag")
+    assert (table.valid, table.reason, bag.valid, bag.reason) == (False, reason, False, reason)
+    part = log.rename(tmp_path / "a.mcap.part")
+    saved = salvage(part, tmp_path / "saved.mcap")
+    assert (saved.statistics.valid, saved.statistics.reason) == (False, reason)
+    assert main(["export", "log", str(part), "--csv", "--out", str(tmp_path / "b.csv")]) == ExitCode.OK
+    assert "INVALID" in capsys.readouterr().err
+
+
+# -- bounds ------------------------------------------------------------------------------------------------------------
+
+
+def _serial(made: MadeUp) -> None:
+    tree = json.loads(readback_bytes(demo_content(made.checkout).readback))
+    tree["axes"][0]["drive"]["serial"] = int(ATTACKER_DIGITS)
+    made.readback = json.dumps(tree).encode()
+
+
+@pytest.mark.parametrize("key", ["rate_hz", "speed", "payload_entered_kg", "started_wall_ns", "started_monotonic_ns"])
+def test_a_number_of_400_digits_in_the_metadata_is_refused(key: str, made: MadeUp, tmp_path: Path) -> None:
+    made.run[key] = ATTACKER_DIGITS
+    log = made.write(tmp_path / "a.mcap")
+    for read in READERS.values():
+        with pytest.raises(LogIncomplete):
+            read(log, tmp_path)
+
+
+@pytest.mark.parametrize("key", ["samples", "lost_cycles", "wall_minus_monotonic_ns"])
+def test_a_number_of_400_digits_in_the_summary_is_refused(key: str, made: MadeUp, tmp_path: Path) -> None:
+    made.statistics[key] = ATTACKER_DIGITS
+    log = made.write(tmp_path / "a.mcap")
+    for read in READERS.values():
+        with pytest.raises(LogIncomplete):
+            read(log, tmp_path)
+
+
+def test_a_serial_number_of_400_digits_is_none(made: MadeUp, tmp_path: Path) -> None:
+    _serial(made)
+    run, _ = load_run(made.write(tmp_path / "a.mcap"))
+    assert run.recording is not None
+    assert run.recording.serials == (None, 7, 7, 7, 7, 7)
+
+
+LARGE: dict[str, tuple[Callable[[MadeUp], object], str]] = {
+    "attachments": (
+        lambda made: made.extra.extend(attachment_record(f"a{k}", b"") for k in range(LARGEST_ENTRIES)),
+        f"more than {LARGEST_ENTRIES} attachments",
+    ),
+    "metadata": (
+        lambda made: made.extra.extend(metadata_record(f"a{k}", {}) for k in range(LARGEST_ENTRIES)),
+        f"more than {LARGEST_ENTRIES} attachments",
+    ),
+    "a text among the metadata": (lambda made: made.run.update(operator="x" * 30_000_000), "of 30000[0-9]+ bytes"),
+    "a text as its reason": (lambda made: made.statistics.update(reason="x" * 30_000_000), "of 30000[0-9]+ bytes"),
+    "an attachment": (
+        lambda made: made.extra.append(attachment_record("notes", b"x" * 30_000_000)),
+        "'notes' of 30000000 bytes",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", LARGE)
+def test_a_log_has_no_more_and_no_larger_texts_than_a_recorder_writes(kind: str, made: MadeUp, tmp_path: Path) -> None:
+    change, message = LARGE[kind]
+    change(made)
+    log = made.write(tmp_path / "a.mcap")
+    for read in READERS.values():
+        with pytest.raises(LogUnreadable, match=message):
+            read(log, tmp_path)
+
+
+def _messages(channel: int, data: bytes, count: int) -> bytes:
+    return raw_record(5, np.array([channel], "<u2").tobytes() + bytes(20) + data) * count
+
+
+EVENT = event_bytes(CellEvent(START_NS, None, EventKind.STATE, 1, ""))
+
+
+@pytest.mark.parametrize(
+    ("message", "allowed"),
+    [
+        (_messages(2, EVENT, 1), RECORDS // 2),
+        (_messages(2, event_bytes(CellEvent(START_NS, None, EventKind.STATE, 1, "x" * 6_400)), 1), RECORDS // 100),
+        (_messages(9, b"", 1), RECORDS),
+        (raw_record(0x80, b""), RECORDS),
+    ],
+    ids=["events", "texts", "messages of no topic", "records of no kind"],
+)
+def test_few_bytes_of_equal_messages_take_neither_gigabytes_nor_minutes(
+    message: bytes, allowed: int, made: MadeUp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The budget is that of a file; a hundredth of it keeps the test short."""
+    monkeypatch.setattr("daq.log.container.RECORDS", RECORDS // 100)
+    made.extra.append(chunk_record(TOPICS + message * (2 * allowed // 100)))
+    log = made.write(tmp_path / "a.mcap")
+    assert log.stat().st_size < 100_000
+    reader = LogReader(log)
+    with pytest.raises(LogUnreadable, match="too many messages for a file of its size"):
+        list(reader)
+    assert len(reader.events) <= 2 * allowed // 100
+
+
+# -- columns of an export ----------------------------------------------------------------------------------------------
+
+NAMES = st.lists(st.text("A1_+-.", min_size=1, max_size=4), min_size=6, max_size=6, unique=True)
+
+
+@given(NAMES)
+def test_every_axis_keeps_columns_of_its_own(cell: Cell, names: Sequence[str]) -> None:
+    axes = tuple(replace(axis, name=name) for axis, name in zip(cell.axes, names, strict=True))
+    assert len(set(column_names(replace(cell, axes=axes)))) == 6
+
+
+@pytest.fixture(scope="module")
+def cell(checkout: Path) -> Cell:
+    """The demo cell."""
+    return load_cell(checkout / "configs/cells/demo.yaml")

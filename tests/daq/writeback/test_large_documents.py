@@ -1,0 +1,47 @@
+"""Controller files of any size: read within seconds of processor time, or refused at once."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from daq.config.yaml_file import MAX_BYTES as MAX_CELL_BYTES
+from daq.config.yaml_file import parse_yaml
+from daq.errors import ControllerUnfit, YamlInvalid
+from daq.writeback.formats import yaml_document as limits
+from daq.writeback.formats.document import decode
+
+GAIN = "drives: {J1: {gain: 32.96}}\n"
+LARGE = {
+    "values": GAIN + "more:\n" + "- 1.5\n" * (limits.MAX_VALUES + 1),
+    "bytes": GAIN + "# a comment\n" * (limits.MAX_BYTES // 10),
+    "nested": GAIN + "more: " + "[" * 2000 + "]" * 2000,
+    "unclosed": GAIN + "more: " + "[" * 200_000,
+}
+
+
+@pytest.mark.parametrize("text", LARGE.values(), ids=LARGE)
+def test_yaml_that_would_take_minutes_is_refused_at_once(text: str) -> None:
+    began = time.process_time()
+    with pytest.raises(ControllerUnfit, match="nothing was written"):
+        decode(text.encode(), "controller.yaml").locate(("drives.J1.gain",))
+    assert time.process_time() - began < 2.0
+
+
+def test_yaml_within_the_bounds_is_read_and_rewritten() -> None:
+    text = GAIN + "more:\n" + "- 1.5\n" * 5000 + "# a comment\n" * 10_000
+    document = decode(text.encode(), "controller.yaml")
+    assert document.with_values({"drives.J1.gain": "33.1"}).text == text.replace("32.96", "33.1")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"\n" * (MAX_CELL_BYTES - 100) + b"a: [1\n", b"[" * MAX_CELL_BYTES, b"- 1\n" * 200_000, b"a: 1\n" * 2_500_000],
+    ids=["blank", "brackets", "values", "10 MB"],
+)
+def test_a_large_cell_file_is_refused_at_once(content: bytes) -> None:
+    began = time.process_time()
+    with pytest.raises(YamlInvalid, match="right file"):
+        parse_yaml(content, "cell.yaml")
+    assert time.process_time() - began < 2.0

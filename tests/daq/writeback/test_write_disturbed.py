@@ -1,0 +1,162 @@
+"""A file system that fails at any call of a write: every message says what is true, and the next command repairs."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daq.cli.app import main
+from daq.config.cell_file import load_cell
+from daq.errors import ExitCode
+from daq.ledger.audit import AuditAction, read
+from tests.daq.calibrations import calibration_for
+
+CALLS = ("open", "close", "fsync", "write", "replace", "unlink", "fchmod", "listxattr")
+WRITING = ("fsync", "write", "replace", "unlink", "fchmod")
+DENIALS = ("nothing was", "it is as it was", "as before")
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Path:
+    """The demo cell in a folder of its own."""
+    kept = shutil.ignore_patterns("*.jsonl", "*.sqlite*")
+    shutil.copytree(Path(__file__).parents[3] / "configs", tmp_path / "configs", ignore=kept)
+    return tmp_path / "configs" / "cells" / "demo.yaml"
+
+
+class Disk:
+    """Counts the calls of the operating system, and fails at one of them or from one of them on."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, at: int | None = None, *, lasting: bool = False) -> None:
+        self.calls: list[str] = []
+        self.renamed: int | None = None  #: number of the call that put the new content in its place
+        self._at, self._lasting = at, lasting
+        for name in CALLS:
+            patch.setattr(os, name, self._counted(name, getattr(os, name)))
+
+    def _counted(self, name: str, genuine: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*given: Any, **named: Any) -> Any:
+            number = len(self.calls)
+            self.calls.append(name)
+            if name == "replace" and str(given[1]).endswith("controllers/demo.yaml") and self.renamed is None:
+                self.renamed = number
+            later = self._lasting and self._at is not None and number > self._at and name in WRITING
+            if number == self._at or later:
+                if name == "close":
+                    genuine(*given)  # the descriptor is closed, whatever close(2) says
+                code = errno.EROFS if self._lasting else errno.EIO
+                raise OSError(code, os.strerror(code))
+            return genuine(*given, **named)
+
+        return call
+
+
+def apply(cell: Path, calibration: Path) -> int:
+    return main(["apply", str(cell), str(calibration), "--yes"])
+
+
+def controller_of(cell: Path) -> Path:
+    path = load_cell(cell).controller_path
+    assert path is not None
+    return path
+
+
+@pytest.mark.parametrize("lasting", [False, True], ids=["once", "from then on"])
+@pytest.mark.parametrize("verb", ["apply", "rollback"])
+def test_no_message_denies_a_write_and_the_next_command_enters_it(
+    cell: Path, verb: str, lasting: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    controller, calibration = controller_of(cell), calibration_for(cell)
+    if verb == "rollback":
+        assert apply(cell, calibration) == ExitCode.OK
+    work: Callable[[], int] = (lambda: apply(cell, calibration)) if verb == "apply" else lambda: main([verb, str(cell)])
+    kept = cell.parents[1].with_name("kept")
+    shutil.copytree(cell.parents[1], kept)
+    before = controller.read_bytes()
+
+    def run(at: int | None) -> tuple[int, Disk]:
+        shutil.rmtree(cell.parents[1])
+        shutil.copytree(kept, cell.parents[1])
+        capsys.readouterr()
+        with monkeypatch.context() as patch:
+            disk = Disk(patch, at, lasting=lasting)
+            return work(), disk
+
+    code, whole = run(None)
+    assert code == ExitCode.OK
+    assert whole.renamed is not None
+    after = controller.read_bytes()
+    assert after != before
+    for at in range(whole.renamed - 4, len(whole.calls)):
+        code, _ = run(at)
+        said, found = " ".join(capsys.readouterr().err.split()), controller.read_bytes()
+        assert found in (before, after), at
+        if found == after:
+            assert not any(denial in said for denial in DENIALS), (at, said)
+            assert code == ExitCode.OK or "has the new content" in said, (at, said)
+        else:
+            assert code == ExitCode.UNEXPECTED, (at, said)
+        if verb == "apply":
+            assert apply(cell, calibration) == ExitCode.OK, at
+            assert controller.read_bytes() == after
+        else:
+            assert main(["history", str(cell), "--add", str(calibration)]) == ExitCode.OK, at
+        assert main(["history", str(cell), "--verify"]) == ExitCode.OK, (at, capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
+def test_an_audit_that_takes_no_entry_is_named_and_nothing_is_written(
+    cell: Path, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    controller, calibration, genuine = controller_of(cell), calibration_for(cell), os.write
+    before = controller.read_bytes()
+
+    def full(descriptor: int, data: bytes) -> int:
+        if Path(f"/proc/self/fd/{descriptor}").readlink().name.endswith("audit.jsonl"):
+            raise OSError(code, os.strerror(code))
+        return genuine(descriptor, data)
+
+    monkeypatch.setattr(os, "write", full)
+    assert apply(cell, calibration) == ExitCode.UNEXPECTED
+    said = capsys.readouterr().err
+    assert "demo.audit.jsonl" in said.splitlines()[0]
+    assert "nothing was written to the controller" in said
+    assert controller.read_bytes() == before
+
+
+def test_what_is_in_place_is_called_applied_by_the_audit(
+    cell: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The folder cannot be flushed, and the old content cannot be put back either."""
+    genuine, renamed = os.replace, list[str]()
+
+    def once(source: Any, target: Any, **named: Any) -> None:
+        if str(target).endswith("controllers/demo.yaml"):
+            if renamed:
+                raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+            renamed.append(str(target))
+        genuine(source, target, **named)
+
+    def unflushed(_: Path) -> None:
+        if renamed:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    calibration = calibration_for(cell)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", once)
+        patch.setattr("daq.files.fsync_folder", unflushed)
+        assert apply(cell, calibration) == ExitCode.UNEXPECTED
+    said = " ".join(capsys.readouterr().err.split())
+    assert "has the new content, complete; the history lacks this write" in said
+    history = load_cell(cell).history
+    assert history is not None
+    assert [entry.action for entry in read(history.audit)] == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED]
+    assert main(["history", str(cell), "--verify"]) == ExitCode.DATA_UNFIT
+    assert main(["history", str(cell), "--add", str(calibration)]) == ExitCode.OK
+    assert main(["history", str(cell), "--verify"]) == ExitCode.OK

@@ -1,0 +1,154 @@
+"""Drives of other makers, built on their data sheets: what they lack is found before anything is written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from daq.config.drive import drive_from_text
+from daq.environment import shipped_configurations
+from drivers.canopen.pdo import Direction, PdoRecord, fixed_setpoints
+from drivers.errors import SetupRefused
+from drivers.motion.execute import execute
+from drivers.motion.move import Move
+from drivers.profiles.profile import DriveProfile
+from drivers.stream.stream import SyncStream
+from drivers.stream.sync import LockstepSync
+from tests.drivers.foreign import ForeignNode, foreign_cell
+from tests.drivers.scripted import PERIOD_NS, ScriptedBus, permission
+
+MAKES = {
+    "pilz_prbt_0_1.dcf": "schunk-pilz-prbt",
+    "Schunk_0_63_cob.dcf": "schunk-pilz-prbt",
+    "Elmo_cob.dcf": "elmo-gold",
+    "ElmoSimplIQ_cob.dcf": "elmo-gold",
+    "maxon_epos4.eds": "maxon-epos4",
+}
+MOVE = Move((3000, -2000), (100_000, 80_000), (1_000_000, 800_000))
+
+
+def shipped(name: str) -> DriveProfile:
+    path = shipped_configurations() / "drives" / f"{name}.yaml"
+    return drive_from_text(path.read_bytes(), path.name)
+
+
+def written(bus: ScriptedBus) -> list[str]:
+    """Objects that were written, and NMT commands."""
+    return [
+        f"{frame.arbitration_id:03X} {frame.data.hex(' ')}"
+        for frame in bus.sent
+        if frame.arbitration_id == 0 or (0x600 < frame.arbitration_id < 0x680 and frame.data[0] >> 5 == 1)
+    ]
+
+
+@pytest.mark.parametrize(("file", "profile"), MAKES.items())
+def test_a_drive_of_this_data_sheet_is_set_up_moved_and_restored(file: str, profile: str, shared_data: Path) -> None:
+    network, bus = foreign_cell(shared_data / "eds" / file, shipped(profile))
+    before = [settings(node) for node in bus.nodes]
+    with network:
+        network.prepare()
+        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock))
+        samples = list(execute(network, stream, (MOVE,), permission()))
+        assert not any(sample.missing for sample in samples)
+        # A drive that acts in its 6040h callback would have gone to the target of before.
+        assert [(node.position, len(node.setpoint_cycles)) for node in bus.nodes] == [(3000, 1), (-2000, 1)]
+        assert samples[-1].position_counts == (3000, -2000)
+    assert [settings(node) for node in bus.nodes] == before
+
+
+def settings(node: object) -> dict[str, int]:
+    assert isinstance(node, ForeignNode)
+    keys = [(0x1017, 0), (0x6007, 0), (0x6060, 0), *((0x1016, sub) for sub in range(1, 4))]
+    for base in (0x1400, 0x1800):
+        for number in node.numbers(base):
+            keys += [(base + number, sub) for sub in (1, 2)]
+            keys += [(base + 0x200 + number, sub) for sub in range(node.value(base + 0x200 + number, 0) + 1)]
+    return {f"{index:04X}h:{sub:02X}": node.value(index, sub) for index, sub in keys}
+
+
+def test_a_fixed_mapping_that_carries_the_same_is_used_as_it_is(shared_data: Path) -> None:
+    network, bus = foreign_cell(shared_data / "eds" / "pilz_prbt_0_1.dcf", shipped("schunk-pilz-prbt"), fixed=True)
+    for node in bus.nodes:
+        for base, number, words in (
+            (0x1A00, 0, (0x60410010, 0x60770010, 0x60640020)),  # the default in the data sheet
+            (0x1600, 0, (0x607A0020, 0x60400010)),
+            (0x1601, 0, (0x60810020, 0x60830020)),
+        ):
+            for sub, value in enumerate((len(words), *words)):
+                node.store(base + number, sub, value)
+    with network:
+        network.prepare()
+        assert network.pdos[0].feedback[0].entries == (0x60410010, 0x60770010, 0x60640020)
+        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock))
+        samples = list(execute(network, stream, (MOVE,), permission()))
+        assert samples[-1].position_counts == (3000, -2000)
+        assert {word & 0x6F for word in samples[-1].statusword} == {0x40}
+
+
+def test_a_fixed_mapping_that_does_not_carry_the_same_is_refused(shared_data: Path) -> None:
+    network, _ = foreign_cell(shared_data / "eds" / "pilz_prbt_0_1.dcf", shipped("schunk-pilz-prbt"), fixed=True)
+    with pytest.raises(SetupRefused, match=r"J1 \(node 1\): TPDO1: writing .*read only"), network:
+        network.prepare()
+
+
+@pytest.mark.parametrize(
+    ("file", "missing", "fitting"),
+    [
+        ("pilz_prbt_0_1.dcf", "no object 6074h:00 (current)", "`schunk-pilz-prbt` (current from 6077h:00)"),
+        ("Schunk_0_63_cob.dcf", "no object 6074h:00 (current)", "`schunk-pilz-prbt` (current from 6077h:00)"),
+        (
+            "maxon_epos4.eds",
+            "no object 6074h:00 (current), no object 6075h:00 (scale of the current)",
+            "`maxon-epos4` (current from 30D0h:00, rated current from 3001h:01)",
+        ),
+        ("ros2_canopen_cia402_slave.eds", "no object 6074h:00 (current)", "no shipped profile fits this drive"),
+    ],
+)
+def test_a_profile_that_does_not_fit_is_refused_before_anything_is_written(
+    file: str, missing: str, fitting: str, shared_data: Path
+) -> None:
+    others = tuple(map(shipped, ("elmo-gold", "maxon-epos4", "schunk-pilz-prbt", "copley")))
+    network, bus = foreign_cell(shared_data / "eds" / file, shipped("generic-cia402"), profiles=lambda: others)
+    with pytest.raises(SetupRefused) as refused, network:
+        network.prepare()
+    assert missing in str(refused.value)
+    assert fitting in str(refused.value)
+    assert written(bus) == []
+
+
+def test_too_few_pdos_are_named_before_anything_is_written(shared_data: Path) -> None:
+    network, bus = foreign_cell(shared_data / "eds" / "pilz_prbt_0_1.dcf", shipped("schunk-pilz-prbt"))
+    for node in bus.nodes:
+        assert isinstance(node, ForeignNode)
+        del node.local.object_dictionary[0x1401]
+    with pytest.raises(SetupRefused, match=r"found 1 RPDOs in the drive; expected 2"), network:
+        network.prepare()
+    assert written(bus) == []
+
+
+def rpdo(number: int, *entries: int) -> PdoRecord:
+    return PdoRecord(Direction.RPDO, number, 0x201 + 0x100 * number, 255, entries)
+
+
+PROFILE_RPDOS = (rpdo(2, 0x60810020, 0x60830020), rpdo(3, 0x60840020))
+
+
+@pytest.mark.parametrize(
+    ("command", "fits"),
+    [
+        ((rpdo(0, 0x607A0020, 0x60400010),), True),
+        ((rpdo(0, 0x607A0020), rpdo(1, 0x60400010)), True),
+        ((rpdo(0, 0x60400010, 0x607A0020),), False),
+        ((rpdo(0, 0x60400010), rpdo(1, 0x607A0020)), False),
+        ((rpdo(0, 0x607A0020, 0x60400010, 0x60600008),), False),
+        ((rpdo(0, 0x60400010), rpdo(1, 0x607A0020, 0x60400010)), False),
+    ],
+    ids=["target first", "earlier frame", "controlword first", "later frame", "another object", "twice"],
+)
+def test_own_rpdos_are_used_only_if_the_target_comes_first_and_nothing_else(
+    command: tuple[PdoRecord, ...], fits: bool
+) -> None:
+    used = fixed_setpoints(command + PROFILE_RPDOS)
+    assert [record.number for record in used] == ([r.number for r in command + PROFILE_RPDOS] if fits else [])
+    assert all(record.transmission == 1 for record in used)

@@ -1,0 +1,246 @@
+"""A scan of nodes that answer badly, without end or twice: every node is reported, in a bounded time."""
+
+from __future__ import annotations
+
+import binascii
+import re
+import struct
+from collections.abc import Callable
+
+import can
+import pytest
+
+from drivers.canopen.link import Link
+from drivers.canopen.network import CanopenNetwork
+from drivers.errors import ObjectAccessError, SetupRefused
+from drivers.profiles.profile import ObjectEntry
+from tests.drivers.scripted import ScriptedBus, ScriptedNode, cell
+
+NAME = 0x1008
+STATUSWORD = 0x6041
+Answer = Callable[[bytes, ScriptedBus], bytes | None]
+
+
+class Hostile(ScriptedNode):
+    """A node that answers some requests in a way of its own; an answer of None is that of a sound node."""
+
+    def __init__(self, node_id: int, bus: ScriptedBus, answer: Answer) -> None:
+        super().__init__(node_id)
+        self._bus, self._own = bus, answer
+
+    def sdo(self, data: bytes) -> bytes | None:
+        own = self._own(data, self._bus)
+        return super().sdo(data) if own is None else own or None
+
+
+def about(data: bytes) -> int:
+    return int.from_bytes(data[1:3], "little")
+
+
+def endless(data: bytes, _: ScriptedBus) -> bytes | None:
+    """Send a name of seven bytes after the other."""
+    if data[0] >> 5 == 3:
+        return bytes((data[0] & 0x10,)) + b"endless"
+    return bytes((0x40, *data[1:4])) + bytes(4) if about(data) == NAME else None
+
+
+def huge(data: bytes, _: ScriptedBus) -> bytes | None:
+    """Announce a name of 4 GB."""
+    return bytes((0x41, *data[1:4])) + b"\xff" * 4 if about(data) == NAME else None
+
+
+def one_byte(data: bytes, _: ScriptedBus) -> bytes | None:
+    return bytes((0x4F, *data[1:4])) + bytes(4) if about(data) == STATUSWORD else None
+
+
+def garbage(data: bytes, _: ScriptedBus) -> bytes | None:
+    return bytes((0xE7, *data[1:4])) + b"\xff" * 4 if about(data) != 0x1000 else None
+
+
+def flood(data: bytes, bus: ScriptedBus) -> bytes | None:
+    """Answer every request with answers about something else."""
+    if about(data) == 0x1000:
+        return None
+    for _ in range(200):
+        other = can.Message(arbitration_id=0x582, is_extended_id=False, data=bytes.fromhex("4399999900000000"))
+        bus.inject(other)
+    return b""
+
+
+def silent(data: bytes, _: ScriptedBus) -> bytes | None:
+    return None if about(data) == 0x1000 else b""
+
+
+@pytest.mark.parametrize(
+    ("answer", "problem"),
+    [
+        (endless, r"1008h:00: found \d+ bytes and no end, expected at most 256 bytes"),
+        (huge, "1008h:00: found 4294967295 bytes and no end"),
+        (one_byte, "6041h:00: has 8 bits, expected 16"),
+        (garbage, "1018h:01: Unexpected response 0xE7"),
+        (flood, "1018h:01: 64 answers to other requests"),
+        (silent, "1018h:01: no answer within 0.5 s"),
+    ],
+)
+def test_every_node_is_reported_whatever_one_of_them_does(answer: Answer, problem: str) -> None:
+    network, bus = cell(3)
+    bus.nodes = (bus.nodes[0], Hostile(2, bus, answer), bus.nodes[2])
+    begun_ns = bus.clock.now_ns
+    with network:
+        found = network.scan(wait_s=0.05)
+    assert [node.node_id for node in found] == [1, 2, 3]
+    assert [node.identity is not None and node.device_name == "axis" for node in found[::2]] == [True, True]
+    assert [node.problems for node in found[::2]] == [(), ()]
+    assert any(re.search(problem, text) for text in found[1].problems)
+    assert bus.clock.now_ns - begun_ns < 5_000_000_000
+
+
+def test_an_object_of_unbounded_length_is_no_reason_to_ask_again() -> None:
+    network, bus = cell(1)
+    bus.nodes = (Hostile(1, bus, endless),)
+    with network:
+        with pytest.raises(ObjectAccessError, match="no end, expected at most 4096 bytes within 2 s"):
+            network.link.objects(1).read_bytes(NAME, 0)
+        assert network.link.objects(1).read(ObjectEntry(0x6075, 0, 32, signed=False)) == 2000
+    assert len([frame for frame in bus.sent if frame.data[0] == 0x40 and about(bytes(frame.data)) == NAME]) == 1
+
+
+TEXT = b"a name that its node has by block transfer alone " * 20
+
+
+class BlockServer(ScriptedNode):
+    """A node that gives its name by block upload alone (CiA 301); `spoilt` sends another checksum."""
+
+    def __init__(self, bus: ScriptedBus, *, spoilt: bool = False) -> None:
+        super().__init__(1)
+        self._bus, self._spoilt = bus, spoilt
+        self._rest = [TEXT[at : at + 7] for at in range(0, len(TEXT), 7)]
+
+    def sdo(self, data: bytes) -> bytes | None:
+        if data[0] >> 5 != 5:
+            refused = bytes((0x80, *data[1:4])) + struct.pack("<L", 0x05040001)
+            return refused if about(data) == NAME else super().sdo(data)
+        if data[0] & 3 == 0:
+            return bytes((0xC6, *data[1:4])) + struct.pack("<L", len(TEXT))
+        if data[0] & 3 == 1:
+            return None
+        if data[0] & 3 == 2:
+            del self._rest[: data[1]]
+        if not self._rest:
+            unused = -len(TEXT) % 7
+            checksum = binascii.crc_hqx(TEXT, 0) ^ self._spoilt
+            return struct.pack("<BH5x", 0xC1 | unused << 2, checksum)
+        for number, segment in enumerate(self._rest[:127], start=1):
+            last = 0x80 if number == len(self._rest) else 0
+            frame = bytes((number | last,)) + segment.ljust(7, b"\0")
+            self._bus.inject(can.Message(arbitration_id=0x581, is_extended_id=False, data=frame))
+        return None
+
+
+def test_an_object_that_comes_by_block_transfer_alone_is_read_so() -> None:
+    network, bus = cell(1)
+    bus.nodes = (BlockServer(bus),)
+    with network:
+        assert network.link.objects(1).read_bytes(NAME, 0) == TEXT
+
+
+def test_a_block_transfer_with_a_wrong_checksum_is_not_believed() -> None:
+    network, bus = cell(1)
+    bus.nodes = (BlockServer(bus, spoilt=True),)
+    with network, pytest.raises(ObjectAccessError, match="1008h:00: "):
+        network.link.objects(1).read_bytes(NAME, 0)
+
+
+# -- two devices with one node id --------------------------------------------------------------------------------------
+
+
+def twins(serial: int = 8) -> tuple[CanopenNetwork, ScriptedBus]:
+    """Axes 1 and 2, and a second device with node id 2."""
+    network, bus = cell(2)
+    bus.nodes = (*bus.nodes, ScriptedNode(2, serial))
+    return network, bus
+
+
+@pytest.mark.parametrize("serial", [7, 8], ids=["equal answers", "other serial"])
+def test_two_devices_with_one_node_id_are_found(serial: int) -> None:
+    network, _ = twins(serial)
+    with network:
+        found = network.scan(wait_s=0.05)
+    assert [(node.node_id, bool(node.shared)) for node in found] == [(1, False), (2, True)]
+    assert "two answers to one request for 10" in found[1].shared
+
+
+@pytest.mark.parametrize("serial", [7, 8], ids=["equal answers", "other serial"])
+def test_they_are_refused_before_anything_is_written(serial: int) -> None:
+    network, bus = twins(serial)
+    with network, pytest.raises(SetupRefused, match=r"J2 \(node 2\): found two answers to one request .* two have it"):
+        network.prepare()
+    assert [f for f in bus.sent if 0x600 < f.arbitration_id < 0x680 and f.data[0] >> 5 == 1] == []
+
+
+def heartbeat(state: int) -> can.Message:
+    return can.Message(arbitration_id=0x702, is_extended_id=False, data=bytes((state,)))
+
+
+def listen(network: CanopenNetwork, bus: ScriptedBus, states: list[int], every_ns: int) -> Link:
+    for state in states:
+        bus.inject(heartbeat(state))
+        network.link.pump(0.0)
+        bus.clock.now_ns += every_ns
+    return network.link
+
+
+def test_two_boot_ups_right_after_another_are_two_devices() -> None:
+    network, bus = cell(2)
+    with network:
+        link = listen(network, bus, [0, 0, 127], 50_000_000)
+        assert link.shared_id(2, 0) == "2 boot-up messages within 0.5 s"
+        assert link.shared_id(1, 0) == ""
+
+
+def test_a_node_that_boots_again_later_is_one_device() -> None:
+    network, bus = cell(2)
+    with network:
+        assert listen(network, bus, [0, 127, 0, 127], 300_000_000).shared_id(2, 0) == ""
+
+
+@pytest.mark.parametrize(("every_ms", "shared"), [(50, True), (100, False)])
+def test_two_heartbeats_a_period_are_two_devices(every_ms: int, shared: bool) -> None:
+    network, bus = cell(2)
+    with network:
+        link = listen(network, bus, [5] * 30, every_ms * 1_000_000)
+        assert bool(link.shared_id(2, 100)) is shared
+        assert (link.shared_id(2, 100) == "30 heartbeats in 1500 ms, its period is 100 ms") is shared
+
+
+def test_an_answer_to_another_program_is_no_second_device() -> None:
+    network, bus = cell(1)
+    with network:
+        access = network.link.objects(1)
+        for _ in range(3):
+            access.read(ObjectEntry(0x6075, 0, 32, signed=False))
+            bus.inject(can.Message(arbitration_id=0x601, is_extended_id=False, data=bytes.fromhex("4075600000000000")))
+            answer = can.Message(arbitration_id=0x581, is_extended_id=False, data=bytes.fromhex("43756000d0070000"))
+            bus.inject(answer)
+        assert network.link.shared_id(1, 0) == ""
+
+
+def test_a_late_answer_to_a_request_that_was_repeated_is_no_second_device() -> None:
+    network, bus = cell(1)
+    held: list[can.Message] = []
+
+    def delay_first(message: can.Message) -> tuple[can.Message, ...]:
+        if message.arbitration_id == 0x581 and not held:
+            held.append(message)
+            return ()
+        if len(held) == 1:
+            held.append(message)
+            return (held[0], message)
+        return (message,)
+
+    bus.tamper = delay_first
+    with network:
+        access = network.link.objects(1)
+        for _ in range(3):
+            access.read(ObjectEntry(0x6075, 0, 32, signed=False))
+        assert network.link.shared_id(1, 0) == ""
