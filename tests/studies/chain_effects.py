@@ -34,9 +34,9 @@ class PlantedEffect:
     place: str  #: axis or joint without a motor
     coefficient: str  #: parameter of that effect to compare
     size: float  #: its true value
-    seconds: float = 40.0  #: of each run [s]
+    seconds: float = 11.0  #: of each run [s]; enough for these sizes
     pairs: int = 1  #: of runs without and with the cell's payload, each with a plan of its own
-    exchanges: int = 60  #: tries of the planner
+    exchanges: int = 0  #: tries of the planner; random moves will do
 
     @property
     def fingerprint(self) -> str:
@@ -59,14 +59,15 @@ PLANTED = (
     PlantedEffect(
         robot="DualV",
         cell="dualv",
-        effect=UndeclaredEffect("spring", 0, {"stiffness_nm_per_rad": 3.0, "rest_rad": 0.1}, joint="elbow-2"),
+        effect=UndeclaredEffect("spring", 0, {"stiffness_nm_per_rad": 0.8, "rest_rad": 0.1}, joint="elbow-2"),
         name="passive-spring",
         place="elbow-2",
         coefficient="stiffness",
-        size=3.0,
+        size=0.8,
     ),
 )
-"""One on a driven joint that gravity loads, one on a joint without a motor beside a redundant drive."""
+"""One on a driven joint that gravity loads, one on a joint without a motor beside a redundant drive. A stiffer spring
+holds the DualV short of its targets, as its drives have no integral part."""
 
 
 def study_effect(planted: PlantedEffect, seed: int, folder: Path) -> dict[str, Any]:

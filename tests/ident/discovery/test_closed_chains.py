@@ -55,7 +55,8 @@ CASES = (
 
 def _planted(mechanism: Mechanism, joint: str, torque: Torque, size: float) -> tuple[Made, tuple[Run, ...]]:
     """Recordings in which a joint needs more torque than the model says: on top of the currents, by virtual power."""
-    made = recorded(mechanism, 7, seconds=18.0 if mechanism is THREE_LEGS else 25.0, noise_a=0.01)
+    seconds = 12.0 if torque is _load_friction else 18.0 if mechanism is THREE_LEGS else 25.0
+    made = recorded(mechanism, 7, seconds=seconds, noise_a=0.01)
     runs = []
     index = [one.name for one in made.model.robot.joints].index(joint)
     driven = list(made.model.robot.axis_joints)
