@@ -246,16 +246,24 @@ def _allowed(
     """Positions of a closed chain that can be reached one after the other, shape (count, m)."""
     found = [checker.home]
     while len(found) <= count:
-        found.append(towards(checker, found[-1], rng.uniform(lower, upper)))
+        found.append(towards(checker, found[-1], rng.uniform(lower, upper), lower, upper))
     return np.array(found[1:])
 
 
 SHARES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
 
 
-def towards(checker: Checker, start: FloatArray, target: FloatArray) -> FloatArray:
-    """The farthest position that a closed chain can go to on the way to a target; the start where there is none."""
-    found = checker.farthest(start, start + np.array(SHARES)[:, None] * (target - start))
+def towards(
+    checker: Checker, start: FloatArray, target: FloatArray, lower: FloatArray, upper: FloatArray
+) -> FloatArray:
+    """The farthest position that a closed chain can go to on the way to a target; the start where there is none.
+
+    Args:
+        checker: of the robot.
+        start, target: positions of the axes [rad or m], shape (m,).
+        lower, upper: limits of the axes, shape (m,).
+    """
+    found = checker.farthest(start, start + np.array(SHARES)[:, None] * (target - start), lower, upper)
     return start if found is None else found
 
 
@@ -378,5 +386,5 @@ def _swing_of_chain(
     for limit in (low, high):
         target = posture.copy()
         target[moved] = limit[moved]
-        ends.append(towards(checker, ends[-1] if ends else posture, target))
+        ends.append(towards(checker, ends[-1] if ends else posture, target, low, high))
     return None if np.allclose(ends[0], ends[1]) else (ends[0], ends[1])

@@ -218,6 +218,8 @@ class Search:
             # The time is quick to check, the clearance is not.
             if sum(lengths) + sum(move.dwell_s for move in moves) > self._duration_s:
                 continue
+            if not all(map(self._is_within, moves)):
+                continue
             obstruction = self._experiment.scene.checker.obstruction
             if all(obstruction(path.start, path.end) is None for way, path in new.items() if way not in fresh):
                 kept.append((moves, ways))
@@ -235,9 +237,9 @@ class Search:
         for _ in range(MAX_TRIES):
             move, checker = self._random_move(), self._experiment.scene.checker
             if checker.robot.closures:
-                near = towards(checker, checker.home, np.array(move.target_rad))
+                near = towards(checker, checker.home, np.array(move.target_rad), self._low, self._high)
                 move = replace(move, target_rad=self._written(near))
-            if checker.margins(np.array(move.target_rad)[None])[0] > 0.0:
+            if self._is_within(move) and checker.margins(np.array(move.target_rad)[None])[0] > 0.0:
                 return move
         raise self._blocked("posture")
 
@@ -246,9 +248,11 @@ class Search:
             move = self._random_move()
             checker, target = self._experiment.scene.checker, np.array(move.target_rad)
             if checker.robot.closures:  # a way to a far target often leaves the workspace
-                target = towards(checker, start, target)
+                target = towards(checker, start, target, self._low, self._high)
                 move = replace(move, target_rad=self._written(target))
-            if not np.array_equal(target, start) and checker.obstruction(start, np.array(move.target_rad)) is None:
+            if np.array_equal(target, start) or not self._is_within(move):
+                continue
+            if checker.obstruction(start, np.array(move.target_rad)) is None:
                 return move
         return None
 
@@ -259,6 +263,13 @@ class Search:
             velocity=round(self._speed * float(self._rng.uniform(0.35, 1.0)), PLACES),
             acceleration=round(self._speed * float(self._rng.uniform(0.4, 1.0)), PLACES),
             dwell_s=DWELL_S,
+        )
+
+    def _is_within(self, move: PlannedMove) -> bool:
+        """Whether the joints' limits allow a target; the motors of a redundant drive were moved to fit each other."""
+        return all(
+            axis.limits.position[0] <= target <= axis.limits.position[1]
+            for axis, target in zip(self._cell.axes, move.target_rad, strict=True)
         )
 
     def _written(self, target: FloatArray) -> tuple[float, ...]:

@@ -182,11 +182,21 @@ class Checker:
             middles = np.concatenate((open_ - half, open_ + half))
         return None
 
-    def farthest(self, start: FloatArray, ends: FloatArray) -> FloatArray | None:
-        """Choose the first of some ends, shape (e, m), that a closed chain can go to; None where it can go to none."""
+    def farthest(self, start: FloatArray, ends: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray | None:
+        """Choose the first of some ends that a closed chain can go to; None where it can go to none.
+
+        Args:
+            start, lower, upper: positions of the axes [rad or m], shape (m,).
+            ends: shape (e, m). Motors of a redundant drive are moved to positions that fit each other, which may be
+                outside the limits.
+        """
         ends = self.fitting(ends)
+        inside = np.all((ends >= lower) & (ends <= upper), axis=1)
         found = self._ways(np.broadcast_to(start, ends.shape), ends)
-        return next((end for end, obstruction in zip(ends, found, strict=True) if obstruction is None), None)
+        clear = (
+            end for end, within, obstruction in zip(ends, inside, found, strict=True) if within and not obstruction
+        )
+        return next(clear, None)
 
     def _ways(self, starts: FloatArray, ends: FloatArray) -> list[Obstruction | None]:
         """Look at poses of straight ways so close to each other that nothing happens between them."""

@@ -46,13 +46,16 @@ def test_the_payload_is_expected_at_the_platform() -> None:
 @pytest.fixture(scope="module")
 def made(cell: Cell, experiment: Experiment) -> Plan:
     """The planner's own plan."""
-    return plan(cell, seed=1, duration_s=SECONDS, exchanges=16, experiment=experiment)
+    return plan(cell, seed=4, duration_s=SECONDS, exchanges=16, experiment=experiment)
 
 
 def test_the_planners_own_plan_shows_every_gain(cell: Cell, experiment: Experiment, made: Plan) -> None:
     judged = verdicts(experiment.design, [(experiment.excitation(paths_of(cell, made.moves))[0], RUNS)])
     assert judged.rank == judged.known_preload_rank == 4
     assert not judged.sentences(cell.axis_names)
+    lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
+    targets = np.array([move.target_rad for move in made.moves])
+    assert ((targets >= lower) & (targets <= upper)).all()
     text = plan_text(Path("plan.yaml"), None, cell, experiment, made, judged)
     assert "Internal preload obscures no gain: these moves determine 4 of 4 independent directions" in text
 

@@ -139,7 +139,7 @@ def test_a_five_bar_goes_where_its_rods_reach() -> None:
     assert found.first == "the closures"
     assert checker.obstruction(home, home + 0.2) is None
     shares = home + np.array([[1.0], [0.5], [0.1]]) * (stretched - home)
-    farthest = checker.farthest(home, shares)
+    farthest = checker.farthest(home, shares, home - 1.0, home + 1.0)
     assert farthest is not None
     assert not np.array_equal(farthest, shares[0])
 
@@ -151,6 +151,12 @@ def test_motors_of_a_redundant_drive_are_made_to_fit() -> None:
     fitting = checker.fitting(wanted)
     assert checker.margins(fitting[None])[0] == np.inf
     assert checker.fitting(fitting) == pytest.approx(fitting, abs=1e-9)
+    # Where that is beyond a limit, it is no place to go to.
+    near = checker.home + 0.05 * (wanted - checker.home)
+    there = checker.fitting(near)
+    everywhere = checker.farthest(checker.home, near[None], there - 1e-6, there + 1e-6)
+    assert everywhere == pytest.approx(there)
+    assert checker.farthest(checker.home, near[None], there - 1.0, there - 1e-6) is None
     poses = axis_positions(PLANAR, np.random.default_rng(0), 6.0)[::300]
     way = np.linspace(0.0, 1.0, 21)[:, None]
     straight = poses[0] + way * (poses[-1] - poses[0])
