@@ -201,7 +201,7 @@ def hold_lock(lock: Path) -> Iterator[None]:
 
 
 def _open_lock(lock: Path) -> int:
-    """Open the lock file, made where there is none; one that another user has left excludes nobody."""
+    """Open the lock file, made where there is none; one that another user has left excludes no process."""
     flags = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # a FIFO of that name must not keep us waiting
     while True:
         with suppress(FileExistsError):

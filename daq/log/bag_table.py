@@ -281,7 +281,7 @@ class _Rows:
         return require_finite(table)
 
 
-LOOKED_AT = 10_000  #: Messages that are looked at to say what a file is
+EXAMINED = 10_000  #: Messages that are examined to say what a file is
 
 
 def foreign_recording(path: Path) -> LogForeign | None:
@@ -289,7 +289,7 @@ def foreign_recording(path: Path) -> LogForeign | None:
     bag = BagFile(path)
     joints: tuple[str, ...] = ()
     with suppress(LogUnreadable, ValueError):
-        for _, channel, message in islice(bag.messages(bag.unfinished()), LOOKED_AT):
+        for _, channel, message in islice(bag.messages(bag.unfinished()), EXAMINED):
             if bag.is_joint_state(channel):
                 joints = joints or joint_state_from_cdr(message.data).names
     topics = {channel.topic: bag.is_joint_state(channel) for channel in bag.channels.values()}

@@ -107,7 +107,7 @@ def _identity_verdict(expected: Identity | None, found: Identity | None) -> str:
 
 
 def _remarks(node: FoundNode | None, expected: Identity | None) -> Iterator[str]:
-    """What is wrong with a node, in words."""
+    """Describe what is wrong with a node."""
     if node is None:
         return
     if node.shared:

@@ -163,7 +163,7 @@ def _reach(ends_m: FloatArray, checker: Checker) -> _Reach:
 
 
 def _facts(cell: Cell, checker: Checker, drawn: Mapping[str, Any]) -> Iterator[str]:
-    """What a person must know before approving the plan, a sentence each."""
+    """List what a person must know before approving the plan, a sentence each."""
     known = [pair for pair in zip(drawn["clearance_mm"], drawn["time_s"], strict=True) if pair[0] is not None]
     if known:
         least_mm, at_s = min(known)

@@ -1,8 +1,8 @@
 """A small socketcand-protocol server: a CAN bus between processes of one machine, without any kernel driver.
 
 Every frame of one client goes to all other clients of its channel; one that no CAN bus carries is refused to its sender
-and reaches nobody. The server listens on the loopback interface alone. A client that does not read is disconnected when
-``BACKLOG_BYTES`` wait for it, so that no frame is lost silently: its next call fails.
+and reaches no client. The server listens on the loopback interface alone. A client that does not read is disconnected
+when ``BACKLOG_BYTES`` wait for it, so that no frame is lost silently: its next call fails.
 """
 
 from __future__ import annotations

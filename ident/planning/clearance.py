@@ -71,8 +71,8 @@ LARGEST_CONDITION = 60.0
 """Largest condition of the closures in a planned pose (Frobenius): nearer to a singularity, forces in loops grow."""
 LARGEST_MISFIT = 0.01
 """Motors of a redundant drive may differ by this on the way between two poses that fit [rad or m]: they work against
-each other there, which is what tells their gains apart, and no more than their position loops can bear."""
-STEP_SHARE = 0.05  #: Of the way between two poses of a closed chain that are looked at
+each other there, which is what separates their gains, and no more than their position loops can bear."""
+STEP_SHARE = 0.05  #: Of the way between two poses of a closed chain that are examined
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -151,8 +151,8 @@ def hear(name: str, period_us: int, cycles: int) -> dict[str, Any]:
 def spare(action: Callable[[], object]) -> tuple[float, float]:
     """Count in a program of the lowest priority while something is done; returns seconds, and counts a second.
 
-    A guest charges processor time to whoever runs at a tick, and what wakes up with the ticks escapes it. What is left
-    to others does not.
+    A guest charges processor time to the process that runs at a tick, and what wakes up with the ticks escapes it. What
+    is left to others does not.
     """
     with subprocess.Popen((sys.executable, "-S", "-c", SPARE), stdout=subprocess.PIPE, text=True) as process:
         time.sleep(0.5)

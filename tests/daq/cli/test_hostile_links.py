@@ -86,7 +86,7 @@ def test_the_link_of_another_user_is_followed_nowhere(cell: Path, tmp_path: Path
     os.lchown(link, 4711, 4711)
     with pytest.raises(ConfigurationError, match="user 4711 has made"):
         load_cell(cell)
-    os.chown(target, 4711, 4711)  # whoever made the link may write the file
+    os.chown(target, 4711, 4711)  # the link's maker may write the file
     assert load_cell(cell).name == "demo"
 
 

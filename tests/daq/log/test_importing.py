@@ -325,7 +325,7 @@ def test_a_rate_that_is_ten_times_off_is_noticed(
 
 @pytest.mark.parametrize("back", [False, True])
 def test_a_step_that_no_motor_makes(bench: Bench, capsys: pytest.CaptureFixture[str], back: bool) -> None:
-    """Of 0.5 rad in one sample: the speeds over many samples do not show it."""
+    """A step of 0.5 rad in one sample: the speeds over many samples do not show it."""
     bench.joint_deg[120 : 121 if back else None, 2] += np.degrees(0.5)
     bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
     _refused(

@@ -202,7 +202,7 @@ def test_no_line_of_one_client_reaches_or_ends_another(line: bytes) -> None:
         with _raw_client(hub) as hostile:
             hostile.sendall(line)
             hostile.settimeout(WAIT_S)
-            with suppress(ConnectionResetError):  # the hub may hang up on it, and on nobody else
+            with suppress(ConnectionResetError):  # the hub may hang up on it, and on no other client
                 assert hostile.recv(256)[:8] in (b"< error ", b"")
             _arrives_alone(hub, ends)
         for end in ends:
@@ -230,8 +230,8 @@ def test_a_frame_that_arrives_is_one_that_a_bus_carries(lines: list[bytes]) -> N
 
 
 @pytest.mark.parametrize("unfinished", [b"<" + b" " * 200_000, b"< send " + b"1" * 200_000, b"<\t " * 60_000])
-def test_an_unfinished_line_holds_up_nobody(unfinished: bytes) -> None:
-    """The hub reads each byte a bounded number of times: these took it minutes, and nobody else was served."""
+def test_an_unfinished_line_holds_up_no_other(unfinished: bytes) -> None:
+    """The hub reads each byte a bounded number of times: these took it minutes, and no other client was served."""
     with Hub(("can0",)) as hub:
         ends = [open_bus(hub.address()) for _ in range(2)]
         with _raw_client(hub) as hostile, suppress(ConnectionResetError, BrokenPipeError):

@@ -53,7 +53,7 @@ def one_byte(data: bytes, _: ScriptedBus) -> bytes | None:
     return bytes((0x4F, *data[1:4])) + bytes(4) if about(data) == STATUSWORD else None
 
 
-def garbage(data: bytes, _: ScriptedBus) -> bytes | None:
+def nonsense(data: bytes, _: ScriptedBus) -> bytes | None:
     return bytes((0xE7, *data[1:4])) + b"\xff" * 4 if about(data) != 0x1000 else None
 
 
@@ -77,7 +77,7 @@ def silent(data: bytes, _: ScriptedBus) -> bytes | None:
         (endless, r"1008h:00: found \d+ bytes and no end, expected at most 256 bytes"),
         (huge, "1008h:00: found 4294967295 bytes and no end"),
         (one_byte, "6041h:00: has 8 bits, expected 16"),
-        (garbage, "1018h:01: Unexpected response 0xE7"),
+        (nonsense, "1018h:01: Unexpected response 0xE7"),
         (flood, "1018h:01: 64 answers to other requests"),
         (silent, "1018h:01: no answer within 0.5 s"),
     ],
@@ -180,10 +180,10 @@ def test_they_are_refused_before_anything_is_written(serial: int) -> None:
 
 def test_a_second_device_that_refuses_first_is_named_too() -> None:
     network, bus = cell(2)
-    stranger = Hostile(2, bus, lambda data, _: None)
-    stranger.objects = {key: value for key, value in stranger.objects.items() if key[0] in (0x1000, 0x1017)}
-    stranger._refresh = lambda: None  # type: ignore[method-assign]
-    bus.nodes = (bus.nodes[0], stranger, bus.nodes[1])
+    other = Hostile(2, bus, lambda data, _: None)
+    other.objects = {key: value for key, value in other.objects.items() if key[0] in (0x1000, 0x1017)}
+    other._refresh = lambda: None  # type: ignore[method-assign]
+    bus.nodes = (bus.nodes[0], other, bus.nodes[1])
     with network, pytest.raises(SetupRefused, match=r"J2 \(node 2\): found two answers .* two have it"):
         network.prepare()
 
