@@ -28,7 +28,7 @@ from daq.workflow.plan import Plan
 from daq.workflow.record import motor_limits, motor_moves
 from drivers.canopen.needs import MODE_OF_OPERATION
 from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.pdo import SETPOINT_PDOS, Direction, records, write_record
+from drivers.canopen.pdo import SETPOINT_PDOS, Direction, records, wanted_pdos, write_record
 from drivers.canopen.sdo import ObjectAccess
 from drivers.canopen.setup import PROFILE_POSITION_MODE
 from drivers.motion.execute import execute
@@ -183,6 +183,11 @@ class DirectStream:
             SimpleNamespace(
                 axes=axes,
                 node_ids=tuple(axis.node_id for axis in axes),
+                pdos=tuple(map(wanted_pdos, axes)),
+                powered=set(),
+                begin_stop=lambda: None,
+                begin_closing=lambda: None,
+                link=SimpleNamespace(deadline_ns=None),
                 guard=lambda: None,
                 unguard=lambda: None,
                 block_signals=nullcontext,

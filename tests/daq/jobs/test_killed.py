@@ -163,22 +163,32 @@ def finished_from_any_moment(rig: Rig, wait_s: float) -> tuple[bool, bool]:
     left = rig.controller.read_bytes()
     with HistoryStore(rig.cells / "demo.history.sqlite") as store:
         entered = bool(store.events())
-    assert _verified(rig).complete == (left == before or entered)
+    found = _verify(rig)
+    assert found.verdict.holds
+    # Killed between the two, a row of the audit is not in the index yet: verify says so, and the next job enters it.
+    assert all("found no such row, expected one as" in flaw for flaw in found.broken)
+    assert found.broken or found.complete == (left == before or entered)
     rig.clock.go_on(minutes=10)
     assert rig.job().exit_code == ExitCode.OK
     after = rig.controller.read_bytes()
     assert after != before
     assert left in (before, after)
-    assert len(rig.backups) == 1
+    # Killed between backup and replacement, the next job backs the same content up once more.
+    assert {backup.read_bytes() for backup in rig.backups} == {before}
     assert _verified(rig).complete
     return killed, left == after
 
 
-def _verified(rig: Rig) -> Verification:
-    """`drivegain history --verify`, whose audit holds and whose history has no flaw, whatever it lacks."""
+def _verify(rig: Rig) -> Verification:
+    """`drivegain history --verify`."""
     assert rig.cell.history is not None
     with Ledger(rig.cell, rig.cell.history, "a test") as ledger:
-        found = ledger.verify()
+        return ledger.verify()
+
+
+def _verified(rig: Rig) -> Verification:
+    """The same of an audit that holds and a history without a flaw, whatever it lacks."""
+    found = _verify(rig)
     assert found.verdict.holds
     assert found.broken == ()
     return found

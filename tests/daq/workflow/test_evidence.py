@@ -287,6 +287,7 @@ def test_the_log_has_the_second_weighing_and_the_controller_s_digest(
         run_id="1",
         clocks=Clocks(lambda: WALL_NS, rig.bus.clock),
         entered_kg=4.595,
+        unguarded=True,  # the scripted drives have no 1016h
     )
     run = read_log(rig.out).head.run
     assert run.entered_kg == 4.595

@@ -95,7 +95,7 @@ def test_a_joint_that_is_held_never_moves(truth: Truth, noisy_runs: tuple[Run, .
     position[:, 3] = 0.7 + noise_rad * np.random.default_rng(1).standard_normal(len(position))
     held = [replace(noisy_runs[0], position_rad=position), replace(noisy_runs[1], position_rad=position)]
     assert not _derived(truth, held[0]).moving[:, 3].any()
-    with pytest.raises(DataUnfit, match="joint 4 never moves"):
+    with pytest.raises(DataUnfit, match="J4 never moves"):
         identify(truth.model, held, DERIVED)
 
 
