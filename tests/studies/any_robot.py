@@ -98,8 +98,9 @@ def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
             )
             for number in range(robot.weighed)
         ]
-        # The weighed payload of the fit once more, in one run that no fit has seen, then the second body in each.
-        mounted = [(first, plans[0]), *((robot.second, plan) for plan in plans)]
+        # The weighed payload of the fit once more, in one run that no fit has seen (on moves that it can carry), then
+        # the second body in each.
+        mounted = [(first, folder / "plan-0.yaml"), *((robot.second, plan) for plan in plans)]
         logs: dict[str, list[Path]] = {first: [], robot.second: []}
         for number, (body, plan) in enumerate(mounted):
             logs[body].append(folder / f"{body}-{number}.mcap")
