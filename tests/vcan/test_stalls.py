@@ -58,7 +58,7 @@ class Heard:
     """SYNC, EMCY, TPDO1, RPDO1 and heartbeats on the bus with the kernel's times, in a thread of its own.
 
     Attributes:
-        frames: time [ns since 1970], identifier and first byte of each.
+        frames: time [ns since 1970], identifier and low byte of a controlword of each; RPDO1 has the target before it.
         moves: is set by the first new set-point.
     """
 
@@ -74,8 +74,8 @@ class Heard:
             data, ancillary, _, _ = end.recvmsg(16, 64)
             identifier, _, payload = struct.unpack("=IB3x8s", data)
             seconds, rest_ns = struct.unpack("=qq", ancillary[0][2])
-            self.frames.append((1_000_000_000 * seconds + rest_ns, identifier, payload[0]))
-            if identifier & 0x780 == RPDO1 and payload[0] & NEW_SETPOINT:
+            self.frames.append((1_000_000_000 * seconds + rest_ns, identifier, payload[4]))
+            if identifier & 0x780 == RPDO1 and payload[4] & NEW_SETPOINT:
                 self.moves.set()
 
     def end(self) -> None:
