@@ -16,6 +16,16 @@ from tests.daq.calibrations import demo_calibration, recorded
 
 BEGIN = datetime(2026, 1, 5, 6, 0, 0, tzinfo=UTC)
 STD = 0.004
+RECALIBRATION = """
+recalibration:
+  runs:
+    - {name: bare, plan: {seed: 1}}
+    - {name: loaded, payload: disc, mass_kg: 4.59, plan: {seed: 1}}
+    - {name: held-out, payload: disc, mass_kg: 4.59, plan: {seed: 3}, holdout: true}
+  interlock: {file: interlock}
+  mount: {command: ["true"]}
+"""
+"""To follow a cell file: a job of three runs."""
 
 
 def calibration_of(week: int, factors: tuple[float, ...] = (1.0,) * 6) -> Calibration:

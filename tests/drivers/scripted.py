@@ -15,6 +15,7 @@ import can
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.network import Bounds, CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
+from drivers.canopen.socketcan import NO_LOSSES
 from drivers.motion.move import AxisLimits, MotionPermission
 from drivers.profiles.profile import Amplitude, Axis, CurrentScale, DriveProfile, Identity, ObjectEntry, TapPoint
 
@@ -71,6 +72,7 @@ class ScriptedNode:
         self.lies: dict[tuple[int, int], int] = {}
         self.obeys_nmt = self.beats = True
         self.quick_stop_stays = self.ignores_setpoint = self.second_controlword = False
+        self.largest_pdo_bits = 64
         self.powered_cycles = 0
         self.setpoint_cycles: list[int] = []
         self.next_beat_ns = 0
@@ -107,6 +109,9 @@ class ScriptedNode:
                     o[base + 0x200 + number, sub] = (default if sub == 1 else 0, 4)
         self.objects = o
 
+    def has(self, index: int, sub: int) -> bool:
+        return (index, sub) in self.objects
+
     def value(self, index: int, sub: int) -> int:
         return self.objects[index, sub][0]
 
@@ -117,7 +122,7 @@ class ScriptedNode:
         command, index, sub = struct.unpack_from("<BHB", data)
         if command == 0x80:
             return None
-        if (index, sub) not in self.objects:
+        if not self.has(index, sub):
             return struct.pack("<BHBL", 0x80, index, sub, 0x06020000)
         _, size = self.objects[index, sub]
         if command == 0x40:
@@ -144,11 +149,15 @@ class ScriptedNode:
             return 0
         if not self.value(index - 0x200, 1) >> 31:
             return 0x06090030
-        return 0x06010000 if sub and self.value(index, 0) else 0
+        if sub:
+            return 0x06010000 if self.value(index, 0) else 0
+        bits = sum(self.value(index, entry + 1) & 0xFF for entry in range(data[4]) if data[4] <= 8)
+        return 0x06040042 if bits > self.largest_pdo_bits else 0
 
     def _refresh(self) -> None:
-        self.store(0x6041, 0, self.statusword)
-        self.store(0x6064, 0, round(self.position))
+        for key, value in (((0x6041, 0), self.statusword), ((0x6064, 0), round(self.position))):
+            if self.has(*key):
+                self.store(*key, value)
 
     def _mapped(self, base: int, number: int) -> list[tuple[int, int, int]]:
         words = [self.value(base + 0x200 + number, sub + 1) for sub in range(self.value(base + 0x200 + number, 0))]
@@ -240,11 +249,21 @@ class ScriptedNode:
 
 
 class ScriptedBus(can.BusABC):
-    """The bus of those nodes; ``tamper`` sees every frame of a node and says what becomes of it."""
+    """The bus of those nodes.
+
+    Attributes:
+        tamper: sees every frame of a node and returns what becomes of it.
+        flood_period_ns: one frame that concerns no node in each such time, for ever; 0 for none.
+        losses, remarks, read_until_ns: as of `drivers.canopen.socketcan.SocketcanBus`.
+    """
 
     def __init__(self, nodes: tuple[ScriptedNode, ...], clock: FakeClock) -> None:
         self.nodes = nodes
         self.clock = clock
+        self.flood_period_ns = 0
+        self.losses = NO_LOSSES
+        self.remarks: tuple[str, ...] = ()
+        self.read_until_ns: int | None = None
         self.cycle = -1
         self.sent: list[can.Message] = []
         self.tamper: Tamper = lambda message: (message,)
@@ -300,7 +319,11 @@ class ScriptedBus(can.BusABC):
         return (self._queue.popleft() if self._queue else None), True
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        return self._recv_internal(timeout)[0]
+        self.clock.now_ns += self.flood_period_ns
+        message = self._recv_internal(timeout)[0]
+        if message is None and self.flood_period_ns:
+            return can.Message(arbitration_id=0x7FF, is_extended_id=False)
+        return message
 
 
 def cell(axes: int = 2) -> tuple[CanopenNetwork, ScriptedBus]:
@@ -317,6 +340,26 @@ def cell(axes: int = 2) -> tuple[CanopenNetwork, ScriptedBus]:
         opener=lambda address: bus,
     )
     return network, bus
+
+
+def lose_first_answer(bus: ScriptedBus, *, repeats: bool) -> None:
+    """Hold node 1's first SDO answer back; it comes before its second answer, and if so before every one after that."""
+    held: list[can.Message] = []
+    released = False
+
+    def tamper(message: can.Message) -> tuple[can.Message, ...]:
+        nonlocal released
+        if message.arbitration_id != 0x581:
+            return (message,)
+        if not held:
+            held.append(message)
+            return ()
+        if released and not repeats:
+            return (message,)
+        released = True
+        return (held[0], message)
+
+    bus.tamper = tamper
 
 
 def permission(axes: int = 2, span: int = 100_000) -> MotionPermission:

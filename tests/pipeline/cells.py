@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -57,34 +58,6 @@ class Job:
         }
 
 
-def run_job(
-    name: str,
-    folder: Path,
-    *,
-    seconds: float,
-    pairs: int,
-    seed: int,
-    simulation: str | None = None,
-    exchanges: int = 100,
-) -> Job:
-    """Plan, record in turn without and with the cell's first payload, and fit.
-
-    Args:
-        name: of a shipped cell.
-        folder: to fill.
-        seconds: of each run [s].
-        pairs: of runs, each with a plan of its own.
-        seed: of plans and noise.
-        simulation: name of the shipped simulation; that of the cell when None.
-        exchanges: of moves in planning.
-    """
-    job, logs = record_job(
-        name, folder, seconds=seconds, pairs=pairs, seed=seed, simulation=simulation, exchanges=exchanges
-    )
-    _do(["fit", *map(str, logs), "--out", str(folder / "calibration.yaml")])
-    return job
-
-
 def record_job(
     name: str,
     folder: Path,
@@ -96,10 +69,16 @@ def record_job(
     exchanges: int = 100,
     effects: tuple[UndeclaredEffect, ...] = (),
 ) -> tuple[Job, list[Path]]:
-    """Plan and record as `run_job` does, without a fit; return the job and its logs.
+    """Plan, and record in turn without and with the cell's first payload; return the job and its logs.
 
     Args:
-        name, folder, seconds, pairs, seed, simulation, exchanges: as of `run_job`.
+        name: of a shipped cell.
+        folder: to fill.
+        seconds: of each run [s].
+        pairs: of runs, each with a plan of its own.
+        seed: of plans and noise.
+        simulation: name of the shipped simulation; that of the cell when None.
+        exchanges: of moves in planning.
         effects: of the plant, beside those of the simulation file.
     """
     # A copy: what is written to a controller leaves an audit and a history beside the cell file.
@@ -124,6 +103,11 @@ def record_job(
                 effects=effects,
             )
     return job, logs
+
+
+def fit_job(job: Job, logs: Sequence[Path]) -> None:
+    """Fit logs into the calibration of the job's folder."""
+    _do(["fit", *map(str, logs), "--out", str(job.folder / "calibration.yaml")])
 
 
 def make_plan(job: Job, name: str, *, seed: int, seconds: float, exchanges: int = 100) -> Path:

@@ -8,7 +8,7 @@ import yaml
 from daq.cli.app import main
 from daq.errors import ExitCode
 from daq.log.conversion import load_run
-from tests.pipeline.cells import Job, run_job
+from tests.pipeline.cells import Job, fit_job, record_job
 
 ROBOTS = ("seven-axis", "gantry")
 
@@ -17,7 +17,9 @@ ROBOTS = ("seven-axis", "gantry")
 def job(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Job:
     """One run of 12 s without load and one with; longer ones are in tests/studies/any_robot.py."""
     name: str = request.param
-    return run_job(name, tmp_path_factory.mktemp(name), seconds=12.0, pairs=1, seed=1)
+    made, logs = record_job(name, tmp_path_factory.mktemp(name), seconds=12.0, pairs=1, seed=1)
+    fit_job(made, logs)
+    return made
 
 
 def test_every_gain_is_found_within_what_it_claims(job: Job) -> None:

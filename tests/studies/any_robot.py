@@ -31,7 +31,7 @@ from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.calibration_file import load_calibration
 from daq.workflow.weigh import weigh_logs
 from ident.arrays import BoolArray, FloatArray
-from tests.pipeline.cells import make_plan, record_run, run_job
+from tests.pipeline.cells import fit_job, make_plan, record_job, record_run
 from tests.studies.chain_effects import PLANTED, kept_effect, table_of_effects
 from tests.studies.fingerprint import digest, made_once
 from tests.studies.robot_tables import write_tables
@@ -82,7 +82,7 @@ ROBOTS = (
 def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
     """Gains and second payload of one seed; the folder is filled with its plans, logs and calibration."""
     with contextlib.redirect_stdout(io.StringIO()):
-        job = run_job(
+        job, fitted = record_job(
             robot.cell,
             folder,
             seconds=robot.seconds,
@@ -91,6 +91,7 @@ def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
             simulation=robot.simulation,
             exchanges=robot.exchanges,
         )
+        fit_job(job, fitted)
         first = job.cell.payloads[0].name
         plans = [
             make_plan(
@@ -101,12 +102,14 @@ def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
         # The weighed payload of the fit once more, in one run that no fit has seen (on moves that it can carry), then
         # the second body in each.
         mounted = [(first, folder / "plan-0.yaml"), *((robot.second, plan) for plan in plans)]
-        logs: dict[str, list[Path]] = {first: [], robot.second: []}
+        weighings: dict[str, list[Path]] = {first: [], robot.second: []}
         for number, (body, plan) in enumerate(mounted):
-            logs[body].append(folder / f"{body}-{number}.mcap")
-            record_run(job, plan, logs[body][-1], mounted=body, declared=False, seed=100 * seed + LAST_NOISE - number)
+            weighings[body].append(folder / f"{body}-{number}.mcap")
+            record_run(
+                job, plan, weighings[body][-1], mounted=body, declared=False, seed=100 * seed + LAST_NOISE - number
+            )
         calibration = load_calibration(folder / "calibration.yaml")
-        weighed = {body: weigh_logs(calibration, mine).body for body, mine in logs.items()}
+        weighed = {body: weigh_logs(calibration, mine).body for body, mine in weighings.items()}
     payloads: dict[str, float] = {}
     for role, name in (("payload", robot.second), ("first_payload", first)):
         true = load_simulation(shipped_simulation(robot.simulation), name).payload

@@ -35,6 +35,7 @@ from ident.arrays import FloatArray
 from ident.data.run import Run
 from tests.studies.direct_cell import MOVING, RawRun, demand_rad, run_of, simulate_run
 from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished
+from tests.studies.output import print_line
 from tests.studies.raw_runs import read_runs, write_runs
 from tests.studies.side_by_side import Shard, shard, side_by_side
 from tests.studies.study_cells import WORLDS, Truth, declared_payload, spec_of, study_cell, truth_of, world_cell
@@ -225,11 +226,6 @@ def make_runs(task: RunsTask) -> str:
     )
 
 
-def _print_line(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Check the direct path, or simulate the cells."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.coverage_runs", description=__doc__)
@@ -249,7 +245,7 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stdout.write(f"direct path and bus differ in: {', '.join(differing) or 'nothing, to the count'}\n")
         return 1 if differing else 0
     tasks = tasks_of(options.cells, options.world, out=options.out, duration_s=options.duration, part=options.shard)
-    make_coverage(tasks, processes=options.processes, report_line=_print_line)
+    make_coverage(tasks, processes=options.processes, report_line=print_line)
     return 0
 
 

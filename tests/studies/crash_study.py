@@ -36,6 +36,7 @@ from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from drivers.canopen.bus import BusAddress, open_bus
 from drivers.canopen.hub import Hub
 from drivers.simulation.cell import SYNC_ID, SimulatedCell
+from tests.studies.output import print_line
 
 OUT = Path("out/crash-study.json")
 PROMISED_MS = 200.0
@@ -304,14 +305,14 @@ def study(kills: int, damages: int, seconds: float, seed: int) -> dict[str, Any]
             recorder.wait()
         whole = read_log(log)
         length = len(whole.samples.cycle)
-        _print_line(
+        print_line(
             f"a whole recording: {tap.syncs} SYNCs, {length} samples, {time.monotonic() - begun:.0f} s of wall time"
         )
         done = []
         for number in range(kills):
             done.append(kill_once(cell_file, plan, folder, chance.randrange(1, length)))
             one = done[-1]
-            _print_line(
+            print_line(
                 f"kill {number + 1}: sent {one.sent} = recovered {one.recovered} + lost {one.lost}, as sent: {one.same}"
             )
         data = log.read_bytes()
@@ -330,11 +331,6 @@ def study(kills: int, damages: int, seconds: float, seed: int) -> dict[str, Any]
     }
 
 
-def _print_line(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Write the study; 1 when a promise was broken."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.crash_study", description=__doc__)
@@ -347,14 +343,14 @@ def main(arguments: list[str] | None = None) -> int:
     document = study(options.kills, options.damages, options.seconds, options.seed)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    _print_line(
+    print_line(
         f"largest loss of {len(document['kills'])} kills: {document['largest_loss_ms']} ms, {PROMISED_MS:g} promised"
     )
     for title in ("bit_flips", "truncations"):
         found = document[title]
         counts = ", ".join(f"{key} {found[key]}" for key in ("named", "same", "wrong", "crashed", "salvage_wrong"))
-        _print_line(f"{found['tried']} {title.replace('_', ' ')}: {counts}")
-    _print_line(f"every promise kept: {document['kept']}; {options.out}")
+        print_line(f"{found['tried']} {title.replace('_', ' ')}: {counts}")
+    print_line(f"every promise kept: {document['kept']}; {options.out}")
     return 0 if document["kept"] else 1
 
 

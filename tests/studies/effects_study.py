@@ -36,10 +36,10 @@ from ident.effects.effect import PlacedEffect, Side
 from ident.estimators.estimate import Estimate
 from ident.estimators.identify import identify
 from tests.studies.blind_cells import blind_cases, confusion
-from tests.studies.data_file import as_csv
 from tests.studies.effect_cells import APART, CLEAN, SINGLES, SMALLS, TOGETHER, EffectCase
 from tests.studies.effect_runs import DURATION_S, CaseTask, load_runs, make_case
 from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished, mark_of
+from tests.studies.output import as_csv
 from tests.studies.side_by_side import Shard, shard, side_by_side
 from tests.studies.study_cells import WORLDS, world_cell
 from tests.studies.study_plans import CELL, make_plan

@@ -30,6 +30,7 @@ from ident.discovery.noise_floor import FloorSource, noise_floors
 from ident.estimators.identify import identify
 from ident.estimators.method import Method
 from tests.studies.direct_cell import run_of, simulate_run
+from tests.studies.output import print_line
 from tests.studies.study_cells import WORLDS, declared_payload, spec_of, world_cell
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
@@ -86,22 +87,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--worlds", choices=tuple(WORLDS), nargs="+", default=list(WORLDS))
     parser.add_argument("--duration", type=float, default=20.0, help="of each simulated run [s]")
     options = parser.parse_args(arguments)
-    _print_line("| recording | source | J1 | J2 | J3 | J4 | J5 | J6 |\n|---|---|---|---|---|---|---|---|")
+    print_line("| recording | source | J1 | J2 | J3 | J4 | J5 | J6 |\n|---|---|---|---|---|---|---|---|")
     data = Path(os.environ.get("DRIVEGAIN_DATA", SHARED))
     for name, read in (("kr300", kr300), ("tx40", tx40)):
         if (data / name).is_dir():
             for line in lines(name, *read(data / name), fixed=True):
-                _print_line(line)
+                print_line(line)
     for world in options.worlds:
         for seed in options.seeds:
             for line in lines(f"{world}, {seed}", *simulated(world, seed, options.duration), fixed=False):
-                _print_line(line)
+                print_line(line)
     return 0
-
-
-def _print_line(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

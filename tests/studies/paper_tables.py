@@ -29,8 +29,8 @@ from daq.workflow.record import record
 from drivers.canopen.bus import open_bus
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.spec import Body
-from tests.studies.data_file import as_csv
 from tests.studies.fingerprint import digest, finish, is_finished
+from tests.studies.output import as_csv
 from tests.studies.paper_figures import paper_table
 from tests.studies.record_study import CELL, FLOORS, OUT, PROCESSES, StudyLogs, record_study
 from tests.studies.study_cells import declared_payload, spec_of, study_cell, study_masses

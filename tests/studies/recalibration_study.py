@@ -45,6 +45,7 @@ from ident.errors import IdentificationError
 from tests.daq.jobs.made import made_rig, whole_job
 from tests.daq.jobs.rig import RUNS, Rig, make_plan, make_rig
 from tests.daq.jobs.test_killed import Kill, finished_by_the_next, finished_from_any_moment, job_duration_s
+from tests.studies.output import print_line
 
 AXIS, LOSS = 3, 0.94
 FAULT = FaultSpec(FaultKind.EMERGENCY, 2, 2000, None, 0x7305)
@@ -105,15 +106,15 @@ def study(weeks: int, seconds: float, folder: Path) -> int:
         if week == 1:
             rig.closed.unlink()
         outcome = one_job(rig, factor, week, *((FAULT,) if week == 2 else ()))
-        print(f"week {week}: {outcome:12} {week_text(rig, factor)}", flush=True)  # noqa: T201
+        print_line(f"week {week}: {outcome:12} {week_text(rig, factor)}")
         rig.closed.touch()
         if week in (1, 2):
             rig.clock.go_on(days=1)
             outcome = one_job(rig, factor, 100 + week)
-            print(f"  next day: {outcome:12} {week_text(rig, factor)}", flush=True)  # noqa: T201
+            print_line(f"  next day: {outcome:12} {week_text(rig, factor)}")
         wrong += [week] if outcome != expected else []
         rig.clock.go_on(days=7)
-    print(f"{weeks - len(wrong)} of {weeks} weeks as expected{f'; not {wrong}' if wrong else ''}")  # noqa: T201
+    print_line(f"{weeks - len(wrong)} of {weeks} weeks as expected{f'; not {wrong}' if wrong else ''}")
     return int(bool(wrong))
 
 
@@ -129,7 +130,7 @@ def kills(folder: Path) -> int:
             rig = made_rig(new(folder / f"{at}-{behind}"), made, metrics=None)
             finished_by_the_next(rig, Kill(at, behind=behind))
             shutil.rmtree(rig.folder)
-        print(f"call {at + 1} of {len(kill.calls)}, {name}: applied once, killed before it and behind it", flush=True)  # noqa: T201
+        print_line(f"call {at + 1} of {len(kill.calls)}, {name}: applied once, killed before it and behind it")
     return 0
 
 
@@ -144,7 +145,7 @@ def moments(folder: Path, count: int, seed: int = 1) -> int:
         was_killed, was_written = finished_from_any_moment(rig, chance.uniform(0.0, whole_s))
         shutil.rmtree(rig.folder)
         done, killed, written = done + 1, killed + was_killed, written + (was_killed and was_written)
-    print(  # noqa: T201
+    print_line(
         f"{killed} jobs killed within {whole_s:.1f} s, {written} of them after their write; every next job ended "
         "with 0, every file was the old or the new one, every --verify was right"
     )
@@ -169,9 +170,7 @@ def unchanged_years(years: int, seed: int = 1) -> int:
             if decide(axes, in_force, std, found, std).differs:
                 changes[year] += 1
                 in_force = found
-    print(  # noqa: T201
-        f"{years} years of 52 jobs: a change in {(changes > 0).mean():.0%} of them, {changes.mean():.2f} a year"
-    )
+    print_line(f"{years} years of 52 jobs: a change in {(changes > 0).mean():.0%} of them, {changes.mean():.2f} a year")
     return 0
 
 

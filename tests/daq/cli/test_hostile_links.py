@@ -16,18 +16,11 @@ from daq.files import follow_links, replace_file
 from daq.jobs.cell_fit import _check_replaceable
 from daq.ledger.audit import AuditAction, append
 from tests.daq.calibrations import calibration_for
+from tests.daq.histories import RECALIBRATION
 
 NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
-JOB = """
-policy: {motion: allowed}
-recalibration:
-  runs:
-    - {name: bare, plan: {seed: 1}}
-    - {name: loaded, payload: disc, mass_kg: 4.59, plan: {seed: 1}}
-    - {name: held-out, payload: disc, mass_kg: 4.59, plan: {seed: 3}, holdout: true}
-  interlock: {file: interlock}
-  mount: {command: ["true"]}
-  folder: sessions
+JOB = f"""
+policy: {{motion: allowed}}{RECALIBRATION}  folder: sessions
   metrics: metrics
 """
 CONFIGURED = ("demo.history.sqlite", "demo.audit.jsonl", "sessions", "metrics", "interlock")

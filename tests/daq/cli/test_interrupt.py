@@ -96,7 +96,9 @@ def test_what_is_not_known_to_rest_is_not_said_to() -> None:
     assert "axes stopped" in _interrupted(KeyboardInterrupt(), None, out)
     fault = DriveFault(3, "EMCY 7305h")
     fault.add_note("while stopping: node 2 does not answer")
-    assert "emergency" not in _interrupted(fault, None, out)  # type: ignore[arg-type]
+    stopping = KeyboardInterrupt()
+    stopping.__context__ = fault
+    assert "emergency" not in _interrupted(stopping, None, out)
     cut = KeyboardInterrupt()
     cut.add_note("not confirmed without power: J2 (node 2)")
     cut.__context__ = ValueError("in between")

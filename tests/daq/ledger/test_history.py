@@ -40,18 +40,9 @@ from daq.writeback.request import GainChange
 from ident.calibration import Calibration, Gain
 from ident.drift.change import DISPERSION, dispersions
 from tests.daq.calibrations import AXES, recorded, with_recordings
-from tests.daq.histories import BEGIN, calibration_of, digest_of, enter, fill
+from tests.daq.histories import BEGIN, RECALIBRATION, calibration_of, digest_of, enter, fill
 
 FLAT = (1.0,) * 6
-RECALIBRATION = """
-recalibration:
-  runs:
-    - {name: bare, plan: {seed: 1}}
-    - {name: loaded, payload: disc, mass_kg: 4.59, plan: {seed: 1}}
-    - {name: held-out, payload: disc, mass_kg: 4.59, plan: {seed: 3}, holdout: true}
-  interlock: {file: interlock}
-  mount: {command: ["true"]}
-"""
 
 
 def drifting(week: int) -> tuple[float, ...]:

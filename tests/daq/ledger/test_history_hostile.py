@@ -1,4 +1,4 @@
-"""A history that somebody else has changed, or that a killed writer never entered: refused, reported, repaired."""
+"""A history that another program has changed, or that a killed writer never entered: refused, reported, repaired."""
 
 from __future__ import annotations
 

@@ -244,7 +244,7 @@ def test_what_is_reported_after_the_last_sample_counts_too(lockstep: Rig, monkey
         if timeout == pytest.approx(LATE_LOSSES_S) and not ended_ns:
             ended_ns.append(bus.clock.now_ns)
         if ended_ns and bus.clock.now_ns - ended_ns[0] > 200_000_000:
-            bus.losses = Losses(interface=2)  # type: ignore[attr-defined]
+            bus.losses = Losses(interface=2)
         return recv(timeout)
 
     monkeypatch.setattr(bus, "recv", late)

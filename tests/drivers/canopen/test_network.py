@@ -26,7 +26,7 @@ from drivers.errors import (
 from drivers.profiles.cia402 import State
 from drivers.profiles.profile import Axis, Identity, ObjectEntry
 from drivers.stream.sample import EventKind
-from tests.drivers.scripted import ADDRESS, PROFILE, FakeClock, ScriptedBus, ScriptedNode, cell
+from tests.drivers.scripted import ADDRESS, PROFILE, FakeClock, ScriptedBus, ScriptedNode, cell, lose_first_answer
 
 
 def test_scan_reports_who_is_there_and_changes_nothing() -> None:
@@ -48,7 +48,6 @@ def test_a_node_without_name_and_serial_is_described_as_far_as_it_reports() -> N
     network, bus = cell(1)
     for key in ((0x1008, 0), (0x1018, 4), (0x6041, 0)):
         del bus.nodes[0].objects[key]
-    bus.nodes[0]._refresh = lambda: None  # type: ignore[method-assign] # this node has no 6041h to refresh
     with network:
         (found,) = network.scan(wait_s=0.05)
     assert found.identity == Identity(0x29A, 0x40200, None)
@@ -194,17 +193,7 @@ def test_a_multiplexed_pdo_is_switched_off_and_on_again() -> None:
 
 def test_a_drive_with_small_pdos_gets_more_of_them() -> None:
     network, bus = cell(1)
-    write = bus.nodes[0].sdo
-
-    def small(data: bytes) -> bytes | None:
-        index = int.from_bytes(data[1:3], "little")
-        if data[0] >> 5 == 1 and index & 0xFF00 in (0x1600, 0x1A00) and data[3] == 0:
-            mapped = [bus.nodes[0].value(index, sub + 1) & 0xFF for sub in range(data[4])]
-            if sum(mapped) > 48:
-                return bytes((0x80, *data[1:4])) + (0x06040042).to_bytes(4, "little")
-        return write(data)
-
-    bus.nodes[0].sdo = small  # type: ignore[method-assign]
+    bus.nodes[0].largest_pdo_bits = 48
     with network:
         network.prepare()
         assert [len(record.entries) for record in network.pdos[0].feedback] == [2, 1]
@@ -220,15 +209,7 @@ def test_a_mode_that_is_not_taken_is_refused() -> None:
 
 def test_a_lost_answer_is_asked_for_again_and_a_late_one_not_believed() -> None:
     network, bus = cell(1)
-    held: list[can.Message] = []
-
-    def delay_first(message: can.Message) -> tuple[can.Message, ...]:
-        if message.arbitration_id == 0x581 and not held:
-            held.append(message)
-            return ()
-        return (*held[:1], message)  # from now on the old answer comes before every new one
-
-    bus.tamper = delay_first
+    lose_first_answer(bus, repeats=True)
     with network:
         access = network.link.objects(1)
         assert access.read(ObjectEntry(0x1018, 1, 32, signed=False)) == 0x29A
@@ -369,14 +350,8 @@ def test_giving_back_is_undisturbed_and_says_when_it_was_cut_short() -> None:
 
 def deaf_from_now_on(bus: ScriptedBus, node_id: int) -> None:
     """A node that answers no SDO request any more, beside a flood of frames of no importance."""
-    receive = bus.recv
-
-    def recv(timeout: float | None = None) -> can.Message | None:
-        bus.clock.now_ns += 90_000  # 11 000 frames/s
-        return receive(timeout) or can.Message(arbitration_id=0x7FF, is_extended_id=False)
-
     bus.tamper = lambda m: () if m.arbitration_id == 0x580 + node_id else (m,)
-    bus.recv = recv  # type: ignore[method-assign]
+    bus.flood_period_ns = 90_000  # 11 000 frames/s
 
 
 @pytest.mark.parametrize("asked", [False, True])

@@ -14,7 +14,7 @@ from drivers.canopen.link import Link
 from drivers.canopen.network import CanopenNetwork
 from drivers.errors import ObjectAccessError, SetupRefused
 from drivers.profiles.profile import ObjectEntry
-from tests.drivers.scripted import ScriptedBus, ScriptedNode, cell
+from tests.drivers.scripted import ScriptedBus, ScriptedNode, cell, lose_first_answer
 
 NAME = 0x1008
 STATUSWORD = 0x6041
@@ -182,7 +182,6 @@ def test_a_second_device_that_refuses_first_is_named_too() -> None:
     network, bus = cell(2)
     other = Hostile(2, bus, lambda data, _: None)
     other.objects = {key: value for key, value in other.objects.items() if key[0] in (0x1000, 0x1017)}
-    other._refresh = lambda: None  # type: ignore[method-assign]
     bus.nodes = (bus.nodes[0], other, bus.nodes[1])
     with network, pytest.raises(SetupRefused, match=r"J2 \(node 2\): found two answers .* two have it"):
         network.prepare()
@@ -237,18 +236,7 @@ def test_an_answer_to_another_program_is_no_second_device() -> None:
 
 def test_a_late_answer_to_a_request_that_was_repeated_is_no_second_device() -> None:
     network, bus = cell(1)
-    held: list[can.Message] = []
-
-    def delay_first(message: can.Message) -> tuple[can.Message, ...]:
-        if message.arbitration_id == 0x581 and not held:
-            held.append(message)
-            return ()
-        if len(held) == 1:
-            held.append(message)
-            return (held[0], message)
-        return (message,)
-
-    bus.tamper = delay_first
+    lose_first_answer(bus, repeats=False)
     with network:
         access = network.link.objects(1)
         for _ in range(3):

@@ -31,7 +31,7 @@ class Timeline(can.BusABC):
     """A bus whose frames have their times, with a capture process that is stopped now and then.
 
     Attributes:
-        clock: passes only while somebody waits.
+        clock: advances only while a caller waits.
         delays_ns: of the answers of each axis to each SYNC; later than a period, they come after the next SYNC.
         stops_ns: begin and end of the times, since the first SYNC, in which the capture process is stopped.
         producer: SYNC comes by itself.

@@ -557,12 +557,12 @@ def test_set_points_of_another_master_are_a_fault(lockstep: Prepared) -> None:
 
 def test_what_comes_behind_the_last_cycle_is_counted(lockstep: Prepared) -> None:
     stream, bus, events = lockstep
-    bus.losses = Losses()  # type: ignore[attr-defined]
+    bus.losses = Losses()
     bus.tamper = lambda m: (m, m) if m.arbitration_id == 0x182 and bus.cycle == 1 else (m,)
     next(stream)
     next(stream)
     before, sent, begun_ns = stream.statistics, len(bus.sent), bus.clock.now_ns
-    bus.losses = Losses(interface=3)  # type: ignore[attr-defined]
+    bus.losses = Losses(interface=3)
     stream.read_on(0.25)
     assert bus.clock.now_ns - begun_ns == 250_000_000
     assert len(bus.sent) == sent
@@ -649,9 +649,9 @@ def test_the_kernel_is_steered_to_its_period(period_us: int, late: float, noise:
 
 def test_frames_that_this_machine_lost_are_counted_and_reported(lockstep: Prepared) -> None:
     stream, bus, events = lockstep
-    bus.losses = Losses(kernel=5)  # type: ignore[attr-defined]  # before the first SYNC: they do not count
+    bus.losses = Losses(kernel=5)  # before the first SYNC: they do not count
     next(stream)
-    bus.losses = Losses(kernel=7, backlog=1, interface=4)  # type: ignore[attr-defined]
+    bus.losses = Losses(kernel=7, backlog=1, interface=4)
     sample = next(stream)
     next(stream)
     assert stream.statistics == StreamStatistics(
@@ -663,7 +663,7 @@ def test_frames_that_this_machine_lost_are_counted_and_reported(lockstep: Prepar
 
 def test_what_is_to_be_known_of_the_bus_is_reported_at_the_start(lockstep: Prepared) -> None:
     stream, bus, events = lockstep
-    bus.remarks = ("a small buffer",)  # type: ignore[attr-defined]
+    bus.remarks = ("a small buffer",)
     next(stream)
     next(stream)
     assert [event.text for event in events if event.kind is EventKind.CAPTURE] == ["a small buffer"]
@@ -672,7 +672,7 @@ def test_what_is_to_be_known_of_the_bus_is_reported_at_the_start(lockstep: Prepa
 def test_a_timed_sync_has_the_kernels_time(timed: Prepared) -> None:
     """Our own SYNC comes back with it, before its answers."""
     stream, bus, _ = timed
-    bus.read_until_ns = 0  # type: ignore[attr-defined]
+    bus.read_until_ns = 0
     send = bus.send
 
     def echo(msg: can.Message, timeout: float | None = None) -> None:

@@ -1,10 +1,17 @@
-"""Tables of the studies as CSV, which the pages of docs/evidence show."""
+"""Output of the studies: lines while they run, and tables as CSV, which the pages of docs/evidence show."""
 
 from __future__ import annotations
 
 import csv
 import io
 import re
+import sys
+
+
+def print_line(line: str) -> None:
+    """Print a line at once, also into a file."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
 
 
 def as_csv(markdown: str) -> str:
