@@ -22,6 +22,7 @@ from drivers.simulation.spec import (
     SpecInvalid,
 )
 
+POSTURES = 8  #: Postures in which the inertia behind a flexible drive is computed
 BRAKE_FACTOR = 2.0  #: Holding torque of a brake over the peak torque of its motor
 
 DISTURBANCE = 1  #: Kind of the random streams of the torque disturbance; those of the current noise have none
@@ -39,7 +40,7 @@ def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag], joints: int) -> tup
         the mechanics, and the drives between a motor and its joints in the order of their coordinates.
 
     Raises:
-        SpecInvalid: the drive train is wrong, or two flexible drives are given for one motor, or one is too stiff.
+        SpecInvalid: the drive train is wrong, or two flexible drives are given for one motor.
     """
     n, rows, step_s = len(spec.axes), motor_rows(spec.ratio), spec.sync_period_us * 1e-6 / spec.substeps
     flexible = tuple(effect for effect in effects if isinstance(effect, Elasticity))
@@ -50,13 +51,6 @@ def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag], joints: int) -> tup
     for coordinate, drive in enumerate(flexible, start=joints):
         drive.coordinate, drive.row = coordinate, rows[drive.axis]
         motor_direction[drive.axis] = np.eye(total)[coordinate]
-        # A quarter of the stability bound of the explicit spring, stiffness h² = 4 inertia.
-        inertia = spec.axes[drive.axis].motor_inertia_kg_m2
-        if (drive.stiffness_nm_per_rad * step_s + drive.damping_nm_s_per_rad) * step_s > inertia:
-            raise SpecInvalid(
-                f"the flexible drive of axis {drive.axis + 1} is too stiff for steps of {step_s * 1e6:g} us and a "
-                f"motor inertia of {inertia:g} kg m²; lower stiffness or damping"
-            )
     directions = list(np.eye(joints, total))
     own_row = np.zeros(n, dtype=np.int64)
     for motor, row in enumerate(motor_direction):
@@ -186,7 +180,38 @@ class Plant:
         self._settle()
         self.disturbance_nm = np.zeros(n)
         self._disturbance = _disturbance(spec, self._mechanics.step_s)
+        self._refuse_stiff(flexible, spec)
         self.set_brakes(np.ones(n, dtype=np.bool_))
+
+    def _refuse_stiff(self, flexible: Sequence[Elasticity], spec: CellSpec) -> None:
+        """Refuse a drive whose motor and links would swing faster than the steps can follow.
+
+        The spring k and the damper c act with the speeds and the angle at the begin of a step h. Between two masses of
+        reduced inertia μ, that is stable for 2ch + kh² < 4μ (z² - (2 - ch/μ - kh²/μ) z + 1 - ch/μ has its roots in the
+        unit circle). The limit here is half of it, for the arm without payload.
+
+        Raises:
+            SpecInvalid: a drive is too stiff.
+        """
+        if not flexible:
+            return
+        step_s, n = self._mechanics.step_s, len(spec.axes)
+        bare = link_model(spec.urdf, spec.gravity_m_s2, None, spec.platform)
+        if self.mechanism is None:
+            basis, postures = np.eye(n), tuple(np.transpose(self.postures(spec.start_rad, POSTURES)))
+        else:
+            basis, postures = self._basis, (self.position_rad[: self._joints],)
+        masses = [basis.T @ self._mass(bare, bare.createData(), position) @ basis for position in postures]
+        for drive in flexible:
+            row = drive.row @ basis[:n]
+            links = min(1.0 / float(row @ np.linalg.solve(mass, row)) for mass in masses)
+            motor = spec.axes[drive.axis].motor_inertia_kg_m2
+            stiff = (2.0 * drive.damping_nm_s_per_rad + drive.stiffness_nm_per_rad * step_s) * step_s
+            if stiff * (1.0 / motor + 1.0 / links) > 2.0:
+                raise SpecInvalid(
+                    f"the flexible drive of axis {drive.axis + 1} is too stiff for steps of {step_s * 1e6:g} us, a "
+                    f"motor inertia of {motor:g} kg m² and {links:.3g} kg m² behind it; lower stiffness or damping"
+                )
 
     def set_brakes(self, closed: NDArray[np.bool_]) -> None:
         """Close or open the brake of each motor, shape (n,)."""
@@ -220,13 +245,13 @@ class Plant:
         """
         if self.mechanism is not None:
             n = len(self._gain)
-            links = self._mass(self.position_rad[: self._joints])
+            links = self._mass(self._model, self._data, self.position_rad[: self._joints])
             motors = self._rows @ self._basis[:n]
             to_speed = np.linalg.pinv(motors)
             shared = to_speed.T @ self._basis.T @ links @ self._basis @ to_speed
             return np.asarray(np.diag(shared) / np.diag(motors @ to_speed) + self._mechanics.motor_inertia)
         to_joint = np.linalg.inv(self._rows)
-        links = np.array(pin.crba(self._model, self._data, position_rad))
+        links = self._mass(self._model, self._data, position_rad)
         return np.asarray(np.diag(to_joint.T @ links @ to_joint) + self._mechanics.motor_inertia)
 
     def step(self, current_a: FloatArray) -> None:
@@ -318,13 +343,12 @@ class Plant:
                 "pose: keep the limits of motion away from it"
             )
 
-    def _mass(self, position_rad: FloatArray) -> FloatArray:
-        """Return the mass matrix of the links of a closed chain in the order of the plant, shape (n, n)."""
-        assert self.mechanism is not None
-        order = self.mechanism.order
+    def _mass(self, model: pin.Model, data: pin.Data, position_rad: FloatArray) -> FloatArray:
+        """Return the mass matrix of the links in the order of the plant's joints, shape (n, n)."""
+        order = np.arange(self._joints) if self.mechanism is None else self.mechanism.order
         position = np.empty(len(order))
         position[order] = position_rad
-        return np.array(pin.crba(self._model, self._data, position))[np.ix_(order, order)]
+        return np.array(pin.crba(model, data, position))[np.ix_(order, order)]
 
 
 def _disturbance(spec: CellSpec, step_s: float) -> ColouredNoise | None:

@@ -185,7 +185,7 @@ class DirectStream:
                 node_ids=tuple(axis.node_id for axis in axes),
                 pdos=tuple(map(wanted_pdos, axes)),
                 powered=set(),
-                begin_stop=lambda: None,
+                begin_stop=lambda nodes: None,
                 begin_closing=lambda: None,
                 link=SimpleNamespace(deadline_ns=None),
                 guard=lambda: None,

@@ -321,3 +321,19 @@ def test_a_drive_too_stiff_for_the_step_is_refused() -> None:
     effect = UndeclaredEffect("elasticity", 5, {"stiffness_nm_per_rad": 1e7, "damping_nm_s_per_rad": 1.0})
     with pytest.raises(SpecInvalid, match="too stiff"):
         Plant(clean_cell(effects=(effect,)))
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(axis=st.integers(3, 5), stiffness=st.floats(10.0, 1e5), damping=st.floats(0.0, 10.0))
+def test_a_drive_that_is_not_refused_comes_to_rest(axis: int, stiffness: float, damping: float) -> None:
+    """The flange without payload is lighter than its motor."""
+    parameters = {"stiffness_nm_per_rad": stiffness, "damping_nm_s_per_rad": damping}
+    try:
+        plant = Plant(clean_cell(effects=(UndeclaredEffect("elasticity", axis, parameters),)))
+    except SpecInvalid as error:
+        assert "too stiff" in str(error)
+        return
+    plant.velocity_rad_s[axis] = 1.0
+    for _ in range(400):
+        plant.step(np.zeros(6))
+    assert np.abs(plant.velocity_rad_s).max() < 1.0
