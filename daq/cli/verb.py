@@ -194,17 +194,15 @@ _CELLS = ("*.yaml", "cells/*.yaml", "*/cells/*.yaml")
 _TEMPLATE = Path("press-4/cells/press-4.yaml")  #: What the example of `drivegain init` makes
 
 
-def cell_here(name: str | None = None) -> Path:
-    """Find the cell file in or below this folder, for a command to copy; of that cell, if a name is given.
-
-    Where there is none, it is the one that the example of `drivegain init` makes.
-    """
-    return next(_cells_here(name), _TEMPLATE if name is None else Path("CELL"))
+def cell_here() -> Path:
+    """Find a cell file in or below this folder, for a command to copy, or the one that `drivegain init` would make."""
+    return next(cells_in(Path()), _TEMPLATE)
 
 
-def _cells_here(name: str | None) -> Iterator[Path]:
+def cells_in(folder: Path, name: str | None = None) -> Iterator[Path]:
+    """Find the cell files in or below a folder; those of one cell, if a name is given."""
     for pattern in _CELLS:
-        for path in sorted(Path().glob(pattern)):
+        for path in sorted(folder.glob(pattern)):
             try:
                 if not path.is_file():  # opening a FIFO would wait for its writer
                     continue
