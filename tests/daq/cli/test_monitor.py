@@ -317,7 +317,7 @@ def test_a_cell_that_is_not_there_is_a_device_fault(cell: Path, capsys: pytest.C
     assert main(["monitor", str(cell), "--once", "--interval", "0.1"]) == ExitCode.DEVICE_FAULT
     streams = capsys.readouterr()
     assert "(SILENT)" in streams.out
-    assert "did not answer" in streams.err
+    assert "start `drivegain simulate demo`" in streams.err
 
 
 def test_our_own_recorder_is_no_other_master(tmp_path: Path) -> None:
