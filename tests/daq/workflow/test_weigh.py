@@ -61,6 +61,16 @@ def test_a_real_flange_without_a_body_weighs_nothing(
     assert abs(mass) < 3.0 * std < 0.3
 
 
+def test_a_calibration_comes_first_or_as_an_option(real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    file, log = map(str, real)
+    for verb in ("weigh", "validate"):
+        printed = []
+        for words in ([file, log], [log, "--calibration", file], [f"--calibration={file}", log]):
+            assert main([verb, *words, "--json"]) == ExitCode.OK
+            printed.append(capsys.readouterr().out)
+        assert printed[0] == printed[1] == printed[2]
+
+
 def test_a_log_that_declares_a_payload_is_not_bare(
     real: tuple[Path, Path], checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
