@@ -217,6 +217,8 @@ def monitor_view(document: dict[str, Any]) -> Group:
         current = "?" if axis["current_raw"] is None else f"{axis['current_raw']:+d} raw"
         if axis["current_a"] is not None:
             current = f"{axis['current_a']:+.3f} A"
+        if axis["enabled"] is False:
+            current = "no power"  # a reference, or what is left of one: no current flows
         note, style = (" (ENABLED)", "bold green") if axis["enabled"] else ("", None)
         if axis["state"] in _ALARMING:
             style = "bold red"

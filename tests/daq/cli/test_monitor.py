@@ -271,6 +271,15 @@ def test_what_is_not_known_is_shown_as_that() -> None:
     assert "+5 raw" in text
     assert "(SILENT)" in text
     assert "operation enabled (ENABLED)" in text
+    assert "no power" not in text
+    off = tuple(replace(axis, statusword=0x250) for axis in reading.axes[:5])
+    without = replace(reading, axes=(*off, dead))
+    document = monitor_document(CELL, WatchedCell(without, joint_positions(CELL, without), ampere, ()))
+    assert document["axes"][0]["current_a"] == pytest.approx(0.01)  # the document has what the drive says
+    out = io.StringIO()
+    Console(file=out, width=100).print(monitor_view(document))
+    assert out.getvalue().count("no power") == 5
+    assert " A " not in out.getvalue()
     assert "\x1b[2J" not in text
 
 
