@@ -13,6 +13,7 @@ from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
 from daq.report.plan import plan_document, plan_text
+from daq.report.plan_preview import preview_page
 from daq.workflow.experiment import RUNS, Experiment, experiment_of, paths_of
 from daq.workflow.plan import Plan, plan
 from ident.planning.verdict import Hidden, verdicts
@@ -60,6 +61,8 @@ def test_the_planners_own_plan_shows_every_gain(cell: Cell, experiment: Experime
     assert "Internal preload obscures no gain: these moves determine 4 of 4 independent directions" in text
     assert "\nAssumed:\n  payload: disc, 8.2 kg\n" in text
     assert max(len(line) for line in text.partition("Assumed:")[2].splitlines()[:7]) < 110
+    page = preview_page(cell, made.moves, experiment.scene.checker, b"plan")
+    assert "The shape of the arm is unknown: links of a closed chain are not guessed" in page
 
 
 def test_a_weak_gain_is_told_how_to_become_good(cell: Cell, experiment: Experiment, made: Plan) -> None:
