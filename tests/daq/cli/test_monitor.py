@@ -16,13 +16,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
+from rich.table import Table
 
 from daq.cli.app import main
 from daq.config.bus import answer_us, bus_loads_percent, drive_axes
 from daq.config.cell import Cell, PacingMode, model_of
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
-from daq.report.bus import monitor_document, monitor_view
+from daq.report.bus import monitor_document, monitor_view, prediction_view
 from daq.report.bus_schemas import MonitorReport
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.events import event_document
@@ -401,6 +402,10 @@ def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong
     Console(file=out, width=80, force_terminal=True, color_system="standard").print(monitor_view(document))
     coloured = [line for line in out.getvalue().splitlines() if "33m" in line]
     assert [line.split("J")[1][0] for line in coloured] == (["4"] if factor > 1.0 else [])
+    document["axes"][0]["enabled"] = False
+    _, without = prediction_view(document)
+    assert isinstance(without, Table)
+    assert next(str(cell) for cell in without.columns[1].cells) == "no power"
     bus.coming.clear()
     document = monitor_document(CELL, watch.read(0.5))
     assert document["prediction"]["remark"] == "no prediction: there is no SYNC"
