@@ -8,6 +8,7 @@ DaqError
 │   │                               CurrentSaturated, PositionImplausible, EffectsRefuted
 │   └── LogUnreadable               LogMissing, LogForeign, LogTruncated, LogCorrupt, LogIncomplete
 ├── ConfigurationError    exit 6    ConfigurationMissing, YamlInvalid, SchemaMismatch, ConfigurationInconsistent
+├── VirtualBusEmpty       exit 5
 ├── JobHeld               exit 14   NotReleased (exit 11), BusTaken (exit 12), TimeBoundReached (exit 13)
 └── OutputFailed          exit 1    DiskSpaceShort
 
@@ -188,6 +189,10 @@ class ConfigurationInconsistent(ConfigurationError):
     """Each value is valid; together they contradict each other."""
 
 
+class VirtualBusEmpty(DaqError):
+    """No node answers on a virtual bus, which ends at the program that opened it."""
+
+
 class JobHeld(DaqError):
     """A job may not go on now; nothing was written to a controller, and the next job resumes it."""
 
@@ -240,6 +245,7 @@ EXIT_CODES: tuple[tuple[type[Exception], ExitCode], ...] = (
     (CalibrationRefused, ExitCode.CALIBRATION_REFUSED),
     (DataError, ExitCode.DATA_UNFIT),
     (ConfigurationError, ExitCode.CONFIGURATION),
+    (VirtualBusEmpty, ExitCode.DEVICE_FAULT),
     (NotReleased, ExitCode.NOT_RELEASED),
     (BusTaken, ExitCode.BUS_TAKEN),
     (TimeBoundReached, ExitCode.TIME_BOUND),

@@ -37,6 +37,7 @@ from ident.estimators.estimate import RelativeError, relative_error
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
 from ident.model.model import Column, Model
+from ident.model.robot import Place
 from ident.planning.excitation import UNSEEN, side_of_cube
 from ident.planning.verdict import ExtraMoves
 from ident.prediction import placed_effect, standard_parameters
@@ -44,6 +45,7 @@ from ident.prediction import placed_effect, standard_parameters
 MAX_PASSES = 8  #: Of the effects' columns; load friction of a tenth of the load needs three
 STAYS = 1e-3  #: Largest change of the body in the last pass, as a share of its size; each is some 3 % of the one before
 WORTH = 0.7  #: Share of its σ to which moves must bring a parameter in order to be named
+KNOWN = 0.1  #: Largest σ of a parameter that counts as identified, as a share of its value
 FRICTION = ("fv", "fs")  #: First letters of friction's columns, of joints and of coupled motors
 
 
@@ -111,6 +113,15 @@ class WeighedBody:
         """Centre of mass in the frame of the joint that carries it, and its σ [m], shape (3,) each."""
         return self._derived(_centre)
 
+    def centre_in(self, frame: Place) -> tuple[FloatArray, FloatArray]:
+        """Centre of mass in a frame that is fixed to that joint, and its σ [m], shape (3,) each."""
+        turned = frame.rotation.T
+        # A coordinate that is not shown spoils those of the frame that depend on it, and no others.
+        used = np.abs(turned) > 1e-12
+        return self._derived(
+            lambda body: np.where(used, turned * (_centre(body) - frame.translation_m), 0.0).sum(axis=1)
+        )
+
     @property
     def inertia_kg_m2(self) -> tuple[FloatArray, FloatArray]:
         """Inertia about the centre of mass (Ixx, Ixy, Ixz, Iyy, Iyz, Izz) and its σ [kg m²], shape (6,) each."""
@@ -125,8 +136,12 @@ class WeighedBody:
 
     @property
     def identifiable(self) -> BoolArray:
-        """Parameters whose 95 % interval is narrower than what a compact body of this mass has, shape (10,)."""
-        return np.asarray(2.0 * np.nan_to_num(self.std, nan=np.inf) < self.size)
+        """Parameters known to KNOWN of their value, or to less than what a compact body of this mass has, shape (10,).
+
+        The second counts for a parameter near zero, the first for one with a long lever, such as Izz about a far joint.
+        """
+        std = np.nan_to_num(self.std, nan=np.inf)
+        return np.asarray((std <= KNOWN * np.abs(np.nan_to_num(self.values))) | (2.0 * std < self.size))
 
     def _derived(self, quantity: Callable[[FloatArray], FloatArray]) -> tuple[FloatArray, FloatArray]:
         with np.errstate(invalid="ignore"):  # NaN is what depends on a parameter that is not shown

@@ -96,7 +96,8 @@ def export_urdf_verb(
     """Write masses, centres of mass, inertias and joint friction into a copy of the robot's URDF.
 
     A URDF needs the bodies behind the identified parameter combinations. A semidefinite programme finds the nearest
-    physical bodies (pip install 'drivegain[physical]'); the change of torque is reported.
+    physical bodies (pip install 'drivegain[physical]'); the change of torque is reported. Serial robots only: closed
+    chains are refused.
     """
     from daq.cli.terminal import check_output, print_view, status
     from daq.config.cell import model_of
@@ -117,7 +118,6 @@ def export_urdf_verb(
             remedy="give the cell file, then the calibration; or leave the cell file out",
         )
     given, calibration = urdf or cell, calibration or cell
-    require_solver()
     check_output(out, (calibration, given), FORMAT)
     known = load_calibration(calibration)
     left = known.relative_error_percent.total
@@ -137,14 +137,16 @@ def export_urdf_verb(
         if declared.chain is not None:
             raise UsageError(
                 f"cell {declared.name!r}",
-                found="a closed chain",
-                expected="a serial robot: bodies are sought for a tree of driven joints alone",
-                remedy="use the calibration's own `parameters`, which `drivegain validate` predicts with",
+                found="a closed chain: some of its joints have no motor",
+                expected="a serial robot, each joint with a motor: for the links of a loop no masses are computed",
+                remedy="no URDF is written; `drivegain validate`, `weigh` and `contact` predict with the calibration "
+                "itself",
             )
         model, limits, same = model_of(declared), cell_limits(declared), declared.digest == known.configuration_sha256
         content = declared.urdf.encode()  # held joints are fixed in it
     else:
         model, limits, same = *_plain(content.decode("utf-8")), None
+    require_solver()
     text = content.decode("utf-8")
     with status("finding the nearest physical robot"):
         robot = physical_robot(known, model, limits, text)

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from daq.cli.record import mounted
+from daq.cli.scan import no_answer
 from daq.cli.verb import CellArgument, JsonOption, Verb, print_json
 
 
@@ -40,7 +41,6 @@ def monitor_verb(
     from daq.workflow.validate import check_cell
     from drivers.canopen.network import CanopenNetwork
     from drivers.canopen.sdo import SdoPolicy
-    from drivers.errors import NodeMissing
     from drivers.stream.monitor import QUIET_S
 
     declared = load_cell(cell)
@@ -67,7 +67,7 @@ def monitor_verb(
             silent = [axis for axis, shown in zip(network.axes, document["axes"], strict=True) if shown["silent"]]
             heard = tuple(axis["node_id"] for axis in document["axes"] if not axis["silent"])
             if silent:
-                raise NodeMissing(silent, heard, QUIET_S + interval)
+                raise no_answer(declared, silent, heard, QUIET_S + interval)
             return
         if feed.remark:
             console.print(feed.remark)

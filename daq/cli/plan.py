@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -55,7 +57,13 @@ def plan_verb(
     declared = load_cell(cell)
     check_controller(cell, declared)
     experiment = experiment_of(declared, payload)
-    with progress_bar("planning") as report_progress:
+    tried = [0]
+    with say_how_to_resume(tried, exchanges), progress_bar("planning") as report_progress:
+
+        def report(done: int, worst: float) -> None:
+            tried.append(done)
+            report_progress(done, exchanges, f"worst gain σ {worst:.2f} %")
+
         made = plan(
             declared,
             seed=seed,
@@ -65,7 +73,7 @@ def plan_verb(
             largest_condition=condition,
             largest_std_percent=sigma,
             experiment=experiment,
-            progress=lambda done, worst: report_progress(done, exchanges, f"worst gain σ {worst:.2f} %"),
+            progress=report,
         )
     with write_output(out):
         save_plan(made, out)
@@ -81,6 +89,17 @@ def plan_verb(
     else:
         typer.echo(plan_text(out, preview, declared, experiment, made, judged))
         say_next("drivegain", "record", cell, out, "--out", "unloaded.mcap", "--enable-motion")
+
+
+@contextmanager
+def say_how_to_resume(tried: list[int], exchanges: int) -> Iterator[None]:
+    """After an interrupt, say how to get the plan that the search had then: the same seed gives the same moves."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if done := tried[-1]:
+            typer.echo(f"{done} of {exchanges} exchanges were tried; --exchanges {done} writes their plan", err=True)
+        raise
 
 
 PLAN = Verb("plan", plan_verb, "drivegain plan CELL --out plan.yaml --seed 1 --duration 40")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,6 +13,7 @@ from daq.cli.verb import CellArgument, JsonOption, Verb, print_json, say_next
 from daq.errors import UsageError
 
 if TYPE_CHECKING:
+    from daq.config.cell import Cell
     from drivers.canopen.network import CanopenNetwork
     from drivers.profiles.profile import Axis
     from drivers.profiles.scale import ScaleReading
@@ -39,7 +41,6 @@ def scan_verb(
     from daq.report.bus import current_signals, scan_rows, scan_view
     from daq.workflow.nameplates import check_nameplates, nameplate_warnings
     from drivers.canopen.network import CanopenNetwork
-    from drivers.errors import NodeMissing
     from drivers.profiles.cia402 import State
 
     declared = load_cell(cell)
@@ -80,9 +81,27 @@ def scan_verb(
     absent = {row["node_id"] for row in rows if row["verdict"] == "missing"}
     missing = [axis for axis in drive_axes(declared) if axis.node_id in absent]
     if missing:
-        raise NodeMissing(missing, tuple(node.node_id for nodes in found.values() for node in nodes), wait)
+        raise no_answer(declared, missing, tuple(node.node_id for nodes in found.values() for node in nodes), wait)
     if not json and not mistyped and all(row["verdict"] == "ok" for row in rows):
         say_next("drivegain", "plan", cell, "--out", "plan.yaml")
+
+
+def no_answer(cell: Cell, missing: Sequence[Axis], answered: tuple[int, ...], wait_s: float) -> Exception:
+    """Error for axes that did not answer: amplifiers without power, or a simulated cell that was not started."""
+    from daq.cli.simulate import SHIPPED
+    from daq.errors import VirtualBusEmpty
+    from drivers.errors import NodeMissing
+
+    if answered or any(bus.interface != "virtual" for bus in cell.buses):
+        return NodeMissing(missing, answered, wait_s)
+    name = cell.name if cell.name in SHIPPED else "FILE"
+    return VirtualBusEmpty(
+        f"cell {cell.name!r}",
+        found="no node on its bus, which is virtual: no amplifier and no other program is ever on it",
+        expected="the bus of a simulated cell in a second terminal, or of a robot",
+        remedy=f"start `drivegain simulate {name}`, and put the `bus` and `sync` that it prints into a copy of the "
+        "cell file",
+    )
 
 
 def _scale_of(network: CanopenNetwork, axis: Axis) -> ScaleReading | None:

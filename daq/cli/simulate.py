@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from drivers.canopen.split_bus import BusPart
     from drivers.simulation.spec import CellSpec
 
-_SHIPPED = ("demo", "clean", "rx90", "kr270", "seven-axis", "gantry", "five-bar", "orthoglide", "dualv")
+SHIPPED = ("demo", "clean", "rx90", "kr270", "seven-axis", "gantry", "five-bar", "orthoglide", "dualv")
 _SHIPPED_FAULTS = "faults-example"
 LARGEST_NAME_FILE_BYTES = 4096  #: Size of a file that names a body
 
@@ -28,7 +28,7 @@ LARGEST_NAME_FILE_BYTES = 4096  #: Size of a file that names a body
 def simulate(
     simulation: Annotated[
         Path,
-        typer.Argument(help="Simulation file, the truth of a cell; or demo or clean, shipped with drivegain."),
+        typer.Argument(help=f"Simulation file, the truth of a cell, or a shipped one: {', '.join(SHIPPED)}."),
     ],
     payload: Annotated[str | None, typer.Option(help="Name of the mounted body in the simulation file.")] = None,
     faults: Annotated[Path | None, typer.Option(help="Scenario file, or the shipped faults-example.")] = None,
@@ -46,7 +46,8 @@ def simulate(
 ) -> None:
     """Run a simulated cell until Ctrl-C or SIGTERM: amplifiers that answer NMT, SDO, PDO, SYNC, heartbeat and EMCY.
 
-    It prints the bus settings for the cell file; the other verbs then run in a second terminal.
+    It prints the bus settings for the cell file; the other verbs then run in a second terminal. Each shipped one but
+    clean, which is the demo without its hidden effect, has a cell file of its name.
     """
     import signal
     from contextlib import ExitStack
@@ -65,7 +66,7 @@ def simulate(
     from drivers.simulation.spec import SpecInvalid
 
     at_most_one(payload_from=payload_from, payload=payload)
-    shipped = simulation.name in _SHIPPED and not simulation.exists()
+    shipped = simulation.name in SHIPPED and not simulation.exists()
     truth = shipped_simulation(simulation.name) if shipped else simulation
     mounted = None
     if payload_from is not None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CalibrationArgument, CellOption, JsonOption, Verb, cell_here, print_json, say_next
+from daq.cli.verb import CalibrationArgument, CellOption, JsonOption, Verb, cells_in, print_json, say_next
 from daq.errors import CalibrationMissing
 
 if TYPE_CHECKING:
@@ -24,15 +24,17 @@ def validate_verb(
     beside: Annotated[
         list[Path] | None, typer.Option(help="Another calibration, or a folder of them (`fit --cases`); repeatable.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the paper's Tables 5 to 8 (tables.md).")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for tables.md: the same in the form of the paper's Tables 5 to 8.")
+    ] = None,
     cell: CellOption = None,
     json: JsonOption = False,
 ) -> None:
     """Predict the torque of runs with a calibration and weigh their payload with its gains.
 
-    Prints the relative error of each axis, the condition number of each run (paper, Table 5) and the payload mass that
-    the gains give (Tables 7, 8); with --beside every calibration side by side (Table 6 too). With unloaded logs among
-    the others, the payload mass does not depend on the calibration's robot parameters.
+    Prints the relative error of each axis, the condition number of each run, and the payload mass that the gains give;
+    with --beside every calibration side by side. With unloaded logs among the others, the payload mass does not depend
+    on the calibration's robot parameters.
     """
     from daq.cli.terminal import check_output, print_view, status, write_output
     from daq.config.cell_file import load_cell
@@ -66,7 +68,30 @@ def validate_verb(
         print_json({**validation_document(known, found.validations, drawn), **cross_document(found)})
     else:
         print_view(validation_view(known, found), *drawn.values(), page_file)
-        say_next("drivegain", "apply", cell or cell_here(known.cell), calibration)
+        say_next("drivegain", "apply", cell or cell_of(known, logs), calibration)
+
+
+def cell_of(calibration: Calibration, logs: list[Path]) -> Path:
+    """Find the cell file of a calibration, here or beside its logs; CELL, to be filled in, where it is not certain.
+
+    Several files may describe a cell of that name, as the shipped one and a copy of it. The one with the content that
+    the logs of the fit carry is meant.
+    """
+    from contextlib import suppress
+
+    from daq.config.cell_file import load_cell
+    from daq.errors import DaqError
+
+    folders = dict.fromkeys([Path(), *(log.parent for log in logs)])
+    found = {os.path.realpath(path): path for folder in folders for path in cells_in(folder, calibration.cell)}
+    recorded = []
+    for path in found.values():
+        with suppress(DaqError):
+            if load_cell(path).recording_digest == calibration.recording_configuration_sha256:
+                recorded.append(path)
+    # Without the fit's own one, the only one of that name may be it, edited since.
+    likely = recorded or list(found.values())
+    return likely[0] if len(likely) == 1 else Path("CELL")
 
 
 def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]:

@@ -97,11 +97,15 @@ def _example(command: str) -> str:
 
 
 class _VerbCommand(TyperCommand):
-    """Command whose help names values as a manual does: CELL, SECONDS; `--cell CELL` is the former spelling of CELL."""
+    """Command whose help names values as a manual does: CELL, SECONDS.
+
+    `--cell CELL` and `--calibration CALIBRATION` are other spellings of a first argument of that name.
+    """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if any(param.name == "cell" and param.param_type_name == "argument" for param in self.params):
-            args = _cell_first(args)
+        first = next((param.name for param in self.params if param.param_type_name == "argument"), None)
+        if first in _SPELLED_AS_OPTIONS:
+            args = _in_front(first, args)
         return super().parse_args(ctx, args)
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
@@ -178,13 +182,16 @@ def _value_word(param: Any, ctx: Any) -> str:
     return _UNITS.get(unit[1], "NUMBER") if unit is not None else "NUMBER"
 
 
-def _cell_first(args: Sequence[str]) -> list[str]:
-    """Put the value of `--cell` in front, where the cell file is an argument."""
+_SPELLED_AS_OPTIONS = ("cell", "calibration")
+
+
+def _in_front(argument: str, args: Sequence[str]) -> list[str]:
+    """Put the value of the option with the name of the first argument in front."""
     words = list(args)
     end = words.index("--") if "--" in words else len(words)
     for place, word in enumerate(words[:end]):
         name, equals, value = word.partition("=")
-        if name == "--cell" and (equals or place + 1 < end):
+        if name == f"--{argument}" and (equals or place + 1 < end):
             taken = [value] if equals else words[place + 1 : place + 2]
             return [*taken, *words[:place], *words[place + (1 if equals else 2) :]]
     return words
@@ -194,17 +201,15 @@ _CELLS = ("*.yaml", "cells/*.yaml", "*/cells/*.yaml")
 _TEMPLATE = Path("press-4/cells/press-4.yaml")  #: What the example of `drivegain init` makes
 
 
-def cell_here(name: str | None = None) -> Path:
-    """Find the cell file in or below this folder, for a command to copy; of that cell, if a name is given.
-
-    Where there is none, it is the one that the example of `drivegain init` makes.
-    """
-    return next(_cells_here(name), _TEMPLATE if name is None else Path("CELL"))
+def cell_here() -> Path:
+    """Find a cell file in or below this folder, for a command to copy, or the one that `drivegain init` would make."""
+    return next(cells_in(Path()), _TEMPLATE)
 
 
-def _cells_here(name: str | None) -> Iterator[Path]:
+def cells_in(folder: Path, name: str | None = None) -> Iterator[Path]:
+    """Find the cell files in or below a folder; those of one cell, if a name is given."""
     for pattern in _CELLS:
-        for path in sorted(Path().glob(pattern)):
+        for path in sorted(folder.glob(pattern)):
             try:
                 if not path.is_file():  # opening a FIFO would wait for its writer
                     continue

@@ -7,14 +7,12 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.verb import CellOption, JsonOption, Verb, print_json
-
-CalibrationOption = Annotated[Path, typer.Option("--calibration", help="calibration.yaml written by `drivegain fit`.")]
+from daq.cli.verb import CalibrationArgument, CellOption, JsonOption, Verb, print_json
 
 
 def weigh_verb(
+    calibration: CalibrationArgument,
     logs: Annotated[list[Path], typer.Argument(help="Logs with the body, mounted one way.")],
-    calibration: CalibrationOption,
     bare: Annotated[
         list[Path] | None, typer.Option("--bare", help="Log of the same robot without load; repeatable.")
     ] = None,
@@ -42,12 +40,12 @@ def weigh_verb(
         print_view(weighed_view(found))
 
 
-WEIGH = Verb("weigh", weigh_verb, "drivegain weigh loaded.mcap --calibration calibration.yaml --bare unloaded.mcap")
+WEIGH = Verb("weigh", weigh_verb, "drivegain weigh calibration.yaml loaded.mcap --bare unloaded.mcap")
 
 
 def contact_verb(
+    calibration: CalibrationArgument,
     log: Annotated[Path, typer.Argument(help="Log to examine.")],
-    calibration: CalibrationOption,
     quiet: Annotated[
         list[Path] | None, typer.Option("--quiet", help="Log of such motion without contact; repeatable.")
     ] = None,
@@ -80,6 +78,4 @@ def contact_verb(
         print_view(contact_view(found, described), picture)
 
 
-CONTACT = Verb(
-    "contact", contact_verb, "drivegain contact loaded.mcap --calibration calibration.yaml --quiet held-out.mcap"
-)
+CONTACT = Verb("contact", contact_verb, "drivegain contact calibration.yaml loaded.mcap --quiet held-out.mcap")

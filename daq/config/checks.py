@@ -93,8 +93,8 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
         return None, [*faults, Fault(("robot", "urdf"), str(error), expected)]
     joints = robot.axes
     if chain is not None and len(joints) != len(model.axes):
-        found, motors = f"{len(model.axes)} axes", ", ".join(model.robot.motors)
-        faults.append(Fault(("axes",), found, f"one for each joint in `robot.motors` ({motors})"))
+        found, named = f"{len(joints)} joints for {len(model.axes)} axes", ", ".join(axis.name for axis in model.axes)
+        faults.append(Fault(("robot", "motors"), found, f"the joint of each axis, in their order ({named})"))
     elif len(joints) != len(model.axes):
         names = [joint.name for joint in joints]
         expected = f"one for each moving joint of the URDF ({', '.join(names)})"
@@ -104,10 +104,12 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
             expected += f"; joints that are no axes are held at a position [deg; m if prismatic]: `hold: {{{held}}}`"
         faults.append(Fault(("axes",), f"{len(model.axes)} axes", expected))
     axes = [axis.name for axis in model.axes]
-    for name in robot.passive_names:
-        if name in axes:
-            path, found = ("axes", axes.index(name), "name"), f"{name}, the name of a joint without a motor"
-            faults.append(Fault(path, found, "another name: an effect may act on that joint"))
+    for index, name in enumerate(axes[: len(model.robot.motors)]):
+        # Either the list has the wrong joint or the axis the wrong name; both cannot stay: an effect may name either.
+        if name in robot.passive_names:
+            found = f"{model.robot.motors[index]} as the joint of axis {name}, and joint {name} without a motor"
+            expected = f"{name}, or another name of that axis (`axes[{index}].name`)"
+            faults.append(Fault(("robot", "motors", index), found, expected))
     return robot, faults
 
 
@@ -121,6 +123,13 @@ def _ratio_faults(model: CellModel) -> Iterator[Fault]:
     condition = float(np.linalg.cond(ratio_of(model)))
     if not np.isfinite(condition) or condition > LARGEST_CONDITION:
         yield Fault(path, f"a singular matrix (condition {condition:.3g})", "one that can be inverted")
+    free = model.robot.mobility
+    for motor, row in enumerate(ratio if free is not None and len(model.robot.motors) > free else ()):
+        if others := [model.axes[joint].name for joint in range(n) if joint != motor and row[joint] != 0.0]:
+            # The rule of ident.model.model.Model.
+            found = f"the motor of {model.axes[motor].name} also turns with {', '.join(others)}"
+            expected = f"zeros off the diagonal: {len(model.robot.motors)} motors for {free} degrees of freedom"
+            yield Fault((*path, motor), found, expected)
 
 
 def _list_faults(model: CellModel) -> Iterator[Fault]:

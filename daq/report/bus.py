@@ -217,6 +217,8 @@ def monitor_view(document: dict[str, Any]) -> Group:
         current = "?" if axis["current_raw"] is None else f"{axis['current_raw']:+d} raw"
         if axis["current_a"] is not None:
             current = f"{axis['current_a']:+.3f} A"
+        if axis["enabled"] is False:
+            current = "no power"  # the number is an old reference, or the offset of a sensor
         note, style = (" (ENABLED)", "bold green") if axis["enabled"] else ("", None)
         if axis["state"] in _ALARMING:
             style = "bold red"
@@ -252,6 +254,8 @@ def prediction_view(document: dict[str, Any]) -> Iterator[RenderableType]:
             "at rest" if value is None and name == "predicted" else "-" if value is None else f"{value:+.3f}"
             for name, value in ((name, found[name]) for name in ("measured", "predicted"))
         ]
+        if axis["enabled"] is False:
+            values[0] = "no power"
         band, rms = ("-" if found[name] is None else f"{found[name]:.3f}" for name in ("band", "residual_rms"))
         cells = (printable(axis["axis"]), *values, band, rms, f"{100 * found['outside_share']:.0f} %")
         table.add_row(*map(Text, cells), style="bold yellow" if found["conspicuous"] else None)

@@ -377,6 +377,7 @@ class WeighReport(StrictModel):
     declared_kg: Figure
     mass_kg: WeighedValue
     centre_m: WeighedValues
+    centre_in_platform_m: WeighedValues | None
     inertia_about_centre_kg_m2: WeighedValues
     parameters: list[WeighedParameter]
     relative_error_percent: Errors

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from rich.console import RenderableType
 
 from daq.report.text import plain_table, printable, terminal_text
-from daq.workflow.validate import CrossValidation
+from daq.workflow.validate import MANUFACTURER, CrossValidation
 from ident.calibration import Calibration, Parameter
 
 NONE = "—"
+ERROR_ROW = "difference from the scale, %"
 SIGMA_NOTE = "%σ by the formulas of the method: eqs. (10) of wls and (23) of tls take rows as independent: too small."
 
 
@@ -24,19 +25,26 @@ class PaperTable:
     headings: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     notes: tuple[str, ...] = ()
+    number: int | None = None  #: in the paper; None of a table that it has not
+
+    @property
+    def numbered_title(self) -> str:
+        """Title with the number of the paper's table, for a reader who compares the two."""
+        return self.title if self.number is None else f"Table {self.number}: {self.title}"
 
     def markdown(self) -> str:
         """Section of a Markdown page."""
         rule = ("---", *("---:" for _ in self.headings[1:]))
         rows = (" | ".join(cell.replace("|", r"\|") for cell in cells) for cells in (self.headings, rule, *self.rows))
-        lines = [f"## {self.title}", "", *(f"| {row} |" for row in rows)]
+        lines = [f"## {self.numbered_title}", "", *(f"| {row} |" for row in rows)]
         for note in self.notes:
             lines += ["", note]
         return "\n".join(lines) + "\n"
 
-    def view(self) -> Iterator[RenderableType]:
-        """Table and notes for a terminal."""
-        table = plain_table(self.headings, title=self.title, wrap=range(len(self.headings)))
+    def view(self, *, numbered: bool = True) -> Iterator[RenderableType]:
+        """Table and notes for a terminal, with the paper's number or without."""
+        title = self.numbered_title if numbered else f"{self.title[0].upper()}{self.title[1:]}"
+        table = plain_table(self.headings, title=title, wrap=range(len(self.headings)))
         for row in self.rows:
             table.add_row(*map(terminal_text, row))
         yield table
@@ -70,7 +78,8 @@ def parameter_table(number: int, first: Calibration, second: Calibration, method
         rows.append((short, *_parameter(one), *_parameter(other), percent(difference)))
     errors = "‖ρ‖/‖Y‖", *(cell for c in (first, second) for cell in (f"{c.relative_error_percent.total:.2f} %", "")), ""
     return PaperTable(
-        title=f"Table {number}: essential parameters, {method}",
+        number=number,
+        title=f"essential parameters, {method}",
         headings=("parameter", "10 CAD: value", "%σ", "mass alone: value", "%σ", "%e"),
         rows=(*rows, errors),
         notes=(
@@ -97,7 +106,8 @@ def gain_table(number: int, first: Calibration, second: Calibration, method: str
     )
     means = [_mean([abs(gain.change_percent) for gain in c.gains]) for c in (first, second)]
     return PaperTable(
-        title=f"Table {number}: drive gains, {method}",
+        number=number,
+        title=f"drive gains, {method}",
         headings=("axis", "a priori", "10 CAD: gain", "%σ", "%e", "mass alone: gain", "%σ", "%e"),
         rows=(*rows, ("mean", "", "", "", percent(means[0]), "", "", percent(means[1]))),
         notes=("%e is the change from the a priori gain.", SIGMA_NOTE),
@@ -107,10 +117,14 @@ def gain_table(number: int, first: Calibration, second: Calibration, method: str
 def condition_table(found: CrossValidation) -> PaperTable:
     """Build Table 5: condition number of each run."""
     return PaperTable(
-        title="Table 5: condition number of each run's observation matrix",
+        number=5,
+        title="condition number of each run's observation matrix",
         headings=("", *(run.run for run in found.runs)),
         rows=(("cond(W)", *(NONE if run.condition is None else f"{run.condition:.0f}" for run in found.runs)),),
-        notes=("Base parameters of the run, its payload taken as part of the last link; rows of each joint weighted.",),
+        notes=(
+            "A small number means that the moves show all base parameters of the run evenly; its payload is taken as "
+            "part of the last link. `plan` allows 3500, for a closed chain 1e5.",
+        ),
     )
 
 
@@ -134,7 +148,8 @@ def error_table(found: CrossValidation) -> PaperTable:
     unmet = [f"{', '.join(runs)}: {reason}." for reason, runs in reasons.items()]
     seen = sorted({run.run for run in found.runs if run.seen_by})
     return PaperTable(
-        title="Table 6: relative error norms ‖ρ‖/‖Y‖ [%]",
+        number=6,
+        title="relative error norms ‖ρ‖/‖Y‖ [%]",
         headings=("run, joint", *labels),
         rows=(*rows, ("mean", *(percent(mean) for mean in means))),
         notes=(*([f"Used by a fit: {', '.join(seen)}."] if seen else ()), *unmet),
@@ -168,25 +183,28 @@ def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -
             columns.append((f"{mass.mass_kg:.3f}", *map(percent, percents)))
             if mass.error_percent is not None:
                 errors[label].append(mass.error_percent)
-        figures = zip((f"{run.run}, kg", "%σ", "%σ with the calibration's", "%e"), *columns, strict=True)
-        rows += [row for row in figures if row[0] != "%e" or run.weighed_kg is not None]
+        names = (f"{run.run}, kg", "σ %, moves alone", "σ %, with the calibration's", ERROR_ROW)
+        figures = zip(names, *columns, strict=True)
+        rows += [row for row in figures if row[0] != ERROR_ROW or run.weighed_kg is not None]
     weighed = runs[0].weighed_kg
     if weighed is not None:
-        rows.append(("mean %e", *(percent(_mean(errors[label])) for label in labels)))
+        rows.append((f"mean {ERROR_ROW}", *(percent(_mean(errors[label])) for label in labels)))
     of = f"{weighed:g} kg" if weighed is not None else "not weighed"
-    method = (
-        "Robot and payload together from this run and the runs without load (§2.4)"
+    how = (
+        "robot and payload together, from this run and the runs without load"
         if found.with_bare_runs
-        else "The payload and the joints' friction, on the robot of the calibration"
+        else "the payload and the joints' friction, on the robot of the calibration"
     )
+    # The label of gains that no calibration has is for documents; a reader knows them by the cell file's word.
+    shown = ("nameplate" if label == MANUFACTURER and label not in found.calibrations else label for label in labels)
     return PaperTable(
-        title=f"Table {number}: payload mass of {name} ({mounting}), {of}",
-        headings=("run", *labels),
+        number=number,
+        title=f"mass of payload {name} ({mounting}), {of}",
+        headings=("run", *shown),
         rows=tuple(rows),
         notes=(
-            f"{method}; gains held, effects in the model, all ten parameters of the payload unknown. %σ: from the "
-            "scatter of the moves; below it with the errors of the calibration. A scale is a weak check: errors of "
-            "several axes can cancel.",
+            f"Found by the gains of each column: {how}. Gains that find the mass of the scale may still be wrong: "
+            "errors of several axes can cancel.",
             *dict.fromkeys(notes),
         ),
     )

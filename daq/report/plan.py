@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from daq.config.cell import Cell
+import numpy as np
+
+from daq.config.cell import Cell, joint_unit
 from daq.workflow.experiment import Experiment
 from daq.workflow.plan import Plan
-from ident.planning.verdict import Identifiability
+from daq.workflow.plan_file import LONGEST_S
+from ident.planning.verdict import GOOD_PERCENT, Identifiability, Verdict
 
 
 def plan_document(
@@ -54,6 +57,38 @@ def _nothing_hidden(judged: Identifiability) -> tuple[str, ...]:
     return (f"Internal preload obscures no gain: these moves determine {directions}.",)
 
 
+def _to_get_good(cell: Cell, made: Plan, judged: Identifiability) -> tuple[str, ...]:
+    """Say what makes weak gains good; σ falls with the square root of the time."""
+    weak = [gain for gain in judged.gains if gain.verdict is not Verdict.GOOD]
+    if not weak:
+        return ()
+    seconds = made.duration_s * (max(gain.std_percent for gain in weak) / GOOD_PERCENT) ** 2
+    longer = f"a longer run (some --duration {10.0 * math.ceil(seconds / 10.0):.0f})" if seconds <= LONGEST_S else ""
+    ways = (longer, "a heavier payload", "wider limits of position, speed and acceleration in the cell file")
+    names = ", ".join(cell.axes[gain.axis].name for gain in weak)
+    return (f"For good gains ({GOOD_PERCENT:g} %) of {names}: {'; or '.join(way for way in ways if way)}.",)
+
+
+def _assembly(cell: Cell, experiment: Experiment) -> tuple[str, ...]:
+    """Positions of the joints without a motor that close the loops, to compare with the real robot."""
+    if cell.chain is None:
+        return ()
+    robot = experiment.scene.checker.robot
+    position = experiment.design.expectation.model.assembly.position_rad
+
+    def listed(joints: tuple[int, ...]) -> str:
+        units = [joint_unit(robot.joints[joint].kind) for joint in joints]
+        # Adding zero removes the sign of a rounded -0.
+        values = (np.round(position[joint] / unit.si, 1) + 0.0 for joint, unit in zip(joints, units, strict=True))
+        parts = zip(joints, values, units, strict=True)
+        return ", ".join(f"{robot.joints[joint].name} {value:g} {unit.name}" for joint, value, unit in parts)
+
+    return (
+        f"Assembly pose, to compare with the robot: {listed(robot.passive_joints)} while the motors' joints are at "
+        f"{listed(robot.axis_joints)}.",
+    )
+
+
 def plan_text(
     out: Path, preview: Path | None, cell: Cell, experiment: Experiment, made: Plan, judged: Identifiability
 ) -> str:
@@ -69,7 +104,10 @@ def plan_text(
         ),
         *(f"  {gain.words(axis.name)}" for axis, gain in zip(cell.axes, judged.gains, strict=True)),
         *(judged.sentences(cell.axis_names) or _nothing_hidden(judged)),
-        "Assumed: " + "; ".join(experiment.remarks) + ".",
+        *_to_get_good(cell, made, judged),
+        *_assembly(cell, experiment),
+        "Assumed:",
+        *(f"  {remark}" for remark in experiment.remarks),
         f"Read the plan before the robot executes it{look}. "
         + (
             "`record` checks the way to its first target from where the robot stands."

@@ -178,6 +178,8 @@ def _facts(cell: Cell, checker: Checker, drawn: Mapping[str, Any]) -> Iterator[s
         yield f"They come {-lowest_m:.2f} m below z = 0, the plane of the grid: is there a floor or a table?"
     declared = cell.clearance is not None and bool(cell.clearance.capsules)
     shape = "that of the cell file" if declared else "a guess from the URDF; the real arm may be thicker"
+    if cell.chain is not None and not declared:
+        shape = "unknown: links of a closed chain are not guessed, and nothing keeps them apart"
     yield f"The shape of the arm is {shape}."
     bodies = {"obstacle": checker.scene.boxes, "workspace": checker.scene.workspace}
     if missing := [word for word, found in bodies.items() if not found]:

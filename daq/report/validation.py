@@ -25,7 +25,7 @@ from ident.calibration import Calibration
 
 
 def validation_view(calibration: Calibration, found: CrossValidation) -> Iterator[RenderableType]:
-    """Relative errors, doubts about the logs, and the paper's tables."""
+    """Relative errors, doubts about the logs, condition numbers and weighed payloads."""
     validations = found.validations
     headings = ("log", *(gain.axis for gain in calibration.gains), "total", "")
     table = plain_table(headings, title="Relative error ‖ρ‖/‖Y‖ [%]", left=(0, len(headings) - 1), wrap=(0,))
@@ -55,7 +55,7 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
     yield from (Text(printable(doubt), style="bold") for doubt in doubts)
     for paper_table in validation_tables(found, complete=False):
         yield ""
-        yield from paper_table.view()
+        yield from paper_table.view(numbered=False)
 
 
 def validation_tables(found: CrossValidation, *, complete: bool) -> list[paper_tables.PaperTable]:

@@ -15,12 +15,14 @@ from daq.files import replace_file
 from daq.report.fit import error_document
 from daq.report.gains import with_deviation
 from daq.report.picture import BLACK, ORANGE, SKY, legend_below, panels, render, unformatted
-from daq.report.text import picked, plain_table
+from daq.report.text import picked, plain_table, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
 from daq.workflow.weigh import Weighed
 from ident.contact import ExternalTorque
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, pseudo_inertia
+from ident.model.robot import Place
 from ident.model.urdf import read_urdf
+from ident.weighing import KNOWN
 
 LISTED = 20  #: Contacts shown in a terminal; `--json` has all
 NOISE_ROWS = 4.0
@@ -35,10 +37,16 @@ def weighed_view(found: Weighed) -> Iterator[RenderableType]:
     table.add_row("mass", with_deviation(body.mass_kg, body.mass_std_kg), "kg")
     for name, value, std in zip("xyz", 1000.0 * centre, 1000.0 * centre_std, strict=True):
         table.add_row(f"centre {name}", with_deviation(value, std), "mm")
+    platform = _platform(found.cell)
+    if platform is not None:
+        link, (centre, centre_std) = platform[0], body.centre_in(platform[1])
+        for name, value, std in zip("xyz", 1000.0 * centre, 1000.0 * centre_std, strict=True):
+            table.add_row(terminal_text(f"centre {name} in {link}"), with_deviation(value, std), "mm")
     for name, value, std in zip(LINK_PARAMETERS[:6], inertia, inertia_std, strict=True):
         table.add_row(f"{name} about the centre", with_deviation(value, std), "kg m²")
     yield table
-    yield f"In the frame of {carrier_text(found.cell)}."
+    but = "" if platform is None else f"; `centre … in {platform[0]}` is in the link's own frame"
+    yield f"In the frame of {carrier_text(found.cell)}{but}."
     if found.declared_kg is not None:
         yield f"The logs declare {found.declared_kg:g} kg: {100.0 * (body.mass_kg / found.declared_kg - 1.0):+.2f} %."
     within = "moves, gains, robot and effects" if body.complete else "moves and gains"
@@ -51,6 +59,11 @@ def weighed_view(found: Weighed) -> Iterator[RenderableType]:
         ten.add_row(name, with_deviation(value, std), unit, "yes" if identifiable else "no")
     yield ""
     yield ten
+    if any(np.isfinite(body.std) & ~body.identifiable):
+        yield (
+            f"no beside a σ: it is more than {100 * KNOWN:.0f} % of the value, and 2 σ is more than a steel cube of "
+            "this mass has."
+        )
     # Below the table: beside the rows they would push σ and unit off a terminal of 80 columns.
     yield from (f"{one.name}: add {one.seconds:.0f} s of {one.words} (σ {one.std:.2g})" for one in found.help)
     yield from (Text(doubt, style="bold") for doubt in _doubts(found))
@@ -83,10 +96,19 @@ def carrier_text(cell: Cell) -> str:
     return f"{name}, in which the link {cell.chain.platform} is at ({x:.4g}, {y:.4g}, {z:.4g}) mm"
 
 
+def _platform(cell: Cell) -> tuple[str, Place] | None:
+    """Platform's link and its frame in that of the joint that carries it; None where it is that joint's frame."""
+    if cell.chain is None or cell.chain.platform is None:
+        return None
+    frame = read_urdf(cell.urdf).links[cell.chain.platform]
+    same = np.allclose(frame.rotation, np.eye(3)) and not frame.translation_m.any()
+    return None if same else (cell.chain.platform, frame)
+
+
 def weighed_document(found: Weighed) -> dict[str, Any]:
     """Build `weigh --json`."""
     body, advice = found.body, {one.name: one for one in found.help}
-    moves_std = np.sqrt(np.diag(body.moves_covariance))
+    moves_std, platform = np.sqrt(np.diag(body.moves_covariance)), _platform(found.cell)
     return {
         "cell": found.cell.name,
         "logs": [str(log) for log in found.logs],
@@ -94,6 +116,7 @@ def weighed_document(found: Weighed) -> dict[str, Any]:
         "declared_kg": found.declared_kg,
         "mass_kg": {"value": body.mass_kg, "std": body.mass_std_kg},
         "centre_m": _pair(*body.centre_m),
+        "centre_in_platform_m": None if platform is None else _pair(*body.centre_in(platform[1])),
         "inertia_about_centre_kg_m2": _pair(*body.inertia_kg_m2),
         "parameters": [
             {

@@ -50,15 +50,18 @@ class CheckedScene:
     def remarks(self) -> tuple[str, ...]:
         """Remarks for the operator."""
         scene = self.checker.scene
-        shape = "a guess from the joint chain; declare `clearance` in the cell file" if self.guessed else "as declared"
+        known = "guessed from the joint chain; declare `clearance` in the cell file" if self.guessed else "as declared"
+        shape = f"shape of the arm: {len(scene.capsules)} capsules, {known}"
         if self.guessed and self.checker.robot.closures:
-            shape = "of a closed chain is not guessed; declare `clearance` in the cell file"
-        lines = [f"arm of {len(scene.capsules)} capsules, {shape}; {1000 * scene.minimum_m:.0f} mm kept"]
+            shape = (
+                "shape of the links: unknown, of a closed chain it is not guessed; declare `clearance` in the cell file"
+            )
+        lines = [shape, f"clearance: {1000 * scene.minimum_m:.0f} mm"]
         if self.together:
             pairs = ", ".join(f"{first} and {second}" for first, second in self.together)
-            lines.append(f"left unchecked, as they touch in nearly every posture: {pairs}")
+            lines.append(f"not checked against each other, as they touch in nearly every posture: {pairs}")
         if not scene.boxes and scene.workspace is None:
-            lines.append("no obstacles and no workspace declared: tables, cables and people are not known")
+            lines.append("obstacles and workspace: none declared; tables, cables and people are not known")
         return tuple(lines)
 
 
@@ -209,8 +212,9 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     )
     scene = scene_of(cell, model.robot, mounted.mass_kg)
     remarks = (
-        f"payload {mounted.name}, {mounted.mass_kg:g} kg" + ("" if from_urdf else "; link masses guessed"),
-        f"noise {100 * NOISE_SHARE:g} % of the current at each motor's torque limit, correlation {LAG_ONE:g} from row "
+        f"payload: {mounted.name}, {mounted.mass_kg:g} kg",
+        f"masses of the links: {'from the URDF' if from_urdf else 'guessed'}",
+        f"noise: {100 * NOISE_SHARE:g} % of each motor's current at its torque limit, correlation {LAG_ONE:g} from row "
         "to row",
         *scene.remarks,
     )

@@ -14,7 +14,7 @@ from ident.data.run import Run
 from ident.errors import DataUnfit, TooFewMoves
 from ident.estimators.estimate import RelativeError
 from ident.model.bodies import LINK_PARAMETERS, Payload, body_of
-from ident.model.robot import Motion
+from ident.model.robot import Motion, Place
 from ident.planning.excitation import Excitation
 from ident.planning.verdict import ExtraMoves
 from ident.weighing import RowsToWeigh, Scale, WeighedBody, moves_that_help, rows_to_weigh, weigh, weigh_rows
@@ -194,9 +194,32 @@ def test_centre_and_inertia_are_those_of_the_ten(seed: int) -> None:
     (centre, centre_std), (inertia, inertia_std) = found.centre_m, found.inertia_kg_m2
     upper = np.triu_indices(3)
     body, near = body_of(ten), body_of(ten + step)
+    frame = Place(0, np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([0.4, 0.1, 0.0]))
+    placed, placed_std = found.centre_in(frame)
+    x, y, z = body.centre_m
+    assert placed == pytest.approx([y - 0.1, 0.4 - x, z])  # a quarter turn about z
+    assert placed_std == pytest.approx(centre_std[[1, 0, 2]])
+    planar = replace(found, values=np.where(np.arange(10) == 8, np.nan, ten))  # no mz, so no z
+    assert planar.centre_in(frame)[0] == pytest.approx([y - 0.1, 0.4 - x, np.nan], nan_ok=True)
     assert centre == pytest.approx(body.centre_m)
     assert inertia == pytest.approx(body.inertia_kg_m2[upper], abs=1e-12)
     assert centre_std == pytest.approx(np.abs(near.centre_m - body.centre_m), rel=1e-2, abs=1e-9)
     assert inertia_std == pytest.approx(np.abs(near.inertia_kg_m2 - body.inertia_kg_m2)[upper], rel=1e-2, abs=1e-9)
     lost = replace(found, values=np.where(np.arange(10) == 6, np.nan, ten))
     assert np.isnan(lost.centre_m[0]).tolist() == [True, False, False]
+
+
+def test_a_parameter_with_a_long_lever_is_identified_though_a_compact_body_has_less() -> None:
+    """Izz of 5 kg, 0.45 m from the joint, known to 2 %: twice σ is more than a steel cube of that mass has."""
+    ten = np.array([np.nan, np.nan, np.nan, np.nan, np.nan, 1.0, 2.2, 0.01, np.nan, 5.0])
+
+    def identified(std_of_izz: float) -> list[str]:
+        std = np.where(np.isnan(ten), np.nan, 0.01)
+        std[5] = std_of_izz
+        covariance = np.diag(std**2)
+        body = WeighedBody(ten, covariance, covariance, True, 9, RelativeError((), 0.0), Scale.__new__(Scale))
+        return [name for name, known in zip(LINK_PARAMETERS, body.identifiable, strict=True) if known]
+
+    assert 2.0 * 0.02 > 5.0 * (5.0 / 7850.0) ** (2.0 / 3.0)
+    assert identified(0.02) == ["Izz", "mx", "my", "m"]  # my is near zero, and known to less than the cube's
+    assert identified(0.2) == ["mx", "my", "m"]

@@ -20,7 +20,7 @@ from daq.cli import main
 from daq.cli.app import BY_JOB, VERBS
 from daq.cli.init import INIT
 from daq.cli.terminal import say_written
-from daq.cli.verb import Job, Listed, cell_here, continued
+from daq.cli.verb import Job, Listed, cell_here, cells_in, continued
 from daq.config.cell import PacingMode
 from daq.config.cell_file import load_cell
 from daq.config.import_description import load_import
@@ -78,7 +78,7 @@ def test_an_example_uses_the_cell_file_of_the_folder(
     assert main(["init", "other-cells/lathe"]) == 0
     assert main(["init", example]) == 0
     assert cell_here().is_file()
-    assert cell_here("press-4") == Path("press-4/cells/press-4.yaml")
+    assert [*cells_in(Path(), "press-4")] == [Path("press-4/cells/press-4.yaml")]
     monkeypatch.chdir(tmp_path / "other-cells" / "lathe")
     assert main(["scan", "-h"]) == 0
     assert capsys.readouterr().out.splitlines()[-1].strip() == "drivegain scan cells/lathe.yaml"

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from daq.cli.plan import say_how_to_resume
 from daq.cli.record import _interrupted
 from daq.cli.terminal import GRACE_S, SIGNALS, delay_signals, interruptible
 from daq.errors import ExitCode
@@ -129,3 +130,12 @@ sys.exit(main(["explain-emcy", "--help"]))
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (ExitCode.INTERRUPTED, "", "interrupted\n")
+
+
+def test_an_interrupted_plan_says_how_to_get_what_it_had(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(KeyboardInterrupt), say_how_to_resume([0, 8, 16], 3000):
+        raise KeyboardInterrupt
+    assert capsys.readouterr().err == "16 of 3000 exchanges were tried; --exchanges 16 writes their plan\n"
+    with pytest.raises(KeyboardInterrupt), say_how_to_resume([0], 3000):
+        raise KeyboardInterrupt
+    assert capsys.readouterr().err == ""

@@ -16,13 +16,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
+from rich.table import Table
 
 from daq.cli.app import main
 from daq.config.bus import answer_us, bus_loads_percent, drive_axes
 from daq.config.cell import Cell, PacingMode, model_of
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
-from daq.report.bus import monitor_document, monitor_view
+from daq.report.bus import monitor_document, monitor_view, prediction_view
 from daq.report.bus_schemas import MonitorReport
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.events import event_document
@@ -271,6 +272,15 @@ def test_what_is_not_known_is_shown_as_that() -> None:
     assert "+5 raw" in text
     assert "(SILENT)" in text
     assert "operation enabled (ENABLED)" in text
+    assert "no power" not in text
+    off = tuple(replace(axis, statusword=0x250) for axis in reading.axes[:5])
+    without = replace(reading, axes=(*off, dead))
+    document = monitor_document(CELL, WatchedCell(without, joint_positions(CELL, without), ampere, ()))
+    assert document["axes"][0]["current_a"] == pytest.approx(0.01)  # the document has what the drive says
+    out = io.StringIO()
+    Console(file=out, width=100).print(monitor_view(document))
+    assert out.getvalue().count("no power") == 5
+    assert " A " not in out.getvalue()
     assert "\x1b[2J" not in text
 
 
@@ -317,7 +327,7 @@ def test_a_cell_that_is_not_there_is_a_device_fault(cell: Path, capsys: pytest.C
     assert main(["monitor", str(cell), "--once", "--interval", "0.1"]) == ExitCode.DEVICE_FAULT
     streams = capsys.readouterr()
     assert "(SILENT)" in streams.out
-    assert "did not answer" in streams.err
+    assert "start `drivegain simulate demo`" in streams.err
 
 
 def test_our_own_recorder_is_no_other_master(tmp_path: Path) -> None:
@@ -392,6 +402,10 @@ def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong
     Console(file=out, width=80, force_terminal=True, color_system="standard").print(monitor_view(document))
     coloured = [line for line in out.getvalue().splitlines() if "33m" in line]
     assert [line.split("J")[1][0] for line in coloured] == (["4"] if factor > 1.0 else [])
+    document["axes"][0]["enabled"] = False
+    _, without = prediction_view(document)
+    assert isinstance(without, Table)
+    assert next(str(cell) for cell in without.columns[1].cells) == "no power"
     bus.coming.clear()
     document = monitor_document(CELL, watch.read(0.5))
     assert document["prediction"]["remark"] == "no prediction: there is no SYNC"

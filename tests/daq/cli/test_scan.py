@@ -14,7 +14,8 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from daq.cli import main
-from daq.config.bus import bus_address
+from daq.cli.scan import no_answer
+from daq.config.bus import bus_address, drive_axes
 from daq.config.cell import Cell
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.errors import ExitCode
@@ -80,6 +81,20 @@ def test_a_narrow_terminal_gets_every_column_and_whole_words(cell: Cell) -> None
         assert text.count("ENABLED") == 6
         assert text.count("pre-operational") == 6
         assert all(str(1000 + number) in text for number in range(1, 7))
+
+
+def test_a_virtual_bus_without_a_cell_names_the_simulation(checkout: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scan", str(checkout / "configs/cells/five-bar.yaml"), "--wait", "0.05"]) == ExitCode.DEVICE_FAULT
+    said = capsys.readouterr().err
+    assert "start `drivegain simulate five-bar`" in said
+    assert "wiring" not in said
+
+
+def test_a_real_bus_without_a_node_names_the_wiring(cell: Cell) -> None:
+    real = replace(cell, buses=(replace(cell.buses[0], interface="socketcan"),))
+    axes = drive_axes(real)
+    assert "check power, wiring" in str(no_answer(real, axes, (), 0.5))
+    assert "check power, wiring" in str(no_answer(cell, axes[1:], (1,), 0.5))  # one answered: a cell is there
 
 
 def test_a_message_names_the_axis_first(cell: Cell) -> None:

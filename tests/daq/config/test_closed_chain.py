@@ -105,9 +105,23 @@ def _cell(folder: Path, *changes: tuple[str, str], name: str = "five-bar") -> Ce
         pytest.param(
             "- name: crank-2\n",
             "- name: elbow-1\n",
-            "33: axes[1].name: found elbow-1, the name of a joint without a motor; expected another name: an effect "
-            "may act on that joint",
+            "6: robot.motors[1]: found crank-2 as the joint of axis elbow-1, and joint elbow-1 without a motor; "
+            "expected elbow-1, or another name of that axis (`axes[1].name`)",
             id="axis named as a joint without a motor",
+        ),
+        pytest.param(
+            MOTORS,
+            "motors: [crank-1, elbow-2]",
+            "6: robot.motors[1]: found elbow-2 as the joint of axis crank-2, and joint crank-2 without a motor; "
+            "expected crank-2, or another name of that axis (`axes[1].name`)",
+            id="a joint without a motor among the motors",
+        ),
+        pytest.param(
+            MOTORS,
+            "motors: [crank-1, crank-2, elbow-1]",
+            "6: robot.motors: found 3 joints for 2 axes; expected the joint of each axis, in their order (crank-1, "
+            "crank-2)",
+            id="more motors than axes",
         ),
         pytest.param(
             "mass_tolerance_kg: 0.005\n",
@@ -122,6 +136,17 @@ def test_a_bad_description_is_refused_by_name(tmp_path: Path, old: str, new: str
     with pytest.raises(ConfigurationInconsistent) as refusal:
         _cell(tmp_path, (old, new))
     assert str(refusal.value) == f"{tmp_path}/cell.yaml:{message}; correct the cell file"
+
+
+def test_a_coupled_drive_train_of_a_redundant_robot_is_refused(tmp_path: Path) -> None:
+    """Such a model cannot be fitted; the refusal comes before a plan or a recording."""
+    with pytest.raises(ConfigurationInconsistent) as refusal:
+        _cell(tmp_path, ("- [0, 0, -5, 0]", "- [0, 1, -5, 0]"), name="dualv")
+    assert str(refusal.value) == (
+        f"{tmp_path}/cell.yaml:20: drive_train.ratio[2]: found the motor of crank-3 also turns with crank-2; expected "
+        "zeros off the diagonal: 4 motors for 3 degrees of freedom; correct the cell file"
+    )
+    assert _cell(tmp_path, ("- [0, -50]", "- [10, -50]")).ratio[1, 0] == 10.0  # two motors, two degrees of freedom
 
 
 def test_a_singular_start_is_refused(tmp_path: Path) -> None:

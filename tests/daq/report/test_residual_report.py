@@ -225,6 +225,17 @@ def test_the_page_says_the_outcome_first(closed: Closed, shown: Reader) -> None:
     assert "scales all gains alike" in page.text
 
 
+def test_an_effect_that_hardly_lowers_the_error_is_called_small(closed: Closed) -> None:
+    (turn, *others) = closed.account.turns
+    assert turn is not None
+    assert turn.before.holdout is not None
+    nearly = replace(turn.before.holdout, axes=tuple(0.95 * error for error in turn.before.holdout.axes))
+    small = replace(turn, after=replace(turn.after, holdout=nearly))
+    sentences = summary(closed.fitted, replace(closed.account, turns=(small, *others)))
+    assert any(one.startswith("J3 has a spring, a small effect: the error of J3 on held-out") for one in sentences)
+    assert not any("a small effect" in one for one in summary(closed.fitted, closed.account))
+
+
 def test_what_files_say_is_escaped(closed: Closed) -> None:
     fitted = closed.fitted
     axes = tuple(replace(axis, name=f"{axis.name}{HOSTILE}") for axis in fitted.cell.axes)
@@ -423,6 +434,9 @@ def test_effects_that_held_out_runs_refute_are_not_written(
 def test_what_rises_is_not_said_to_fall() -> None:
     assert error_change_text(6.94, 2.8) == "falls from 6.9 to 2.8 %"
     assert error_change_text(2.8, 6.9) == "rises from 2.8 to 6.9 %"
+    assert error_change_text(2.39, 2.34) == "falls slightly, from 2.4 to 2.3 %"
+    assert error_change_text(2.34, 2.39) == "rises from 2.3 to 2.4 %"
+    assert error_change_text(2.4, 2.1) == "falls from 2.4 to 2.1 %"
     assert error_change_text(2.81, 2.79) == "stays at 2.8 %"
 
 

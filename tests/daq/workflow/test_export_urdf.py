@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ from ident.model.bodies import Body
 from ident.model.model import DriveTrain, Model
 from ident.model.urdf import robot_from_urdf
 from ident.physical.physical import random_motion, urdf_links
+from tests.daq.calibrations import demo_calibration
 from tests.ident.arms import GANTRY
 
 FloatArray = NDArray[np.float64]
@@ -193,6 +195,24 @@ def test_what_is_refused_and_with_which_code(
     assert _export(calibration, "--urdf", bomb, "--out", out) == 6
     assert "document type" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_a_closed_chain_is_refused_without_the_solver_too(
+    checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(daq.workflow.urdf_export, "find_spec", lambda _: None)
+    five_bar = replace(
+        demo_calibration(),
+        cell="five-bar",
+        gains=tuple(Gain(f"crank-{number}", 7.0, 0.01, "Nm/A", 7.0) for number in (1, 2)),
+    )
+    save_calibration(five_bar, tmp_path / "calibration.yaml")
+    cell = checkout / "configs/cells/five-bar.yaml"
+    assert _export(cell, tmp_path / "calibration.yaml", "--out", tmp_path / "out.urdf") == 2
+    said = capsys.readouterr().err
+    assert "a closed chain: some of its joints have no motor" in said
+    assert "physical" not in said
+    assert not (tmp_path / "out.urdf").exists()
 
 
 def test_no_input_and_no_foreign_file_is_overwritten(

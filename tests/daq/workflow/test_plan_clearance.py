@@ -80,7 +80,7 @@ def test_a_guessed_arm_has_a_payload_and_room_to_move(name: str) -> None:
     assert found.guessed
     assert found.checker.scene.capsules[-1].name == "payload"
     assert any("guess" in line for line in found.remarks)
-    assert any("no obstacles" in line for line in found.remarks)
+    assert any("obstacles and workspace: none declared" in line for line in found.remarks)
     lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
     postures = np.random.default_rng(3).uniform(lower, upper, (300, len(lower)))
     assert float((found.checker.margins(postures) > 0.0).mean()) > 0.3

@@ -13,6 +13,7 @@ from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
 from daq.report.plan import plan_document, plan_text
+from daq.report.plan_preview import preview_page
 from daq.workflow.experiment import RUNS, Experiment, experiment_of, paths_of
 from daq.workflow.plan import Plan, plan
 from ident.planning.verdict import Hidden, verdicts
@@ -58,6 +59,64 @@ def test_the_planners_own_plan_shows_every_gain(cell: Cell, experiment: Experime
     assert ((targets >= lower) & (targets <= upper)).all()
     text = plan_text(Path("plan.yaml"), None, cell, experiment, made, judged)
     assert "Internal preload obscures no gain: these moves determine 4 of 4 independent directions" in text
+    assert "\nAssumed:\n  payload: disc, 8.2 kg\n" in text
+    assert max(len(line) for line in text.partition("Assumed:")[2].splitlines()[:7]) < 110
+    page = preview_page(cell, made.moves, experiment.scene.checker, b"plan")
+    assert "The shape of the arm is unknown: links of a closed chain are not guessed" in page
+
+
+def test_a_weak_gain_is_told_how_to_become_good(cell: Cell, experiment: Experiment, made: Plan) -> None:
+    """σ falls with the square root of the time: the same moves made so many times over are good."""
+    excitation = experiment.excitation(paths_of(cell, made.moves))[0]
+    judged = verdicts(experiment.design, [(excitation, RUNS)])
+    worst = max(gain.std_percent for gain in judged.gains)
+    assert worst > 1.0
+    (line,) = (
+        line
+        for line in plan_text(Path("plan.yaml"), None, cell, experiment, made, judged).splitlines()
+        if line.startswith("For good gains (1 %)")
+    )
+    seconds = float(line.partition("--duration ")[2].partition(")")[0])
+    assert "a heavier payload" in line
+    repeated = verdicts(experiment.design, [(excitation, RUNS)] * int(np.ceil(seconds / made.duration_s)))
+    assert max(gain.std_percent for gain in repeated.gains) <= 1.0
+    good = replace(judged, gains=repeated.gains)
+    assert "For good gains" not in plan_text(Path("plan.yaml"), None, cell, experiment, made, good)
+
+
+def test_the_assembly_pose_that_was_found_is_shown(tmp_path: Path) -> None:
+    """Bent elbows, declared roughly: the pose shown is the one that closes the loop."""
+    text = (shipped_configurations() / "cells" / "five-bar.yaml").read_text(encoding="utf-8")
+    text = text.replace("../", f"{shipped_configurations()}/")
+    text = text.replace("crank-1: 0, elbow-1: 0, crank-2: 0, elbow-2: 0", "elbow-1: 3, elbow-2: 4")
+    (tmp_path / "cell.yaml").write_text(text, encoding="utf-8")
+    five_bar = load_cell(tmp_path / "cell.yaml")
+    experiment = experiment_of(five_bar)
+    made = plan(five_bar, seed=1, duration_s=SECONDS, exchanges=0, experiment=experiment)
+    judged = verdicts(experiment.design, [(experiment.excitation(paths_of(five_bar, made.moves))[0], RUNS)])
+    text = plan_text(Path("plan.yaml"), None, five_bar, experiment, made, judged)
+    (line,) = (line for line in text.splitlines() if line.startswith("Assembly pose"))
+    assert line == (
+        "Assembly pose, to compare with the robot: elbow-1 0 deg, elbow-2 0 deg while the motors' joints are at "
+        "crank-1 0 deg, crank-2 0 deg."
+    )
+
+
+def test_an_interrupted_search_is_repeated_by_its_number_of_exchanges(cell: Cell, experiment: Experiment) -> None:
+    """What `plan` says when it is interrupted: the first exchanges do not depend on how many are to come."""
+
+    def reported(tries: int) -> list[tuple[int, float]]:
+        reports = list[tuple[int, float]]()
+
+        def note(done: int, worst: float) -> None:
+            reports.append((done, worst))
+
+        plan(cell, seed=4, duration_s=SECONDS, exchanges=tries, experiment=experiment, progress=note)
+        return reports
+
+    longer = reported(16)
+    assert [done for done, _ in longer] == [8, 16]
+    assert longer[:1] == reported(8)
 
 
 def test_the_same_moves_around_one_pose_hide_gains(cell: Cell, experiment: Experiment, made: Plan) -> None:

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from daq.cli import main
+from daq.cli.validate import cell_of
+from daq.config.cell_file import load_cell
 from daq.errors import CalibrationUnreadable
 from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.validate import DataUse, conditioning_of, together, validate, warn_without_temperature
@@ -51,6 +53,26 @@ def test_text_and_picture(real: tuple[Path, Path], tmp_path: Path, capsys: pytes
     error = capsys.readouterr().err
     assert f"error:    {tmp_path / 'occupied'}\n" in error
     assert "expected: a folder" in error
+
+
+def test_the_next_step_names_the_cell_file_that_the_logs_carry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, checkout: Path
+) -> None:
+    shipped = (checkout / "configs/cells/demo.yaml").read_text(encoding="utf-8")
+    shipped = shipped.replace("../", f"{checkout}/configs/")
+    other, own = tmp_path / "a/cells/demo.yaml", tmp_path / "mine/own.yaml"
+    for file, kg in ((other, "4.59"), (own, "4.58")):
+        file.parent.mkdir(parents=True)
+        file.write_text(shipped.replace("mass_kg: 4.59", f"mass_kg: {kg}"), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    fitted = replace(demo_calibration(), cell="demo", recording_configuration_sha256=load_cell(own).recording_digest)
+    logs = [Path("mine/log.mcap")]
+    assert cell_of(fitted, logs) == Path("mine/own.yaml")
+    unknown = replace(fitted, recording_configuration_sha256=None)
+    assert cell_of(unknown, logs) == Path("CELL")
+    assert cell_of(unknown, [Path("log.mcap")]) == Path("a/cells/demo.yaml")
+    own.write_text("name: demo\nrobot:\n", encoding="utf-8")  # one that cannot be read is no reason to fail
+    assert cell_of(fitted, logs) == Path("CELL")
 
 
 def test_what_a_calibration_has_met_and_what_it_was_made_with(real: tuple[Path, Path]) -> None:

@@ -11,11 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 from rich.console import Console, RenderableType
 
 from daq.cli import main
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
+from daq.report.fit_schemas import WeighReport
+from daq.report.text import json_text
 from daq.report.weighing import contact_document, contact_view, weighed_document, weighed_view
 from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.weigh import Weighed
@@ -56,6 +59,16 @@ def test_a_real_flange_without_a_body_weighs_nothing(
     assert "No body shows" in text
     mass, std = map(float, text.partition("mass ")[2].split("kg")[0].split("±"))
     assert abs(mass) < 3.0 * std < 0.3
+
+
+def test_a_calibration_comes_first_or_as_an_option(real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    file, log = map(str, real)
+    for verb in ("weigh", "validate"):
+        printed = []
+        for words in ([file, log], [log, "--calibration", file], [f"--calibration={file}", log]):
+            assert main([verb, *words, "--json"]) == ExitCode.OK
+            printed.append(capsys.readouterr().out)
+        assert printed[0] == printed[1] == printed[2]
 
 
 def test_a_log_that_declares_a_payload_is_not_bare(
@@ -109,6 +122,27 @@ def test_a_weighed_body_is_shown_with_what_would_help(checkout: Path) -> None:
     assert [one["name"] for one in document["parameters"] if not one["identifiable"]] == ["mz"]
     nothing = replace(found, body=replace(body, values=np.full(10, 0.001)), declared_kg=None)
     assert "No body shows" in _text(weighed_view(nothing))
+
+
+def test_the_centre_is_shown_in_the_platforms_frame_too(checkout: Path) -> None:
+    """The plate of the five-bar is 450 mm from its joint; a planar robot shows Izz, two first moments and the mass."""
+    cell = load_cell(checkout / "configs/cells/five-bar.yaml")
+    ten = np.array([np.nan] * 5 + [1.0, 2.16, 0.15, np.nan, 5.0])
+    std = np.where(np.isnan(ten), np.nan, 0.02)
+    std[5] = 0.2
+    covariance = np.diag(std**2)
+    body = WeighedBody(ten, covariance, covariance, True, 20, RelativeError((2.0,) * 2, 2.0), Scale.__new__(Scale))
+    found = Weighed(cell, (Path("a.mcap"),), (), body, (), 5.0)
+    text = _text(weighed_view(found))
+    assert re.search(r"centre x +432\.0 ± 4\.4 +mm", text)
+    assert re.search(r"centre x in plate +-18\.0 ± 4\.4 +mm", text)
+    assert "no beside a σ: it is more than 10 % of the value" in text
+    document = weighed_document(found)
+    TypeAdapter(WeighReport).validate_json(json_text(document))
+    assert document["centre_in_platform_m"]["value"] == pytest.approx([-0.018, 0.03, np.nan], nan_ok=True)
+    serial = replace(found, cell=load_cell(checkout / "configs/cells/demo.yaml"))
+    assert weighed_document(serial)["centre_in_platform_m"] is None
+    assert " in " not in _text(weighed_view(serial)).partition("In the frame")[0]
 
 
 def test_contacts_are_listed(checkout: Path) -> None:
