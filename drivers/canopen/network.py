@@ -439,8 +439,12 @@ class CanopenNetwork:
                 if state not in POWERLESS:
                     access.write(CONTROLWORD, next_command(state, Goal.QUICK_STOP))
 
-    def disable(self, axis: Axis) -> None:
+    def disable(self, axis: Axis, goal: Goal = Goal.QUICK_STOP) -> None:
         """Quick stop one axis by SDO, then remove its power, and confirm both by its statusword.
+
+        Args:
+            axis: to disable.
+            goal: SWITCH_ON_DISABLED removes the power of an axis that is known to stand still, without quick stop.
 
         Raises:
             StateRefused: not reached within ``bounds.disable_s``.
@@ -448,7 +452,6 @@ class CanopenNetwork:
         """
         access = self.link.objects(axis.node_id)
         deadline = self.link.clock() + round(self.bounds.disable_s * 1e9)
-        goal = Goal.QUICK_STOP
         while True:
             state = decode(statusword := access.read(STATUSWORD))
             self.see(axis, state)
