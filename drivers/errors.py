@@ -203,7 +203,14 @@ class SampleLost(DriverError):
 
 
 class MotionRefused(DriverError):
-    """Motion was requested without permission, or outside the limits."""
+    """Motion was requested without permission, or outside the limits.
+
+    Without `expected` and `remedy` the text of what was found has the rest.
+    """
+
+    def __init__(self, found: str, *, expected: str = "", remedy: str = "") -> None:
+        super().__init__(f"found {found}; expected {expected}; {remedy}" if remedy else found)
+        self.found, self.expected, self.remedy = found, expected, remedy
 
 
 class MotionTimeout(DriverError):

@@ -185,7 +185,7 @@ class CanopenNetwork:
             self.link.deadline_ns = self.link.clock() + round(self.bounds.closing_s * 1e9)
 
     def end_closing(self) -> None:
-        """Lift the time limit of `begin_closing`: the axes stand without power, and the network stays open."""
+        """Lift the time limit of `begin_closing`: the axes have no power, and the network stays open."""
         self.link.deadline_ns = None
 
     def scan(self, node_ids: Sequence[int] = range(1, 128), wait_s: float = 0.5) -> tuple[FoundNode, ...]:
