@@ -20,8 +20,7 @@ from daq.log.container import UNFINISHED
 from tests.daq.jobs.made import Made
 from tests.daq.jobs.rig import Rig, make_rig
 
-PART_BYTES = 60_000
-"""Size of an unfinished log in which the axes move: a run of one move writes several times as many."""
+SHARE = 0.5  #: Of the size of a whole log that is written when the job is killed: the axes move
 
 
 @contextmanager
@@ -52,8 +51,8 @@ def real_recorder(rig: Rig, made: Made) -> Rig:
     return rig
 
 
-def kill_while_recording(rig: Rig, name: str) -> None:
-    """Run the job in a process of its own, and kill it in the moves of this run."""
+def kill_while_recording(rig: Rig, name: str, part_bytes: float) -> None:
+    """Run the job in a process of its own, and kill it when the unfinished log of this run has that size."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of threads of the test runner
         child = os.fork()
@@ -65,7 +64,7 @@ def kill_while_recording(rig: Rig, name: str) -> None:
     ended = 0
     while not ended:
         parts = [path.stat().st_size for path in rig.cells.glob(f"*/*/{name}.mcap{UNFINISHED}")]
-        if parts and parts[0] > PART_BYTES:
+        if parts and parts[0] > part_bytes:
             os.kill(child, signal.SIGKILL)
             break
         ended, _ = os.waitpid(child, os.WNOHANG)
@@ -75,12 +74,18 @@ def kill_while_recording(rig: Rig, name: str) -> None:
     assert os.WIFSIGNALED(status)
 
 
-def test_a_job_killed_in_a_recording_is_taken_up_by_the_next(tmp_path: Path, made: Made, one_move: Path) -> None:
-    rig = real_recorder(make_rig(tmp_path / "cell", one_move), made)
+def taken_up_from_a_recording(rig: Rig, made: Made, name: str, share: float) -> None:
+    """Kill a job in a recording, with that share of its log written, and let the next one finish the session."""
+    rig = real_recorder(rig, made)
     with cell_process(rig):
-        kill_while_recording(rig, "bare-1")
+        kill_while_recording(rig, name, share * made.logs[name].stat().st_size)
         assert rig.session.state.outcome is None
         rig.clock.go_on(minutes=10)
         assert rig.job().outcome is Outcome.APPLIED
     assert rig.session.state.attempt == 2
-    assert (rig.session.folder / "bare-1-partial-1.mcap").exists()
+    assert (rig.session.folder / f"{name}-partial-1.mcap").exists()
+
+
+def test_a_job_killed_in_a_recording_is_taken_up_by_the_next(tmp_path: Path, made: Made) -> None:
+    """One moment; `tests.studies.recalibration_study --recordings 5` takes more."""
+    taken_up_from_a_recording(make_rig(tmp_path / "cell", made.plan_file), made, "bare-1", SHARE)
