@@ -146,13 +146,15 @@ class SetupRefused(NodeError):
 class StateRefused(NodeError):
     """An NMT state (no statusword) or a CiA 402 state was not reached in time."""
 
-    def __init__(self, node: Node, asked: str, found: str, statusword: int | None = None) -> None:
+    def __init__(
+        self, node: Node, asked: str, found: str, statusword: int | None = None, *, remedy: str | None = None
+    ) -> None:
         if statusword is None:
-            shown, remedy = f"its heartbeat still says {found}", "read its error register 1001h"
+            shown, usual = f"its heartbeat still says {found}", "read its error register 1001h"
         else:
             shown = f"statusword {statusword:#06x} says {found}"
-            remedy = "check the power stage, the safety chain (STO) and the fault memory"
-        super().__init__(node, f"asked for {asked}, {shown}; {remedy}")
+            usual = "check the power stage, the safety chain (STO) and the fault memory"
+        super().__init__(node, f"asked for {asked}, {shown}; {remedy or usual}")
         self.asked = asked
         self.found = found
         self.statusword = statusword
@@ -201,7 +203,14 @@ class SampleLost(DriverError):
 
 
 class MotionRefused(DriverError):
-    """Motion was requested without permission, or outside the limits."""
+    """Motion was requested without permission, or outside the limits.
+
+    Without `expected` and `remedy` the text of what was found has the rest.
+    """
+
+    def __init__(self, found: str, *, expected: str = "", remedy: str = "") -> None:
+        super().__init__(f"found {found}; expected {expected}; {remedy}" if remedy else found)
+        self.found, self.expected, self.remedy = found, expected, remedy
 
 
 class MotionTimeout(DriverError):

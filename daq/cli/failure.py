@@ -198,6 +198,8 @@ def _parts(error: Exception) -> tuple[str, str, str, str]:
         known = _BY_NUMBER.get(_number(error) or 0)
         if known is not None:
             return f"bus {error.address}", *known
+    if isinstance(error, driver.MotionRefused) and error.remedy:
+        return "motion is refused", error.found, error.expected, error.remedy
     advice = next((ADVICE[kind] for kind in type(error).__mro__ if kind in ADVICE), ("", ""))
     return str(error), str(error), *advice
 

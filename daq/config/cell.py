@@ -14,7 +14,7 @@ from pydantic import Field
 from daq.config.clearance import Clearance
 from daq.config.closed_chain import ClosedChain, robot_with
 from daq.config.controller import Controller
-from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistoryPlace
+from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistoryPlace, Permission
 from daq.config.recalibration import Recalibration
 from daq.config.yaml_file import FileName, Name
 from drivers.profiles.profile import DriveProfile, Identity
@@ -178,6 +178,8 @@ class Cell:
     #: a calibration (`policy`, `history`, `recalibration`).
     recording_digest: str
     motion: MotionPolicy = MotionPolicy.ASK  #: permission that a recording needs
+    unguarded: Permission = Permission.REFUSED  #: to move axes that go on moving when the recorder is killed
+    recovery_motion: Permission = Permission.REFUSED  #: to move axes slowly back within their limits before a recording
     apply: ApplyPolicy = DEFAULT_APPLY_POLICY  #: bounds and permissions of the write-back
     history: HistoryPlace | None = None  #: files of the history; None for a cell from a log
     recalibration: Recalibration | None = None  #: the scheduled job; None without one, or for a cell from a log

@@ -99,6 +99,8 @@ def cell_from_bundle(
         digest=digest({name: files[name] for name in used}),
         recording_digest=digest({name: _canonical(name, files[name], names.get(name, name)) for name in used}),
         motion=model.policy.motion,
+        unguarded=model.policy.unguarded,
+        recovery_motion=model.policy.recovery_motion,
         apply=model.policy.apply,
         history=None if file is None else model.history.place(file, controller),
         recalibration=None if file is None or model.recalibration is None else model.recalibration.recalibration(file),

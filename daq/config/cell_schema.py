@@ -17,7 +17,7 @@ from daq.config.cell import DEGREE, MILLIMETRE, Bus, JointUnit, MotionPolicy, Sy
 from daq.config.clearance import ClearanceSection, WorkspaceSection
 from daq.config.closed_chain import ChainModel, ClosureModel
 from daq.config.controller import Controller
-from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistorySection
+from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistorySection, Permission
 from daq.config.recalibration import RecalibrationSection
 from daq.config.yaml_file import FileName, Name, Positive, StrictModel, not_in_file
 from ident.arrays import FloatArray
@@ -203,6 +203,12 @@ class PolicyModel(StrictModel):
     """Actions that are permitted in this cell."""
 
     motion: MotionPolicy = MotionPolicy.ASK
+    unguarded: Annotated[
+        Permission, Field(description="Move axes that do not stop by themselves when the recorder is killed.")
+    ] = Permission.REFUSED
+    recovery_motion: Annotated[
+        Permission, Field(description="Before a recording, move axes slowly back that are a little beyond a limit.")
+    ] = Permission.REFUSED
     apply: ApplyPolicy = DEFAULT_APPLY_POLICY
 
 

@@ -1,4 +1,4 @@
-"""`policy.apply` and `history` of a cell file: bounds of the write-back, approvers, and the record of all writes."""
+"""`policy` and `history` of a cell file: permissions, bounds of the write-back, approvers, the record of all writes."""
 
 from __future__ import annotations
 
@@ -16,6 +16,13 @@ from daq.errors import ConfigurationInconsistent
 from daq.files import follow_links
 
 _Percent = Annotated[float, Field(ge=0)]
+
+
+class Permission(Enum):
+    """Whether a cell allows something that is refused by default."""
+
+    REFUSED = "refused"
+    ALLOWED = "allowed"
 
 
 class AppliedBy(Enum):

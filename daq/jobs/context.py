@@ -14,7 +14,8 @@ from daq.config.controller import Controller
 from daq.config.policy import HistoryPlace
 from daq.config.recalibration import Recalibration
 from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, writing
-from daq.jobs.interlock import Runner, check_drives, require_release, run_command
+from daq.jobs.drives import check_drives
+from daq.jobs.interlock import Runner, require_release, run_command
 from daq.jobs.journal import Journal, Level
 from daq.jobs.session import Session
 from daq.ledger.store import HistoryStore
@@ -38,7 +39,8 @@ class Tools:
     """Functions that a job calls; tests replace those whose result they know."""
 
     save_report: Callable[[Fit, Account, Calibration, Path], None]  #: writes the report of a fit into a folder
-    drives: Callable[[Cell, SignalBlocker], None] = check_drives  #: checks the drives before anything moves
+    #: Checks the drives before anything moves, and takes over those of a killed recorder if the last argument says so.
+    drives: Callable[[Cell, SignalBlocker, bool], None] = check_drives
     plan: Callable[..., Plan] = plan
     record: Callable[..., Recorded] = record
     fit: Callable[..., Fit] = fit
@@ -158,8 +160,12 @@ def require_clock(found: tuple[Session, ...], now: datetime) -> None:
         )
 
 
-def before_motion(context: JobContext) -> None:
+def before_motion(context: JobContext, *, take_over: bool = True) -> None:
     """Check disk space, history, interlock and drives.
+
+    Args:
+        context: of the job.
+        take_over: remove the power of drives that a killed recorder left with it; else nothing is changed.
 
     Raises:
         DiskSpaceShort, HistoryUnreadable, NotReleased, DriverError: nothing has moved.
@@ -179,5 +185,5 @@ def before_motion(context: JobContext) -> None:
         store.entries()  # the gains are compared with them: unreadable now is better than after the recordings
     require_release(section.interlock, tools.run, tools.now, section.working_folder)
     context.journal.say(Level.INFO, "the interlock lets the robot move", free_mb=round(free_mb))
-    tools.drives(context.cell, context.block_signals)
+    tools.drives(context.cell, context.block_signals, take_over)
     context.journal.say(Level.INFO, "drives are as declared, without fault and without power")

@@ -1,4 +1,4 @@
-"""Interlock, mount command, drive check and time limit of a job: everything that may hold a motion back."""
+"""Interlock, mount command and time limit of a job: what may hold a motion back besides the drives."""
 
 from __future__ import annotations
 
@@ -15,14 +15,10 @@ from datetime import datetime
 from pathlib import Path
 from types import FrameType
 
-from daq.config.cell import Cell
 from daq.config.recalibration import Command, Interlock, PlannedRun, Recalibration
 from daq.errors import JobHeld, NotReleased, TimeBoundReached
 from daq.files import open_regular
-from daq.workflow.record import network_of
 from drivers.canopen.network import SignalBlocker
-from drivers.errors import DriveFault, StateRefused
-from drivers.profiles.cia402 import POWERLESS, State, decode
 
 MAX_OUTPUT_CHARACTERS = 400  #: Characters of what a program said that are shown
 _KEPT_BYTES = 4 * MAX_OUTPUT_CHARACTERS  #: As many as those characters may take in UTF-8
@@ -156,34 +152,6 @@ def _held(subject: str, found: str, expected: str) -> NotReleased:
         expected=expected,
         remedy="nothing moves: close the cell, let everyone leave it, set automatic mode; the next job takes it up",
     )
-
-
-FAULTS = (State.FAULT, State.FAULT_REACTION_ACTIVE)
-IDLE = (*POWERLESS, State.READY_TO_SWITCH_ON)  #: Without power in the motor, and without a request for it
-
-LEFT_BEHIND = (
-    " (so a recorder that was killed leaves a drive to which no SYNC comes any more: `drivegain record` takes it over, "
-    "or switch it off and on)"
-)
-
-
-def check_drives(cell: Cell, block_signals: SignalBlocker) -> None:
-    """Check identity and state of every drive; nothing is changed and nothing moves.
-
-    Raises:
-        DriveFault: one has a fault; to reset it is a person's decision.
-        StateRefused: one has power already: another controller drives this robot.
-        DriverError: a drive does not answer, is another one than declared, or the bus has gone.
-    """
-    with network_of(cell, block_signals) as network:
-        network.check_identities()
-        for axis, statusword in zip(network.axes, network.statuswords(), strict=True):
-            state = decode(statusword)
-            if state in FAULTS:
-                raise DriveFault(axis, f"{state} before the job began; find its cause, then reset it", statusword)
-            if state not in IDLE:
-                left = LEFT_BEHIND if state is State.QUICK_STOP_ACTIVE else ""
-                raise StateRefused(axis, "no power before a job begins", f"{state}{left}", statusword)
 
 
 AGAIN_S = 1.0  #: After an alarm that came while the axes were being stopped for another reason

@@ -100,7 +100,7 @@ def preview(
         if left:
             folder = next((path for path in (section.folder, *section.folder.parents) if path.is_dir()), section.folder)
             there = replace(tools, free=lambda _: tools.free(folder))
-            before_motion(JobContext(cell_file, cell, section, target, there, journal, who))
+            before_motion(JobContext(cell_file, cell, section, target, there, journal, who), take_over=False)
     steps = [f"warm up for {section.warm_up_min:g} min"] if left and section.warm_up_min else []
     steps += [f"mount {run.payload or 'none'}, record {run.name}" for run in left]
     if session is None or calibration_of_session(session) is None:

@@ -163,7 +163,6 @@ def _record(context: JobContext, planned: PlannedRun, plan: Plan, out: Path) -> 
         block_signals=context.block_signals,
         # Waiting for the drives and mapping their PDOs takes seconds, in which the cell may be opened.
         before_motion=released,
-        unguarded=True,  # the job's journal has the warning; there is no person to ask
     )
 
 

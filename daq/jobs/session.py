@@ -27,6 +27,8 @@ LARGEST_STATE_BYTES = 4 << 20  # a job writes a few kilobytes
 _STAMP = "%Y%m%dT%H%M%SZ"
 _Count = Annotated[int, Field(ge=0, le=2**53)]  #: Exact in a metric, which is a float
 _NAME = re.compile(r"[0-9]{8}T[0-9]{6}Z(?:-[0-9]{2})?")
+_REMOVED = re.compile(rf"\.{_NAME.pattern}\.removed")  #: A session that is being removed
+_UNWRITTEN = f".{STATE}."  #: First part of the name of a state that is being written (`daq.files.replace_file`)
 
 
 class Outcome(Enum):
@@ -269,9 +271,32 @@ def remove_old(found: tuple[Session, ...], keep: int, in_force: Collection[str])
         fitted = session.state.fitted
         if session is not good and (fitted is None or fitted.calibration_sha256 not in in_force):
             with suppress(OSError):
-                shutil.rmtree(session.folder)
+                # Renamed first: killed halfway, it would be a folder without a state, which no job removes.
+                doomed = session.folder.with_name(f".{session.folder.name}.removed")
+                session.folder.rename(doomed)
+                shutil.rmtree(doomed)
                 removed.append(session.folder)
+    for session in found[-1:]:
+        with suppress(OSError):
+            _remove_remnants(session.folder)
     return tuple(removed)
+
+
+def _remove_remnants(newest: Path) -> None:
+    """Remove what killed jobs left beside this folder: sessions half removed, and those that never got a state.
+
+    A later folder without a state may be that of another cell's job, which begins just now. One with any other file in
+    it is left to a person.
+    """
+    for entry in tuple(newest.parent.iterdir()):
+        if _REMOVED.fullmatch(entry.name):
+            shutil.rmtree(entry, ignore_errors=True)
+        elif _NAME.fullmatch(entry.name) and entry.name < newest.name and entry.is_dir():
+            content = tuple(entry.iterdir())
+            if all(file.name.startswith(_UNWRITTEN) for file in content):
+                for file in content:
+                    file.unlink()
+                entry.rmdir()
 
 
 def _read(path: Path) -> SessionState | None:

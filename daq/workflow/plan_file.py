@@ -148,13 +148,23 @@ def check_approach(cell: Cell, plan: Plan, start_rad: FloatArray) -> None:
     Raises:
         MotionRefused: with the place and the bodies that come too close.
     """
+    first = np.array(plan.moves[0].target_rad)
+    check_way(cell, start_rad, first, "the way from here to the first target of the plan")
+
+
+def check_way(cell: Cell, start_rad: FloatArray, end_rad: FloatArray, way: str) -> None:
+    """Refuse a way, named for the message, that leaves what the cell file declares.
+
+    Raises:
+        MotionRefused: with the place and the bodies that come too close.
+    """
     if not _is_bounded(cell):
         return
-    found = _checker(cell).obstruction(start_rad, np.array(plan.moves[0].target_rad))
+    found = _checker(cell).obstruction(start_rad, end_rad)
     if found is not None:
         raise MotionRefused(
-            f"the way from here to the first target of the plan: found {_spell(cell, found)}; bring the robot near the "
-            f"first target by hand, or correct {_keys(found)} in the cell file"
+            f"{way}: found {_spell(cell, found)}; bring the robot near the first target by hand, or correct "
+            f"{_keys(found)} in the cell file"
         )
 
 

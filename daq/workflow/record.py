@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from daq.config.bus import bus_loads, cell_address, drive_axes, load_warnings, p
 from daq.config.cell import Cell, joint_names
 from daq.config.cell_file import bundle
 from daq.config.drive import shipped_profiles
+from daq.config.policy import Permission
 from daq.environment import software
 from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
 from daq.files import sha256
@@ -26,6 +28,7 @@ from daq.workflow.feed import Feed, RunFacts
 from daq.workflow.nameplates import check_nameplates, nameplate_warnings
 from daq.workflow.plan import Plan
 from daq.workflow.plan_file import check_approach
+from daq.workflow.recovery import bring_back, recovery_move
 from daq.workflow.safeguards import (
     DiskRoom,
     FreeBytes,
@@ -145,12 +148,12 @@ def record(
         progress: receives the number of finished moves and of all moves.
         before_motion: last check before the log is opened; if it raises, the axes have no power and no file is made.
         feed: gets what the log gets, for consoles.
-        unguarded: whether axes may move that go on moving when this program is killed.
+        unguarded: whether axes may move that go on moving when this program is killed, whatever the cell's policy says.
 
     Raises:
         UsageError: the weighed mass is not the payload's; nothing has moved and no file was made.
-        MotionRefused: motion is disabled, an axis is unguarded, or the moves leave the limits; nothing has moved and no
-            file was made.
+        MotionRefused: motion is disabled, an axis is unguarded or outside its limits, or the moves leave them; no file
+            was made, and nothing has moved, except where an axis was brought back (`daq.workflow.recovery`).
         DiskSpaceShort: before the run, nothing has moved; during it, the axes were stopped, and the log is complete but
             marked invalid.
         ConfigurationInconsistent, UsageError, OutputFailed: see daq/errors.py.
@@ -163,12 +166,7 @@ def record(
     check_entered_mass(cell, payload, entered_kg)
     with defer_full_gc(), network_of(cell, block_signals) as network, _sync_producer(cell, network) as wanted:
         network.prepare()
-        if (without := network.without_guard()) and not unguarded:
-            raise MotionRefused(
-                f"found axes that are UNGUARDED: {'; '.join(network.unguarded())}; expected that every axis watches "
-                f"the recorder's heartbeat (1016h); nothing has moved; pass --unguarded to move {', '.join(without)} "
-                "all the same, with a hand at the emergency stop"
-            )
+        _require_guarded(cell, network, unguarded)
         polling = Polling(network, beside_stream=polling_fits(cell))
         scales = network.scales()
         check_nameplates(cell_file, cell, scales)
@@ -182,8 +180,9 @@ def record(
         # Read the positions first, so that a refusal comes before a file exists. This takes a stream of its own: the
         # checks below last many periods, and the schedule of the recording does not wait.
         producer, remarks = _started(cell, wanted)
-        start_counts = _positions(network, _pacing(cell, clocks.wall_ns(), clocks, producer))
         permission = MotionPermission(granted_by, motor_limits(cell, scale))
+        pacing = partial(_pacing, cell, clocks.wall_ns(), clocks, producer)
+        start_counts, recovered = _start(cell, network, scale, permission, pacing, before_motion)
         moves = _checked_moves(cell, plan, scale, start_counts, permission)
         room = DiskRoom(out, free)
         longest_s = duration_of(moves, start_counts, rate_hz) + ALLOWANCE_S
@@ -230,7 +229,7 @@ def record(
         kept.feed.finish()
         if short is not None:
             raise short
-        return Recorded(out, log.statistics, stream.statistics, (*warnings, *remarks, *polling.remarks))
+        return Recorded(out, log.statistics, stream.statistics, (*warnings, *remarks, *recovered, *polling.remarks))
 
 
 def controller_digest(cell: Cell) -> str | None:
@@ -369,6 +368,46 @@ def motor_moves(cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence
         moves.append(synchronised_move(here, target, exact, dwell))
         here_rad, here = target_rad, target
     return tuple(moves)
+
+
+def _require_guarded(cell: Cell, network: CanopenNetwork, unguarded: bool) -> None:
+    """Refuse axes that go on moving when this program is killed, unless operator or policy accept it.
+
+    Raises:
+        MotionRefused: names them.
+    """
+    without = network.without_guard()
+    if without and not unguarded and cell.unguarded is not Permission.ALLOWED:
+        raise MotionRefused(
+            f"axes that are UNGUARDED: {'; '.join(network.unguarded())}",
+            expected="that every axis watches the recorder's heartbeat (1016h)",
+            remedy=f"nothing has moved; pass --unguarded to move {', '.join(without)} all the same, with a hand at the "
+            "emergency stop; a scheduled job needs `policy: {unguarded: allowed}` in the cell file",
+        )
+
+
+def _start(
+    cell: Cell,
+    network: CanopenNetwork,
+    scale: SiScaling,
+    permission: MotionPermission,
+    pacing: Callable[[], Pacing],
+    before_motion: Callable[[], None],
+) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Return the positions of the axes [counts], brought back within their limits if need be, and remarks about that.
+
+    Raises:
+        MotionRefused: an axis is outside its limits, and may not be brought back.
+        DriverError: as `execute`.
+    """
+    start_counts = _positions(network, pacing())
+    way = recovery_move(cell, scale, start_counts, permission.limits)
+    if way is None:
+        return start_counts, ()
+    before_motion()
+    move, slow, remark = way
+    bring_back(network, pacing(), move, slow, permission.granted_by)
+    return _positions(network, pacing()), (remark,)
 
 
 def _checked_moves(

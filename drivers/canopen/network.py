@@ -184,6 +184,10 @@ class CanopenNetwork:
         if self.link.deadline_ns is None:
             self.link.deadline_ns = self.link.clock() + round(self.bounds.closing_s * 1e9)
 
+    def end_closing(self) -> None:
+        """Lift the time limit of `begin_closing`: the axes have no power, and the network stays open."""
+        self.link.deadline_ns = None
+
     def scan(self, node_ids: Sequence[int] = range(1, 128), wait_s: float = 0.5) -> tuple[FoundNode, ...]:
         """Find the nodes on the bus; changes nothing."""
         return scan_link(self.link, node_ids, wait_s)
@@ -435,8 +439,12 @@ class CanopenNetwork:
                 if state not in POWERLESS:
                     access.write(CONTROLWORD, next_command(state, Goal.QUICK_STOP))
 
-    def disable(self, axis: Axis) -> None:
+    def disable(self, axis: Axis, goal: Goal = Goal.QUICK_STOP) -> None:
         """Quick stop one axis by SDO, then remove its power, and confirm both by its statusword.
+
+        Args:
+            axis: to disable.
+            goal: SWITCH_ON_DISABLED removes the power of an axis that is known to stand still, without quick stop.
 
         Raises:
             StateRefused: not reached within ``bounds.disable_s``.
@@ -444,7 +452,6 @@ class CanopenNetwork:
         """
         access = self.link.objects(axis.node_id)
         deadline = self.link.clock() + round(self.bounds.disable_s * 1e9)
-        goal = Goal.QUICK_STOP
         while True:
             state = decode(statusword := access.read(STATUSWORD))
             self.see(axis, state)

@@ -103,7 +103,7 @@ def execute(
         yield from execution.stop()
         if not execution.problems:  # amplifiers without confirmed standstill go on watching us
             network.unguard()
-            network.link.deadline_ns = None
+            network.end_closing()
     except BaseException as error:
         # Also a closed generator and an interrupt, during the stop above as well: it then runs without yielding.
         with network.block_signals():

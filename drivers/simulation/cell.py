@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 from functools import partial
 from types import TracebackType
 
@@ -25,6 +26,9 @@ SYNC_ID = 0x080
 NMT_ID = 0x000
 
 IDLE_S = 0.02  #: Longest wait for a frame [s]; it limits the punctuality of heartbeats by wall time
+
+LONE_REST_S = 0.1  #: Plant time without a moving axis after which time that runs without SYNC stops again
+LONE_CYCLES = 100  #: Most cycles without SYNC between two looks at the bus: a busy machine goes on answering
 
 PATIENCE = 3  #: SYNCs of one bus that may wait for another bus: a busy machine delivers some of one bus first
 
@@ -82,12 +86,24 @@ class SyncGate:
         return (present,) * cycles
 
 
+@dataclass(slots=True)
+class _LoneTime:
+    """Time that runs without SYNC."""
+
+    since_s: float  #: by the clock
+    cycles: int = 0  #: run since then
+    rested: int = 0  #: of those, the last ones in which no axis moved
+
+
 class SimulatedCell:
     """Cell that answers on a bus until it is closed.
 
     Each SYNC (COB-ID 80h) advances the plant by one sync period and is answered with the transmit PDOs, so equal frames
     give equal answers. SDO, NMT and heartbeats need no SYNC. On several buses the plant advances when SYNC has come on
     all of them, and each node receives its own bus only.
+
+    When the heartbeat that a node monitors (1016h) stays away, its master is gone and sends no SYNC either: the plant
+    then advances by the clock until no axis moves any more, or a SYNC comes.
 
     As a context manager it answers in a thread of its own; ``serve_forever`` answers in the caller's thread.
     """
@@ -104,7 +120,7 @@ class SimulatedCell:
         Args:
             spec: description of the cell.
             bus: any python-can bus that does not receive its own messages, or a split bus; the caller shuts it down.
-            clock: seconds, for heartbeats while no SYNC comes.
+            clock: seconds, for heartbeats while no SYNC comes, and for the end of the motion of a master that is gone.
             mounted: exchanges the payload while no axis has power; called after each wait for a frame, so it must be
                 fast, and another object is another payload. The loops keep their tuning, as those of real drives do.
 
@@ -143,6 +159,7 @@ class SimulatedCell:
                 if self._disturbance.active(kind, index):
                     node.inject(kind)
         self._by_id = {node.node_id: node for node in self.nodes}
+        self._lone: _LoneTime | None = None  # while time runs without SYNC
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self._failure: Exception | None = None
@@ -193,7 +210,9 @@ class SimulatedCell:
                     self._advance(wires)
             wall_s, now_us = self._clock(), self.time_us
             for node in self.nodes:
-                node.keep_time(now_us, wall_s)
+                if node.keep_time(now_us, wall_s) and self._lone is None:
+                    self._lone = _LoneTime(wall_s)
+            self._run_alone(wall_s)
             if message is None and self._disturbance:
                 self._interfere()  # other masters do not wait for our SYNC
 
@@ -250,7 +269,21 @@ class SimulatedCell:
             for node in hearing:
                 node.receive_pdo(can_id, data)
 
+    def _run_alone(self, wall_s: float) -> None:
+        """Advance by wall time while the axes of a master that is gone come to rest; no node receives a SYNC."""
+        lone, period_s = self._lone, self._period_us * 1e-6
+        for _ in range(LONE_CYCLES):
+            # Another bus of this cell may still have its master, whose next SYNC ends this.
+            if lone is None or lone.cycles * period_s > wall_s - lone.since_s - IDLE_S:
+                return
+            self._advance(())
+            moving = any(node.drive.powered and node.drive.moving for node in self.nodes)
+            lone.cycles, lone.rested = lone.cycles + 1, 0 if moving else lone.rested + 1
+            if lone.rested * period_s >= LONE_REST_S:
+                lone = self._lone = None
+
     def _receive_sync(self, wire: int) -> None:
+        self._lone = None
         if self._gate.late(wire):
             for node in self._on_wire[wire]:
                 node.begin_cycle()
@@ -318,7 +351,8 @@ class SimulatedCell:
         for node in synchronised:
             node.send_sync(self.time_us)
         burst, self._burst = self._burst, None
-        self._put(burst)
+        if burst:
+            self._put(burst)
 
     def _send_of(self, index: int, can_id: int, data: bytes) -> None:
         for frame in self._disturbance.sent(index, self.nodes[index].node_id, can_id, data):

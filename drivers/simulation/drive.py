@@ -108,9 +108,9 @@ class Drive:
     def monitor(self) -> ErrorCode:
         """Update faults, quick stop and waiting set-point after a SYNC period; return the code of a new fault."""
         if self.state is PowerState.QUICK_STOP_ACTIVE:
-            if not self._stays_in_quick_stop and not self._moving:
+            if not self._stays_in_quick_stop and not self.moving:
                 self._enter(PowerState.SWITCH_ON_DISABLED)  # transition 12
-        elif self._waiting is not None and not self._moving:
+        elif self._waiting is not None and not self.moving:
             waiting, self._waiting = self._waiting, None
             self._acknowledged = bool(self.controlword & 0x10)
             self._start(waiting)
@@ -178,7 +178,7 @@ class Drive:
         self.state = state
 
     def _request(self, controlword: int) -> None:
-        moving = self._moving
+        moving = self.moving
         if moving and not controlword & 0x20 and self._waiting is not None:
             return  # no room: the request stays unacknowledged
         target = self._number(0x607A)
@@ -196,7 +196,8 @@ class Drive:
         self._amplifiers.readings.reached[self._index] = 0
 
     @property
-    def _moving(self) -> bool:
+    def moving(self) -> bool:
+        """Whether the set-point moves."""
         return bool(self._axis["piece"] < SEGMENTS)
 
     def _start(self, setpoint: Setpoint) -> None:

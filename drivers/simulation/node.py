@@ -120,22 +120,27 @@ class Node:
         if self._number(0x1016, 1) >> 16 & 0x7F == producer:
             self._heard_wall_s = wall_s
 
-    def keep_time(self, now_us: int, wall_s: float) -> None:
-        """React by 6007h when the monitored heartbeat is overdue, and send the own one when it is due."""
+    def keep_time(self, now_us: int, wall_s: float) -> bool:
+        """React by 6007h when the monitored heartbeat is overdue, and send the own one when it is due.
+
+        Returns:
+            whether the monitored heartbeat has become overdue now.
+        """
         # Without SYNC plant time is stopped: the first is judged by wall time, the second by the faster of both.
-        allowed_ms = self._values[0x1016, 1] & 0xFFFF
-        if not allowed_ms:
+        allowed_ms, heard_s = self._values[0x1016, 1] & 0xFFFF, self._heard_wall_s
+        lost = bool(allowed_ms) and heard_s is not None and (wall_s - heard_s) * 1e3 >= allowed_ms
+        if lost or not allowed_ms:
             self._heard_wall_s = None
-        elif self._heard_wall_s is not None and (wall_s - self._heard_wall_s) * 1e3 >= allowed_ms:
-            self._heard_wall_s = None
+        if lost:
             self.fall_back()
         self._now_us = now_us
         period_ms = self._values[0x1017, 0]
         if period_ms == 0 or self.nmt is NmtState.INITIALISING:
-            return
+            return lost
         if now_us - self._beat_us >= 1000 * period_ms or (wall_s - self._beat_wall_s) * 1e3 >= period_ms:
             self._beat_us, self._beat_wall_s = now_us, wall_s
             self._send(0x700 + self.node_id, bytes([self.nmt]))
+        return lost
 
     def fall_back(self) -> None:
         """React to a heartbeat error: EMCY, the reaction of 6007h, and PRE-OPERATIONAL (the default of 1029h)."""

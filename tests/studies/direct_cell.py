@@ -187,7 +187,7 @@ class DirectStream:
                 powered=set(),
                 begin_stop=lambda nodes: None,
                 begin_closing=lambda: None,
-                link=SimpleNamespace(deadline_ns=None),
+                end_closing=lambda: None,
                 guard=lambda: None,
                 unguard=lambda: None,
                 block_signals=nullcontext,

@@ -3,6 +3,7 @@
     python -m tests.studies.recalibration_study [--weeks 8] [--seconds 12]
     python -m tests.studies.recalibration_study --kills
     python -m tests.studies.recalibration_study --moments 60
+    python -m tests.studies.recalibration_study --recordings 5
     python -m tests.studies.recalibration_study --years 300
 
 Each week the timer calls the job, and where it was ended calls it again the next day. J4 loses 6 % in the middle of the
@@ -12,8 +13,9 @@ what the controller has.
 `--kills` kills a job (-9) before and behind every call to another room and lets the next one finish it; the tests do
 the same at some of them. `--moments` kills at random moments instead, and checks that the controller's file is the old
 or the new one, that `history --verify` reports exactly the writes that the history lacks, and that the next job ends
-with exit code 0. `--years` draws years of weekly jobs in which nothing changes, and counts those in which a gain was
-changed all the same.
+with exit code 0. `--recordings` kills jobs in recordings, at a simulated cell that is a process of its own: the next
+job takes the drives over and ends with exit code 0. `--years` draws years of weekly jobs in which nothing changes, and
+counts those in which a gain was changed all the same.
 """
 
 from __future__ import annotations
@@ -45,6 +47,7 @@ from ident.errors import IdentificationError
 from tests.daq.jobs.made import made_rig, whole_job
 from tests.daq.jobs.rig import RUNS, Rig, make_plan, make_rig
 from tests.daq.jobs.test_killed import Kill, finished_by_the_next, finished_from_any_moment, job_duration_s
+from tests.daq.jobs.test_killed_recording import taken_up_from_a_recording
 from tests.studies.output import print_line
 
 AXIS, LOSS = 3, 0.94
@@ -152,6 +155,18 @@ def moments(folder: Path, count: int, seed: int = 1) -> int:
     return int(killed < count)
 
 
+def recordings(folder: Path, count: int, seed: int = 1) -> int:
+    """Kills in so many recordings; an AssertionError where the next job does not take the session up."""
+    (folder / "whole").mkdir()
+    _, made = whole_job(folder / "whole")
+    chance = random.Random(seed)
+    for number in range(count):
+        name, share = chance.choice(sorted(made.logs)), chance.uniform(0.05, 0.9)
+        taken_up_from_a_recording(make_rig(new(folder / f"{number}"), made.plan_file), made, name, share)
+        print_line(f"killed in {name} with {share:.0%} of its log: the next job ended with 0")
+    return 0
+
+
 def new(folder: Path) -> Path:
     """An empty folder."""
     folder.mkdir()
@@ -181,6 +196,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=12.0)
     parser.add_argument("--kills", action="store_true")
     parser.add_argument("--moments", type=int)
+    parser.add_argument("--recordings", type=int)
     parser.add_argument("--years", type=int)
     chosen = parser.parse_args()
     if chosen.years is not None:
@@ -188,6 +204,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         if chosen.moments is not None:
             return moments(Path(folder), chosen.moments)
+        if chosen.recordings is not None:
+            return recordings(Path(folder), chosen.recordings)
         return kills(Path(folder)) if chosen.kills else study(chosen.weeks, chosen.seconds, Path(folder))
 
 

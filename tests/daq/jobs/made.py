@@ -77,7 +77,7 @@ class Made:
         return replace(
             rig.tools,
             save_report=lambda _fit, _account, _calibration, folder: (folder / "report.html").touch(),
-            drives=lambda _cell, _undisturbed: None,
+            drives=lambda _cell, _undisturbed, _take_over: None,
             record=copied,
             fit=lambda _logs, **_: self.fitted,
             close_loop=lambda _fit, _seed, _report: self.closed,

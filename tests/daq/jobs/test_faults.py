@@ -13,7 +13,8 @@ from daq.environment import shipped_configurations
 from daq.errors import ExitCode, JobHeld, RunInvalid, exit_code
 from daq.jobs.session import Outcome
 from daq.ledger.audit import AuditAction
-from drivers.errors import BusError, DriveFault, SampleLost, StateRefused
+from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from drivers.errors import BusError, DriveFault, MotionRefused, SampleLost, StateRefused
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultKind, FaultSpec
@@ -120,13 +121,47 @@ def test_a_run_with_a_single_bad_frame_is_recorded_again(tmp_path: Path, one_mov
 
 
 def test_faults_with_which_a_run_goes_on_do_not_end_the_job(tmp_path: Path, one_move: Path) -> None:
-    rig = make_rig(tmp_path / "cell", one_move, retries=0, mount=ONLY_BARE)
+    policy = {"motion": "allowed", "unguarded": "allowed"}
+    rig = make_rig(tmp_path / "cell", one_move, policy=policy, retries=0, mount=ONLY_BARE)
     with serving(rig, *BORNE) as cell:
         assert "mount command" in str(fails(rig, cell, JobHeld))
         assert powerless(cell)
     assert [run.name for run in rig.session.state.runs] == ["bare-1"]
     warned = [event["text"] for event in rig.events if event["level"] == "warning"]
     assert [text for text in warned if "no 1016h" in text]
+
+
+def test_a_job_moves_no_axis_that_would_go_on_without_it_unless_the_cell_says_so(
+    tmp_path: Path, one_move: Path
+) -> None:
+    rig = make_rig(tmp_path / "cell", one_move)
+    with serving(rig, FaultSpec(FaultKind.NO_GUARD, AXIS)) as cell:
+        error = fails(rig, cell, MotionRefused)
+        assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
+        assert cell.plant.time_s < 1.0
+    assert exit_code(type(error)) == ExitCode.USAGE
+    assert "J3: no 1016h" in str(error)
+    assert "`policy: {unguarded: allowed}`" in str(error)
+
+
+@pytest.mark.parametrize("allowed", [False, True])
+def test_an_axis_beyond_its_limit_is_brought_back_by_a_job_where_the_cell_says_so(
+    tmp_path: Path, one_move: Path, allowed: bool
+) -> None:
+    """In the simulated cell, with friction and noise; the run after it is refused only for its payload."""
+    policy = {"motion": "allowed", "recovery_motion": "allowed"} if allowed else {"motion": "allowed"}
+    rig = make_rig(tmp_path / "cell", one_move, policy=policy, mount=ONLY_BARE)
+    spec = load_simulation(shipped_simulation("demo"))
+    start_rad, limit_rad = spec.start_rad.copy(), rig.cell.axes[AXIS].limits.position[1]
+    start_rad[AXIS] = limit_rad + 0.002
+    with serving(rig, spec=replace(spec, start_rad=start_rad)) as cell:
+        error = fails(rig, cell, JobHeld if allowed else MotionRefused)
+        assert powerless(cell)
+        assert bool(cell.plant.position_rad[AXIS] < limit_rad) is allowed
+    warned = [event["text"] for event in rig.events if event["level"] == "warning"]
+    assert any("brought back slowly" in text for text in warned) is allowed
+    assert ("recovery_motion" in str(error)) is not allowed
+    assert [run.name for run in rig.session.state.runs] == ["bare-1"] * allowed
 
 
 def test_no_kind_of_fault_is_left_out() -> None:

@@ -56,6 +56,33 @@ def test_what_another_cell_keeps_is_not_removed(tmp_path: Path) -> None:
     assert (len(sessions(tmp_path, "demo")), len(sessions(tmp_path, "another"))) == (1, 3)
 
 
+def test_sessions_that_a_killed_job_left_half_made_or_half_removed_are_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = [begin(tmp_path, BASIS, BEGAN + timedelta(days=7 * week)) for week in range(3)]
+    whole = shutil.rmtree
+
+    def killed(folder: Path, **_: object) -> None:
+        (folder / STATE).unlink()
+        (folder / "bare-1.mcap").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(shutil, "rmtree", killed)
+    with pytest.raises(KeyboardInterrupt):
+        remove_old(sessions(tmp_path), 2, ())
+    monkeypatch.setattr(shutil, "rmtree", whole)
+    stateless, damaged, later = (
+        tmp_path / name for name in ("20260101T000000Z", "20260102T000000Z-02", "20990101T000000Z")
+    )
+    for folder in (stateless, damaged, later):
+        folder.mkdir()
+        (folder / f".{STATE}.4711-0.tmp").touch()
+    (damaged / "bare-1.mcap").touch()
+    assert remove_old(sessions(tmp_path), 2, ()) == ()
+    left = {made[1].folder, made[2].folder, damaged, later}
+    assert set(tmp_path.iterdir()) == left
+
+
 def test_no_one_waits_for_a_pipe_in_the_place_of_a_state(tmp_path: Path) -> None:
     session = begin(tmp_path, BASIS, BEGAN)
     (session.folder / STATE).unlink()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from math import radians
 from pathlib import Path
 
@@ -59,7 +59,13 @@ class Rig:
 
         patch.setattr("daq.workflow.record.network_of", network_of)
 
-    def run(self, clocks: Clocks | None = None, *, unguarded: bool = True) -> Recorded:
+    def run(
+        self,
+        clocks: Clocks | None = None,
+        *,
+        unguarded: bool = True,
+        before_motion: Callable[[], None] = lambda: None,
+    ) -> Recorded:
         """Record the plan."""
         declared = load_cell(self.cell_file)
         clocks = clocks or Clocks(lambda: WALL_NS, self.bus.clock)
@@ -74,6 +80,7 @@ class Rig:
             granted_by="the test",
             run_id="1",
             clocks=clocks,
+            before_motion=before_motion,
             unguarded=unguarded,  # the scripted drives have no 1016h
         )
 

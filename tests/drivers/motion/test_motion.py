@@ -78,6 +78,17 @@ def test_axes_start_together_arrive_and_end_without_power(moving: Moving) -> Non
     assert stream.statistics.missing == 0
 
 
+def test_the_time_limit_of_a_stop_ends_with_a_stop_that_is_confirmed(moving: Moving) -> None:
+    """Slow readings and another motion may follow in the same network; a closing network keeps its limit."""
+    network, _, _, _ = moving
+    run(moving, FAR)
+    assert network.link.allowed_s(3600.0) == 3600.0
+    network.begin_closing()
+    assert network.link.allowed_s(3600.0) < 3600.0
+    network.end_closing()
+    assert network.link.allowed_s(3600.0) == 3600.0
+
+
 def test_the_profile_objects_are_those_of_the_move(moving: Moving) -> None:
     _, _, bus, _ = moving
     run(moving, FAR)

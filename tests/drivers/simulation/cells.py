@@ -117,11 +117,13 @@ def abort_code(answer: bytes) -> int:
 
 
 @contextmanager
-def running(spec: CellSpec, channel: str) -> Iterator[tuple[SimulatedCell, Master]]:
+def running(
+    spec: CellSpec, channel: str, clock: Callable[[], float] = STOPPED_CLOCK
+) -> Iterator[tuple[SimulatedCell, Master]]:
     """A cell in a thread and a master on one virtual bus; the master's bus is open before the cell boots."""
     with (
         can.Bus(interface="virtual", channel=channel) as near,
         can.Bus(interface="virtual", channel=channel) as far,
-        SimulatedCell(spec, far, clock=STOPPED_CLOCK) as cell,
+        SimulatedCell(spec, far, clock) as cell,
     ):
         yield cell, Master(near)

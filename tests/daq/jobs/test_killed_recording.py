@@ -1,0 +1,91 @@
+"""A job that is killed (-9) in a recording, at a cell that is a process of its own; the next job takes it up."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from daq.jobs.session import Outcome
+from daq.log.container import UNFINISHED
+from tests.daq.jobs.made import Made
+from tests.daq.jobs.rig import Rig, make_rig
+
+SHARE = 0.5  #: Of the size of a whole log that is written when the job is killed: the axes move
+
+
+@contextmanager
+def cell_process(rig: Rig) -> Iterator[None]:
+    """`drivegain simulate` on a hub of its own, to which the rig's cell file is changed."""
+    command = [sys.executable, "-m", "daq", "simulate", "demo", "--port", "0"]
+    with subprocess.Popen(
+        [*command, "--payload-from", str(rig.cells / "mounted")], stdout=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            found = re.search(r"can0@127\.0\.0\.1:(\d+)", process.stdout.readline())
+            assert found is not None
+            document = json.loads(rig.cell_file.read_text(encoding="utf-8"))
+            document["bus"] |= {"interface": "socketcand", "channel": "can0", "port": int(found[1])}
+            document["bus"] |= {"host": "127.0.0.1"}
+            rig.cell_file.write_text(json.dumps(document), encoding="utf-8")
+            yield
+        finally:
+            process.send_signal(signal.SIGINT)
+            assert process.wait(timeout=60) == 0
+
+
+def real_recorder(rig: Rig, made: Made) -> Rig:
+    """The rig with its own recorder and check of the drives; the fit is what was found before."""
+    own = rig.tools
+    rig.tools = replace(made.tools(rig), drives=own.drives, record=own.record)
+    return rig
+
+
+def kill_while_recording(rig: Rig, name: str, part_bytes: float) -> None:
+    """Run the job in a process of its own, and kill it when the unfinished log of this run has that size."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of threads of the test runner
+        child = os.fork()
+    if child == 0:
+        try:
+            rig.job()
+        finally:
+            os._exit(0)
+    ended = 0
+    while not ended:
+        parts = [path.stat().st_size for path in rig.cells.glob(f"*/*/{name}.mcap{UNFINISHED}")]
+        if parts and parts[0] > part_bytes:
+            os.kill(child, signal.SIGKILL)
+            break
+        ended, _ = os.waitpid(child, os.WNOHANG)
+        time.sleep(0.002)
+    assert not ended, "the job ended before its axes moved"
+    _, status = os.waitpid(child, 0)
+    assert os.WIFSIGNALED(status)
+
+
+def taken_up_from_a_recording(rig: Rig, made: Made, name: str, share: float) -> None:
+    """Kill a job in a recording, with that share of its log written, and let the next one finish the session."""
+    rig = real_recorder(rig, made)
+    with cell_process(rig):
+        kill_while_recording(rig, name, share * made.logs[name].stat().st_size)
+        assert rig.session.state.outcome is None
+        rig.clock.go_on(minutes=10)
+        assert rig.job().outcome is Outcome.APPLIED
+    assert rig.session.state.attempt == 2
+    assert (rig.session.folder / f"{name}-partial-1.mcap").exists()
+
+
+def test_a_job_killed_in_a_recording_is_taken_up_by_the_next(tmp_path: Path, made: Made) -> None:
+    """One moment; `tests.studies.recalibration_study --recordings 5` takes more."""
+    taken_up_from_a_recording(make_rig(tmp_path / "cell", made.plan_file), made, "bare-1", SHARE)

@@ -1,0 +1,80 @@
+"""Drives that a killed recorder left with power: waited for, taken over at standstill, or left to a person."""
+
+from __future__ import annotations
+
+import struct
+from contextlib import nullcontext
+from pathlib import Path
+
+import pytest
+
+import daq.jobs.drives
+import daq.workflow.record
+from daq.config.cell import PacingMode
+from daq.jobs.drives import check_drives
+from drivers.errors import StateRefused
+from drivers.motion.execute import MotionBounds
+from drivers.simulation.cell import SimulatedCell
+from drivers.simulation.drive import PowerState
+from tests.daq.jobs.rig import make_rig, serving
+
+AXIS, GUARD_MS = 2, 300
+STAYS = PowerState.QUICK_STOP_ACTIVE
+
+
+@pytest.fixture(autouse=True)
+def _short_guard(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A job waits for as long as a guard and a stop may take."""
+    monkeypatch.setattr(daq.workflow.record, "GUARD_MS", dict.fromkeys(PacingMode, GUARD_MS))
+    monkeypatch.setattr(daq.jobs.drives, "DEFAULT_BOUNDS", MotionBounds(stop_s=0.2))
+
+
+def leave(cell: SimulatedCell, state: PowerState, recorder_id: int = 127) -> PowerState:
+    """Leave an axis as a killed recorder does, if it has that id; the axis does not leave a quick stop by itself."""
+    node = cell.nodes[AXIS]
+    node.write(0x605A, 0, struct.pack("<h", 6))
+    node.write(0x1016, 1, struct.pack("<I", recorder_id << 16 | GUARD_MS))
+    node.drive.state = state
+    return state
+
+
+@pytest.mark.parametrize("take_over", [True, False], ids=["job", "dry run"])
+def test_a_drive_that_stays_in_quick_stop_loses_its_power_to_a_job_alone(
+    tmp_path: Path, one_move: Path, take_over: bool
+) -> None:
+    rig = make_rig(tmp_path / "cell", one_move)
+    with serving(rig) as cell:
+        leave(cell, STAYS)
+        check_drives(rig.cell, nullcontext, take_over)
+        assert cell.nodes[AXIS].drive.state is (PowerState.SWITCH_ON_DISABLED if take_over else STAYS)
+        assert cell.plant.time_s < 1.0
+
+
+@pytest.mark.parametrize(
+    ("state", "recorder_id"),
+    [(STAYS, 0), (STAYS, 3), (STAYS, 100), (PowerState.OPERATION_ENABLED, 0), (PowerState.OPERATION_ENABLED, 127)],
+    ids=lambda value: getattr(value, "name", str(value)),
+)
+def test_a_drive_that_is_anothers_or_did_not_stop_is_a_persons_business(
+    tmp_path: Path, one_move: Path, state: PowerState, recorder_id: int
+) -> None:
+    """An axis with id 3 is there, and no recorder takes 100: neither was a recorder that is gone."""
+    rig = make_rig(tmp_path / "cell", one_move)
+    with serving(rig) as cell:
+        leave(cell, state, recorder_id)
+        with pytest.raises(StateRefused, match=r"J3 .*no power before a job.*nothing was changed.*drivegain record"):
+            check_drives(rig.cell, nullcontext, True)
+        assert cell.nodes[AXIS].drive.state is state
+
+
+def test_a_drive_that_moves_in_its_quick_stop_is_left_alone(
+    tmp_path: Path, one_move: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places = iter(((0,), (17,)))
+    monkeypatch.setattr(daq.jobs.drives, "_positions", lambda *_: next(places))
+    rig = make_rig(tmp_path / "cell", one_move)
+    with serving(rig) as cell:
+        leave(cell, STAYS)
+        with pytest.raises(StateRefused, match=r"17 counts in 0\.2 s: press the emergency stop"):
+            check_drives(rig.cell, nullcontext, True)
+        assert cell.nodes[AXIS].drive.state is STAYS
