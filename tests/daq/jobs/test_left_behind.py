@@ -38,15 +38,16 @@ def leave(cell: SimulatedCell, state: PowerState, recorder_id: int = 127) -> Pow
     return state
 
 
+@pytest.mark.parametrize("state", [STAYS, PowerState.SWITCHED_ON])
 @pytest.mark.parametrize("take_over", [True, False], ids=["job", "dry run"])
-def test_a_drive_that_stays_in_quick_stop_loses_its_power_to_a_job_alone(
-    tmp_path: Path, one_move: Path, take_over: bool
+def test_a_drive_that_was_left_without_motion_loses_its_power_to_a_job_alone(
+    tmp_path: Path, one_move: Path, state: PowerState, take_over: bool
 ) -> None:
     rig = make_rig(tmp_path / "cell", one_move)
     with serving(rig) as cell:
-        leave(cell, STAYS)
+        leave(cell, state)
         check_drives(rig.cell, nullcontext, take_over)
-        assert cell.nodes[AXIS].drive.state is (PowerState.SWITCH_ON_DISABLED if take_over else STAYS)
+        assert cell.nodes[AXIS].drive.state is (PowerState.SWITCH_ON_DISABLED if take_over else state)
         assert cell.plant.time_s < 1.0
 
 
