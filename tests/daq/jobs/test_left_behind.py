@@ -13,7 +13,6 @@ import daq.workflow.record
 from daq.config.cell import PacingMode
 from daq.jobs.drives import check_drives
 from drivers.errors import StateRefused
-from drivers.motion.execute import MotionBounds
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
 from tests.daq.jobs.rig import make_rig, serving
@@ -26,7 +25,7 @@ STAYS = PowerState.QUICK_STOP_ACTIVE
 def _short_guard(monkeypatch: pytest.MonkeyPatch) -> None:
     """A job waits for as long as a guard and a stop may take."""
     monkeypatch.setattr(daq.workflow.record, "GUARD_MS", dict.fromkeys(PacingMode, GUARD_MS))
-    monkeypatch.setattr(daq.jobs.drives, "DEFAULT_BOUNDS", MotionBounds(stop_s=0.2))
+    monkeypatch.setattr(daq.jobs.drives, "STOP_S", 0.2)
 
 
 def leave(cell: SimulatedCell, state: PowerState, recorder_id: int = 127) -> PowerState:
