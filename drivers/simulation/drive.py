@@ -134,9 +134,11 @@ class Drive:
         return self._number(0x605A) >= 5  # options 5 and 6: as 1 and 2, without leaving the state
 
     def quick_stop(self) -> None:
-        """Start a quick stop without a controlword."""
+        """Obey the quick stop command without a controlword: transitions 7, 10 and 11."""
         if self.state is PowerState.OPERATION_ENABLED:
             self._change(PowerState.QUICK_STOP_ACTIVE)
+        elif self.state in (PowerState.READY_TO_SWITCH_ON, PowerState.SWITCHED_ON):
+            self._enter(PowerState.SWITCH_ON_DISABLED)
 
     def statusword(self) -> int:
         """Return object 6041h."""

@@ -29,6 +29,7 @@ Send = Callable[[int, bytes], None]
 NOT_STORED = 0x08000020
 NOT_IN_THIS_STATE = 0x08000022
 GAIN, STORE, LOAD_DEFAULTS = 0x2003, 0x1010, 0x1011
+QUICK_STOP = 3  #: Value of 6007h
 
 
 class NmtState(IntEnum):
@@ -335,7 +336,7 @@ class Node:
     def _connection_lost(self) -> None:
         """React by the abort connection option code 6007h."""
         option = self._number(0x6007)
-        if not self.drive.powered or option == 0:
+        if option == 0 or (not self.drive.powered and option < QUICK_STOP):
             return
         if option == 1:
             self.drive.fail(ErrorCode.COMMUNICATION_LOST)

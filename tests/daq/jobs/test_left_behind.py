@@ -13,7 +13,6 @@ import daq.workflow.record
 from daq.config.cell import PacingMode
 from daq.jobs.drives import check_drives
 from drivers.errors import StateRefused
-from drivers.motion.execute import MotionBounds
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
 from tests.daq.jobs.rig import make_rig, serving
@@ -26,7 +25,7 @@ STAYS = PowerState.QUICK_STOP_ACTIVE
 def _short_guard(monkeypatch: pytest.MonkeyPatch) -> None:
     """A job waits for as long as a guard and a stop may take."""
     monkeypatch.setattr(daq.workflow.record, "GUARD_MS", dict.fromkeys(PacingMode, GUARD_MS))
-    monkeypatch.setattr(daq.jobs.drives, "DEFAULT_BOUNDS", MotionBounds(stop_s=0.2))
+    monkeypatch.setattr(daq.jobs.drives, "STOP_S", 0.2)
 
 
 def leave(cell: SimulatedCell, state: PowerState, recorder_id: int = 127) -> PowerState:
@@ -38,15 +37,16 @@ def leave(cell: SimulatedCell, state: PowerState, recorder_id: int = 127) -> Pow
     return state
 
 
+@pytest.mark.parametrize("state", [STAYS, PowerState.SWITCHED_ON])
 @pytest.mark.parametrize("take_over", [True, False], ids=["job", "dry run"])
-def test_a_drive_that_stays_in_quick_stop_loses_its_power_to_a_job_alone(
-    tmp_path: Path, one_move: Path, take_over: bool
+def test_a_drive_that_was_left_without_motion_loses_its_power_to_a_job_alone(
+    tmp_path: Path, one_move: Path, state: PowerState, take_over: bool
 ) -> None:
     rig = make_rig(tmp_path / "cell", one_move)
     with serving(rig) as cell:
-        leave(cell, STAYS)
+        leave(cell, state)
         check_drives(rig.cell, nullcontext, take_over)
-        assert cell.nodes[AXIS].drive.state is (PowerState.SWITCH_ON_DISABLED if take_over else STAYS)
+        assert cell.nodes[AXIS].drive.state is (PowerState.SWITCH_ON_DISABLED if take_over else state)
         assert cell.plant.time_s < 1.0
 
 

@@ -14,7 +14,7 @@ from daq.config.cell_file import load_cell
 from daq.simulation.simulation_file import load_simulation
 from drivers.canopen.bus import BusAddress, open_bus
 from drivers.canopen.hub import Hub
-from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.network import Bounds, CanopenNetwork
 from drivers.errors import DriveFault
 from drivers.motion.execute import execute
 from drivers.motion.move import AxisLimits, MotionPermission, synchronised_move
@@ -29,6 +29,9 @@ CONFIGS = Path(__file__).parents[3] / "configs"
 PERIOD_NS = 1_000_000
 ROOM = (AxisLimits(-20_000_000, 20_000_000, 900_000.0, 6_000_000.0),) * 6
 PERMISSION = MotionPermission("the test", ROOM)
+#: A busy machine keeps any of the three threads waiting for seconds: no limit of the wall clock decides a test.
+PATIENT = Bounds(answer_s=30.0, silence_s=10.0, nmt_s=30.0, mode_s=30.0, disable_s=30.0, closing_s=120.0)
+GUARD_MS = 60_000
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +70,7 @@ def settings(network: CanopenNetwork) -> list[tuple[bytes, ...]]:
 @pytest.mark.usefixtures("cell")
 def test_scan_prepare_move_and_give_back(address: BusAddress, axes: tuple[Axis, ...]) -> None:
     events: list[CellEvent] = []
-    with CanopenNetwork(address, axes) as network:
+    with CanopenNetwork(address, axes, guard_ms=GUARD_MS, bounds=PATIENT) as network:
         found = network.scan(range(1, 20))
         assert [(node.node_id, node.state) for node in found] == [(n, State.SWITCH_ON_DISABLED) for n in range(1, 7)]
         assert [node.identity for node in found] == [axis.identity for axis in axes]
@@ -94,14 +97,14 @@ def test_scan_prepare_move_and_give_back(address: BusAddress, axes: tuple[Axis, 
         for position, wanted in zip(arrived.position_counts, target, strict=True):
             assert abs(position - wanted) < 2000
         assert any(any(sample.current_raw) for sample in recorded)
-    with CanopenNetwork(address, axes) as network:
+    with CanopenNetwork(address, axes, guard_ms=GUARD_MS, bounds=PATIENT) as network:
         assert {node.state for node in network.scan(range(1, 7))} == {State.SWITCH_ON_DISABLED}
         assert settings(network) == before
 
 
 @pytest.mark.usefixtures("cell")
 def test_a_closed_run_leaves_no_axis_with_power(address: BusAddress, axes: tuple[Axis, ...]) -> None:
-    with CanopenNetwork(address, axes) as network:
+    with CanopenNetwork(address, axes, guard_ms=GUARD_MS, bounds=PATIENT) as network:
         network.prepare()
         stream = SyncStream(network, LockstepSync(PERIOD_NS, 10.0))
         start = next(stream).position_counts
@@ -119,7 +122,7 @@ def test_a_closed_run_leaves_no_axis_with_power(address: BusAddress, axes: tuple
 def test_an_emergency_of_a_node_stops_the_others(address: BusAddress, axes: tuple[Axis, ...]) -> None:
     intruder = open_bus(address)
     try:
-        with CanopenNetwork(address, axes) as network:
+        with CanopenNetwork(address, axes, guard_ms=GUARD_MS, bounds=PATIENT) as network:
             network.prepare()
             stream = SyncStream(network, LockstepSync(PERIOD_NS, 10.0))
             start = next(stream).position_counts

@@ -83,6 +83,18 @@ def test_an_axis_that_watches_no_one_ends_its_move_as_at_a_bus_with_time_of_its_
         assert cell.plant.position_rad[1] < spec.start_rad[1] + 0.7
 
 
+def test_an_axis_that_is_only_switched_on_goes_off_with_its_master(request: pytest.FixtureRequest) -> None:
+    clock = Clock()
+    with running(clean_cell(), request.node.name, clock) as (cell, master):
+        set_up(master)
+        for controlword in (0x00, 0x06, 0x07):
+            master.control(SIX, controlword)
+            master.sync()
+        assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCHED_ON}
+        let_go_on(master, clock, 1.0)
+        assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
+
+
 def test_a_sync_ends_the_time_without_sync(request: pytest.FixtureRequest) -> None:
     """The next program brings its own time: between its SYNCs nothing moves, however long it takes."""
     spec, clock = clean_cell(), Clock()
