@@ -259,6 +259,10 @@ class SyncStream:
         self._watch.faults.append(BusError(str(self._link.address), reason))
         self.pacing = TimedSync(pacing.period_ns, pacing.start_ns, pacing.clock)
         self._next_sync_ns = pacing.clock()
+        if self._cycles:
+            # The wait leaves a gap in the cycles, as it does in their times.
+            since_ns = self._next_sync_ns - self._last_sync_ns
+            self._skipped += max(0, (since_ns - pacing.period_ns // 2) // pacing.period_ns)
         return self._send_sync()
 
     def _open_own_cycle(self) -> int:

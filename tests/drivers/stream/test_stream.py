@@ -464,6 +464,20 @@ def test_a_producer_that_dies_is_a_fault_and_the_axes_can_still_be_stopped(follo
     assert bus.cycle == before + 3
 
 
+def test_the_periods_without_a_producer_are_a_gap_in_the_cycles(followed: Followed) -> None:
+    """Number and time of a sample belong together, also when this program sends SYNC after a wait."""
+    stream, bus, producer, _ = followed
+    first = next(stream)
+    producer.pulse()
+    bus.clock.now_ns = producer.at_ns
+    before, after = next(stream), stream.advance()
+    passed = (after.time_ns - first.time_ns + PERIOD_NS // 2) // PERIOD_NS
+    assert (before.cycle, after.cycle) == (1, passed)
+    assert passed >= 11  # the producer may be silent for ten periods
+    assert stream.statistics.skipped_periods == passed - 2
+    assert stream.advance().cycle == passed + 1
+
+
 def test_heartbeats_do_not_hide_that_a_producer_is_dead() -> None:
     """A bus is never silent for as long as a producer may be: the drives' heartbeats come in between."""
     for stream, bus, _, events in followed_stream():
