@@ -440,6 +440,19 @@ def test_a_missing_answer_ends_with_the_next_sync(followed: Followed) -> None:
     assert stream.statistics == StreamStatistics(cycles=4, frames=6, missing=2, late=1)
 
 
+def test_a_silence_that_is_read_late_has_its_own_length(followed: Followed) -> None:
+    """Five periods without an answer are five periods, also when they are read within no time."""
+    stream, bus, producer, _ = followed
+    next(stream)
+    bus.tamper = lambda _message: ()
+    for _ in range(6):
+        producer.pulse()
+    for _ in range(5):
+        stream.advance()
+    with pytest.raises(SampleLost, match=r"no axis answered within 0\.004 s"):
+        stream.check()
+
+
 def test_what_is_to_be_sent_goes_out_at_once(followed: Followed) -> None:
     stream, bus, producer, _ = followed
     next(stream)
