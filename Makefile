@@ -11,12 +11,13 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-vcan vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study coverage-study paper planning-study robot-study crash-study kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study weigh-study words wheel lock clean
+.PHONY: help setup demo test test-vcan chaos guard-study vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study coverage-study paper planning-study robot-study crash-study kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study weigh-study words wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
 	@echo "make test    set up, then lint, types, import contracts and tests"
 	@echo "make test-vcan  the main job over real SocketCAN (vcan), under User-Mode Linux where this kernel has none"
+	@echo "make chaos    random faults at random moments on SocketCAN for 10 minutes; SEED=1 MINUTES=10 or ROUND=7 (docs/evidence/socketcan.md)"
 	@echo "make test-console  the live console in headless Chromium beside whole recordings; screenshots in out/console"
 	@echo "make docs    build the documentation site into out/docs, offline, warnings as errors"
 	@echo "make screenshots  refresh the pictures of the documentation from real commands; minutes"
@@ -32,6 +33,7 @@ help:
 	@echo "make planning-study  planned against random moves (docs/evidence/planning.md); minutes"
 	@echo "make crash-study  recorders killed at random moments, damaged logs; some minutes"
 	@echo "make kill-study  jobs killed at 60 random moments, each finished by the next one; some minutes"
+	@echo "make guard-study  the axes of a recorder killed by kill -9, with a foreign node on every id from 1 to 127; minutes"
 	@echo "make console-study  60 minutes on SocketCAN with the console alternately open and closed: losses, jitter, processor, memory"
 	@echo "make drift-study  detection delay and false alarms of a drifting gain (docs/evidence/drift.md); a minute"
 	@echo "make holdout-study  which wrong gains the hold-out gate detects (docs/evidence/hold-out.md); a minute"
@@ -73,6 +75,11 @@ test-vcan: setup vcan-tools
 	@if command -v npm >/dev/null; then npm ci --prefix tests/vcan/foreign --no-audit --no-fund; \
 		else echo "no npm: the foreign stack's tests are skipped"; fi
 	$(BIN)/python -m tests.vcan.run $(BIN)/python -m pytest -q -m vcan tests/vcan
+
+chaos: setup vcan-tools
+	@mkdir -p out
+	DRIVEGAIN_VCAN_OUT=$(CURDIR)/out $(BIN)/python -m tests.vcan.run $(BIN)/python -m tests.chaos \
+		$(if $(SEED),--seed $(SEED)) $(if $(MINUTES),--minutes $(MINUTES)) $(if $(ROUND),--round $(ROUND))
 
 # What brings a kernel with vcan where this one has none.
 vcan-tools:
@@ -156,6 +163,9 @@ crash-study: setup
 
 kill-study: setup
 	$(BIN)/python -m tests.studies.recalibration_study --moments 60
+
+guard-study: setup
+	$(BIN)/python -m tests.faults.test_killed
 
 console-study: setup vcan-tools
 	@mkdir -p out

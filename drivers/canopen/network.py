@@ -67,6 +67,10 @@ SignalBlocker = Callable[[], AbstractContextManager[Callable[[], bool] | None]]
 
 It yields None, or a function that returns whether the operator has asked a second time: restoring is then given up.
 """
+UNRESTORED = (
+    WHILE + "closing the network: settings of {} not restored; switch these drives off and on before they are used"
+)
+"""Note on the error of nodes that could not be reached."""
 DEFAULT_BOUNDS = Bounds()
 DEFAULT_POLICY = SdoPolicy()
 
@@ -155,14 +159,19 @@ class CanopenNetwork:
         finally:
             self.link.close()
         if error is not None:
-            for problem in problems:
-                error.add_note(f"{WHILE}closing the network: {problem}")
+            self._note(error, problems)
             self._note_powered(error)
         elif problems:
-            for problem in problems[1:]:
-                problems[0].add_note(str(problem))
+            self._note(problems[0], problems[1:])
             self._note_powered(problems[0])
             raise problems[0]
+
+    def _note(self, error: BaseException, problems: Sequence[DriverError]) -> None:
+        """Attach failures to close the network, with their own notes, to the error that the operator gets."""
+        for problem in problems:
+            error.add_note(f"{WHILE}closing the network: {problem}")
+            for note in getattr(problem, "__notes__", ()):
+                error.add_note(note)
 
     def _note_powered(self, error: BaseException) -> None:
         """Name on an error the axes that may still have power."""
@@ -480,10 +489,12 @@ class CanopenNetwork:
                 if not problems or str(problem) != str(problems[0]):
                     problems.append(problem)
                 if attempt == "last":
+                    names = ", ".join(node_label(axis) for axis in axes)
+                    problems[-1].add_note(UNRESTORED.format(names))
                     self._setups.clear()
                     return problems
         if silent is not None:
-            silent.add_note("its settings were not restored")
+            silent.add_note(UNRESTORED.format(", ".join(node_label(n, self.link.names) for n in silent.node_ids)))
             problems.append(silent)
             axes = [axis for axis in axes if axis.node_id not in silent.node_ids]
         self.begin_stop(axes)

@@ -100,7 +100,7 @@ class SyncStream:
         self._behind = self._waited = self._cycle_over = False
         self._base = self._counted = self._losses = Losses()
         self._watch = Watch(network, on_event)
-        self._cycles = self._skipped = self._reads_past_deadline = self._incomplete_cycles = 0
+        self._cycles = self._skipped = self._reads_past_deadline = self._incomplete_cycles = self._silent_cycles = 0
         self._counts = self._answers.counts
 
     @property
@@ -259,6 +259,10 @@ class SyncStream:
         self._watch.faults.append(BusError(str(self._link.address), reason))
         self.pacing = TimedSync(pacing.period_ns, pacing.start_ns, pacing.clock)
         self._next_sync_ns = pacing.clock()
+        if self._cycles:
+            # The wait leaves a gap in the cycles, as it does in their times.
+            since_ns = self._next_sync_ns - self._last_sync_ns
+            self._skipped += max(0, (since_ns - pacing.period_ns // 2) // pacing.period_ns)
         return self._send_sync()
 
     def _open_own_cycle(self) -> int:
@@ -380,6 +384,7 @@ class SyncStream:
                     deadline_ns = min(deadline_ns, pacing.clock() + round(pacing.timeout_s * 1e9) // STRAGGLING)
                 answers.take(message.arbitration_id, slot, message.data)
         self.silent = not answers.any
+        self._silent_cycles = self._silent_cycles + 1 if self.silent else 0
         if not self.silent:
             self._answered_ns = pacing.clock()
 
@@ -449,7 +454,9 @@ class SyncStream:
                 text = f"no complete answer from {name} to cycle {cycle}"
                 self.emit(CellEvent(self.time_ns, axis, EventKind.SAMPLE_LOST, cycle, text))
             if self._incomplete_cycles > self.max_missing_cycles:
-                silent_s = (self.pacing.clock() - self._answered_ns) * 1e-9 if len(silent) == axes else None
+                # A reader that is late takes many cycles at once; those waited for no answer by the clock.
+                silent_ns = max(self.pacing.clock() - self._answered_ns, self._silent_cycles * self.pacing.period_ns)
+                silent_s = silent_ns * 1e-9 if len(silent) == axes else None
                 self._watch.faults.append(SampleLost(cycle, silent, names, silent_s))
         self._note_losses()
         statuswords = tuple(values[2 * axes :])

@@ -87,13 +87,13 @@ class Heard:
         return (max(times, default=after_ns) - after_ns) * 1e-9
 
     def stop_s(self, after_ns: int) -> float:
-        """Time from one moment to the first command without power for the axes [s]."""
+        """Time from one moment to the first command without power for the axes [s]; infinite without one."""
         times = [
             at_ns
             for at_ns, number, word in self.frames
             if at_ns > after_ns and number & 0x780 == RPDO1 and not word & RUNNING
         ]
-        return (min(times) - after_ns) * 1e-9
+        return (min(times, default=float("inf")) - after_ns) * 1e-9
 
 
 @contextmanager
@@ -241,12 +241,18 @@ def test_a_fault_stops_the_axes_on_a_flooded_bus(tmp_path: Path, figure: Callabl
 def test_a_deaf_node_on_a_flooded_bus_is_named_within_the_time_limit(
     tmp_path: Path, figure: Callable[[str], None]
 ) -> None:
-    with recording(tmp_path, f"  - {{fault: silent, axis: J3, at_cycle: {STRIKE}}}\n") as run, flooded():
-        said, _ = run.end()
-        answered_ns = max(at_ns for at_ns, number, _ in run.heard.frames if number == TPDO1 + 3)
-        stop_s, closing_s = run.heard.stop_s(answered_ns), (time.time_ns() - answered_ns) * 1e-9
-        figure(f"flood, J3 deaf: stop {1e3 * stop_s:.0f} ms after its last answer, ended after {closing_s:.1f} s")
-        assert run.process.returncode == ExitCode.DEVICE_FAULT, said
-        assert "J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop" in said
-        assert stop_s < 6 * CYCLE_S + 0.05  # four cycles without an answer are tolerated
-        assert closing_s < CLOSING_S
+    for attempt in range(1, ATTEMPTS + 1):
+        folder = tmp_path / str(attempt)
+        folder.mkdir()
+        with recording(folder, f"  - {{fault: silent, axis: J3, at_cycle: {STRIKE}}}\n") as run, flooded():
+            said, _ = run.end()
+            answered_ns = max(at_ns for at_ns, number, _ in run.heard.frames if number == TPDO1 + 3)
+            stop_s, closing_s = run.heard.stop_s(answered_ns), (time.time_ns() - answered_ns) * 1e-9
+        if "no axis answered" not in said:  # a flooded guest on a busy host may starve all amplifiers before J3 is deaf
+            break
+    stop_ms = 1e3 * stop_s
+    figure(f"flood, J3 deaf: stop {stop_ms:.0f} ms after its last answer, end {closing_s:.1f} s, attempt {attempt}")
+    assert run.process.returncode == ExitCode.DEVICE_FAULT, said
+    assert "J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop" in said
+    assert stop_s < 6 * CYCLE_S + 0.05  # four cycles without an answer are tolerated
+    assert closing_s < CLOSING_S

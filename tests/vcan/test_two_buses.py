@@ -20,6 +20,7 @@ from tests.vcan.run import INTERFACE, SECOND_INTERFACE
 
 PERIOD_US = 40_000
 """Four capture processes, the recorder and the cell share the one processor of the guest."""
+BUSES = {INTERFACE: LEFT, SECOND_INTERFACE: RIGHT}
 SO_TIMESTAMPNS, SO_RCVBUFFORCE = 35, 33  # asm-generic/socket.h
 
 pytestmark = pytest.mark.skipif(
@@ -66,8 +67,7 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     path = write_cell(folder, PERIOD_US, "timed")
     text = on_two_buses(path.read_text(encoding="utf-8"), "socketcan", INTERFACE, SECOND_INTERFACE)
     path.write_text(text, encoding="utf-8")
-    buses = {INTERFACE: LEFT, SECOND_INTERFACE: RIGHT}
-    with simulated(write_simulation(folder, PERIOD_US), buses=buses):
+    with simulated(write_simulation(folder, PERIOD_US), buses=BUSES):
         yield path
 
 

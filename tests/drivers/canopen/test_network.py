@@ -15,6 +15,7 @@ from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
 from drivers.errors import (
     POWERED,
+    WHILE,
     BusError,
     DriverError,
     MotionRefused,
@@ -385,3 +386,25 @@ def test_an_axis_that_had_power_and_fell_silent_is_named_alone() -> None:
         bus.tamper = lambda m: () if m.arbitration_id == 0x582 else (m,)
         raise ValueError("cause")
     assert [note for note in error.value.__notes__ if note.startswith(POWERED)] == [f"{POWERED}J2 (node 2)"]
+
+
+@pytest.mark.parametrize("cause", [True, False], ids=["beside another error", "alone"])
+def test_the_operator_reads_whose_settings_were_not_restored(cause: bool) -> None:
+    network, bus = cell(3)
+    with pytest.raises((ValueError, DriverError)) as error, network:
+        network.prepare()
+        bus.tamper = lambda m: () if m.arbitration_id == 0x582 else (m,)
+        if cause:
+            raise ValueError("cause")
+    said = [note for note in error.value.__notes__ if "not restored" in note]
+    assert len(said) == 1
+    assert said[0].startswith(f"{WHILE}closing the network: settings of J2 (node 2) not restored")
+
+
+def test_a_bus_that_is_cut_leaves_the_settings_of_all_axes_and_that_is_said() -> None:
+    network, bus = cell(2)
+    with pytest.raises(ValueError, match="cause") as error, network:
+        network.prepare()
+        bus.broken = True
+        raise ValueError("cause")
+    assert [note for note in error.value.__notes__ if "settings of J1 (node 1), J2 (node 2) not restored" in note]

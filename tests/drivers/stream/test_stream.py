@@ -440,6 +440,19 @@ def test_a_missing_answer_ends_with_the_next_sync(followed: Followed) -> None:
     assert stream.statistics == StreamStatistics(cycles=4, frames=6, missing=2, late=1)
 
 
+def test_a_silence_that_is_read_late_has_its_own_length(followed: Followed) -> None:
+    """Five periods without an answer are five periods, also when they are read within no time."""
+    stream, bus, producer, _ = followed
+    next(stream)
+    bus.tamper = lambda _message: ()
+    for _ in range(6):
+        producer.pulse()
+    for _ in range(5):
+        stream.advance()
+    with pytest.raises(SampleLost, match=r"no axis answered within 0\.004 s"):
+        stream.check()
+
+
 def test_what_is_to_be_sent_goes_out_at_once(followed: Followed) -> None:
     stream, bus, producer, _ = followed
     next(stream)
@@ -462,6 +475,20 @@ def test_a_producer_that_dies_is_a_fault_and_the_axes_can_still_be_stopped(follo
     before = bus.cycle
     assert [stream.advance().missing for _ in range(3)] == [0, 0, 0]
     assert bus.cycle == before + 3
+
+
+def test_the_periods_without_a_producer_are_a_gap_in_the_cycles(followed: Followed) -> None:
+    """Number and time of a sample belong together, also when this program sends SYNC after a wait."""
+    stream, bus, producer, _ = followed
+    first = next(stream)
+    producer.pulse()
+    bus.clock.now_ns = producer.at_ns
+    before, after = next(stream), stream.advance()
+    passed = (after.time_ns - first.time_ns + PERIOD_NS // 2) // PERIOD_NS
+    assert (before.cycle, after.cycle) == (1, passed)
+    assert passed >= 11  # the producer may be silent for ten periods
+    assert stream.statistics.skipped_periods == passed - 2
+    assert stream.advance().cycle == passed + 1
 
 
 def test_heartbeats_do_not_hide_that_a_producer_is_dead() -> None:
