@@ -26,7 +26,7 @@ import numpy as np
 from ident.arrays import BoolArray, FloatArray
 from ident.model.robot import JointKind, Robot, skew
 
-BLOCK_SAMPLES = 1024  #: Samples computed at once: their screws and products stay in a core's own cache
+BLOCK_SAMPLES = 4096  #: Samples computed at once: with fewer, most of the time goes into the calls of numpy
 
 
 def fill_rigid(
@@ -63,10 +63,18 @@ def fill_rigid(
             _fill_wrench(work.inertia, work.moments, screws[0], screws[1])
             for screw, mover in zip(screws[2:], link.movers, strict=True):
                 row = out[mover, index, :, block]
+                # Most joints turn or slide along an axis of their link's frame: their own row is one of Y's.
+                alone = link.component if mover == index else None
                 for part in inertias[index]:
-                    np.einsum("dk,dck->ck", screw[:3], work.inertia[:, part], out=row[:6][part])
+                    if alone is None:
+                        np.einsum("dk,dck->ck", screw[:3], work.inertia[:, part], out=row[:6][part])
+                    else:
+                        row[:6][part] = work.inertia[alone, part] if alone < 3 else 0.0
                 for part in moments[index]:
-                    np.einsum("dk,dck->ck", screw, work.moments[:, part], out=row[6:][part])
+                    if alone is None:
+                        np.einsum("dk,dck->ck", screw, work.moments[:, part], out=row[6:][part])
+                    else:
+                        row[6:][part] = work.moments[alone, part]
 
 
 def _spans(wanted: BoolArray) -> list[slice]:
@@ -151,6 +159,7 @@ class _Link:
     fixed: FloatArray  #: from the parent's frame to the joint's at q = 0, shape (6, 6)
     back: FloatArray | None  #: from the joint's frame to the link's; None where they are the same
     own: FloatArray  #: S in the link's frame, shape (6,)
+    component: int | None  #: the only one that S has, where it is 1; None where S is no axis of the frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,6 +190,7 @@ def _links(robot: Robot) -> tuple[_Link, ...]:
                 fixed=_blocks(turn @ joint.rotation.T, -turn @ joint.rotation.T @ skew(joint.translation_m)),
                 back=None if (turn == np.eye(3)).all() else _blocks(turn.T),
                 own=own,
+                component=int(np.argmax(own)) if np.count_nonzero(own) == 1 and own.max() == 1.0 else None,
             )
         )
     return tuple(links)

@@ -19,7 +19,7 @@ from ident.model.robot import Motion, Robot
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-PIECE_SAMPLES = 2048
+PIECE_SAMPLES = 8192
 DRIVE_PARAMETERS = ("Ia", "fv", "fs", "off")
 WIDTH = len(LINK_PARAMETERS) + len(DRIVE_PARAMETERS)
 
