@@ -32,6 +32,7 @@ class Job:
         folder: with plans, logs and calibration.yaml.
         truth: true gain by axis.
         simulation: name of the shipped simulation.
+        noise: factor of its current noise.
     """
 
     cell_file: Path
@@ -39,6 +40,7 @@ class Job:
     folder: Path
     truth: dict[str, float]
     simulation: str
+    noise: float = 1.0
 
     @property
     def calibration(self) -> dict[str, Any]:
@@ -68,6 +70,7 @@ def record_job(
     simulation: str | None = None,
     exchanges: int = 100,
     effects: tuple[UndeclaredEffect, ...] = (),
+    noise: float = 1.0,
 ) -> tuple[Job, list[Path]]:
     """Plan, and record in turn without and with the cell's first payload; return the job and its logs.
 
@@ -80,6 +83,7 @@ def record_job(
         simulation: name of the shipped simulation; that of the cell when None.
         exchanges: of moves in planning.
         effects: of the plant, beside those of the simulation file.
+        noise: factor of the current noise of the simulation file.
     """
     # A copy: what is written to a controller leaves an audit and a history beside the cell file.
     shutil.copytree(shipped_configurations(), folder / "configs")
@@ -87,7 +91,7 @@ def record_job(
     cell = load_cell(cell_file)
     plant = load_simulation(shipped_simulation(simulation or name))
     truth = {axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, plant.axes, strict=True)}
-    job = Job(cell_file, cell, folder, truth, simulation or name)
+    job = Job(cell_file, cell, folder, truth, simulation or name, noise)
     logs = []
     for pair in range(pairs):
         plan = make_plan(job, f"plan-{pair}.yaml", seed=10 * seed + pair, seconds=seconds, exchanges=exchanges)
@@ -141,13 +145,14 @@ def record_run(
         effects: of the plant, beside those of the simulation file.
     """
     spec = load_simulation(shipped_simulation(job.simulation), mounted)
+    axes = tuple(replace(axis, current_noise_a=job.noise * axis.current_noise_a) for axis in spec.axes)
     chosen = []
     if declared:
         mass_kg = next(payload.mass_kg for payload in job.cell.payloads if payload.name == mounted)
         chosen = ["--payload", str(mounted), "--mass", str(mass_kg)]
     bus = open_bus(bus_address(job.cell))
     try:
-        with SimulatedCell(replace(spec, seed=seed, effects=spec.effects + effects), bus):
+        with SimulatedCell(replace(spec, axes=axes, seed=seed, effects=spec.effects + effects), bus):
             moving = ["--enable-motion", "--operator", "test"]
             _do(["record", str(job.cell_file), str(plan), "--out", str(log), *moving, *chosen])
     finally:

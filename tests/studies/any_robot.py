@@ -56,6 +56,7 @@ class StudiedRobot:
     second: str  #: second body in the simulation file
     weighed: int = 2  #: recordings with it, each with a plan of its own
     exchanges: int = 200  #: tries of the planner
+    noise: float = 1.0  #: factor of the simulation's current noise, for a relative error of 3 to 4 %
 
     @property
     def fingerprint(self) -> str:
@@ -67,14 +68,14 @@ class StudiedRobot:
 
 
 ROBOTS = (
-    StudiedRobot("TX-40", "demo", "clean", 40.0, 3, "plate", weighed=3),
+    StudiedRobot("TX-40", "demo", "clean", 40.0, 3, "plate", weighed=3, noise=1.3),
     StudiedRobot("RX-90", "rx90", "rx90", 40.0, 2, "plate", weighed=3),
     StudiedRobot("KR270", "kr270", "kr270", 60.0, 3, "tool"),
-    StudiedRobot("seven-axis", "seven-axis", "seven-axis", 40.0, 2, "bar"),
+    StudiedRobot("seven-axis", "seven-axis", "seven-axis", 40.0, 2, "bar", noise=1.3),
     StudiedRobot("gantry", "gantry", "gantry", 60.0, 2, "box"),
     StudiedRobot("five-bar", "five-bar", "five-bar", 60.0, 3, "block"),
-    StudiedRobot("Orthoglide", "orthoglide", "orthoglide", 40.0, 3, "spindle"),
-    StudiedRobot("DualV", "dualv", "dualv", 40.0, 2, "plate"),
+    StudiedRobot("Orthoglide", "orthoglide", "orthoglide", 40.0, 3, "spindle", noise=0.85),
+    StudiedRobot("DualV", "dualv", "dualv", 40.0, 2, "plate", noise=0.8),
 )
 """To study another robot, ship its cell and simulation, with two bodies, and add a row."""
 
@@ -90,6 +91,7 @@ def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
             seed=seed,
             simulation=robot.simulation,
             exchanges=robot.exchanges,
+            noise=robot.noise,
         )
         fit_job(job, fitted)
         first = job.cell.payloads[0].name
