@@ -203,9 +203,14 @@ def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effect
     torque = columns @ estimate.parameters[own]
     rest = problem.jacobian.only(np.flatnonzero(~taken))
     for place, motor in enumerate(problem.free[problem.free < len(estimate.gains)]):
-        # ∂(γ τ)/∂g = −γ² τ, and τ loses these effects.
-        slope = torque[problem.rows_of(motor)] * problem.gamma[motor] * problem.scale[place]
-        rest.parts[motor][rest.seen[motor] == place] += slope
+        # ∂(γ τ)/∂g = −γ² τ, and τ loses these effects; with preload ∂e/∂g_i = (T_D)_i (v_i − σ_i e_i), in all rows.
+        lost, scale = torque[problem.rows_of(motor)], problem.scale[place]
+        if problem.transform is None:
+            rest.parts[motor][rest.seen[motor] == place] += lost * problem.gamma[motor] * scale
+            continue
+        for other, (part, seen) in enumerate(zip(rest.parts, rest.seen, strict=True)):
+            passed = problem.transform[problem.source[problem.rows_of(other)], other, motor]
+            part[seen == place] += lost * passed * problem.noise[motor] * scale
     hessian = np.zeros((rest.width, rest.width))
     for part, seen in zip(rest.parts, rest.seen, strict=True):
         hessian[np.ix_(seen, seen)] += part @ part.T

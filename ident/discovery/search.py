@@ -262,7 +262,7 @@ def _judge(
     )
     refusals = tuple(words for refused, words in verdicts if refused)
     floor_a = search_problem.floors_a[motor]
-    excess = 0.0 if floor_a is None else own - float(np.sum(rows)) * (floor_a / problem.noise[motor]) ** 2
+    excess = 0.0 if floor_a is None else own - problem.shown(motor) * (floor_a / problem.noise[motor]) ** 2
     return Finding(
         effect=effect,
         axis=family.axis,

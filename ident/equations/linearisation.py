@@ -101,6 +101,14 @@ class Linearisation:
         first, last = np.searchsorted(self.motor, (motor, motor + 1))
         return slice(int(first), int(last))
 
+    def shown(self, motor: int) -> float:
+        """Σ P_ii over a motor's rows: their number, less what internal preload hides of the current's noise."""
+        rows = self.rows_of(motor)
+        if self.transform is None:
+            return float(rows.stop - rows.start)
+        passed = self.transform[self.source[rows], motor, motor]
+        return float(passed.sum() * self.noise[motor] / self.gamma[motor])
+
     def felt(self, torque_nm: FloatArray, to_motor: FloatArray) -> dict[int, FloatArray]:
         """Joint torque columns, shape (n, extra, r), whitened, on the rows of each motor that feels any: (extra, rows).
 
