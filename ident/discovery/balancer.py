@@ -12,8 +12,8 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from ident.discovery.candidates import SearchProblem
-from ident.discovery.refinement import is_possible, refine_together
-from ident.discovery.search import Gates
+from ident.discovery.gates import Gates
+from ident.discovery.refinement import is_strictly_possible, refine_together
 from ident.effects.effect import Effect
 from ident.effects.position import Counterbalance
 
@@ -49,7 +49,7 @@ def propose_balancers(
             (float(np.max(trial.fallen / left)), effect)
             for family in tested
             for effect, trial in family.members
-            if is_possible(effect, trial)
+            if is_strictly_possible(effect, trial)
         ]
         members = [effect for share, effect in sorted(found, key=lambda one: -one[0]) if share >= gates.smallest_share]
         refined = [refine_together(search_problem, start, axis) for start in _apart(members)]

@@ -27,8 +27,8 @@ import scipy  # loads scipy.special when it is first used: a fit needs none of i
 
 from ident.arrays import FloatArray
 from ident.discovery.candidates import SearchProblem, score_candidates
-from ident.discovery.gates import impossible, shifts_by, whitened_columns, without_effects_of
-from ident.discovery.search import Finding, Gates, paired_t
+from ident.discovery.gates import Gates, impossible, shifts_by, whitened_columns, without_effects_of
+from ident.discovery.search import Finding, paired_t
 from ident.effects.effect import PlacedEffect
 from ident.estimators.estimate import Estimate
 

@@ -1,4 +1,4 @@
-"""Gates that are no matter of one score: physics, runs left out, gains, and every effect against all the others.
+"""Limits of the search, and gates that are no matter of one score: physics, runs left out, gains, effects together.
 
 A column declares which values physics allows its coefficient (`ident.model.model.Column`); `impossible` compares an
 estimate with them. `RunsLeftOut` predicts whole runs without and with a candidate: moves of one run share its
@@ -34,6 +34,26 @@ SIGMAS = 2.0  #: A coefficient outside its possible values by more than this man
 MIN_RUNS = 3  #: With two runs, one left out leaves a fit of the other alone
 CONFIDENCE = 0.95  #: Of a coefficient that is not zero; one-sided, of a rise by more than noise
 _RIDGE = 1e-10  #: Share of the diagonal of JᵀJ added to it
+
+
+@dataclass(frozen=True, slots=True)
+class Gates:
+    """Limits that a candidate must pass before it may join the model."""
+
+    false_alarm: float = 0.01  #: largest probability that noise makes one this strong anywhere
+    folds_better: float = 0.75  #: least share of folds on which the candidate lowers the error
+    explained: float = 0.03  #: least share of the motor's squared residual
+    error_fall: float = 0.02  #: least relative fall of the motor's error on held-out moves
+    # With few moves the bootstrap has little power, and a correct prediction is evidence of another kind.
+    strong_folds: float = 0.875  #: as `folds_better`, for a strong candidate
+    strong_fall: float = 0.1  #: as `error_fall`, for a strong candidate
+    strong_false_alarm: float = 0.05  #: as `false_alarm`, for a strong candidate
+    draws: int = 999  #: number of draws of the bootstrap
+
+    @property
+    def smallest_share(self) -> float:
+        """Share of a motor's squared residual below which an effect fails a gate, if held-out moves fall as all do."""
+        return max(self.explained, 1.0 - (1.0 - self.error_fall) ** 2)
 
 
 def impossible(columns: Sequence[Column], values: FloatArray, deviations: FloatArray) -> str:

@@ -16,6 +16,7 @@ from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem,
 from ident.discovery.choice import choice_covariance, is_small
 from ident.discovery.evidence import Evidence, by_instruments, with_effects
 from ident.discovery.gates import (
+    Gates,
     RunsLeftOut,
     gain_shifts,
     impossible,
@@ -29,19 +30,15 @@ from ident.discovery.refinement import refine_together
 from ident.discovery.resonance import propose_resonances
 from ident.discovery.ripple import propose_orders
 from ident.discovery.search import (
-    MIN_MOVES_FOR_STRUCTURE,
     EffectKey,
     Finding,
-    Gates,
     choose_effect,
-    detection_limits_nm,
     effect_key,
-    find_structure,
-    is_inadequate,
     rank_effects,
     rank_families,
     refine_setting,
 )
+from ident.discovery.structure import MIN_MOVES_FOR_STRUCTURE, detection_limits_nm, find_structure, is_inadequate
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.position import Counterbalance

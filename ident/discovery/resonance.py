@@ -16,7 +16,7 @@ import numpy as np
 
 from ident.arrays import BoolArray, FloatArray
 from ident.discovery.candidates import SearchProblem, Trial
-from ident.discovery.search import Gates
+from ident.discovery.gates import Gates
 from ident.effects.effect import Effect
 from ident.effects.signals import Signals, curvature
 from ident.effects.transmission import SETTLED_S, Backlash, Elasticity, spring_torque, twist_acceleration

@@ -28,7 +28,8 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.discovery.candidates import SearchProblem
-from ident.discovery.search import MIN_MOVES_FOR_STRUCTURE, Gates
+from ident.discovery.gates import Gates
+from ident.discovery.structure import MIN_MOVES_FOR_STRUCTURE
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.electrical import Cogging
 from ident.effects.transmission import Ripple
