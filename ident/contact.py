@@ -53,11 +53,11 @@ FAR_OUT = 3.0  #: Interquartile ranges above the upper quartile (Tukey's "far ou
 class Band:
     """Band and thresholds of every joint, learned from quiet motion."""
 
-    scale: FloatArray  #: (a, b, c, d) of each joint in the order of DRIVERS, shape (n, 4)
-    factor: FloatArray  #: half the band over s, shape (n,)
-    threshold: FloatArray  #: threshold over s; NaN where the quiet motion has fewer than MIN_PEAKS, shape (n,)
-    correlation_s: FloatArray  #: correlation time of the residual [s], shape (n,)
-    quiet_s: FloatArray  #: time that each joint moved in the quiet motion [s], shape (n,)
+    scale: FloatArray  #: (a, b, c, d) of each joint in the order of DRIVERS, shape (m, 4)
+    factor: FloatArray  #: half the band over s, shape (m,)
+    threshold: FloatArray  #: threshold over s; NaN where the quiet motion has fewer than MIN_PEAKS, shape (m,)
+    correlation_s: FloatArray  #: correlation time of the residual [s], shape (m,)
+    quiet_s: FloatArray  #: time that each joint moved in the quiet motion [s], shape (m,)
     alarms_per_hour: float  #: false alarms of all joints together, in an hour of motion
 
 
@@ -77,21 +77,21 @@ class ExternalTorque:
     """External torque of one run; arrays are joint-first, rows last."""
 
     time_s: FloatArray  #: of each row, since the start of the run, shape (r,)
-    torque_nm: FloatArray  #: τ_ext, shape (n, r)
-    scale_nm: FloatArray  #: s, shape (n, r)
-    use: BoolArray  #: whether each row of a joint counts, moving and valid, shape (n, r)
+    torque_nm: FloatArray  #: τ_ext, shape (m, r)
+    scale_nm: FloatArray  #: s, shape (m, r)
+    use: BoolArray  #: whether each row of a joint counts, moving and valid, shape (m, r)
     band: Band  #: learned from quiet runs, or from the run's own quiet stretches
     from_itself: bool  #: the band is from the run's own quiet stretches
     left_out: int  #: stretches of the run that were not quiet; 0 where the band is from other runs
 
     @property
     def band_nm(self) -> FloatArray:
-        """Half the band, shape (n, r)."""
+        """Half the band, shape (m, r)."""
         return self.scale_nm * self.band.factor[:, None]
 
     @property
     def threshold_nm(self) -> FloatArray:
-        """Threshold, shape (n, r)."""
+        """Threshold, shape (m, r)."""
         return self.scale_nm * self.band.threshold[:, None]
 
     @property
@@ -112,9 +112,9 @@ class _Residual:
     """Decimated rows of one run."""
 
     time_s: FloatArray  #: shape (r,)
-    torque_nm: FloatArray  #: shape (n, r)
-    drivers: FloatArray  #: shape (n, 4, r)
-    use: BoolArray  #: shape (n, r)
+    torque_nm: FloatArray  #: shape (m, r)
+    drivers: FloatArray  #: shape (m, 4, r)
+    use: BoolArray  #: shape (m, r)
     move: IntArray  #: shape (r,)
 
 
@@ -195,7 +195,7 @@ def _quiet(rows: _Residual) -> tuple[_Residual, int]:
 
 
 def _scales(parts: Sequence[_Residual], *, robust: bool = False) -> FloatArray:
-    """(a, b, c, d) of each joint, shape (n, 4); robust: rows beyond four times the scale are left out."""
+    """(a, b, c, d) of each joint, shape (m, 4); robust: rows beyond four times the scale are left out."""
     out = np.zeros((len(parts[0].use), len(DRIVERS)))
     for joint in range(len(out)):
         size = np.concatenate([np.abs(part.torque_nm[joint, part.use[joint]]) for part in parts])

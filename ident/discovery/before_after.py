@@ -25,7 +25,7 @@ Estimates before and after share their noise, so the σ of a change is neither o
 is the jackknife of the change itself: leaving out block c of moves shifts g by d_c = −(H − G_c)⁻¹ s_c
 (ident/equations/linearisation.py; the longer blocks of the two models serve both), and
 
-    σ_Δ² = (m − 1)/m Σ_c (Δd_c − mean)²,        Δd_c = d_c after − d_c before.
+    σ_Δ² = (C − 1)/C Σ_c (Δd_c − mean)²,        Δd_c = d_c after − d_c before,        of C blocks.
 
 It takes the effects as given; σ after the whole search includes their choice (ident/discovery/choice.py).
 """
@@ -66,7 +66,7 @@ from ident.estimators.identify import estimate_with
 class CurrentError:
     """Sums over rows, so that errors of parts of the data can be added."""
 
-    size: FloatArray  #: ‖v_i‖² of each motor [A²], shape (n,)
+    size: FloatArray  #: ‖v_i‖² of each motor [A²], shape (m,)
     left: FloatArray  #: ‖e_i‖² [A²], same shape
 
     def __add__(self, other: CurrentError) -> CurrentError:
@@ -74,7 +74,7 @@ class CurrentError:
         return CurrentError(self.size + other.size, self.left + other.left)
 
     def relative(self, weights_nm_a: FloatArray) -> RelativeError:
-        """ε_i and ε [%] with weights w, shape (n,); NaN for a motor without a row."""
+        """ε_i and ε [%] with weights w, shape (m,); NaN for a motor without a row."""
         return of_squares(self.size * weights_nm_a**2, self.left * weights_nm_a**2)
 
 
@@ -219,10 +219,10 @@ class Errors:
 class Moves:
     """The linearised problem by move: what leaving moves out needs."""
 
-    grams: FloatArray  #: G_c of each move, shape (m, f, f)
-    scores: FloatArray  #: s_c of each move, shape (m, f)
+    grams: FloatArray  #: G_c of each move, shape (c, f, f)
+    scores: FloatArray  #: s_c of each move, shape (c, f)
     scale: FloatArray  #: unit of each unknown, shape (f,); the gains are the first
-    runs: IntArray  #: run of each move, shape (m,)
+    runs: IntArray  #: run of each move, shape (c,)
 
     def blocks(self) -> IntArray:
         """First move of each block of moves that is independent of the others."""
@@ -240,9 +240,9 @@ class Assessment:
 
     effects: tuple[PlacedEffect, ...]  #: in the model
     errors: Errors  #: of the model
-    gains: FloatArray  #: drive gains [Nm at the joint per A], shape (n,)
-    gains_std: FloatArray  #: their σ, shape (n,)
-    choice_std: FloatArray  #: the part of it that comes from the choice of the effects, shape (n,)
+    gains: FloatArray  #: drive gains [Nm at the joint per A], shape (m,)
+    gains_std: FloatArray  #: their σ, shape (m,)
+    choice_std: FloatArray  #: the part of it that comes from the choice of the effects, shape (m,)
     moves: Moves | None  #: what each move says of the gains; None for fixed gains
 
 
@@ -416,7 +416,7 @@ def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
 
 
 def capped(floors: Sequence[NoiseFloor | None], left_a: FloatArray) -> tuple[NoiseFloor | None, ...]:
-    """Lower each floor to what a model leaves on the rows it is shown for [A, root mean square], shape (n,)."""
+    """Lower each floor to what a model leaves on the rows it is shown for [A, root mean square], shape (m,)."""
     return tuple(
         None if floor is None else replace(floor, noise_a=float(np.fmin(floor.noise_a, left)))
         for floor, left in zip(floors, left_a, strict=True)

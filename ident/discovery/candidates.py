@@ -78,12 +78,12 @@ class SearchProblem:
         return tuple(FamilyTrials(axis, tuple(found)) for found in members.values())
 
     def trials(self, torques: Iterable[FloatArray]) -> tuple[Trial | None, ...]:
-        """Test candidates given by their joint torques (n, p, r); None where the model contains them already."""
+        """Test candidates given by their joint torques (m, p, r); None where the model contains them already."""
         problem, to_motor = self.folds.linearisation, self.model.drive_train.to_motor
         return _scored(self.folds, ((torque.shape[1], problem.felt(torque, to_motor)) for torque in torques))
 
     def torque(self, effect: Effect, axis: int) -> FloatArray:
-        """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (n, p, r)."""
+        """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (m, p, r)."""
         kept = self.cache.get((effect, axis))
         if kept is None:
             conditioning = self.observation.conditioning
@@ -111,7 +111,7 @@ class FamilyTrials:
     members: tuple[tuple[Effect, Trial], ...]  #: settings and their trials, at least one
 
     def nested(self) -> FloatArray:
-        """‖e‖² of each fold and motor, shape (folds, n), with the setting chosen by the other folds alone."""
+        """‖e‖² of each fold and motor, shape (folds, m), with the setting chosen by the other folds alone."""
         chosen = np.argmax(np.stack([trial.training_fall for _, trial in self.members]), axis=0)
         return np.stack([self.members[best][1].held_out[fold] for fold, best in enumerate(chosen)])
 
@@ -121,9 +121,9 @@ class Trial:
     """Result of testing one candidate."""
 
     coefficients: FloatArray  #: in-sample, in the unit of the columns, shape (p,)
-    fallen: FloatArray  #: in-sample fall of ‖e‖² of each motor, shape (n,)
+    fallen: FloatArray  #: in-sample fall of ‖e‖² of each motor, shape (m,)
     training_fall: FloatArray  #: fall of ‖e‖² on the other folds, by which a setting may be chosen, shape (folds,)
-    held_out: FloatArray  #: ‖e‖² of each fold and motor with the candidate fitted on the others, shape (folds, n)
+    held_out: FloatArray  #: ‖e‖² of each fold and motor with the candidate fitted on the others, shape (folds, m)
     score: FloatArray  #: Φ⊥ᵀe, shape (p,)
     scatter: FloatArray  #: Φ⊥ᵀe of each cluster with the candidate fitted: its noise alone, shape (clusters, p)
     gram: FloatArray  #: Φ⊥ᵀΦ⊥ of each cluster, shape (clusters, p, p)

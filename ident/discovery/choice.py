@@ -39,7 +39,7 @@ def choice_covariance(
     accepted: Sequence[tuple[Finding, Sequence[Finding]]],
     left: Sequence[Finding],
 ) -> FloatArray:
-    """Covariance of (gains, parameters) from the choice of the effects in a joint fit, shape (n + p, n + p).
+    """Covariance of (gains, parameters) from the choice of the effects in a joint fit, shape (m + p, m + p).
 
     Args:
         search_problem: linearised around the joint fit.
@@ -88,7 +88,7 @@ def _by_rivals(
         torque: of the chosen effect, whitened, shape (rows,); zero where there is none.
         fold_errors: ‖e‖² of the chosen model on each fold, shape (folds,).
         rivals: the other effects.
-        size: n + p.
+        size: m + p.
     """
     gain = fold_errors - np.stack([one.fold_errors for one in rivals])
     better = scipy.special.stdtr(gain.shape[1] - 1, paired_t(gain))

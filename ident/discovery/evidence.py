@@ -139,7 +139,7 @@ def _torques(
     began_s: float | None,
     runs: Sequence[Signals] = (),
 ) -> FloatArray:
-    """Columns of effects on the rows of runs, load and current predicted by an estimate, shape (n, p, r)."""
+    """Columns of effects on the rows of runs, load and current predicted by an estimate, shape (m, p, r)."""
     parts, through_links = [], any(placed.effect.side is Side.ALL_JOINTS for placed in effects)
     for index, data in enumerate(datasets):  # one by one: signals at full rate are the largest arrays of a search
         if runs:

@@ -198,7 +198,7 @@ class Reduced:
 
     @property
     def gain_shifts(self) -> FloatArray:
-        """Shift of each gain by these effects [Nm at the joint per A], shape (n,)."""
+        """Shift of each gain by these effects [Nm at the joint per A], shape (m,)."""
         return gain_shifts(self.search_problem.folds, self.torque)
 
 
@@ -248,7 +248,7 @@ def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effect
 
 
 def gain_shifts(folds: Folds, torque: FloatArray) -> FloatArray:
-    """Shift of each gain when a whitened torque, shape (rows,), joins the model [Nm at the joint per A], shape (n,)."""
+    """Shift of each gain when a whitened torque, shape (rows,), joins the model [Nm at the joint per A], shape (m,)."""
     count = len(folds.linearisation.gamma)
     return shifts_by(folds, torque, max(count, int(folds.linearisation.free[-1]) + 1))[:count]
 

@@ -78,12 +78,12 @@ class Step:
     #: Smooth and periodic terms: on the axis of the best named effect, which must not be much worse than they are, or
     #: on all axes where no named effect passed.
     structures: tuple[Finding, ...]
-    limits_nm: FloatArray  #: torque (root mean square) that a detectable effect has at each motor, shape (n,)
+    limits_nm: FloatArray  #: torque (root mean square) that a detectable effect has at each motor, shape (m,)
     accepted: Finding | None  #: the finding, or the structure without a name, that joined the model; None ends the loop
     after: Evidence  #: the model with it
     set_aside: tuple[SetAside, ...] = ()  #: what would have joined the model, but for runs left out or the joint fit
     ended: str = ""  #: reason why the search ended here although the residual may call for more; else empty
-    #: σ of each gain [Nm/A] from the choice of the effects, contained in that of `after`, shape (n,); last turn only.
+    #: σ of each gain [Nm/A] from the choice of the effects, contained in that of `after`, shape (m,); last turn only.
     choice_std: FloatArray | None = None
     declared: bool = False  #: the cell declares the effect that joined: it was not searched for
 

@@ -59,7 +59,7 @@ def is_inadequate(named: Finding, structure: Finding) -> bool:
 
 
 def detection_limits_nm(search_problem: SearchProblem, gates: Gates) -> FloatArray:
-    """Compute the torque of a detectable effect at each motor, root mean square over the moving rows, shape (n,).
+    """Compute the torque of a detectable effect at each motor, root mean square over the moving rows, shape (m,).
 
     It is torque that the declared model cannot mimic: most of an effect that resembles gravity or viscous friction is
     absorbed by those. The limit holds for effects whose shape the dictionary or a spline can follow; on a short

@@ -1,6 +1,6 @@
 """The problem around an estimate as a linear one, and everything that leaves moves out of it.
 
-The residual of motor i is e_i = (v_i − γ_i (T τ)_i)/σ_i with the unknowns (g_1 … g_n, χ, χ_uL); see
+The residual of motor i is e_i = (v_i − γ_i (T τ)_i)/σ_i with the unknowns (g_1 … g_m, χ, χ_uL); see
 estimators/maximum_likelihood.py. Its derivative to a gain is built from the *predicted* torque, not from the measured
 current, so that the noise does not enter it. `motor_jacobian` is that derivative. Error bars leave out one move at a
 time (`left_out_shifts`); the search for effects leaves out folds of moves (`cut_into_folds`).
@@ -79,8 +79,8 @@ class Linearisation:
     motor: IntArray  #: of each row, shape (rows,)
     cluster: IntArray  #: number of each row's cluster, 0 … without gaps, shape (rows,)
     source: IntArray  #: index of each row among the observation's decimated rows, shape (rows,)
-    gamma: FloatArray  #: 1/g, shape (n,)
-    noise: FloatArray  #: σ_i [A], shape (n,)
+    gamma: FloatArray  #: 1/g, shape (m,)
+    noise: FloatArray  #: σ_i [A], shape (m,)
     free: IntArray  #: which of (gains, parameters) are free, shape (f,)
     #: Unit of each free unknown: a step of one in the scaled unknown is this much of the real one, shape (f,).
     scale: FloatArray
@@ -110,7 +110,7 @@ class Linearisation:
         return float(passed.sum() * self.noise[motor] / self.gamma[motor])
 
     def felt(self, torque_nm: FloatArray, to_motor: FloatArray) -> dict[int, FloatArray]:
-        """Joint torque columns, shape (n, extra, r), whitened, on the rows of each motor that feels any: (extra, rows).
+        """Joint torque columns, shape (m, extra, r), whitened, on the rows of each motor that feels any: (extra, rows).
 
         Args:
             torque_nm: per unit of each column.
@@ -201,7 +201,7 @@ def motor_jacobians(
 def motor_jacobian(
     rows: FloatArray, motor: int, gains: FloatArray, parameters: FloatArray, noise: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """J = ∂(γ_i (T τ)_i/σ_i)/∂(g, χ, χ_uL) and e of one motor's equations, shapes (m, n + p) and (m,).
+    """J = ∂(γ_i (T τ)_i/σ_i)/∂(g, χ, χ_uL) and e of one motor's equations, shapes (r, m + p) and (r,).
 
     Args:
         rows: [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], or the triangle of these, which has the same JᵀJ and Jᵀe.
@@ -219,11 +219,11 @@ def motor_jacobian(
 
 
 def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
-    """Shift of the unknowns when each cluster is left out, d_c = −(H − G_c)⁻¹ s_c with H = Σ G_c, shape (m, f).
+    """Shift of the unknowns when each cluster is left out, d_c = −(H − G_c)⁻¹ s_c with H = Σ G_c, shape (c, f).
 
     Args:
-        grams: G_c = J_cᵀJ_c of each cluster, shape (m, f, f).
-        scores: s_c = J_cᵀe_c around the estimate, where they sum to zero, shape (m, f).
+        grams: G_c = J_cᵀJ_c of each cluster, shape (c, f, f).
+        scores: s_c = J_cᵀe_c around the estimate, where they sum to zero, shape (c, f).
     """
     hessian = grams.sum(axis=0)
     # In units in which every unknown is seen equally well: kilograms are beside kg m².
@@ -240,7 +240,7 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def scatter_of(shifts: FloatArray) -> FloatArray:
-    """Jackknife covariance (m − 1)/m Σ (d_c − mean)(d_c − mean)ᵀ, shape (f, f), of shifts d_c, shape (m, f)."""
+    """Jackknife covariance (C − 1)/C Σ (d_c − mean)(d_c − mean)ᵀ, shape (f, f), of C shifts d_c, shape (C, f)."""
     centred = shifts - shifts.mean(axis=0)
     return np.asarray((len(shifts) - 1) / len(shifts) * (centred.T @ centred))
 
@@ -258,9 +258,9 @@ def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) ->
     Fishman 1978).
 
     Args:
-        grams: G_c of each cluster, shape (m, f, f), in the order of time.
-        scores: s_c, shape (m, f).
-        runs: run of each cluster, shape (m,).
+        grams: G_c of each cluster, shape (c, f, f), in the order of time.
+        scores: s_c, shape (c, f).
+        runs: run of each cluster, shape (c,).
 
     Returns:
         first cluster of each block, ascending; at least MIN_MOVES_TO_LEAVE_OUT where there are as many clusters.
@@ -299,13 +299,13 @@ def jackknife_covariance(
 
     Args:
         system: of the fit.
-        gains, parameters: the estimate, gains in Nm/A, shapes (n,) and (p,).
-        noise: σ_i of each motor's current [A], shape (n,).
+        gains, parameters: the estimate, gains in Nm/A, shapes (m,) and (p,).
+        noise: σ_i of each motor's current [A], shape (m,).
         gains_fixed: the gains were given.
         recorded: equations whose residuals count, where those of ``system`` are projected on instruments.
 
     Returns:
-        shape (n + p, n + p).
+        shape (m + p, m + p).
 
     Raises:
         TooFewMoves: fewer than MIN_MOVES_TO_LEAVE_OUT.
@@ -385,9 +385,9 @@ class Folds:
     scores: FloatArray  #: Jᵀe without each fold, shape (folds, f)
     cluster_hessian: FloatArray  #: JᵀJ of each cluster, shape (clusters, f, f)
     cluster_score: FloatArray  #: Jᵀe of each cluster, shape (clusters, f)
-    part_hessian: FloatArray  #: JᵀJ of each fold and motor, shape (folds, n, f, f)
-    part_score: FloatArray  #: Jᵀr of each fold and motor, shape (folds, n, f)
-    motor_score: FloatArray  #: Jᵀe of each motor, shape (n, f)
+    part_hessian: FloatArray  #: JᵀJ of each fold and motor, shape (folds, m, f, f)
+    part_score: FloatArray  #: Jᵀr of each fold and motor, shape (folds, m, f)
+    motor_score: FloatArray  #: Jᵀe of each motor, shape (m, f)
     residual: FloatArray  #: r, the e of each row predicted by a fit that did not see its fold, shape (rows,)
 
     @property
@@ -396,7 +396,7 @@ class Folds:
         return len(self.factors)
 
     def square_sum(self, residual: FloatArray) -> FloatArray:
-        """‖e‖² of each fold and motor, shape (folds, n)."""
+        """‖e‖² of each fold and motor, shape (folds, m)."""
         rows, fold, _, motor = zip(*self.blocks, strict=True)
         total = np.zeros((self.count, len(self.linearisation.gamma)))
         np.add.at(total, (fold, motor), np.add.reduceat(residual**2, [part.start for part in rows]))

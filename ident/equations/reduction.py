@@ -44,7 +44,7 @@ class Cluster:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Which of the columns [v_1 … v_n | W_st] a joint's or a motor's equation holds."""
+    """Which of the columns [v_1 … v_m | W_st] a joint's or a motor's equation holds."""
 
     joint: tuple[IntArray, ...]  #: for each joint, indices into [V | W_st], ascending
     motor: tuple[IntArray, ...]  #: for each motor, indices of W_st; its own current comes before them
@@ -60,8 +60,8 @@ class Reduction:
     runs: tuple[str, ...]  #: names of the runs
     #: For each mounting, −1 (without load) first, the triangle of each joint's rows.
     joints: tuple[tuple[FloatArray, ...], ...]
-    joint_rows: IntArray  #: equations of each joint, shape (n,)
-    motor_rows: IntArray  #: equations of each motor, shape (n,)
+    joint_rows: IntArray  #: equations of each joint, shape (m,)
+    motor_rows: IntArray  #: equations of each motor, shape (m,)
     clusters: tuple[Cluster, ...]  #: in the order of the runs
     instrumented: bool = False  #: the clusters hold instruments, made of the demanded motion
     kept: tuple[RunRows, ...] = ()  #: the runs with all their rows, where they were asked for

@@ -52,7 +52,7 @@ class Equations:
 class System(Equations):
     """The equations of several runs as triangles, W_tot = [V | −W | −W_uL | −W_kL χ_kL]."""
 
-    joints: Triangles  #: triangle of each joint's rows of W_tot, c = n + p + 1 columns
+    joints: Triangles  #: triangle of each joint's rows of W_tot, c = m + p + 1 columns
     #: Triangle of each motor's rows [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], p + 2 columns: the equation g_i v_i =
     #: (T W χ + T W_kL χ_kL)_i holds one current alone.
     motors: Triangles

@@ -92,7 +92,7 @@ def identify(
         conditioning: the filters.
         holdout: runs that the fit must not see; their payload mountings must be among those of ``runs``.
         method: estimator, or its name.
-        fixed_gains: known gains, shape (n,).
+        fixed_gains: known gains, shape (m,).
         keep_rows: keep all runs and their rows, for a search for effects by ``ml``; otherwise no run is kept.
         judge: refuse a fit that its data contradict; False where effects are declared that the model lacks here.
 

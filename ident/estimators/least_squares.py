@@ -18,7 +18,7 @@ def ls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
 
     Args:
         system: of at least one loaded and one unloaded run where the gains are unknown.
-        fixed_gains: known gains [Nm/A], shape (n,); then it is the classical IDIM-LS (eq. 7).
+        fixed_gains: known gains [Nm/A], shape (m,); then it is the classical IDIM-LS (eq. 7).
 
     Raises:
         DataUnfit: free gains without a known payload: every gain could be scaled at will.

@@ -28,7 +28,7 @@ def base_parameters(triangle: FloatArray, names: tuple[str, ...], tolerance: flo
     remains. Taking columns in the given order keeps the paper's regrouping (``Izz1 + Ia1 + …``).
 
     Args:
-        triangle: any matrix with the same Gram matrix as the observation matrix, shape (m, c).
+        triangle: any matrix with the same Gram matrix as the observation matrix, shape (r, c).
         names: of the c standard parameters.
         tolerance: relative to each column's norm. Before that, columns below SMALLEST_COLUMN of the largest count as
             zero: normalised, one of them could be chosen, and the condition number would become 1e16.
