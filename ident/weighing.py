@@ -222,7 +222,7 @@ def weigh_rows(calibration: Calibration, given: RowsToWeigh) -> WeighedBody:
     effects = [placed_effect(accepted, calibration) for accepted in calibration.effects]
     known = np.concatenate((standard, np.zeros(10), *(coefficients for _, coefficients in effects)))
     ten = np.arange(len(standard), len(standard) + 10)
-    depends = not all(placed.effect.abscissa.is_kinematic for placed, _ in effects)
+    depends = not all(placed.effect.abscissa.is_independent_of_model for placed, _ in effects)
     without, mounted = given.datasets[: given.bare], given.datasets[given.bare :]
 
     def signals(datasets: Sequence[Dataset], body: FloatArray) -> list[Signals]:

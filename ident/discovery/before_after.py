@@ -47,7 +47,7 @@ from ident.discovery.loop import Step
 from ident.discovery.noise_floor import NoiseFloor, noise_floors
 from ident.drift.change import FALSE_ALARM
 from ident.effects.effect import PlacedEffect
-from ident.equations.currents import without_preload
+from ident.equations.currents import whitening_transform
 from ident.equations.linearisation import (
     Folds,
     cut_into_folds,
@@ -123,7 +123,7 @@ def _currents(observation: Observation, estimate: Estimate) -> _Currents:
         left = measured - observation.drive_train.to_motor @ predicted / estimate.gains[:, None]
         return _Currents(measured, left, np.ones_like(measured))
     noise, torque = estimate.axis_noise, observation.torque(estimate.gains)
-    seen = noise[:, None] * without_preload(observation.preload.transpose(2, 0, 1), estimate.gains, noise)
+    seen = noise[:, None] * whitening_transform(observation.preload.transpose(2, 0, 1), estimate.gains, noise)
     return _Currents(
         measured=np.einsum("rij,jr->ir", seen, torque),
         left=np.einsum("rij,jr->ir", seen, torque - predicted),

@@ -90,7 +90,7 @@ class SearchProblem:
             pairs = zip(self.datasets, self.runs, strict=True)
             parts = [decimate_rows(data, conditioning, columns_at(effect, run, axis)) for data, run in pairs]
             kept = np.concatenate(parts, axis=-1, dtype=np.float32)
-            if effect.abscissa.is_kinematic:
+            if effect.abscissa.is_independent_of_model:
                 self.cache[effect, axis] = kept
         columns = kept.astype(np.float64)
         return at_joints(effect, axis, columns, self.model.drive_train)

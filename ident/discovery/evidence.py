@@ -93,7 +93,7 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequ
     joints = before.model.robot.places
     columns = tuple(column.at(joints[placed.axis].kind) for placed in effects for column in placed.columns)
     bare, unseen = _split_holdout(before.rows_without_effects, before.held_out)
-    for signals in (runs,) if all(placed.effect.abscissa.is_kinematic for placed in effects) else (runs, ()):
+    for signals in (runs,) if all(placed.effect.abscissa.is_independent_of_model for placed in effects) else (runs, ()):
         around, training = current, bare
         if effects:
             training = bare.extended(columns, _torques(effects, around, before.fit_runs, began_s, signals))

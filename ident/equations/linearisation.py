@@ -16,12 +16,12 @@ import numpy as np
 from scipy import linalg
 
 from ident.arrays import FloatArray, IntArray
-from ident.equations.currents import PreloadedCurrents, without_preload
+from ident.equations.currents import PreloadedCurrents, whitening_transform
 from ident.equations.rows import Observation
 from ident.equations.system import System
 from ident.errors import TooFewMoves
 
-OF_ROWS = ("residual", "current", "motor", "cluster", "source")
+LINEARISATION_ROWS = ("residual", "current", "motor", "cluster", "source")
 """Fields of a linearisation that have a number a row."""
 MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter, and each fold holds one
 CORRELATED = 2.0  #: Standard errors of the correlation of neighbouring clusters, above which they are joined
@@ -172,7 +172,7 @@ def linearise(
         noise=noise,
         free=np.arange(first, width),
         scale=unit,
-        transform=without_preload(observation.preload.transpose(2, 0, 1), gains, noise) if preload.size else None,
+        transform=whitening_transform(observation.preload.transpose(2, 0, 1), gains, noise) if preload.size else None,
     )
 
 
@@ -422,7 +422,7 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
     fold_of = move_of % count
     motors, jacobian, width = len(problem.gamma), problem.jacobian, problem.jacobian.width
     order = np.lexsort((problem.cluster, fold_of[problem.cluster], problem.motor))
-    problem = replace(problem, **{name: getattr(problem, name)[order] for name in OF_ROWS})
+    problem = replace(problem, **{name: getattr(problem, name)[order] for name in LINEARISATION_ROWS})
     change = (np.diff(problem.cluster, prepend=-1) != 0) | (np.diff(problem.motor, prepend=-1) != 0)
     starts = np.flatnonzero(change)
     rows_of = (slice(int(a), int(b)) for a, b in pairwise((*starts, len(problem.motor))))

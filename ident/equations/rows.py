@@ -171,7 +171,7 @@ class RunRows:
     pieces: tuple[Rows, ...]  #: its rows, piece by piece
 
 
-OF_ROWS = (
+OBSERVATION_ROWS = (
     "current",
     "drive",
     "preload",
@@ -248,7 +248,7 @@ class Observation(Equations):
 
     def only(self, rows: BoolArray | IntArray | slice) -> Observation:
         """Keep some of the rows, in the order of their indices; those of a slice are views."""
-        return replace(self, **{name: getattr(self, name)[..., rows] for name in OF_ROWS})
+        return replace(self, **{name: getattr(self, name)[..., rows] for name in OBSERVATION_ROWS})
 
     def extended(self, columns: tuple[Column, ...], torque: FloatArray) -> Observation:
         """Add columns to W, torque of shape (m, extra, r) [Nm per unit]; what preload hides of them is left out."""

@@ -43,7 +43,7 @@ class Triangles:
         """‖R x‖² of each axis, shape (m,)."""
         return np.array([float(np.sum((factor @ vector) ** 2)) for factor in self.factors])
 
-    def weighted_system(self, solution: FloatArray, free: int, *, gains: bool) -> FloatArray:
+    def weighted_singular_values(self, solution: FloatArray, free: int, *, gains: bool) -> FloatArray:
         """Singular values of W_r with rows of a joint divided by its residual's deviation (paper Table 5).
 
         Args:
