@@ -23,7 +23,8 @@ from ident.errors import TooFewMoves
 
 LINEARISATION_ROWS = ("residual", "current", "motor", "cluster", "source")
 """Fields of a linearisation that have a number a row."""
-MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter, and each fold holds one
+MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter
+FOLDS = MIN_MOVES_TO_LEAVE_OUT  #: Of moves; each holds one at least
 CORRELATED = 2.0  #: Standard errors of the correlation of neighbouring clusters, above which they are joined
 
 
@@ -403,12 +404,11 @@ class Folds:
         return total
 
 
-def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | None = None) -> Folds:
+def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> Folds:
     """Deal the moves out to folds in turn, so that every fold sees every run; a move is never parted.
 
     Args:
         problem: around an estimate.
-        count: of folds; fewer where there are fewer moves.
         move_of: the move that each cluster is a piece of, shape (clusters,); the clusters themselves when None.
 
     Raises:
@@ -418,8 +418,7 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
     moves = int(move_of.max()) + 1
     if moves < MIN_MOVES_TO_LEAVE_OUT:
         raise TooFewMoves(moves, MIN_MOVES_TO_LEAVE_OUT)
-    count = min(count, moves)
-    fold_of = move_of % count
+    fold_of = move_of % FOLDS
     motors, jacobian, width = len(problem.gamma), problem.jacobian, problem.jacobian.width
     order = np.lexsort((problem.cluster, fold_of[problem.cluster], problem.motor))
     problem = replace(problem, **{name: getattr(problem, name)[order] for name in LINEARISATION_ROWS})
@@ -430,7 +429,7 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
     blocks = tuple(zip(rows_of, fold_of[cluster].tolist(), cluster.tolist(), motor.tolist(), strict=True))
     cluster_hessian = np.zeros((problem.cluster_count, width, width))
     cluster_score = np.zeros((problem.cluster_count, width))
-    part_hessian, motor_score = np.zeros((count, motors, width, width)), np.zeros((motors, width))
+    part_hessian, motor_score = np.zeros((FOLDS, motors, width, width)), np.zeros((motors, width))
     by_motor, sorted_parts = [], list(jacobian.parts)
     for i in np.unique(motor):
         here, whole, seen = motor == i, problem.rows_of(int(i)), jacobian.seen[i]
@@ -445,14 +444,14 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
         grams, scores = products[..., :-1], products[..., -1]
         cluster_hessian[np.ix_(own.cluster, seen, seen)] += grams
         cluster_score[np.ix_(own.cluster, seen)] += scores
-        part_hessian[:, i][:, seen[:, None], seen] = own.by_fold(grams, count)
+        part_hessian[:, i][:, seen[:, None], seen] = own.by_fold(grams, FOLDS)
         motor_score[i, seen] = scores.sum(axis=0)
     by_fold = part_hessian.sum(axis=1)
     hessian, score = by_fold.sum(axis=0), motor_score.sum(axis=0)
     # Two effects may be nearly equal: regularise the direction in which they differ.
     hessian[np.diag_indices_from(hessian)] *= 1.0 + 1e-10
     factors, scores_without = [], []
-    for k in range(count):
+    for k in range(FOLDS):
         rest = hessian - by_fold[k]
         # A direction that only this fold sees must not explode: it stays where the whole data put it.
         rest[np.diag_indices_from(rest)] += 1e-10 * np.diag(hessian)
@@ -460,12 +459,12 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
         scores_without.append(score - cluster_score[fold_of == k].sum(axis=0))
     steps = [linalg.cho_solve(factor, part) for factor, part in zip(factors, scores_without, strict=True)]
     residual = np.empty_like(problem.residual)
-    part_score = np.zeros((count, motors, width))
+    part_score = np.zeros((FOLDS, motors, width))
     for own in by_motor:
         left = own.equations[-1]
         left[:] = problem.residual[own.rows] - own.predicted([steps[k] for k in own.fold])
         residual[own.rows] = left
-        parts = own.by_fold(own.sums(own.equations[:-2], left[None])[..., 0], count)
+        parts = own.by_fold(own.sums(own.equations[:-2], left[None])[..., 0], FOLDS)
         part_score[:, own.motor][:, own.seen] = parts
     return Folds(
         linearisation=replace(
