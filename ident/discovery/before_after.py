@@ -144,9 +144,9 @@ def error_left_out(folds: Folds) -> CurrentError:
 class LeftOutRun:
     """One run of the fit, predicted by the others; `error` is None where they cannot be fitted, with the reason."""
 
-    run: str
-    error: RelativeError | None
-    reason: str = ""
+    run: str  #: its name
+    error: RelativeError | None  #: on its rows [%]
+    reason: str = ""  #: why there is no error
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,10 +209,10 @@ def _in_order(bare: Observation, order: Sequence[int]) -> Observation:
 class Errors:
     """Errors of one model [%]; None where not requested, or without held-out runs."""
 
-    in_sample: RelativeError
-    cross_validated: RelativeError
-    left_out_runs: LeftOutRuns | None
-    holdout: RelativeError | None
+    in_sample: RelativeError  #: on the rows of the fit
+    cross_validated: RelativeError  #: on moves left out of one step of the fit
+    left_out_runs: LeftOutRuns | None  #: on runs left out of a fit of their own
+    holdout: RelativeError | None  #: on runs that neither fit nor choice has seen
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,9 @@ Burnham & Augustin 1997; here around the one that was chosen, whose estimate is 
 
     C_r = w_r (θ_r − θ)(θ_r − θ)ᵀ,      w_r = o_r/(1 + Σ o),      o_r = p_r/(1 − p_r),
 
-with p_r the probability that r predicts left-out moves better than the chosen model, by a paired comparison over folds
-(Student's t). Models that do equally well have equal weights. They are
+with Σ over the rivals of the same effect, or of the same axis, and p_r the probability that r predicts left-out moves
+better than the chosen model, by a paired comparison over folds (Student's t). Models that do equally well have equal
+weights. They are
 
 - for each effect in the fit, those of its ambiguity set in its place;
 - for each axis, one further effect that is no noise (`Gates.false_alarm`, over all candidates) and possible, but too

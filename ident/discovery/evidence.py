@@ -117,6 +117,7 @@ def by_instruments(evidence: Evidence) -> Estimate | None:
 
 
 def _with_instruments(evidence: Evidence) -> System | None:
+    """System with instruments from the demanded motion; None where none is known or the drive is redundant."""
     model, conditioning = evidence.model, evidence.conditioning
     if model.is_redundant:
         return None
@@ -128,7 +129,7 @@ def _with_instruments(evidence: Evidence) -> System | None:
         datasets, began_s = tuple(map(as_demanded, asked)), session_began_s(evidence.fit_runs)
         demanded = replace(demanded, effects=_torques(evidence.effects, evidence, datasets, began_s))
         del datasets
-    del asked  # one more copy of all runs, while the equations are built
+    del asked  # free the copies of the runs before the equations are built
     return evidence.training.system(demanded)
 
 

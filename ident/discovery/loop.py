@@ -286,7 +286,7 @@ def _turn(
             return Step(findings, structures, limits_nm, accepted, joined.evidence, tuple(aside)), joined
         progress(f"{effect.name} on {names[accepted.axis]} does not join the model: {joined.reason(names)}")
         aside.append(joined)
-        # The variables of an axis go together: if its best term may not join, no other one stands in for it.
+        # The variables of an axis go together: if its best term may not join, no other term replaces it.
         others = structures if is_unnamed(effect) else ()
         taken |= {effect_key(one.effect, one.axis) for one in (accepted, *others) if one.axis == accepted.axis}
     if accepted is not None:

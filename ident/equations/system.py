@@ -30,12 +30,12 @@ class Equations:
 
     @property
     def drive_train(self) -> DriveTrain:
-        """R."""
+        """The drive train R."""
         return self.model.drive_train
 
     @property
     def axis_count(self) -> int:
-        """m."""
+        """Number of motors m."""
         return len(self.drive_train.ratio)
 
     @property
@@ -163,7 +163,7 @@ def require_rows(system: System) -> None:
 
 
 def require_known_payload(system: System) -> None:
-    """Without a known payload the system (17) is homogeneous and gains have no scale.
+    """Refuse a system without a known payload: it is homogeneous, so gains have no scale.
 
     Raises:
         DataUnfit: no run carries one.

@@ -88,7 +88,7 @@ def solve(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray
 
 
 def singular_values(matrix: FloatArray) -> FloatArray:
-    """In decreasing order."""
+    """Singular values in decreasing order."""
     return np.asarray(np.linalg.svd(matrix, compute_uv=False), dtype=np.float64)
 
 

@@ -19,7 +19,7 @@ from ident.estimators.maximum_likelihood import iv, ml
 from ident.model.model import Model
 
 CUTOFF_FACTORS = (0.5, 1.0, 2.0)
-"""Of both cut-offs: an estimator that follows the data and not the filters gives the same gains over two octaves."""
+"""Factors of both cut-offs: an estimator that follows the data alone has the same gains over two octaves."""
 
 
 RATIO = 20.0  #: r_σ of essential parameters; the paper finds 10 to 30 right, depending on the noise
@@ -58,7 +58,7 @@ class Comparison:
 
     @property
     def declared(self) -> tuple[EstimatorTrial, ...]:
-        """Under the declared filters."""
+        """Trials under the declared filters."""
         return self.trials[: len(ESTIMATORS)]
 
     def spread_percent(self, estimator: str) -> FloatArray | None:

@@ -20,8 +20,8 @@ if TYPE_CHECKING:  # a calibration has relative errors, and reading one needs no
 class RelativeError:
     """‖ρ‖/‖Y‖ of each axis and of all together [%]; only comparable under the same filter."""
 
-    axes: tuple[float, ...]
-    total: float
+    axes: tuple[float, ...]  #: of each axis [%]
+    total: float  #: of all together [%]
 
     def at(self, place: int) -> float:
         """Error of an axis [%]; for a joint without a motor (numbers above the axes'), that of all axes together."""

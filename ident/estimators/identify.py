@@ -50,12 +50,12 @@ class Identification:
 
     @property
     def training_error(self) -> RelativeError:
-        """On the rows of the fit [%]."""
+        """Relative error on the rows of the fit [%]."""
         return self.estimate.relative_error(self.system)
 
     @property
     def holdout_error(self) -> RelativeError | None:
-        """On the rows that the fit has not seen [%]."""
+        """Relative error on held-out rows [%]; None without any."""
         return None if self.holdout is None else self.estimate.relative_error(self.holdout)
 
     @property

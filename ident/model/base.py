@@ -14,7 +14,7 @@ SMALLEST_COLUMN = 1e-9  #: Norm of a column, relative to the largest, that is ro
 
 @dataclass(frozen=True, slots=True)
 class BaseParameters:
-    """Which standard columns are independent, and what each of them gathers from the others."""
+    """Independent standard columns, and their grouping with the others."""
 
     independent: tuple[int, ...]  #: indices of the base columns among the standard ones, ascending
     grouping: FloatArray  #: shape (b, c): base parameter = grouping @ standard parameters
