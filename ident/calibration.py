@@ -130,7 +130,7 @@ class Calibration:
 
     @property
     def covariance(self) -> FloatArray | None:
-        """Covariance of (gains, parameters), shape (n + p, n + p); None where the calibration has none.
+        """Covariance of (gains, parameters), shape (m + p, m + p); None where the calibration has none.
 
         Raises:
             ModelError: its factor has another shape.

@@ -46,6 +46,7 @@ PEAK_QUANTILES = (0.99, 0.98, 0.97, 0.95, 0.9)  #: u, the first with enough peak
 ENOUGH_PEAKS = 30
 MIN_PEAKS = 10  #: With fewer at the last of them, nothing can be said about the tail
 TAIL_CONFIDENCE = 0.90  #: Of the tail's scale
+ALARMS_PER_HOUR = 1.0  #: False alarms of all joints together, in an hour of motion
 FAR_OUT = 3.0  #: Interquartile ranges above the upper quartile (Tukey's "far out")
 
 
@@ -53,11 +54,11 @@ FAR_OUT = 3.0  #: Interquartile ranges above the upper quartile (Tukey's "far ou
 class Band:
     """Band and thresholds of every joint, learned from quiet motion."""
 
-    scale: FloatArray  #: (a, b, c, d) of each joint in the order of DRIVERS, shape (n, 4)
-    factor: FloatArray  #: half the band over s, shape (n,)
-    threshold: FloatArray  #: threshold over s; NaN where the quiet motion has fewer than MIN_PEAKS, shape (n,)
-    correlation_s: FloatArray  #: correlation time of the residual [s], shape (n,)
-    quiet_s: FloatArray  #: time that each joint moved in the quiet motion [s], shape (n,)
+    scale: FloatArray  #: (a, b, c, d) of each joint in the order of DRIVERS, shape (m, 4)
+    factor: FloatArray  #: half the band over s, shape (m,)
+    threshold: FloatArray  #: threshold over s; NaN where the quiet motion has fewer than MIN_PEAKS, shape (m,)
+    correlation_s: FloatArray  #: correlation time of the residual [s], shape (m,)
+    quiet_s: FloatArray  #: time that each joint moved in the quiet motion [s], shape (m,)
     alarms_per_hour: float  #: false alarms of all joints together, in an hour of motion
 
 
@@ -77,21 +78,21 @@ class ExternalTorque:
     """External torque of one run; arrays are joint-first, rows last."""
 
     time_s: FloatArray  #: of each row, since the start of the run, shape (r,)
-    torque_nm: FloatArray  #: τ_ext, shape (n, r)
-    scale_nm: FloatArray  #: s, shape (n, r)
-    use: BoolArray  #: whether each row of a joint counts, moving and valid, shape (n, r)
+    torque_nm: FloatArray  #: τ_ext, shape (m, r)
+    scale_nm: FloatArray  #: s, shape (m, r)
+    use: BoolArray  #: whether each row of a joint counts, moving and valid, shape (m, r)
     band: Band  #: learned from quiet runs, or from the run's own quiet stretches
     from_itself: bool  #: the band is from the run's own quiet stretches
     left_out: int  #: stretches of the run that were not quiet; 0 where the band is from other runs
 
     @property
     def band_nm(self) -> FloatArray:
-        """Half the band, shape (n, r)."""
+        """Half the band, shape (m, r)."""
         return self.scale_nm * self.band.factor[:, None]
 
     @property
     def threshold_nm(self) -> FloatArray:
-        """Threshold, shape (n, r)."""
+        """Threshold, shape (m, r)."""
         return self.scale_nm * self.band.threshold[:, None]
 
     @property
@@ -112,9 +113,9 @@ class _Residual:
     """Decimated rows of one run."""
 
     time_s: FloatArray  #: shape (r,)
-    torque_nm: FloatArray  #: shape (n, r)
-    drivers: FloatArray  #: shape (n, 4, r)
-    use: BoolArray  #: shape (n, r)
+    torque_nm: FloatArray  #: shape (m, r)
+    drivers: FloatArray  #: shape (m, 4, r)
+    use: BoolArray  #: shape (m, r)
     move: IntArray  #: shape (r,)
 
 
@@ -139,7 +140,7 @@ def external_torque(
     itself, left_out = band is None, 0
     if band is None:
         quiet, left_out = _quiet(rows)
-        band = _band([quiet], 1.0)
+        band = _band([quiet])
     scale = np.einsum("jd,jdr->jr", band.scale, rows.drivers)
     return ExternalTorque(rows.time_s, rows.torque_nm, scale, rows.use, band, itself, left_out)
 
@@ -149,20 +150,17 @@ def prediction_band(
     model: Model,
     quiet: Iterable[Run],
     conditioning: Conditioning,
-    *,
-    alarms_per_hour: float = 1.0,
 ) -> Band:
     """Learn band and thresholds from runs without contact, best held out of the calibration's fit.
 
     Args:
         calibration, model, conditioning: as for `external_torque`.
         quiet: the runs; a minute or more, with the motion that is to be watched.
-        alarms_per_hour: false alarms of all joints together, in an hour of motion.
 
     Raises:
         DataUnfit, ModelError, EffectRefused: as from `external_torque`.
     """
-    return _band([_residual(calibration, model, run, conditioning) for run in quiet], alarms_per_hour)
+    return _band([_residual(calibration, model, run, conditioning) for run in quiet])
 
 
 def _residual(calibration: Calibration, model: Model, run: Run, conditioning: Conditioning) -> _Residual:
@@ -195,7 +193,7 @@ def _quiet(rows: _Residual) -> tuple[_Residual, int]:
 
 
 def _scales(parts: Sequence[_Residual], *, robust: bool = False) -> FloatArray:
-    """(a, b, c, d) of each joint, shape (n, 4); robust: rows beyond four times the scale are left out."""
+    """(a, b, c, d) of each joint, shape (m, 4); robust: rows beyond four times the scale are left out."""
     out = np.zeros((len(parts[0].use), len(DRIVERS)))
     for joint in range(len(out)):
         size = np.concatenate([np.abs(part.torque_nm[joint, part.use[joint]]) for part in parts])
@@ -215,7 +213,7 @@ def _scales(parts: Sequence[_Residual], *, robust: bool = False) -> FloatArray:
     return out
 
 
-def _band(parts: Sequence[_Residual], alarms_per_hour: float) -> Band:
+def _band(parts: Sequence[_Residual]) -> Band:
     if not parts:
         raise DataUnfit("", "no quiet run was given; expected at least one without contact")
     scale = _scales(parts)
@@ -236,9 +234,9 @@ def _band(parts: Sequence[_Residual], alarms_per_hour: float) -> Band:
         correlation_s[joint] = row_s * _correlation(runs)
         factor[joint] = np.nanquantile(np.abs(signed), PREDICTED_SHARE)
         times = np.concatenate([part.time_s + 1e6 * index for index, part in enumerate(parts)])
-        level = alarm_level(np.abs(signed), times, 2.0 * correlation_s[joint], alarms_per_hour / count, quiet_s[joint])
+        level = alarm_level(np.abs(signed), times, 2.0 * correlation_s[joint], ALARMS_PER_HOUR / count, quiet_s[joint])
         threshold[joint] = np.nan if level is None else level
-    return Band(scale, factor, threshold, correlation_s, quiet_s, alarms_per_hour)
+    return Band(scale, factor, threshold, correlation_s, quiet_s, ALARMS_PER_HOUR)
 
 
 def alarm_level(

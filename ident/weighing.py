@@ -73,7 +73,7 @@ class Scale:
 
     model: Model  #: the declared model
     unknowns: IntArray  #: which columns belong to unknowns, whether the motion shows them or not, shape (u,)
-    weight: FloatArray  #: 1/(g_i σ_i) of each motor, shape (n,)
+    weight: FloatArray  #: 1/(g_i σ_i) of each motor, shape (m,)
     information: FloatArray  #: AᵀA of the unknowns, shape (u, u)
     beside_bare_runs: bool  #: the robot was found together with the body
 
@@ -222,7 +222,7 @@ def weigh_rows(calibration: Calibration, given: RowsToWeigh) -> WeighedBody:
     effects = [placed_effect(accepted, calibration) for accepted in calibration.effects]
     known = np.concatenate((standard, np.zeros(10), *(coefficients for _, coefficients in effects)))
     ten = np.arange(len(standard), len(standard) + 10)
-    depends = not all(placed.effect.abscissa.is_kinematic for placed, _ in effects)
+    depends = not all(placed.effect.abscissa.is_independent_of_model for placed, _ in effects)
     without, mounted = given.datasets[: given.bare], given.datasets[given.bare :]
 
     def signals(datasets: Sequence[Dataset], body: FloatArray) -> list[Signals]:
@@ -299,7 +299,7 @@ def _of_calibration(calibration: Calibration, gains: FloatArray, slope: FloatArr
 
     Args:
         calibration: with its covariance, or with the σ of its gains alone.
-        gains: its gains, shape (n,).
+        gains: its gains, shape (m,).
         slope: ∂p/∂(g, held parameters), shape (10, n + h).
         held: names of the columns held, leading names for base parameters.
     """

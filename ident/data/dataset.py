@@ -21,7 +21,7 @@ STANDSTILL_SIGMAS = 6.0
 """Least standstill speed in standard deviations of the encoder's noise after filter and difference."""
 
 LONGEST_MOVE_S = 2.0
-"""Two seconds are several times the residual's correlation (lag one about 0.67 at 50 rows a second)."""
+"""Two seconds are some forty correlation times of the residual (lag one about 0.67 at 50 rows a second)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,8 @@ set-point of the loop knows nothing of the disturbance. Its motion gives the *in
 A drive in profile position mode makes a trapezoid of velocity from each set-point (CiA 402-2). So every motion of a
 motor between two rests is fitted by one, with three unknowns: when it starts, how long it accelerates, how long it
 lasts. Three numbers out of some hundred samples carry next to nothing of the disturbance. The lag of the loop goes into
-the start; a smoother profile differs little from its trapezoid, and an instrument need only resemble what it stands
-for. Instruments from the recorded demand 6062h give the same gains (docs/decisions/0010).
+the start; a smoother profile differs little from its trapezoid, and an instrument need only resemble the motion.
+Instruments from the recorded demand 6062h give the same gains (docs/decisions/0010).
 """
 
 from __future__ import annotations

@@ -2,18 +2,16 @@
 
 Both are settings on which the torque depends strongly, so no grid of a usual size comes close: a spline would always
 explain more, and the effect would get no name. They are fitted beside the model on each axis whose residual a member of
-the dictionary's grid explains a part of, and compete together with the grid, which stands for the search over them.
+the dictionary's grid explains a part of, and compete together with the grid, which represents the search over them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-import numpy as np
-
-from ident.discovery.candidates import SearchProblem
-from ident.discovery.refinement import is_possible, refine_together
-from ident.discovery.search import Gates
+from ident.discovery.candidates import SearchProblem, shares_explained
+from ident.discovery.gates import Gates
+from ident.discovery.refinement import is_strictly_possible, refine_together
 from ident.effects.effect import Effect
 from ident.effects.position import Counterbalance
 
@@ -35,8 +33,6 @@ def propose_balancers(
         taken: axes that have one already.
     """
     grid = next((family for family in families if isinstance(family[0], Counterbalance)), ())
-    problem = search_problem.folds.linearisation
-    left = np.bincount(problem.motor, problem.residual**2)
     proposed: dict[int, tuple[tuple[Effect, ...], ...]] = {}
     for axis in range(search_problem.axes) if grid else ():
         if axis in taken:
@@ -45,16 +41,17 @@ def propose_balancers(
         if not tested:  # gravity's parameters hold the spring's share
             bare = tuple(effect.with_settings({"with_spring": 0}) for effect in grid)
             tested = search_problem.test((bare,), axis, at_rows=True)
+        grid_trials = [member for family in tested for member in family.members]
+        shares = shares_explained(search_problem, [trial for _, trial in grid_trials])
         found = [
-            (float(np.max(trial.fallen / left)), effect)
-            for family in tested
-            for effect, trial in family.members
-            if is_possible(effect, trial)
+            (share, effect)
+            for share, (effect, trial) in zip(shares, grid_trials, strict=True)
+            if is_strictly_possible(effect, trial)
         ]
         members = [effect for share, effect in sorted(found, key=lambda one: -one[0]) if share >= gates.smallest_share]
         refined = [refine_together(search_problem, start, axis) for start in _apart(members)]
         if refined:
-            tried = (effect for family in tested for effect, _ in family.members)
+            tried = (effect for effect, _ in grid_trials)
             proposed[axis] = ((*tried, *refined),)
     return proposed
 

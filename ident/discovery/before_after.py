@@ -6,10 +6,13 @@ motor i, over the rows that count for it (Observation.motor_use), with γ_i = 1/
     e_i = v_i − γ_i (T τ)_i,        ε_i = ‖e_i‖/‖v_i‖,        ε = √(Σ_i w_i²‖e_i‖² / Σ_i w_i²‖v_i‖²).
 
 The current is measured: ‖v_i‖ is the same for every model of the same rows, while Y = V g (paper Table 6) scales with
-the gains that a model finds. The weights w convert currents of different motors to torques at the joint, so that a
-robot without coupled axes has the ε of Table 6. They are one set of gains for all models that are compared; whitened by
-σ_i instead, ε would have a scale that an accepted effect moves. A robot with prismatic and revolute axes adds Nm to N
-in ε, as Table 6 would; its ε_i are not affected. The four ways differ in the data that the model has seen:
+the gains that a model finds. No model explains the internal preload of a redundant drive: v and e are without the
+preload that is most likely under the model's g and σ, diag(σ) T_D V g and diag(σ) T_D (V g − τ)
+(ident/equations/currents.py), and e_i then shows the share P_ii of the variance of the current's noise. The weights w
+convert currents of different motors to torques at the joint, so that a robot without coupled axes has the ε of Table 6.
+They are one set of gains for all models that are compared; whitened by σ_i instead, ε would have a scale that an
+accepted effect moves. A robot with prismatic and revolute axes adds Nm to N in ε, as Table 6 would; its ε_i are not
+affected. The four ways differ in the data that the model has seen:
 
 - in-sample: all data; it cannot rise when an effect joins, so it proves nothing;
 - cross-validated: all moves but those predicted (`cut_into_folds`, one Gauss-Newton step around
@@ -22,7 +25,7 @@ Estimates before and after share their noise, so the σ of a change is neither o
 is the jackknife of the change itself: leaving out block c of moves shifts g by d_c = −(H − G_c)⁻¹ s_c
 (ident/equations/linearisation.py; the longer blocks of the two models serve both), and
 
-    σ_Δ² = (m − 1)/m Σ_c (Δd_c − mean)²,        Δd_c = d_c after − d_c before.
+    σ_Δ² = (C − 1)/C Σ_c (Δd_c − mean)²,        Δd_c = d_c after − d_c before,        of C blocks.
 
 It takes the effects as given; σ after the whole search includes their choice (ident/discovery/choice.py).
 """
@@ -44,6 +47,7 @@ from ident.discovery.loop import Step
 from ident.discovery.noise_floor import NoiseFloor, noise_floors
 from ident.drift.change import FALSE_ALARM
 from ident.effects.effect import PlacedEffect
+from ident.equations.currents import whitening_transform
 from ident.equations.linearisation import (
     Folds,
     cut_into_folds,
@@ -62,7 +66,7 @@ from ident.estimators.identify import estimate_with
 class CurrentError:
     """Sums over rows, so that errors of parts of the data can be added."""
 
-    size: FloatArray  #: ‖v_i‖² of each motor [A²], shape (n,)
+    size: FloatArray  #: ‖v_i‖² of each motor [A²], shape (m,)
     left: FloatArray  #: ‖e_i‖² [A²], same shape
 
     def __add__(self, other: CurrentError) -> CurrentError:
@@ -70,19 +74,22 @@ class CurrentError:
         return CurrentError(self.size + other.size, self.left + other.left)
 
     def relative(self, weights_nm_a: FloatArray) -> RelativeError:
-        """ε_i and ε [%] with weights w, shape (n,); NaN for a motor without a row."""
+        """ε_i and ε [%] with weights w, shape (m,); NaN for a motor without a row."""
         return of_squares(self.size * weights_nm_a**2, self.left * weights_nm_a**2)
 
 
 def error_on(observation: Observation, estimate: Estimate) -> CurrentError:
     """Error of an estimate on rows, those of its fit or others with the same columns."""
-    use, measured, residual = observation.motor_use, observation.current, _residual(observation, estimate)
-    return CurrentError(np.sum(measured**2, axis=1, where=use), np.sum(residual**2, axis=1, where=use))
+    use, seen = observation.motor_use, _currents(observation, estimate)
+    return CurrentError(np.sum(seen.measured**2, axis=1, where=use), np.sum(seen.left**2, axis=1, where=use))
 
 
 def left_on(observation: Observation, estimate: Estimate) -> FloatArray:
-    """Root mean square of each motor's e_i [A], shape (n,); NaN for a motor without a row."""
-    rows = observation.motor_use.sum(axis=1)
+    """Root mean square of each motor's e_i [A], shape (m,), of a redundant drive over √P_ii; NaN without a row.
+
+    It compares with the noise of the current.
+    """
+    rows = np.sum(_currents(observation, estimate).shown, axis=1, where=observation.motor_use)
     left = error_on(observation, estimate).left
     return np.asarray(np.sqrt(np.divide(left, rows, out=np.full(len(rows), np.nan), where=rows > 0)))
 
@@ -95,15 +102,33 @@ def holdout_change(before: Evidence, after: Evidence) -> PairedChange | None:
     if before.holdout is None or after.holdout is None:
         return None
     rows = before.holdout
-    first, second = (np.square(_residual(one.holdout or rows, one.estimate)) for one in (before, after))
+    first, second = (np.square(_currents(one.holdout or rows, one.estimate).left) for one in (before, after))
     weights = np.square(before.estimate.gains)[:, None] * rows.motor_use
     return compare_by_move(np.sum(weights * (second - first), axis=0), rows.move)
 
 
-def _residual(observation: Observation, estimate: Estimate) -> FloatArray:
-    """e of each motor and row [A], shape (n, r)."""
-    predicted = observation.drive_train.to_motor @ estimate.predicted_torque(observation)
-    return np.asarray(observation.current - predicted / estimate.gains[:, None])
+@dataclass(frozen=True, slots=True)
+class _Currents:
+    """Currents of each motor and row, of a redundant drive without preload."""
+
+    measured: FloatArray  #: v [A], shape (m, r)
+    left: FloatArray  #: e [A], same shape
+    shown: FloatArray  #: share of the variance of the current's noise that e shows, P_ii, same shape
+
+
+def _currents(observation: Observation, estimate: Estimate) -> _Currents:
+    """Currents of rows under an estimate."""
+    predicted, measured = estimate.predicted_torque(observation), observation.current
+    if not observation.preload.size:
+        left = measured - observation.drive_train.to_motor @ predicted / estimate.gains[:, None]
+        return _Currents(measured, left, np.ones_like(measured))
+    noise, torque = estimate.axis_noise, observation.torque(estimate.gains)
+    seen = noise[:, None] * whitening_transform(observation.preload.transpose(2, 0, 1), estimate.gains, noise)
+    return _Currents(
+        measured=np.einsum("rij,jr->ir", seen, torque),
+        left=np.einsum("rij,jr->ir", seen, torque - predicted),
+        shown=np.einsum("rii->ir", seen) * estimate.gains[:, None],
+    )
 
 
 def error_left_out(folds: Folds) -> CurrentError:
@@ -119,9 +144,9 @@ def error_left_out(folds: Folds) -> CurrentError:
 class LeftOutRun:
     """One run of the fit, predicted by the others; `error` is None where they cannot be fitted, with the reason."""
 
-    run: str
-    error: RelativeError | None
-    reason: str = ""
+    run: str  #: its name
+    error: RelativeError | None  #: on its rows [%]
+    reason: str = ""  #: why there is no error
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,20 +209,20 @@ def _in_order(bare: Observation, order: Sequence[int]) -> Observation:
 class Errors:
     """Errors of one model [%]; None where not requested, or without held-out runs."""
 
-    in_sample: RelativeError
-    cross_validated: RelativeError
-    left_out_runs: LeftOutRuns | None
-    holdout: RelativeError | None
+    in_sample: RelativeError  #: on the rows of the fit
+    cross_validated: RelativeError  #: on moves left out of one step of the fit
+    left_out_runs: LeftOutRuns | None  #: on runs left out of a fit of their own
+    holdout: RelativeError | None  #: on runs that neither fit nor choice has seen
 
 
 @dataclass(frozen=True, slots=True)
 class Moves:
     """The linearised problem by move: what leaving moves out needs."""
 
-    grams: FloatArray  #: G_c of each move, shape (m, f, f)
-    scores: FloatArray  #: s_c of each move, shape (m, f)
+    grams: FloatArray  #: G_c of each move, shape (c, f, f)
+    scores: FloatArray  #: s_c of each move, shape (c, f)
     scale: FloatArray  #: unit of each unknown, shape (f,); the gains are the first
-    runs: IntArray  #: run of each move, shape (m,)
+    runs: IntArray  #: run of each move, shape (c,)
 
     def blocks(self) -> IntArray:
         """First move of each block of moves that is independent of the others."""
@@ -215,9 +240,9 @@ class Assessment:
 
     effects: tuple[PlacedEffect, ...]  #: in the model
     errors: Errors  #: of the model
-    gains: FloatArray  #: drive gains [Nm at the joint per A], shape (n,)
-    gains_std: FloatArray  #: their σ, shape (n,)
-    choice_std: FloatArray  #: the part of it that comes from the choice of the effects, shape (n,)
+    gains: FloatArray  #: drive gains [Nm at the joint per A], shape (m,)
+    gains_std: FloatArray  #: their σ, shape (m,)
+    choice_std: FloatArray  #: the part of it that comes from the choice of the effects, shape (m,)
     moves: Moves | None  #: what each move says of the gains; None for fixed gains
 
 
@@ -313,7 +338,7 @@ def account(
     def floor_below(before: Observation, after: Observation) -> RelativeError:
         """Floor of some rows: where a model leaves less, within the floor's own σ, the model is at the floor."""
         left = np.fmin(left_on(before, start.estimate), left_on(after, end.after.estimate))
-        return floor_on(before, capped(bounds, left)).relative(weights_nm_a)
+        return floor_on(before, start.estimate, capped(bounds, left)).relative(weights_nm_a)
 
     return Account(
         floors=floors,
@@ -391,15 +416,16 @@ def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
 
 
 def capped(floors: Sequence[NoiseFloor | None], left_a: FloatArray) -> tuple[NoiseFloor | None, ...]:
-    """Lower each floor to what a model leaves on the rows it is shown for [A, root mean square], shape (n,)."""
+    """Lower each floor to what a model leaves on the rows it is shown for [A, root mean square], shape (m,)."""
     return tuple(
         None if floor is None else replace(floor, noise_a=float(np.fmin(floor.noise_a, left)))
         for floor, left in zip(floors, left_a, strict=True)
     )
 
 
-def floor_on(observation: Observation, floors: Sequence[NoiseFloor | None]) -> CurrentError:
-    """Error that noise alone would leave on some rows; NaN for a motor whose noise is not known."""
-    use = observation.motor_use
+def floor_on(observation: Observation, estimate: Estimate, floors: Sequence[NoiseFloor | None]) -> CurrentError:
+    """Error that noise alone would leave on some rows under an estimate; NaN for a motor whose noise is not known."""
+    use, seen = observation.motor_use, _currents(observation, estimate)
     noise_a = np.array([np.nan if floor is None else floor.noise_a for floor in floors])
-    return CurrentError(np.sum(observation.current**2, axis=1, where=use), use.sum(axis=1) * noise_a**2)
+    size, rows = (np.sum(part, axis=1, where=use) for part in (seen.measured**2, seen.shown))
+    return CurrentError(size, rows * noise_a**2)

@@ -17,7 +17,7 @@ from scipy import linalg
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.dataset import Dataset
 from ident.discovery.noise_floor import noise_floors
-from ident.effects.effect import Effect, at_joints, columns_at, is_placeable
+from ident.effects.effect import Effect, at_joints, columns_at, effect_columns, is_placeable
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.linearisation import Folds, MotorRows, cut_into_folds, linearise
 from ident.equations.rows import Observation, decimate_rows
@@ -78,22 +78,19 @@ class SearchProblem:
         return tuple(FamilyTrials(axis, tuple(found)) for found in members.values())
 
     def trials(self, torques: Iterable[FloatArray]) -> tuple[Trial | None, ...]:
-        """Test candidates given by their joint torques (n, p, r); None where the model contains them already."""
+        """Test candidates given by their joint torques (m, p, r); None where the model contains them already."""
         problem, to_motor = self.folds.linearisation, self.model.drive_train.to_motor
         return _scored(self.folds, ((torque.shape[1], problem.felt(torque, to_motor)) for torque in torques))
 
     def torque(self, effect: Effect, axis: int) -> FloatArray:
-        """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (n, p, r)."""
+        """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (m, p, r)."""
         kept = self.cache.get((effect, axis))
         if kept is None:
-            conditioning = self.observation.conditioning
-            pairs = zip(self.datasets, self.runs, strict=True)
-            parts = [decimate_rows(data, conditioning, columns_at(effect, run, axis)) for data, run in pairs]
-            kept = np.concatenate(parts, axis=-1, dtype=np.float32)
-            if effect.abscissa.is_kinematic:
+            columns = effect_columns(effect, axis, self.runs, self.datasets, self.observation.conditioning)
+            kept = columns.astype(np.float32)
+            if effect.abscissa.is_independent_of_model:
                 self.cache[effect, axis] = kept
-        columns = kept.astype(np.float64)
-        return at_joints(effect, axis, columns, self.model.drive_train)
+        return at_joints(effect, axis, kept.astype(np.float64), self.model.drive_train)
 
     def torque_at_rows(self, effect: Effect, axis: int) -> FloatArray:
         """Build the same from signals that are decimated already: fast, and good for effects that change slowly."""
@@ -111,7 +108,7 @@ class FamilyTrials:
     members: tuple[tuple[Effect, Trial], ...]  #: settings and their trials, at least one
 
     def nested(self) -> FloatArray:
-        """‖e‖² of each fold and motor, shape (folds, n), with the setting chosen by the other folds alone."""
+        """‖e‖² of each fold and motor, shape (folds, m), with the setting chosen by the other folds alone."""
         chosen = np.argmax(np.stack([trial.training_fall for _, trial in self.members]), axis=0)
         return np.stack([self.members[best][1].held_out[fold] for fold, best in enumerate(chosen)])
 
@@ -121,12 +118,19 @@ class Trial:
     """Result of testing one candidate."""
 
     coefficients: FloatArray  #: in-sample, in the unit of the columns, shape (p,)
-    fallen: FloatArray  #: in-sample fall of ‖e‖² of each motor, shape (n,)
+    fallen: FloatArray  #: in-sample fall of ‖e‖² of each motor, shape (m,)
     training_fall: FloatArray  #: fall of ‖e‖² on the other folds, by which a setting may be chosen, shape (folds,)
-    held_out: FloatArray  #: ‖e‖² of each fold and motor with the candidate fitted on the others, shape (folds, n)
+    held_out: FloatArray  #: ‖e‖² of each fold and motor with the candidate fitted on the others, shape (folds, m)
     score: FloatArray  #: Φ⊥ᵀe, shape (p,)
     scatter: FloatArray  #: Φ⊥ᵀe of each cluster with the candidate fitted: its noise alone, shape (clusters, p)
     gram: FloatArray  #: Φ⊥ᵀΦ⊥ of each cluster, shape (clusters, p, p)
+
+
+def shares_explained(search_problem: SearchProblem, trials: Sequence[Trial | None]) -> list[float]:
+    """Share of a motor's squared residual that each trial explains, of the motor that it affects most."""
+    problem = search_problem.folds.linearisation
+    left = np.bincount(problem.motor, problem.residual**2)
+    return [0.0 if trial is None else float(np.max(trial.fallen / left)) for trial in trials]
 
 
 def prepare_search(
@@ -321,7 +325,7 @@ def _products(own: MotorRows, candidates: Sequence[Felt]) -> _Products:
 
 
 def _is_new(gram: FloatArray, squares: FloatArray) -> BoolArray:
-    """Which candidates the declared model lacks, by Φ⊥ᵀΦ⊥, shape (c, p, p), and ‖φ‖² of their columns, shape (c, p)."""
+    """Mask of candidates that the declared model lacks, from Φ⊥ᵀΦ⊥, (c, p, p), and ‖φ‖² of their columns, (c, p)."""
     size = np.diagonal(gram, axis1=1, axis2=2)
     new = np.asarray(np.all(size > REDUNDANT_SHARE * squares, axis=1))
     root = np.sqrt(size[new])

@@ -6,8 +6,9 @@ Burnham & Augustin 1997; here around the one that was chosen, whose estimate is 
 
     C_r = w_r (θ_r − θ)(θ_r − θ)ᵀ,      w_r = o_r/(1 + Σ o),      o_r = p_r/(1 − p_r),
 
-with p_r the probability that r predicts left-out moves better than the chosen model, by a paired comparison over folds
-(Student's t). Models that do equally well have equal weights. They are
+with Σ over the rivals of the same effect, or of the same axis, and p_r the probability that r predicts left-out moves
+better than the chosen model, by a paired comparison over folds (Student's t). Models that do equally well have equal
+weights. They are
 
 - for each effect in the fit, those of its ambiguity set in its place;
 - for each axis, one further effect that is no noise (`Gates.false_alarm`, over all candidates) and possible, but too
@@ -27,8 +28,8 @@ import scipy  # loads scipy.special when it is first used: a fit needs none of i
 
 from ident.arrays import FloatArray
 from ident.discovery.candidates import SearchProblem, score_candidates
-from ident.discovery.gates import impossible, shifts_by, whitened_columns, without_effects_of
-from ident.discovery.search import Finding, Gates, paired_t
+from ident.discovery.gates import Gates, impossible, shifts_by, whitened_columns, without_effects_of
+from ident.discovery.search import Finding, paired_t
 from ident.effects.effect import PlacedEffect
 from ident.estimators.estimate import Estimate
 
@@ -39,7 +40,7 @@ def choice_covariance(
     accepted: Sequence[tuple[Finding, Sequence[Finding]]],
     left: Sequence[Finding],
 ) -> FloatArray:
-    """Covariance of (gains, parameters) from the choice of the effects in a joint fit, shape (n + p, n + p).
+    """Covariance of (gains, parameters) from the choice of the effects in a joint fit, shape (m + p, m + p).
 
     Args:
         search_problem: linearised around the joint fit.
@@ -88,7 +89,7 @@ def _by_rivals(
         torque: of the chosen effect, whitened, shape (rows,); zero where there is none.
         fold_errors: ‖e‖² of the chosen model on each fold, shape (folds,).
         rivals: the other effects.
-        size: n + p.
+        size: m + p.
     """
     gain = fold_errors - np.stack([one.fold_errors for one in rivals])
     better = scipy.special.stdtr(gain.shape[1] - 1, paired_t(gain))

@@ -93,7 +93,7 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequ
     joints = before.model.robot.places
     columns = tuple(column.at(joints[placed.axis].kind) for placed in effects for column in placed.columns)
     bare, unseen = _split_holdout(before.rows_without_effects, before.held_out)
-    for signals in (runs,) if all(placed.effect.abscissa.is_kinematic for placed in effects) else (runs, ()):
+    for signals in (runs,) if all(placed.effect.abscissa.is_independent_of_model for placed in effects) else (runs, ()):
         around, training = current, bare
         if effects:
             training = bare.extended(columns, _torques(effects, around, before.fit_runs, began_s, signals))
@@ -117,6 +117,7 @@ def by_instruments(evidence: Evidence) -> Estimate | None:
 
 
 def _with_instruments(evidence: Evidence) -> System | None:
+    """System with instruments from the demanded motion; None where none is known or the drive is redundant."""
     model, conditioning = evidence.model, evidence.conditioning
     if model.is_redundant:
         return None
@@ -128,7 +129,7 @@ def _with_instruments(evidence: Evidence) -> System | None:
         datasets, began_s = tuple(map(as_demanded, asked)), session_began_s(evidence.fit_runs)
         demanded = replace(demanded, effects=_torques(evidence.effects, evidence, datasets, began_s))
         del datasets
-    del asked  # one more copy of all runs, while the equations are built
+    del asked  # free the copies of the runs before the equations are built
     return evidence.training.system(demanded)
 
 
@@ -139,7 +140,7 @@ def _torques(
     began_s: float | None,
     runs: Sequence[Signals] = (),
 ) -> FloatArray:
-    """Columns of effects on the rows of runs, load and current predicted by an estimate, shape (n, p, r)."""
+    """Columns of effects on the rows of runs, load and current predicted by an estimate, shape (m, p, r)."""
     parts, through_links = [], any(placed.effect.side is Side.ALL_JOINTS for placed in effects)
     for index, data in enumerate(datasets):  # one by one: signals at full rate are the largest arrays of a search
         if runs:

@@ -1,4 +1,4 @@
-"""Gates that are no matter of one score: physics, runs left out, gains, and every effect against all the others.
+"""Limits of the search, and gates that are no matter of one score: physics, runs left out, gains, effects together.
 
 A column declares which values physics allows its coefficient (`ident.model.model.Column`); `impossible` compares an
 estimate with them. `RunsLeftOut` predicts whole runs without and with a candidate: moves of one run share its
@@ -34,6 +34,26 @@ SIGMAS = 2.0  #: A coefficient outside its possible values by more than this man
 MIN_RUNS = 3  #: With two runs, one left out leaves a fit of the other alone
 CONFIDENCE = 0.95  #: Of a coefficient that is not zero; one-sided, of a rise by more than noise
 _RIDGE = 1e-10  #: Share of the diagonal of JᵀJ added to it
+
+
+@dataclass(frozen=True, slots=True)
+class Gates:
+    """Limits that a candidate must pass before it may join the model."""
+
+    false_alarm: float = 0.01  #: largest probability that noise makes one this strong anywhere
+    folds_better: float = 0.75  #: least share of folds on which the candidate lowers the error
+    explained: float = 0.03  #: least share of the motor's squared residual
+    error_fall: float = 0.02  #: least relative fall of the motor's error on held-out moves
+    # With few moves the bootstrap has little power, and a correct prediction is evidence of another kind.
+    strong_folds: float = 0.875  #: as `folds_better`, for a strong candidate
+    strong_fall: float = 0.1  #: as `error_fall`, for a strong candidate
+    strong_false_alarm: float = 0.05  #: as `false_alarm`, for a strong candidate
+    draws: int = 999  #: number of draws of the bootstrap
+
+    @property
+    def smallest_share(self) -> float:
+        """Share of a motor's squared residual below which an effect fails a gate, if held-out moves fall as all do."""
+        return max(self.explained, 1.0 - (1.0 - self.error_fall) ** 2)
 
 
 def impossible(columns: Sequence[Column], values: FloatArray, deviations: FloatArray) -> str:
@@ -178,7 +198,7 @@ class Reduced:
 
     @property
     def gain_shifts(self) -> FloatArray:
-        """Shift of each gain by these effects [Nm at the joint per A], shape (n,)."""
+        """Shift of each gain by these effects [Nm at the joint per A], shape (m,)."""
         return gain_shifts(self.search_problem.folds, self.torque)
 
 
@@ -203,9 +223,14 @@ def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effect
     torque = columns @ estimate.parameters[own]
     rest = problem.jacobian.only(np.flatnonzero(~taken))
     for place, motor in enumerate(problem.free[problem.free < len(estimate.gains)]):
-        # ∂(γ τ)/∂g = −γ² τ, and τ loses these effects.
-        slope = torque[problem.rows_of(motor)] * problem.gamma[motor] * problem.scale[place]
-        rest.parts[motor][rest.seen[motor] == place] += slope
+        # ∂(γ τ)/∂g = −γ² τ, and τ loses these effects; with preload ∂e/∂g_i = (T_D)_i (v_i − σ_i e_i), in all rows.
+        lost, scale = torque[problem.rows_of(motor)], problem.scale[place]
+        if problem.transform is None:
+            rest.parts[motor][rest.seen[motor] == place] += lost * problem.gamma[motor] * scale
+            continue
+        for other, (part, seen) in enumerate(zip(rest.parts, rest.seen, strict=True)):
+            passed = problem.transform[problem.source[problem.rows_of(other)], other, motor]
+            part[seen == place] += lost * passed * problem.noise[motor] * scale
     hessian = np.zeros((rest.width, rest.width))
     for part, seen in zip(rest.parts, rest.seen, strict=True):
         hessian[np.ix_(seen, seen)] += part @ part.T
@@ -223,7 +248,7 @@ def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effect
 
 
 def gain_shifts(folds: Folds, torque: FloatArray) -> FloatArray:
-    """Shift of each gain when a whitened torque, shape (rows,), joins the model [Nm at the joint per A], shape (n,)."""
+    """Shift of each gain when a whitened torque, shape (rows,), joins the model [Nm at the joint per A], shape (m,)."""
     count = len(folds.linearisation.gamma)
     return shifts_by(folds, torque, max(count, int(folds.linearisation.free[-1]) + 1))[:count]
 

@@ -1,14 +1,14 @@
-"""Which side drives the gear, and what of its efficiency these data can show.
+"""The side that drives each gear, and the part of its loss that the data show.
 
 A gear of efficiency η takes τ/η from a motor that drives the load, and ητ where the load drives the motor. With
 c = (1 − η²)/(1 + η²) and the torque τ through the gear,
 
     τ_motor = (τ + c |τ| sign(q̇)) / √(1 − c²).
 
-The first factor's contrast of the two sides, c, is what `load-friction` and `efficiency` estimate. Where one side gives
-nearly all torque, |τ| sign(q̇) is ±τ: the gain takes up the loss, and the residual stays silent. The second factor
-scales everything, and the gain always carries it: g is the motor's gain times √(1 − c²) if both directions lose the
-same share of the power. No residual can show whether they do.
+`load-friction` and `efficiency` estimate c, the contrast of the two sides. Where one side gives nearly all torque,
+|τ| sign(q̇) is ±τ: the gain takes up the loss, and the residual stays silent. The factor 1/√(1 − c²) scales
+everything, and the gain always carries it: g is the motor's gain times √(1 − c²) if both directions lose the same
+share of the power. No residual can show whether they do.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem,
 from ident.discovery.choice import choice_covariance, is_small
 from ident.discovery.evidence import Evidence, by_instruments, with_effects
 from ident.discovery.gates import (
+    Gates,
     RunsLeftOut,
     gain_shifts,
     impossible,
@@ -29,19 +30,15 @@ from ident.discovery.refinement import refine_together
 from ident.discovery.resonance import propose_resonances
 from ident.discovery.ripple import propose_orders
 from ident.discovery.search import (
-    MIN_MOVES_FOR_STRUCTURE,
     EffectKey,
     Finding,
-    Gates,
     choose_effect,
-    detection_limits_nm,
     effect_key,
-    find_structure,
-    is_inadequate,
     rank_effects,
     rank_families,
     refine_setting,
 )
+from ident.discovery.structure import MIN_MOVES_FOR_STRUCTURE, detection_limits_nm, find_structure, is_inadequate
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.position import Counterbalance
@@ -81,12 +78,12 @@ class Step:
     #: Smooth and periodic terms: on the axis of the best named effect, which must not be much worse than they are, or
     #: on all axes where no named effect passed.
     structures: tuple[Finding, ...]
-    limits_nm: FloatArray  #: torque (root mean square) that a detectable effect has at each motor, shape (n,)
+    limits_nm: FloatArray  #: torque (root mean square) that a detectable effect has at each motor, shape (m,)
     accepted: Finding | None  #: the finding, or the structure without a name, that joined the model; None ends the loop
     after: Evidence  #: the model with it
     set_aside: tuple[SetAside, ...] = ()  #: what would have joined the model, but for runs left out or the joint fit
     ended: str = ""  #: reason why the search ended here although the residual may call for more; else empty
-    #: σ of each gain [Nm/A] from the choice of the effects, contained in that of `after`, shape (n,); last turn only.
+    #: σ of each gain [Nm/A] from the choice of the effects, contained in that of `after`, shape (m,); last turn only.
     choice_std: FloatArray | None = None
     declared: bool = False  #: the cell declares the effect that joined: it was not searched for
 
@@ -289,7 +286,7 @@ def _turn(
             return Step(findings, structures, limits_nm, accepted, joined.evidence, tuple(aside)), joined
         progress(f"{effect.name} on {names[accepted.axis]} does not join the model: {joined.reason(names)}")
         aside.append(joined)
-        # The variables of an axis go together: if its best term may not join, no other one stands in for it.
+        # The variables of an axis go together: if its best term may not join, no other term replaces it.
         others = structures if is_unnamed(effect) else ()
         taken |= {effect_key(one.effect, one.axis) for one in (accepted, *others) if one.axis == accepted.axis}
     if accepted is not None:

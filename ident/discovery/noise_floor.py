@@ -240,7 +240,7 @@ def _repetitions(datasets: Sequence[Dataset], motor: int) -> Iterator[tuple[tupl
 
 
 def _difference(chain: _Chain, data: Dataset, part: slice, motor: int, scale: FloatArray) -> FloatArray | None:
-    """A move minus the last one of a chain: current [A] and accelerations of all axes, shape (1 + n, k).
+    """A move minus the last one of a chain: current [A] and accelerations of all axes, shape (1 + m, k).
 
     None if it is no repetition.
 

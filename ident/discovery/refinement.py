@@ -21,8 +21,8 @@ CLOSE_ENOUGH = 1e-3  #: Change of a setting at which the simplex stops
 DIGITS = 4  #: Of a setting, as a calibration shows it
 
 
-def is_possible(effect: Effect, trial: Trial) -> bool:
-    """Whether physics allows the coefficients of a trial."""
+def is_strictly_possible(effect: Effect, trial: Trial) -> bool:
+    """Whether every coefficient is inside its possible values, without tolerance."""
     return all(
         column.least <= value <= column.largest
         for column, value in zip(effect.coefficients, trial.coefficients, strict=True)
@@ -47,7 +47,7 @@ def refine_together(search_problem: SearchProblem, effect: Effect, axis: int) ->
         if not all(one.least <= value <= one.largest for one, value in zip(ranges, values, strict=True)):
             return 0.0  # it explains nothing
         (trial,) = search_problem.trials([search_problem.torque_at_rows(changed(values), axis)])
-        return -float(trial.fallen.sum()) if trial is not None and is_possible(effect, trial) else 0.0
+        return -float(trial.fallen.sum()) if trial is not None and is_strictly_possible(effect, trial) else 0.0
 
     start = np.array([effect.settings[name] for name in names])
     simplex = start + np.vstack((np.zeros(len(names)), FIRST_STEP * np.eye(len(names))))

@@ -15,8 +15,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray
-from ident.discovery.candidates import SearchProblem, Trial
-from ident.discovery.search import Gates
+from ident.discovery.candidates import SearchProblem, Trial, shares_explained
+from ident.discovery.gates import Gates
 from ident.effects.effect import Effect
 from ident.effects.signals import Signals, curvature
 from ident.effects.transmission import SETTLED_S, Backlash, Elasticity, spring_torque, twist_acceleration
@@ -59,7 +59,7 @@ def _elastic(search_problem: SearchProblem, axis: int, inertia: float, least: fl
         passed = [spring_torque(torque, own, run.rate_hz, one, DAMPING_RATIOS[-1]) for one in compliances[::2]]
         return np.stack([curvature(one, run.rate_hz) for one in passed])
 
-    if max(_shares(search_problem, _tried(search_problem, axis, bent))) < least:
+    if max(shares_explained(search_problem, _tried(search_problem, axis, bent))) < least:
         return ()
     return (Elasticity(), *(Elasticity(one, ratio) for ratio in DAMPING_RATIOS for one in compliances))
 
@@ -74,7 +74,7 @@ def _with_gap(search_problem: SearchProblem, axis: int, inertia: float, least: f
         own, torque = run.inertia(axis, axis), run.geared_torque_nm[axis]
         return twist_acceleration(torque, own, run.rate_hz, gaps, compliances, FLANK_DAMPING)
 
-    shares = _shares(search_problem, _tried(search_problem, axis, bent))
+    shares = shares_explained(search_problem, _tried(search_problem, axis, bent))
     best = int(np.argmax(shares))
     if shares[best] < least:
         return ()
@@ -122,10 +122,3 @@ def _tried(search_problem: SearchProblem, axis: int, bent: Callable[[Signals], F
     torque = np.zeros((search_problem.axes, *columns.shape))
     torque[axis] = columns
     return search_problem.trials([torque[:, index : index + 1] for index in range(len(columns))])
-
-
-def _shares(search_problem: SearchProblem, trials: Sequence[Trial | None]) -> list[float]:
-    """Share of a motor's squared residual that each trial explains, of the motor that it affects most."""
-    problem = search_problem.folds.linearisation
-    left = np.bincount(problem.motor, problem.residual**2)
-    return [0.0 if trial is None else float(np.max(trial.fallen / left)) for trial in trials]

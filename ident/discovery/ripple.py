@@ -28,7 +28,8 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.discovery.candidates import SearchProblem
-from ident.discovery.search import MIN_MOVES_FOR_STRUCTURE, Gates
+from ident.discovery.gates import Gates
+from ident.discovery.structure import MIN_MOVES_FOR_STRUCTURE
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.electrical import Cogging
 from ident.effects.transmission import Ripple
@@ -117,6 +118,7 @@ def periodogram(search_problem: SearchProblem, axis: int, of_joint: int) -> Peri
     places = [((angle - lowest) / (2.0 * np.pi * width_rev)).astype(np.int64) for angle in angles]
     problem, observation = search_problem.folds.linearisation, search_problem.observation
     torque = search_problem.model.drive_train.to_motor[:, axis] if of_joint else np.eye(search_problem.axes)[axis]
+    # A whitened line is T_D times its torque at the axes. T_D = P D⁻¹ and P e = e: T_Dᵀe = D⁻¹e, also with preload.
     weights = torque * problem.gamma / problem.noise
     filters = [row_filter(data, observation.conditioning) for data in search_problem.datasets]
     starts = np.searchsorted(observation.run, np.arange(len(angles)))

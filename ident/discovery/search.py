@@ -16,9 +16,7 @@ Effects that are to join must pass further gates: see `ident.discovery.gates`.
 Candidates are ranked by held-out moves, and the setting of a family (its exponent, its speed) is chosen anew inside
 each fold, by the other folds alone: the score of a family has not seen what it is scored on.
 
-Structure that no named effect explains is found in the same way, with smooth functions of one variable and periodic
-ones of the motor's angle (`find_structure`). Where nothing is found, `detection_limits_nm` gives the size of an effect
-that would have been.
+Structure that no named effect explains is found in the same way: see `ident.discovery.structure`.
 """
 
 from __future__ import annotations
@@ -32,12 +30,10 @@ import scipy  # loads scipy.special when it is first used: a fit needs none of i
 
 from ident.arrays import BoolArray, FloatArray
 from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial
-from ident.discovery.gates import impossible
+from ident.discovery.gates import Gates, impossible
 from ident.discovery.refinement import refine_together
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect, is_placeable
-from ident.effects.signals import Abscissa
-from ident.effects.unnamed import FOLDED, INTERVALS, Periodic, Smooth
 
 EffectKey = tuple[str, int, tuple[float, ...]]
 
@@ -49,26 +45,6 @@ GOLDEN_STEPS = 6  #: Steps of the golden section: the bracket between two neighb
 DECLARED = {"exponent": (0.8, 1.25)}
 """Settings between which an effect is nearly a declared one: friction with exponent one is viscous."""
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class Gates:
-    """Limits that a candidate must pass before it may join the model."""
-
-    false_alarm: float = 0.01  #: largest probability that noise makes one this strong anywhere
-    folds_better: float = 0.75  #: least share of folds on which the candidate lowers the error
-    explained: float = 0.03  #: least share of the motor's squared residual
-    error_fall: float = 0.02  #: least relative fall of the motor's error on held-out moves
-    # With few moves the bootstrap has little power, and a correct prediction is evidence of another kind.
-    strong_folds: float = 0.875  #: as `folds_better`, for a strong candidate
-    strong_fall: float = 0.1  #: as `error_fall`, for a strong candidate
-    strong_false_alarm: float = 0.05  #: as `false_alarm`, for a strong candidate
-    draws: int = 999  #: number of draws of the bootstrap
-
-    @property
-    def smallest_share(self) -> float:
-        """Share of a motor's squared residual below which an effect passes no gate."""
-        return max(self.explained, 1.0 - (1.0 - self.error_fall) ** 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +128,7 @@ def rank_families(
     findings = [_judge(search_problem, before, family, probabilities, gates) for family in tested]
     ranked = sorted(findings, key=lambda finding: -finding.held_out_fall)
     errors = np.stack([finding.fold_errors for finding in ranked])
-    better = _better(errors[:, None], errors[None])
+    better = is_better(errors[:, None], errors[None])
     # Those that a paired comparison cannot distinguish from it.
     rivals = ~(better | better.T | np.eye(len(ranked), dtype=np.bool_))
     rivals &= np.array([finding.held_out_fall > 0 for finding in ranked])
@@ -179,7 +155,7 @@ def choose_effect(findings: Sequence[Finding], taken: Collection[EffectKey] = ()
         for finding in passed
         if finding.axis == best.axis
         and finding.held_out_fall >= AS_GOOD * best.held_out_fall
-        and not (best.effect.refined and _better(best.fold_errors, finding.fold_errors))
+        and not (best.effect.refined and is_better(best.fold_errors, finding.fold_errors))
     ]
     return min(alike, key=lambda finding: len(finding.effect.coefficients) + len(finding.effect.settings))
 
@@ -190,7 +166,7 @@ def effect_key(effect: Effect, axis: int) -> EffectKey:
     return effect.name, axis, tuple(whole)
 
 
-def _better(one: FloatArray, other: FloatArray) -> BoolArray:
+def is_better(one: FloatArray, other: FloatArray) -> BoolArray:
     """Whether one ‖e‖² is less than the other by a paired comparison over folds, folds last."""
     gain = other - one
     return np.asarray(paired_t(gain) > scipy.special.stdtrit(gain.shape[-1] - 1, 0.5 + CLEARLY / 2.0))
@@ -262,7 +238,7 @@ def _judge(
     )
     refusals = tuple(words for refused, words in verdicts if refused)
     floor_a = search_problem.floors_a[motor]
-    excess = 0.0 if floor_a is None else own - float(np.sum(rows)) * (floor_a / problem.noise[motor]) ** 2
+    excess = 0.0 if floor_a is None else own - problem.shown(motor) * (floor_a / problem.noise[motor]) ** 2
     return Finding(
         effect=effect,
         axis=family.axis,
@@ -383,82 +359,3 @@ def _golden_section(
     best = float(f"{np.exp((a + b) / 2.0):.4g}")
     better = fall(np.log(best)) > fall(np.log(effect.settings[name]))
     return effect.with_settings({name: best}) if better else effect
-
-
-VARIABLES = (
-    (Abscissa.VELOCITY, (0, 1)),
-    (Abscissa.POSITION, (0, 1)),
-    (Abscissa.LOAD, (0, 1)),
-    (Abscissa.TIME, (0, 1)),
-    (Abscissa.SESSION, (0, 1)),
-    (Abscissa.DISTANCE, (1,)),
-    (Abscissa.CURRENT, (0,)),
-    (Abscissa.TORQUE_RATE, (0,)),
-    (Abscissa.LOAD_CURVATURE, (0,)),
-)
-"""Each variable, and whether its function is tried as it is (0) or turning with the direction of motion (1)."""
-MUCH_MORE = 0.15  #: Share by which a term must explain more than a named effect to call the name wrong
-MIN_MOVES_FOR_STRUCTURE = 5 * (INTERVALS + 1)  #: Five moves for each coefficient of a term
-TAIL = 0.005
-"""Share of the samples cut off at either end of a variable's range, where a spline would rest on a handful of them."""
-
-
-def find_structure(
-    search_problem: SearchProblem, axes: Iterable[int], rng: np.random.Generator, gates: Gates
-) -> tuple[Finding, ...]:
-    """Find variables that the residual of some axes depends on, the best on held-out moves first."""
-    if search_problem.folds.moves < MIN_MOVES_FOR_STRUCTURE:
-        return ()  # a term of many coefficients would fit the few moves
-    tested = [
-        found for axis in axes for found in search_problem.test(_families(search_problem, axis), axis, at_rows=True)
-    ]
-    return rank_families(search_problem, tested, rng, gates)
-
-
-def is_inadequate(named: Finding, structure: Finding) -> bool:
-    """Whether a term that fits anything explains clearly and much more than a named effect.
-
-    Then the true effect is only similar to the named one, and the residual counts as unexplained.
-    """
-    more = structure.held_out_fall > (1.0 + MUCH_MORE) * named.held_out_fall
-    return structure.passed and more and bool(_better(structure.fold_errors, named.fold_errors))
-
-
-def detection_limits_nm(search_problem: SearchProblem, gates: Gates) -> FloatArray:
-    """Compute the torque of a detectable effect at each motor, root mean square over the moving rows, shape (n,).
-
-    It is torque that the declared model cannot mimic: most of an effect that resembles gravity or viscous friction is
-    absorbed by those. The limit holds for effects whose shape the dictionary or a spline can follow; on a short
-    recording noise raises it.
-    """
-    problem = search_problem.folds.linearisation
-    square = np.bincount(problem.motor, problem.residual**2) / np.bincount(problem.motor)
-    noise_a = problem.noise * np.sqrt(square)
-    return np.asarray(noise_a / np.abs(problem.gamma) * np.sqrt(gates.smallest_share))
-
-
-def _families(search_problem: SearchProblem, axis: int) -> tuple[tuple[Effect, ...], ...]:
-    """One family a variable, with the range that it has in these runs."""
-    families: list[tuple[Effect, ...]] = []
-    has_session = any(not np.array_equal(run.time_s, run.session_s) for run in search_problem.rows)
-    for variable, signs in VARIABLES:
-        if variable is Abscissa.SESSION and not has_session:
-            continue
-        term = _ranged(search_problem, Smooth(variable), axis)
-        families.append(tuple(replace(term, signed=sign) for sign in signs))
-    families.append((Periodic(0), Periodic(1)))
-    for other in range(search_problem.axes):
-        if other != axis:
-            term = _ranged(search_problem, Smooth(Abscissa.OTHER_VELOCITY, other_axis=other + 1), axis)
-            families.append((replace(term, signed=1), replace(term, signed=0)))
-    return tuple(families)
-
-
-def _ranged(search_problem: SearchProblem, term: Smooth, axis: int) -> Smooth:
-    other = term.other_axis - 1 if term.other_axis else None
-    x = np.concatenate([run.variable(term.variable, axis, other) for run in search_problem.rows])
-    x = x[search_problem.observation.use[axis]]
-    if term.variable in FOLDED:
-        x = np.abs(x)
-    lower, upper = np.quantile(x, (0.0 if term.variable in FOLDED else TAIL, 1.0 - TAIL))
-    return replace(term, lower=float(lower), upper=float(max(upper, lower + 1e-9)))

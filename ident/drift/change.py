@@ -123,9 +123,10 @@ def decide(
     new_std: ArrayLike,
     *,
     dispersion: ArrayLike = DISPERSION,
-    false_alarm: float = FALSE_ALARM,
 ) -> ChangeDecision:
     """Decide whether a recalibration changes anything, over all axes together.
+
+    Of recalibrations without change, one is found in a share of FALSE_ALARM at most.
 
     Each axis is tested by itself against its own σ, and the probabilities are corrected for the number of axes, however
     their errors depend on each other. There is no fixed threshold in per cent.
@@ -134,7 +135,6 @@ def decide(
         axes: n names.
         old, old_std, new, new_std: gains in force and found, with their σ, shape (n,) each, in one unit an axis.
         dispersion: scatter of repeated calibrations over their σ, a number or shape (n,).
-        false_alarm: share of recalibrations without change in which one is found, at most.
 
     Raises:
         ValueError: shapes do not fit, a number is not finite, or a σ or a dispersion is negative.
@@ -149,7 +149,7 @@ def decide(
     order = np.argsort(probabilities)
     adjusted = np.empty(n)
     adjusted[order] = np.maximum.accumulate(np.minimum(1.0, probabilities[order] * np.arange(n, 0, -1)))
-    significant = tuple(bool(probability <= false_alarm) for probability in adjusted)
+    significant = tuple(bool(probability <= FALSE_ALARM) for probability in adjusted)
     differs = any(significant)
     words = "no gain to compare"
     if axes:
@@ -313,14 +313,13 @@ class Drift:
         return self.alarm is not None and self.alarm.kind is AlarmKind.TREND
 
 
-def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION, chart: Chart = CHART) -> Drift:
+def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION) -> Drift:
     """Watch one gain.
 
     Args:
         values, stds: of its calibrations since the last acknowledged change, oldest first, shape (n,), n ≥ 1, in one
             unit; σ > 0.
         dispersion: scatter of repeated calibrations over their σ, as `ident.drift.change.dispersions` finds it.
-        chart: limits.
 
     Raises:
         ValueError: shapes do not fit, a number is not finite, a σ is not positive, or the baseline is zero.
@@ -335,15 +334,15 @@ def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION,
         raise ValueError("expected gains other than zero")
     values, stds = values / scale, _bounded(stds, scale)
     sign = 1.0 if values.sum() > 0 else -1.0
-    deviations, upper, lower = cusum_paths(sign * values, stds, dispersion, chart)
+    deviations, upper, lower = cusum_paths(sign * values, stds, dispersion, CHART)
     slopes = trend_statistic(sign * values, stds, dispersion)
     found: list[Alarm] = []
     for index, (z, above, below, slope) in enumerate(zip(deviations, upper, lower, slopes, strict=True)):
-        if max(above, below) > chart.threshold:
+        if max(above, below) > CHART.threshold:
             found.append(Alarm(index, AlarmKind.DRIFT, bool(above > below)))
-        elif abs(z) > chart.single:
+        elif abs(z) > CHART.single:
             found.append(Alarm(index, AlarmKind.JUMP, bool(z > 0)))
-        elif abs(slope) > chart.trend:
+        elif abs(slope) > CHART.trend:
             found.append(Alarm(index, AlarmKind.TREND, bool(slope > 0)))
     alarms = tuple(found)
     # The onset of an alarm that has passed bounds no baseline: that change is over.
@@ -358,7 +357,7 @@ def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION,
         change, change_std = steps * line.slope, steps * line.slope_std
     else:
         # The baseline ends at the onset, and the newest calibrations begin behind both.
-        first = max(1, min(len(values) - 1 if onset is None else onset + 1, chart.baseline))
+        first = max(1, min(len(values) - 1 if onset is None else onset + 1, CHART.baseline))
         since = first if onset is None else max(first, onset + 1)
         newest = max(1, min(_RECENT, len(values) - since))
         baseline, baseline_std = _mean(values[:first], stds[:first])

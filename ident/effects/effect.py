@@ -118,7 +118,7 @@ class Effect(ABC):
 
     @abstractmethod
     def columns(self, signals: Signals, axis: int) -> FloatArray:
-        """Torque per unit coefficient [Nm], (p, k); (2, p, k) of two joints, (n, p, k) of all joints or motors."""
+        """Torque per unit coefficient [Nm], (p, k); (2, p, k) of two joints, (m, p, k) of all joints or motors."""
 
     def fits_in(self, runs: Sequence[Signals], axis: int) -> bool:
         """Whether the data can show it on an axis: no time constant is longer than them, and its variable is there."""
@@ -228,12 +228,19 @@ def effect_torque(
     conditioning: Conditioning,
     model: Model,
 ) -> FloatArray:
-    """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (n, p, r)."""
+    """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (m, p, r)."""
+    return at_joints(effect, axis, effect_columns(effect, axis, runs, datasets, conditioning), model.drive_train)
+
+
+def effect_columns(
+    effect: Effect, axis: int, runs: Sequence[Signals], datasets: Sequence[Dataset], conditioning: Conditioning
+) -> FloatArray:
+    """An effect's columns where it is placed, on the observation's rows, shape (p, r) or (joints, p, r)."""
     parts = [
         decimate_rows(data, conditioning, columns_at(effect, run, axis))
         for run, data in zip(runs, datasets, strict=True)
     ]
-    return at_joints(effect, axis, np.concatenate(parts, axis=-1), model.drive_train)
+    return np.concatenate(parts, axis=-1)
 
 
 def columns_at(effect: Effect, signals: Signals, axis: int) -> FloatArray:
@@ -245,7 +252,7 @@ def columns_at(effect: Effect, signals: Signals, axis: int) -> FloatArray:
 
 
 def at_joints(effect: Effect, axis: int, columns: FloatArray, drive_train: DriveTrain) -> FloatArray:
-    """Convert an effect's columns, shape (p, k) or (joints, p, k), to torques of all joints, shape (n, p, k)."""
+    """Convert an effect's columns, shape (p, k) or (joints, p, k), to torques of all axes, shape (m, p, k)."""
     if axis >= len(drive_train.ratio):
         return columns
     if effect.side is Side.MOTOR:

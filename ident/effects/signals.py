@@ -41,8 +41,8 @@ class Abscissa(Enum):
     TEMPERATURE = "temperature of the motor or its drive [°C]"
 
     @property
-    def is_kinematic(self) -> bool:
-        """Whether the variable follows from the motion alone, not from the model's prediction."""
+    def is_independent_of_model(self) -> bool:
+        """Whether the variable does not depend on the model's predictions."""
         return self not in {Abscissa.LOAD, Abscissa.CURRENT, Abscissa.TORQUE_RATE, Abscissa.LOAD_CURVATURE}
 
 

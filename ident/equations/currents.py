@@ -185,7 +185,7 @@ class PreloadedCurrents(Currents):
 
     def transform(self, gains: FloatArray, noise: FloatArray) -> FloatArray:
         """T_D of each row, shape (r, m, m)."""
-        return without_preload(self.preload, gains, noise)
+        return whitening_transform(self.preload, gains, noise)
 
     def whitened(self, gains: FloatArray, noise: FloatArray) -> Whitened:
         """Take the most likely preload out of the rows, motor by motor below each other."""
@@ -226,7 +226,7 @@ class PreloadedCurrents(Currents):
         return 0.5 * float(residual @ residual)
 
 
-def without_preload(preload: FloatArray, gains: FloatArray, noise: FloatArray) -> FloatArray:
+def whitening_transform(preload: FloatArray, gains: FloatArray, noise: FloatArray) -> FloatArray:
     """T_D = P D⁻¹ of each row, shape (r, m, m).
 
     Args:

@@ -1,6 +1,6 @@
 """The problem around an estimate as a linear one, and everything that leaves moves out of it.
 
-The residual of motor i is e_i = (v_i − γ_i (T τ)_i)/σ_i with the unknowns (g_1 … g_n, χ, χ_uL); see
+The residual of motor i is e_i = (v_i − γ_i (T τ)_i)/σ_i with the unknowns (g_1 … g_m, χ, χ_uL); see
 estimators/maximum_likelihood.py. Its derivative to a gain is built from the *predicted* torque, not from the measured
 current, so that the noise does not enter it. `motor_jacobian` is that derivative. Error bars leave out one move at a
 time (`left_out_shifts`); the search for effects leaves out folds of moves (`cut_into_folds`).
@@ -16,14 +16,15 @@ import numpy as np
 from scipy import linalg
 
 from ident.arrays import FloatArray, IntArray
-from ident.equations.currents import PreloadedCurrents, without_preload
+from ident.equations.currents import PreloadedCurrents, whitening_transform
 from ident.equations.rows import Observation
 from ident.equations.system import System
 from ident.errors import TooFewMoves
 
-OF_ROWS = ("residual", "current", "motor", "cluster", "source")
+LINEARISATION_ROWS = ("residual", "current", "motor", "cluster", "source")
 """Fields of a linearisation that have a number a row."""
-MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter, and each fold holds one
+MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter
+FOLDS = MIN_MOVES_TO_LEAVE_OUT  #: Of moves; each holds one at least
 CORRELATED = 2.0  #: Standard errors of the correlation of neighbouring clusters, above which they are joined
 
 
@@ -79,8 +80,8 @@ class Linearisation:
     motor: IntArray  #: of each row, shape (rows,)
     cluster: IntArray  #: number of each row's cluster, 0 … without gaps, shape (rows,)
     source: IntArray  #: index of each row among the observation's decimated rows, shape (rows,)
-    gamma: FloatArray  #: 1/g, shape (n,)
-    noise: FloatArray  #: σ_i [A], shape (n,)
+    gamma: FloatArray  #: 1/g, shape (m,)
+    noise: FloatArray  #: σ_i [A], shape (m,)
     free: IntArray  #: which of (gains, parameters) are free, shape (f,)
     #: Unit of each free unknown: a step of one in the scaled unknown is this much of the real one, shape (f,).
     scale: FloatArray
@@ -101,8 +102,16 @@ class Linearisation:
         first, last = np.searchsorted(self.motor, (motor, motor + 1))
         return slice(int(first), int(last))
 
+    def shown(self, motor: int) -> float:
+        """Σ P_ii over a motor's rows: their number, less what internal preload hides of the current's noise."""
+        rows = self.rows_of(motor)
+        if self.transform is None:
+            return float(rows.stop - rows.start)
+        passed = self.transform[self.source[rows], motor, motor]
+        return float(passed.sum() * self.noise[motor] / self.gamma[motor])
+
     def felt(self, torque_nm: FloatArray, to_motor: FloatArray) -> dict[int, FloatArray]:
-        """Joint torque columns, shape (n, extra, r), whitened, on the rows of each motor that feels any: (extra, rows).
+        """Joint torque columns, shape (m, extra, r), whitened, on the rows of each motor that feels any: (extra, rows).
 
         Args:
             torque_nm: per unit of each column.
@@ -164,7 +173,7 @@ def linearise(
         noise=noise,
         free=np.arange(first, width),
         scale=unit,
-        transform=without_preload(observation.preload.transpose(2, 0, 1), gains, noise) if preload.size else None,
+        transform=whitening_transform(observation.preload.transpose(2, 0, 1), gains, noise) if preload.size else None,
     )
 
 
@@ -193,7 +202,7 @@ def motor_jacobians(
 def motor_jacobian(
     rows: FloatArray, motor: int, gains: FloatArray, parameters: FloatArray, noise: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """J = ∂(γ_i (T τ)_i/σ_i)/∂(g, χ, χ_uL) and e of one motor's equations, shapes (m, n + p) and (m,).
+    """J = ∂(γ_i (T τ)_i/σ_i)/∂(g, χ, χ_uL) and e of one motor's equations, shapes (r, m + p) and (r,).
 
     Args:
         rows: [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], or the triangle of these, which has the same JᵀJ and Jᵀe.
@@ -211,11 +220,11 @@ def motor_jacobian(
 
 
 def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
-    """Shift of the unknowns when each cluster is left out, d_c = −(H − G_c)⁻¹ s_c with H = Σ G_c, shape (m, f).
+    """Shift of the unknowns when each cluster is left out, d_c = −(H − G_c)⁻¹ s_c with H = Σ G_c, shape (c, f).
 
     Args:
-        grams: G_c = J_cᵀJ_c of each cluster, shape (m, f, f).
-        scores: s_c = J_cᵀe_c around the estimate, where they sum to zero, shape (m, f).
+        grams: G_c = J_cᵀJ_c of each cluster, shape (c, f, f).
+        scores: s_c = J_cᵀe_c around the estimate, where they sum to zero, shape (c, f).
     """
     hessian = grams.sum(axis=0)
     # In units in which every unknown is seen equally well: kilograms are beside kg m².
@@ -232,7 +241,7 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def scatter_of(shifts: FloatArray) -> FloatArray:
-    """Jackknife covariance (m − 1)/m Σ (d_c − mean)(d_c − mean)ᵀ, shape (f, f), of shifts d_c, shape (m, f)."""
+    """Jackknife covariance (C − 1)/C Σ (d_c − mean)(d_c − mean)ᵀ, shape (f, f), of C shifts d_c, shape (C, f)."""
     centred = shifts - shifts.mean(axis=0)
     return np.asarray((len(shifts) - 1) / len(shifts) * (centred.T @ centred))
 
@@ -250,9 +259,9 @@ def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) ->
     Fishman 1978).
 
     Args:
-        grams: G_c of each cluster, shape (m, f, f), in the order of time.
-        scores: s_c, shape (m, f).
-        runs: run of each cluster, shape (m,).
+        grams: G_c of each cluster, shape (c, f, f), in the order of time.
+        scores: s_c, shape (c, f).
+        runs: run of each cluster, shape (c,).
 
     Returns:
         first cluster of each block, ascending; at least MIN_MOVES_TO_LEAVE_OUT where there are as many clusters.
@@ -291,13 +300,13 @@ def jackknife_covariance(
 
     Args:
         system: of the fit.
-        gains, parameters: the estimate, gains in Nm/A, shapes (n,) and (p,).
-        noise: σ_i of each motor's current [A], shape (n,).
+        gains, parameters: the estimate, gains in Nm/A, shapes (m,) and (p,).
+        noise: σ_i of each motor's current [A], shape (m,).
         gains_fixed: the gains were given.
         recorded: equations whose residuals count, where those of ``system`` are projected on instruments.
 
     Returns:
-        shape (n + p, n + p).
+        shape (m + p, m + p).
 
     Raises:
         TooFewMoves: fewer than MIN_MOVES_TO_LEAVE_OUT.
@@ -377,9 +386,9 @@ class Folds:
     scores: FloatArray  #: Jᵀe without each fold, shape (folds, f)
     cluster_hessian: FloatArray  #: JᵀJ of each cluster, shape (clusters, f, f)
     cluster_score: FloatArray  #: Jᵀe of each cluster, shape (clusters, f)
-    part_hessian: FloatArray  #: JᵀJ of each fold and motor, shape (folds, n, f, f)
-    part_score: FloatArray  #: Jᵀr of each fold and motor, shape (folds, n, f)
-    motor_score: FloatArray  #: Jᵀe of each motor, shape (n, f)
+    part_hessian: FloatArray  #: JᵀJ of each fold and motor, shape (folds, m, f, f)
+    part_score: FloatArray  #: Jᵀr of each fold and motor, shape (folds, m, f)
+    motor_score: FloatArray  #: Jᵀe of each motor, shape (m, f)
     residual: FloatArray  #: r, the e of each row predicted by a fit that did not see its fold, shape (rows,)
 
     @property
@@ -388,19 +397,18 @@ class Folds:
         return len(self.factors)
 
     def square_sum(self, residual: FloatArray) -> FloatArray:
-        """‖e‖² of each fold and motor, shape (folds, n)."""
+        """‖e‖² of each fold and motor, shape (folds, m)."""
         rows, fold, _, motor = zip(*self.blocks, strict=True)
         total = np.zeros((self.count, len(self.linearisation.gamma)))
         np.add.at(total, (fold, motor), np.add.reduceat(residual**2, [part.start for part in rows]))
         return total
 
 
-def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | None = None) -> Folds:
+def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> Folds:
     """Deal the moves out to folds in turn, so that every fold sees every run; a move is never parted.
 
     Args:
         problem: around an estimate.
-        count: of folds; fewer where there are fewer moves.
         move_of: the move that each cluster is a piece of, shape (clusters,); the clusters themselves when None.
 
     Raises:
@@ -410,11 +418,10 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
     moves = int(move_of.max()) + 1
     if moves < MIN_MOVES_TO_LEAVE_OUT:
         raise TooFewMoves(moves, MIN_MOVES_TO_LEAVE_OUT)
-    count = min(count, moves)
-    fold_of = move_of % count
+    fold_of = move_of % FOLDS
     motors, jacobian, width = len(problem.gamma), problem.jacobian, problem.jacobian.width
     order = np.lexsort((problem.cluster, fold_of[problem.cluster], problem.motor))
-    problem = replace(problem, **{name: getattr(problem, name)[order] for name in OF_ROWS})
+    problem = replace(problem, **{name: getattr(problem, name)[order] for name in LINEARISATION_ROWS})
     change = (np.diff(problem.cluster, prepend=-1) != 0) | (np.diff(problem.motor, prepend=-1) != 0)
     starts = np.flatnonzero(change)
     rows_of = (slice(int(a), int(b)) for a, b in pairwise((*starts, len(problem.motor))))
@@ -422,7 +429,7 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
     blocks = tuple(zip(rows_of, fold_of[cluster].tolist(), cluster.tolist(), motor.tolist(), strict=True))
     cluster_hessian = np.zeros((problem.cluster_count, width, width))
     cluster_score = np.zeros((problem.cluster_count, width))
-    part_hessian, motor_score = np.zeros((count, motors, width, width)), np.zeros((motors, width))
+    part_hessian, motor_score = np.zeros((FOLDS, motors, width, width)), np.zeros((motors, width))
     by_motor, sorted_parts = [], list(jacobian.parts)
     for i in np.unique(motor):
         here, whole, seen = motor == i, problem.rows_of(int(i)), jacobian.seen[i]
@@ -437,14 +444,14 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
         grams, scores = products[..., :-1], products[..., -1]
         cluster_hessian[np.ix_(own.cluster, seen, seen)] += grams
         cluster_score[np.ix_(own.cluster, seen)] += scores
-        part_hessian[:, i][:, seen[:, None], seen] = own.by_fold(grams, count)
+        part_hessian[:, i][:, seen[:, None], seen] = own.by_fold(grams, FOLDS)
         motor_score[i, seen] = scores.sum(axis=0)
     by_fold = part_hessian.sum(axis=1)
     hessian, score = by_fold.sum(axis=0), motor_score.sum(axis=0)
     # Two effects may be nearly equal: regularise the direction in which they differ.
     hessian[np.diag_indices_from(hessian)] *= 1.0 + 1e-10
     factors, scores_without = [], []
-    for k in range(count):
+    for k in range(FOLDS):
         rest = hessian - by_fold[k]
         # A direction that only this fold sees must not explode: it stays where the whole data put it.
         rest[np.diag_indices_from(rest)] += 1e-10 * np.diag(hessian)
@@ -452,12 +459,12 @@ def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | N
         scores_without.append(score - cluster_score[fold_of == k].sum(axis=0))
     steps = [linalg.cho_solve(factor, part) for factor, part in zip(factors, scores_without, strict=True)]
     residual = np.empty_like(problem.residual)
-    part_score = np.zeros((count, motors, width))
+    part_score = np.zeros((FOLDS, motors, width))
     for own in by_motor:
         left = own.equations[-1]
         left[:] = problem.residual[own.rows] - own.predicted([steps[k] for k in own.fold])
         residual[own.rows] = left
-        parts = own.by_fold(own.sums(own.equations[:-2], left[None])[..., 0], count)
+        parts = own.by_fold(own.sums(own.equations[:-2], left[None])[..., 0], FOLDS)
         part_score[:, own.motor][:, own.seen] = parts
     return Folds(
         linearisation=replace(

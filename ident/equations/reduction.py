@@ -44,7 +44,7 @@ class Cluster:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Which of the columns [v_1 … v_n | W_st] a joint's or a motor's equation holds."""
+    """Columns of [v_1 … v_m | W_st] that each joint's or motor's equation holds."""
 
     joint: tuple[IntArray, ...]  #: for each joint, indices into [V | W_st], ascending
     motor: tuple[IntArray, ...]  #: for each motor, indices of W_st; its own current comes before them
@@ -60,8 +60,8 @@ class Reduction:
     runs: tuple[str, ...]  #: names of the runs
     #: For each mounting, −1 (without load) first, the triangle of each joint's rows.
     joints: tuple[tuple[FloatArray, ...], ...]
-    joint_rows: IntArray  #: equations of each joint, shape (n,)
-    motor_rows: IntArray  #: equations of each motor, shape (n,)
+    joint_rows: IntArray  #: equations of each joint, shape (m,)
+    motor_rows: IntArray  #: equations of each motor, shape (m,)
     clusters: tuple[Cluster, ...]  #: in the order of the runs
     instrumented: bool = False  #: the clusters hold instruments, made of the demanded motion
     kept: tuple[RunRows, ...] = ()  #: the runs with all their rows, where they were asked for
@@ -161,7 +161,7 @@ class Reduction:
 
 
 def layout(model: Model) -> Layout:
-    """Which columns each joint's and each motor's equation can hold (Model.support through T)."""
+    """Columns of [V | W_st] that each joint's or motor's equation can hold (Model.support through T)."""
     support, train = model.support, model.drive_train
     current = np.ones_like(train.direction) if model.is_redundant else train.direction.T != 0.0
     mixed = (np.abs(train.to_motor) > 0.0).astype(np.int64) @ support.astype(np.int64) > 0

@@ -82,11 +82,11 @@ def chunks(filter_: Decimator, samples: int, chunk_rows: int) -> Iterator[slice]
 class Rows:
     """Consecutive decimated rows of one run; arrays are joint-first and time-last."""
 
-    current: FloatArray  #: current references of the motors [A], shape (n, r)
-    standard: FloatArray  #: torque at each joint per unit of each standard parameter, shape (n, c, r)
+    current: FloatArray  #: current references of the motors [A], shape (m, r)
+    standard: FloatArray  #: torque at each joint per unit of each standard parameter, shape (m, c, r)
     instrument: FloatArray  #: the same for the demanded motion; the same array where none is known
-    use: BoolArray  #: rows of each joint that count: moving and valid, shape (n, r)
-    motor_use: BoolArray  #: rows of each motor that count: all joints it turns with, and itself, moving, shape (n, r)
+    use: BoolArray  #: rows of each joint that count: moving and valid, shape (m, r)
+    motor_use: BoolArray  #: rows of each motor that count: all joints it turns with, and itself, moving, shape (m, r)
     time_s: FloatArray  #: of each row, since the start of the run, shape (r,)
     move: IntArray  #: number of each row's move within the run, shape (r,)
     #: Of a redundantly driven robot: torque at each axis per unit of each motor's gain, preload taken out, shape
@@ -171,7 +171,7 @@ class RunRows:
     pieces: tuple[Rows, ...]  #: its rows, piece by piece
 
 
-OF_ROWS = (
+OBSERVATION_ROWS = (
     "current",
     "drive",
     "preload",
@@ -192,12 +192,12 @@ OF_ROWS = (
 class Observation(Equations):
     """Rows of several runs, before any scaling; arrays are joint-first and time-last."""
 
-    current: FloatArray  #: decimated current references of the motors [A], shape (n, r)
-    regressor: FloatArray  #: torque at each joint per unit of each base parameter: W without effects, shape (n, b, r)
-    effects: FloatArray  #: the same of each effect, the other columns of W, shape (n, e, r)
-    flange: FloatArray  #: columns of the payload's link, also of the payload while it was mounted, shape (n, 10, r)
-    use: BoolArray  #: rows of each joint that count: moving and valid, shape (n, r)
-    motor_use: BoolArray  #: rows of each motor that count: all joints it turns with, and itself, moving, shape (n, r)
+    current: FloatArray  #: decimated current references of the motors [A], shape (m, r)
+    regressor: FloatArray  #: torque at each joint per unit of each base parameter: W without effects, shape (m, b, r)
+    effects: FloatArray  #: the same of each effect, the other columns of W, shape (m, e, r)
+    flange: FloatArray  #: columns of the payload's link, also of the payload while it was mounted, shape (m, 10, r)
+    use: BoolArray  #: rows of each joint that count: moving and valid, shape (m, r)
+    motor_use: BoolArray  #: rows of each motor that count: all joints it turns with, and itself, moving, shape (m, r)
     time_s: FloatArray  #: of each row, since the start of its run, shape (r,)
     run: IntArray  #: index of each row's run, shape (r,)
     move: IntArray  #: number of each row's move, unique over all runs, shape (r,)
@@ -214,7 +214,7 @@ class Observation(Equations):
         return np.concatenate(parts)
 
     def known(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
-        """W_kL χ_kL of some rows: the joint torque of what is known of the payloads [Nm], shape (n, rows)."""
+        """W_kL χ_kL of some rows: the joint torque of what is known of the payloads [Nm], shape (m, rows)."""
         # An index of −1, no load, takes the last row, which stays zero.
         weights = np.zeros((len(self.payloads) + 1, 10))
         for index, payload in enumerate(self.payloads):
@@ -241,17 +241,17 @@ class Observation(Equations):
             yield columns
 
     def torque(self, gains: FloatArray, rows: BoolArray | slice = slice(None)) -> FloatArray:
-        """Y = V g: joint torque from the measured current references (eq. 4 through R) [Nm], shape (n, rows)."""
+        """Y = V g: joint torque from the measured current references (eq. 4 through R) [Nm], shape (m, rows)."""
         if self.preload.size:
             return np.asarray(np.einsum("amr,m->ar", self.drive[:, :, rows], gains))
         return self.drive_train.direction.T @ (gains[:, None] * self.current[:, rows])
 
     def only(self, rows: BoolArray | IntArray | slice) -> Observation:
         """Keep some of the rows, in the order of their indices; those of a slice are views."""
-        return replace(self, **{name: getattr(self, name)[..., rows] for name in OF_ROWS})
+        return replace(self, **{name: getattr(self, name)[..., rows] for name in OBSERVATION_ROWS})
 
     def extended(self, columns: tuple[Column, ...], torque: FloatArray) -> Observation:
-        """Add columns to W, torque of shape (n, extra, r) [Nm per unit]; what preload hides of them is left out."""
+        """Add columns to W, torque of shape (m, extra, r) [Nm per unit]; what preload hides of them is left out."""
         if self.preload.size:
             hidden = np.einsum("alr,apr->lpr", self.preload, torque)
             torque = torque - np.einsum("alr,lpr->apr", self.preload, hidden)

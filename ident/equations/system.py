@@ -30,12 +30,12 @@ class Equations:
 
     @property
     def drive_train(self) -> DriveTrain:
-        """R."""
+        """The drive train R."""
         return self.model.drive_train
 
     @property
     def axis_count(self) -> int:
-        """m."""
+        """Number of motors m."""
         return len(self.drive_train.ratio)
 
     @property
@@ -52,7 +52,7 @@ class Equations:
 class System(Equations):
     """The equations of several runs as triangles, W_tot = [V | −W | −W_uL | −W_kL χ_kL]."""
 
-    joints: Triangles  #: triangle of each joint's rows of W_tot, c = n + p + 1 columns
+    joints: Triangles  #: triangle of each joint's rows of W_tot, c = m + p + 1 columns
     #: Triangle of each motor's rows [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], p + 2 columns: the equation g_i v_i =
     #: (T W χ + T W_kL χ_kL)_i holds one current alone.
     motors: Triangles
@@ -163,7 +163,7 @@ def require_rows(system: System) -> None:
 
 
 def require_known_payload(system: System) -> None:
-    """Without a known payload the system (17) is homogeneous and gains have no scale.
+    """Refuse a system without a known payload: it is homogeneous, so gains have no scale.
 
     Raises:
         DataUnfit: no run carries one.

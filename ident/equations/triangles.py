@@ -28,7 +28,7 @@ class Triangles:
     """R of the QR factorisation of each axis' equations; ‖R x‖ is the norm of their residual for any x."""
 
     factors: tuple[FloatArray, ...]  #: one for each axis, shape (≤c, c)
-    rows: IntArray  #: number of equations of each axis, shape (n,)
+    rows: IntArray  #: number of equations of each axis, shape (m,)
 
     def stacked(self, weight: FloatArray) -> FloatArray:
         """All axes below each other, each scaled by its weight."""
@@ -40,10 +40,10 @@ class Triangles:
         return np.asarray(np.sqrt(size / np.maximum(self.rows - free / len(self.rows), 1.0)))
 
     def square_sum(self, vector: FloatArray) -> FloatArray:
-        """‖R x‖² of each axis, shape (n,)."""
+        """‖R x‖² of each axis, shape (m,)."""
         return np.array([float(np.sum((factor @ vector) ** 2)) for factor in self.factors])
 
-    def weighted_system(self, solution: FloatArray, free: int, *, gains: bool) -> FloatArray:
+    def weighted_singular_values(self, solution: FloatArray, free: int, *, gains: bool) -> FloatArray:
         """Singular values of W_r with rows of a joint divided by its residual's deviation (paper Table 5).
 
         Args:
@@ -59,7 +59,7 @@ def triangle(parts: Iterable[FloatArray], columns: int) -> FloatArray:
     """R of rows that come in pieces below each other, shape (≤columns, columns).
 
     Args:
-        parts: pieces of rows, each of shape (m, columns).
+        parts: pieces of rows, each of shape (r, columns).
         columns: c, for the case of no rows.
     """
     rows = np.concatenate([np.empty((0, columns)), *parts])
@@ -88,7 +88,7 @@ def solve(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray
 
 
 def singular_values(matrix: FloatArray) -> FloatArray:
-    """In decreasing order."""
+    """Singular values in decreasing order."""
     return np.asarray(np.linalg.svd(matrix, compute_uv=False), dtype=np.float64)
 
 

@@ -19,7 +19,7 @@ from ident.estimators.maximum_likelihood import iv, ml
 from ident.model.model import Model
 
 CUTOFF_FACTORS = (0.5, 1.0, 2.0)
-"""Of both cut-offs: an estimator that follows the data and not the filters gives the same gains over two octaves."""
+"""Factors of both cut-offs: an estimator that follows the data alone has the same gains over two octaves."""
 
 
 RATIO = 20.0  #: r_σ of essential parameters; the paper finds 10 to 30 right, depending on the noise
@@ -44,7 +44,7 @@ class EstimatorTrial:
     estimator: str  #: its name
     position_cutoff_hz: float  #: cut-off of the position filter
     decimation_cutoff_hz: float  #: cut-off of the decimation filter
-    gains: FloatArray | None  #: Nm/A, shape (n,); None where it found none
+    gains: FloatArray | None  #: Nm/A, shape (m,); None where it found none
     std: FloatArray | None  #: of the gains, same shape
     relative_error_percent: float | None  #: ‖ρ‖/‖Y‖ of the fit; it means nothing beside that of another filter
     reason: str = ""  #: why there are no gains
@@ -58,11 +58,11 @@ class Comparison:
 
     @property
     def declared(self) -> tuple[EstimatorTrial, ...]:
-        """Under the declared filters."""
+        """Trials under the declared filters."""
         return self.trials[: len(ESTIMATORS)]
 
     def spread_percent(self, estimator: str) -> FloatArray | None:
-        """Largest less smallest gain over the filters, in per cent of their mean, shape (n,); None with a failure."""
+        """Largest less smallest gain over the filters, in per cent of their mean, shape (m,); None with a failure."""
         gains = [trial.gains for trial in self.trials if trial.estimator == estimator]
         if any(gain is None for gain in gains):
             return None

@@ -67,8 +67,8 @@ def diagnose(
     Args:
         found: with or without effects; of any estimator.
         axes: name of each axis.
-        nameplate: the manufacturer's gains, shape (n,); without them no gain is compared.
-        effort_limit: of the joints, inf where unknown [Nm or N], shape (n,).
+        nameplate: the manufacturer's gains, shape (m,); without them no gain is compared.
+        effort_limit: of the joints, inf where unknown [Nm or N], shape (m,).
 
     Raises:
         UnitsMistaken: see `require_units`.
@@ -254,8 +254,8 @@ def scale_diagnoses(
     """Compare the torque of a run, from its currents and the gains of a calibration, with what that predicts.
 
     Args:
-        measured_nm, predicted_nm: joint torque, shape (n, r).
-        use: rows of each joint that count, shape (n, r).
+        measured_nm, predicted_nm: joint torque, shape (m, r).
+        use: rows of each joint that count, shape (m, r).
         axes: name of each axis.
         runs: name of the run.
     """
@@ -306,7 +306,7 @@ def estimator_diagnoses(estimate: Estimate, likeliest: Estimate, axes: Sequence[
 
 
 def joint_torques(system: System, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
-    """Torque of each joint, and what the model leaves of it: root mean squares [Nm or N], both of shape (n,)."""
+    """Torque of each joint, and what the model leaves of it: root mean squares [Nm or N], both of shape (m,)."""
     gains = np.concatenate((estimate.gains, np.zeros(len(estimate.parameters) + 1)))
     whole = np.concatenate((estimate.gains, estimate.parameters, [1.0]))
     rows = np.maximum(system.joints.rows, 1)
@@ -315,7 +315,7 @@ def joint_torques(system: System, estimate: Estimate) -> tuple[FloatArray, Float
 
 
 def idle_joints(model: Model, size: FloatArray, left: FloatArray) -> BoolArray:
-    """Joints whose torque and error are nothing beside the torque of another joint of the kind, shape (n,).
+    """Joints whose torque and error are nothing beside the torque of another joint of the kind, shape (m,).
 
     Args:
         model: of the fit.
@@ -340,8 +340,8 @@ def axis_error_diagnoses(
     """Name axes whose error is above LARGEST_AXIS_ERROR_PERCENT.
 
     Args:
-        size, left: torque of each joint and what the model leaves of it, root mean squares [Nm or N], shape (n,).
-        idle: joints whose error is nothing beside the torques of the others, shape (n,).
+        size, left: torque of each joint and what the model leaves of it, root mean squares [Nm or N], shape (m,).
+        idle: joints whose error is nothing beside the torques of the others, shape (m,).
         axes: their names.
         runs: that the fit has not seen, empty for its own.
     """
@@ -439,7 +439,7 @@ def exchanged_channels(
 
 
 def channel_errors(model: Model, runs: Iterable[Run], conditioning: Conditioning) -> FloatArray:
-    """Share of the current k that the equation of motor i leaves, every gain and parameter of its own, shape (n, n).
+    """Share of the current k that the equation of motor i leaves, every gain and parameter of its own, shape (m, m).
 
     Raises:
         DataUnfit: as of `ident.equations.reduction.reduce_runs`.

@@ -20,8 +20,8 @@ if TYPE_CHECKING:  # a calibration has relative errors, and reading one needs no
 class RelativeError:
     """‖ρ‖/‖Y‖ of each axis and of all together [%]; only comparable under the same filter."""
 
-    axes: tuple[float, ...]
-    total: float
+    axes: tuple[float, ...]  #: of each axis [%]
+    total: float  #: of all together [%]
 
     def at(self, place: int) -> float:
         """Error of an axis [%]; for a joint without a motor (numbers above the axes'), that of all axes together."""
@@ -32,15 +32,15 @@ def relative_error(measured_nm: FloatArray, predicted_nm: FloatArray, use: BoolA
     """‖ρ_j‖/‖Y_j‖ of each joint and of all together [%] (paper Table 6); NaN for a joint without a row that counts.
 
     Args:
-        measured_nm, predicted_nm: joint torque, shape (n, r).
-        use: rows of each joint that count, shape (n, r).
+        measured_nm, predicted_nm: joint torque, shape (m, r).
+        use: rows of each joint that count, shape (m, r).
     """
     size = np.sum(measured_nm**2, axis=1, where=use)
     return of_squares(size, np.sum((measured_nm - predicted_nm) ** 2, axis=1, where=use))
 
 
 def of_squares(size: FloatArray, left: FloatArray) -> RelativeError:
-    """Relative error from ‖Y_j‖² and ‖ρ_j‖² of each joint, both of shape (n,)."""
+    """Relative error from ‖Y_j‖² and ‖ρ_j‖² of each joint, both of shape (m,)."""
     with np.errstate(invalid="ignore", divide="ignore"):
         axes = 100.0 * np.sqrt(left / size)
         total = 100.0 * np.sqrt(left.sum() / size.sum())
@@ -52,12 +52,12 @@ class Estimate:
     """Gains and parameters, with their covariance and the condition of their equations."""
 
     method: Method  #: which estimator
-    gains: FloatArray  #: g of each motor [Nm at the joint per A], shape (n,)
+    gains: FloatArray  #: g of each motor [Nm at the joint per A], shape (m,)
     gains_fixed: bool  #: the gains were given, not estimated
     unknowns: tuple[Column, ...]  #: name and unit of each parameter: χ, then χ_uL
     parameters: FloatArray  #: their values, shape (p,)
-    covariance: FloatArray  #: of (gains, parameters), shape (n + p, n + p); gains' rows are zero where they were fixed
-    #: Standard deviation of the residual [Nm for joint equations, A for ml's motor equations], shape (n,).
+    covariance: FloatArray  #: of (gains, parameters), shape (m + p, m + p); gains' rows are zero where they were fixed
+    #: Standard deviation of the residual [Nm for joint equations, A for ml's motor equations], shape (m,).
     axis_noise: FloatArray
     singular_values: FloatArray  #: of the weighted observation matrix W_r (``tls``: of W_tot)
     condition: float  #: of W_r, rows of a joint divided by the deviation of this estimate's residual, as in Table 5
@@ -66,7 +66,7 @@ class Estimate:
 
     @property
     def gains_std(self) -> FloatArray:
-        """σ of each gain, shape (n,)."""
+        """σ of each gain, shape (m,)."""
         return np.sqrt(np.diag(self.covariance)[: len(self.gains)])
 
     @property
@@ -75,12 +75,12 @@ class Estimate:
         return np.sqrt(np.diag(self.covariance)[len(self.gains) :])
 
     def predicted_torque(self, observation: Observation) -> FloatArray:
-        """W χ + W_uL χ_uL + W_kL χ_kL [Nm], shape (n, r)."""
+        """W χ + W_uL χ_uL + W_kL χ_kL [Nm], shape (m, r)."""
         linear = [self.parameters @ observation.of_joint(joint) for joint in range(observation.axis_count)]
         return np.stack(linear) + observation.known()
 
     def residual_torque(self, observation: Observation) -> FloatArray:
-        """ρ = V g − W χ − … (eq. 13) [Nm], shape (n, r)."""
+        """ρ = V g − W χ − … (eq. 13) [Nm], shape (m, r)."""
         return observation.torque(self.gains) - self.predicted_torque(observation)
 
     def relative_error(self, system: System) -> RelativeError:

@@ -50,12 +50,12 @@ class Identification:
 
     @property
     def training_error(self) -> RelativeError:
-        """On the rows of the fit [%]."""
+        """Relative error on the rows of the fit [%]."""
         return self.estimate.relative_error(self.system)
 
     @property
     def holdout_error(self) -> RelativeError | None:
-        """On the rows that the fit has not seen [%]."""
+        """Relative error on held-out rows [%]; None without any."""
         return None if self.holdout is None else self.estimate.relative_error(self.holdout)
 
     @property
@@ -92,7 +92,7 @@ def identify(
         conditioning: the filters.
         holdout: runs that the fit must not see; their payload mountings must be among those of ``runs``.
         method: estimator, or its name.
-        fixed_gains: known gains, shape (n,).
+        fixed_gains: known gains, shape (m,).
         keep_rows: keep all runs and their rows, for a search for effects by ``ml``; otherwise no run is kept.
         judge: refuse a fit that its data contradict; False where effects are declared that the model lacks here.
 

@@ -18,7 +18,7 @@ def ls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
 
     Args:
         system: of at least one loaded and one unloaded run where the gains are unknown.
-        fixed_gains: known gains [Nm/A], shape (n,); then it is the classical IDIM-LS (eq. 7).
+        fixed_gains: known gains [Nm/A], shape (m,); then it is the classical IDIM-LS (eq. 7).
 
     Raises:
         DataUnfit: free gains without a known payload: every gain could be scaled at will.
@@ -51,7 +51,7 @@ def _solve(system: System, weight: FloatArray, method: Method, fixed: FloatArray
     covariance = np.zeros((len(full) - 1, len(full) - 1))
     first = 0 if fixed is None else count
     covariance[first:, first:] = variance * inverse
-    weighted = triangles.weighted_system(full, matrix.shape[1], gains=fixed is None)
+    weighted = triangles.weighted_singular_values(full, matrix.shape[1], gains=fixed is None)
     return Estimate(
         method=method,
         gains=full[:count],
@@ -95,7 +95,7 @@ def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
         weight = 1.0 / triangles.residual_std(first, len(first) - 1)
     vector, covariance, singular = _smallest(triangles, weight, columns)
     count = system.axis_count
-    weighted = triangles.weighted_system(vector, len(vector) - 1, gains=True)
+    weighted = triangles.weighted_singular_values(vector, len(vector) - 1, gains=True)
     return Estimate(
         method=Method.TLS,
         gains=vector[:count],

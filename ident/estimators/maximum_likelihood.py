@@ -33,13 +33,13 @@ def ml(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
 
     Args:
         system: of at least one loaded and one unloaded run where the gains are unknown.
-        fixed_gains: known gains [Nm/A], shape (n,); the problem is then linear.
+        fixed_gains: known gains [Nm/A], shape (m,); the problem is then linear.
 
     Raises:
         DataUnfit: free gains without a known payload, or fewer rows than unknowns.
         RankDeficient: no linear estimate gives every gain a value to start from.
         TooFewMoves: for the covariance.
-        NotConverged: the cost still falls, or cannot fall, after MAX_ITERATIONS.
+        NotConverged: after MAX_ITERATIONS the cost still falls, or no damped step lowers it.
     """
     return _maximum_likelihood(system, system, Method.ML, fixed_gains)
 
@@ -48,8 +48,8 @@ def iv(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
     """Two-stage least squares: `ml` with the columns projected on those of the demanded motion.
 
     Where a torque disturbs the arm inside its position loop, recorded motion and error share a cause, and `ml` is
-    biased. The demanded motion knows nothing of the disturbance: Σ_i (T L̂_i)ᵀ e_i γ_i/σ_i² = 0 and v̂_iᵀ e_i = 0 with L̂
-    and v̂ of that motion hold in the mean however strong it is (Söderström & Stoica, System Identification, ch. 8; for
+    biased. The demanded motion knows nothing of the disturbance: Σ_i γ_i/σ_i² (T Ŵ)_iᵀ e_i = 0 and v̂_iᵀ e_i = 0, with Ŵ
+    and v̂ of that motion, hold in the mean however strong it is (Söderström & Stoica, System Identification, ch. 8; for
     robots Janot, Vandanjon & Gautier 2014). σ is the jackknife of these conditions.
 
     Arguments and errors are those of `ml`.
@@ -85,7 +85,7 @@ def _maximum_likelihood(system: System, recorded: System, method: Method, fixed_
     free = len(system.unknowns) + (0 if fixed_gains is not None else system.axis_count)
     parameters, noise = system.currents.settled(gains, free)
     full = np.concatenate((gains, parameters, [1.0]))
-    weighted = system.joints.weighted_system(full, free, gains=fixed_gains is None)
+    weighted = system.joints.weighted_singular_values(full, free, gains=fixed_gains is None)
     covariance = jackknife_covariance(
         system, gains, parameters, noise, gains_fixed=fixed_gains is not None, recorded=recorded
     )

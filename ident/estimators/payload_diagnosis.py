@@ -80,7 +80,7 @@ def payload_differences(
 
     Args:
         system: of the fit, or of runs that it has not seen.
-        gains, parameters: of the fit, shapes (n,) and (p,).
+        gains, parameters: of the fit, shapes (m,) and (p,).
         held: how many of (gains, parameters) are not in x, because they were given; all of them when None, as in runs
             that the fit has not seen.
 

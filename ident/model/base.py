@@ -14,7 +14,7 @@ SMALLEST_COLUMN = 1e-9  #: Norm of a column, relative to the largest, that is ro
 
 @dataclass(frozen=True, slots=True)
 class BaseParameters:
-    """Which standard columns are independent, and what each of them gathers from the others."""
+    """Independent standard columns, and their grouping with the others."""
 
     independent: tuple[int, ...]  #: indices of the base columns among the standard ones, ascending
     grouping: FloatArray  #: shape (b, c): base parameter = grouping @ standard parameters
@@ -28,7 +28,7 @@ def base_parameters(triangle: FloatArray, names: tuple[str, ...], tolerance: flo
     remains. Taking columns in the given order keeps the paper's regrouping (``Izz1 + Ia1 + …``).
 
     Args:
-        triangle: any matrix with the same Gram matrix as the observation matrix, shape (m, c).
+        triangle: any matrix with the same Gram matrix as the observation matrix, shape (r, c).
         names: of the c standard parameters.
         tolerance: relative to each column's norm. Before that, columns below SMALLEST_COLUMN of the largest count as
             zero: normalised, one of them could be chosen, and the condition number would become 1e16.

@@ -3,7 +3,7 @@
 Every loop is cut, so that a tree with n joints remains, and closed again by φ(q) = 0 (`ident.model.robot.Closure`).
 With J = ∂φ/∂q, d = n − rank J coordinates x move independently, and
 
-    q̇ = G ẋ,    J G = 0,    q̇_a = A ẋ,    q̈ = G q̈_x + h    with    J q̈ = −J̇ q̇.
+    q̇ = G ẋ,    J G = 0,    q̇_a = A ẋ,    q̈ = G ẍ + h,    J h = −J̇ q̇  (h zero in the rows of x).
 
 x are d of the joints themselves, so that G is the identity in their rows and solves J_d G_d = −J_x in the others. With
 as many motors as degrees of freedom (m = d), x are the motors' joints, and A = I. A robot without closures has G = A =
@@ -25,7 +25,8 @@ from ident.model.closures import loops, origin
 from ident.model.robot import JointKind, Motion, Robot, poses
 
 LARGEST_CONDITION = 500.0
-"""Largest condition of J_d, the derivatives to the joints that follow; mechanisms stay below 30 in their workspace."""
+"""Largest condition (Frobenius) of J_d, the derivatives to the joints that follow, and of A for a redundant drive;
+mechanisms stay below 30 in their workspace."""
 CLOSED = 1e-12  #: |φ| at which Newton's iteration ends, in units of the robot's size or radians
 SMALLEST_RANK = 1e-7  #: Singular value of J, relative to the largest, that counts as zero
 LARGEST_GAP = 0.3  #: |φ| at the declared assembly pose, in units of the robot's size or radians
@@ -47,12 +48,12 @@ class Assembly:
     position_rad: FloatArray  #: of all joints, closed exactly, shape (n,)
     independent: tuple[int, ...]  #: joints that are x, d of them
     dependent: tuple[int, ...]  #: the other joints, which follow
-    size_m: float  #: largest distance of two frames that close a loop from the base, at least of two joints
-    condition: float  #: of J_d there
+    size_m: float  #: largest distance from the base of a joint or of a frame that closes a loop
+    condition: float  #: of J_d there, by the Frobenius norm
 
     @property
     def mobility(self) -> int:
-        """d."""
+        """Degrees of freedom d."""
         return len(self.independent)
 
 
@@ -108,7 +109,7 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
         )
     independent = tuple(motors) if len(motors) == found else _independent(free)
     dependent = tuple(joint for joint in everything if joint not in independent)
-    condition = float(np.linalg.cond(jacobian[:, dependent])) if dependent else 1.0
+    condition = float(_condition(np.linalg.qr(jacobian[None, :, dependent]).R)[0]) if dependent else 1.0
     if condition > LARGEST_CONDITION:
         raise ModelError(
             f"the assembly pose is close to a singularity: condition {condition:.3g} of the closures; expected below "
@@ -380,7 +381,8 @@ def _check(robot: Robot, start: FloatArray) -> None:
     if not robot.motors:
         raise ModelError("a robot with closures needs the list of its motors' joints (`motors`); found none")
     if len(set(robot.motors)) < len(robot.motors):
-        raise ModelError("two motors drive the same joint; expected a joint of its own for each (`motors`)")
+        twice = (robot.joints[joint].name for joint in sorted(set(robot.motors)) if robot.motors.count(joint) > 1)
+        raise ModelError(f"two motors drive {', '.join(twice)}; expected a joint of its own for each (`motors`)")
     for closure in robot.closures:
         if not closure.directions:
             raise ModelError(f"closure {closure.name!r} holds no direction; expected some of x, y, z, rx, ry, rz")

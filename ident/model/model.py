@@ -75,10 +75,10 @@ class DriveTrain:
 class Column:
     """One parameter, with the values that physics allows it: a spring may have either sign, a compliance not."""
 
-    name: str
-    unit: str
-    least: float = -np.inf
-    largest: float = np.inf
+    name: str  #: of the parameter
+    unit: str  #: of its value
+    least: float = -np.inf  #: smallest value that physics allows
+    largest: float = np.inf  #: largest value that physics allows
 
     def at(self, kind: JointKind) -> Column:
         """The same at a joint: Nm and rad of a revolute one are N and m of a prismatic one."""
@@ -110,7 +110,7 @@ class Model:
         if motors != axes:
             raise ModelError(
                 f"the drive train has shape {self.drive_train.ratio.shape}, expected {(axes, axes)}: the robot has "
-                f"{axes} joints; give one motor for each"
+                f"{axes} driven joints; give one motor for each"
             )
         object.__setattr__(self, "assembly", assemble(self.robot))
         ratio = self.drive_train.ratio
@@ -158,7 +158,7 @@ class Model:
 
     @property
     def support(self) -> BoolArray:
-        """Which standard parameters can load which axis, shape (m, c); all other entries of the regressor are zero."""
+        """Mask of the standard parameters that load each axis, shape (m, c); all else in the regressor is zero."""
         count, axes = self.robot.joint_count, self.robot.axis_count
         out = np.zeros((axes, len(self.columns)), dtype=np.bool_)
         for axis, joint in enumerate(self.robot.axis_joints):

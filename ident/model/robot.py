@@ -33,9 +33,9 @@ class Joint:
 class Place:
     """A frame fixed to the link behind a joint (-1: to the base), written in that joint's frame."""
 
-    joint: int
-    rotation: FloatArray  #: (3, 3)
-    translation_m: FloatArray  #: (3,)
+    joint: int  #: index of the joint, -1 for the base
+    rotation: FloatArray  #: of the frame in that joint's frame, (3, 3)
+    translation_m: FloatArray  #: its origin there, (3,)
 
 
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
@@ -49,9 +49,9 @@ class Closure:
     A ball joint coincides in x, y, z; a hinge about z in x, y, z, rx, ry; in a planar mechanism x, y are enough.
     """
 
-    name: str
-    first: Place
-    second: Place
+    name: str  #: as the cell file has it
+    first: Place  #: frame whose axes the directions are
+    second: Place  #: frame that coincides with it
     directions: tuple[str, ...]  #: of DIRECTIONS; in the others the links move freely
 
 
@@ -117,9 +117,9 @@ class Robot:
 class Motion:
     """Motion of n joints over k samples, arrays of shape (k, n) [rad; m for a prismatic joint]."""
 
-    position_rad: FloatArray
-    velocity_rad_s: FloatArray
-    acceleration_rad_s2: FloatArray
+    position_rad: FloatArray  #: q
+    velocity_rad_s: FloatArray  #: q̇, per s
+    acceleration_rad_s2: FloatArray  #: q̈, per s²
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -67,9 +67,9 @@ class Obstruction:
 
 
 CLOSURES = "the closures"  #: What is in the way where the loops of a closed chain do not close, or are nearly singular
-LARGEST_CONDITION = 60.0
+LARGEST_PLANNED_CONDITION = 60.0
 """Largest condition of the closures in a planned pose (Frobenius): nearer to a singularity, forces in loops grow."""
-LARGEST_MISFIT = 0.01
+LARGEST_PLANNED_MISFIT = 0.01
 """Motors of a redundant drive may differ by this on the way between two poses that fit [rad or m]: they work against
 each other there, which is what separates their gains, and no more than their position loops can bear."""
 STEP_SHARE = 0.05  #: Of the way between two poses of a closed chain that are examined
@@ -140,7 +140,7 @@ class Checker:
 
     def _reached(self, position: FloatArray) -> _Reached:
         found = reach(self.robot, self._assembly, position)
-        usable = found.closed & (found.condition < LARGEST_CONDITION) & (found.misfit < LARGEST_MISFIT)
+        usable = found.closed & (found.condition < LARGEST_PLANNED_CONDITION) & (found.misfit < LARGEST_PLANNED_MISFIT)
         return _Reached(found.position_rad, usable)
 
     def apart(self, position: FloatArray) -> FloatArray:

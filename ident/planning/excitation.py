@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ident.arrays import BoolArray, FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
-from ident.equations.currents import without_preload
+from ident.equations.currents import whitening_transform
 from ident.equations.rows import row_filter, row_masks
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, Body, Payload
@@ -158,7 +158,7 @@ class Design:
         """
         expected = self.expectation
         _, to_motors = expected.model.balance(excitation.motion)
-        transform = without_preload(preload_directions(to_motors), expected.gains, expected.noise_a)
+        transform = whitening_transform(preload_directions(to_motors), expected.gains, expected.noise_a)
         transform *= np.all(excitation.use, axis=0).astype(np.float64)[:, None, None]
         columns = np.einsum("kij,jak->iak", transform, torque, optimize=True)
         return np.concatenate((columns, torque, transform.transpose(1, 2, 0)), axis=1)

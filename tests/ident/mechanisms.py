@@ -20,12 +20,13 @@ class Mechanism:
     """A URDF with its closures, and where its motors may go.
 
     Attributes:
+        urdf: text of the tree.
         motors: joint of each axis.
         closures: pairs of links.
-        assembly_rad: of the joints that are not at zero.
-        reach: half the range of each independent motor around the assembly pose [rad or m].
+        platform: link that carries the payload.
+        mobility: degrees of freedom d.
         gains: of the motors [Nm/A or N/A].
-        mobility: d.
+        assembly_rad: of the joints that are not at zero.
     """
 
     name: str

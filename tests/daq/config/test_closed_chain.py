@@ -62,7 +62,7 @@ def _cell(folder: Path, *changes: tuple[str, str], name: str = "five-bar") -> Ce
         pytest.param(
             MOTORS,
             "motors: [crank-1, crank-1]",
-            "11: closures: found two motors drive the same joint; expected a joint of its own for each (`motors`)",
+            "11: closures: found two motors drive crank-1; expected a joint of its own for each (`motors`)",
             id="one joint twice",
         ),
         pytest.param(

@@ -228,7 +228,7 @@ def test_a_left_out_run_is_predicted_by_the_others_alone(
 
 def test_the_noise_floor_is_relative_to_the_same_currents(start: Evidence) -> None:
     floors = (NoiseFloor(0.05, FloorSource.STANDSTILL, 20, 100.0),) * 5 + (None,)
-    error = floor_on(start.training, floors).relative(start.estimate.gains)
+    error = floor_on(start.training, start.estimate, floors).relative(start.estimate.gains)
     used = start.training.motor_use[0]
     rms_a = np.sqrt(np.mean(start.training.current[0, used] ** 2))
     assert error.axes[0] == pytest.approx(100.0 * 0.05 / rms_a)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from ident.data.dataset import Dataset
 from ident.discovery.choice import choice_covariance, is_small
 from ident.discovery.evidence import Evidence, with_effects
-from ident.discovery.search import Finding, Gates
+from ident.discovery.gates import Gates
+from ident.discovery.search import Finding
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.friction import NonlinearViscous, Stribeck
 from tests.ident.recordings import Truth, acting_on, bent, search_problem_of

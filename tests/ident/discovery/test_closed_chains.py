@@ -13,8 +13,14 @@ from numpy.typing import NDArray
 from ident.calibration import Calibration, calibration_of
 from ident.data.dataset import differentiate
 from ident.data.run import Run
-from ident.discovery.evidence import gather
+from ident.discovery.before_after import assess, error_on, floor_on, holdout_change, left_on
+from ident.discovery.candidates import prepare_search
+from ident.discovery.evidence import gather, with_effects
+from ident.discovery.gates import own_unknowns, without_effects_of
 from ident.discovery.loop import find_effects
+from ident.discovery.noise_floor import FloorSource, NoiseFloor
+from ident.effects.effect import PlacedEffect
+from ident.effects.position import Spring
 from ident.equations.rows import row_filter, row_masks
 from ident.errors import CurrentReversed
 from ident.estimators.diagnosis import diagnose, exchanged_channels
@@ -24,6 +30,7 @@ from ident.model.closed_chain import TreeMotion
 from ident.prediction import measured_current, measured_torque, placed_effect, predict_torque
 from tests.ident.closed_recordings import Made, recorded
 from tests.ident.mechanisms import FIVE_BAR, PLANAR, THREE_LEGS, Mechanism
+from tests.ident.recordings import search_problem_of
 
 FloatArray = NDArray[np.float64]
 Torque = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
@@ -129,6 +136,45 @@ def test_internal_preload_is_in_no_comparison() -> None:
     shown = measured_current(*arguments, preloaded, data.motion())
     assert_allclose(shown * PLANAR.gains, seen, rtol=0.0, atol=1e-10)
     assert _error(calibration, made, replace(made.runs[0], current_a=_at_samples(made.runs[0], preloaded))) < 5.0
+
+
+def test_internal_preload_is_no_error() -> None:
+    """Preload is far larger than the error; the model is exact, so seen moves are predicted as well as unseen ones."""
+    made = recorded(PLANAR, 7, seconds=12.0, noise_a=0.01, preload_nm=2.0)
+    evidence = gather(identify(made.model, made.runs, made.conditioning, keep_rows=True))
+    rows, estimate = evidence.training, evidence.estimate
+    errors = assess(evidence, estimate.gains).errors
+    assert 0.8 * errors.cross_validated.total < errors.in_sample.total < errors.cross_validated.total
+    # e shows three of four shares of the noise: what it leaves, divided by these, is the noise of the currents.
+    assert left_on(rows, estimate) == pytest.approx(estimate.axis_noise, rel=0.02)
+    floors = [NoiseFloor(float(noise), FloorSource.STANDSTILL, 20, 1e4) for noise in estimate.axis_noise]
+    floor = floor_on(rows, estimate, floors).relative(estimate.gains)
+    assert floor.axes == pytest.approx(errors.in_sample.axes, rel=0.02)
+    search_problem = search_problem_of(evidence)
+    shown = [search_problem.folds.linearisation.shown(motor) for motor in range(len(estimate.gains))]
+    assert sum(shown) == pytest.approx(made.model.assembly.mobility * np.sum(rows.motor_use[0]))
+    worse = replace(estimate, parameters=1.01 * estimate.parameters)
+    change = holdout_change(replace(evidence, holdout=rows), replace(evidence, holdout=rows, estimate=worse))
+    assert change is not None
+    assert change.is_rise
+    rise = error_on(rows, worse).left - error_on(rows, estimate).left
+    assert change.rise == pytest.approx(rise @ estimate.gains**2)
+
+
+def test_an_effect_is_taken_out_of_the_rows_of_all_motors() -> None:
+    """The derivative to a gain holds the corrected current: without an effect, that of the same fit without it."""
+    made = recorded(PLANAR, 7, seconds=12.0, noise_a=0.01, preload_nm=2.0)
+    bare = gather(identify(made.model, made.runs, made.conditioning, keep_rows=True))
+    placed = PlacedEffect(Spring(), 1)
+    joined = with_effects(bare, (placed,))
+    estimate = joined.estimate
+    declared = replace(estimate, parameters=np.delete(estimate.parameters, own_unknowns(estimate, (placed,))))
+    problems = (
+        without_effects_of(search_problem_of(joined), estimate, (placed,)).search_problem,
+        prepare_search(made.model, joined.fit_runs, bare.training, declared),
+    )
+    found, expected = (problem.folds.linearisation.jacobian.columns(np.arange(4)) for problem in problems)
+    assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
 def _at_samples(run: Run, inner: FloatArray) -> FloatArray:

@@ -8,8 +8,8 @@ import pytest
 from ident.arrays import FloatArray
 from ident.calibration import calibration_of
 from ident.discovery.evidence import Evidence, gather
+from ident.discovery.gates import Gates
 from ident.discovery.loop import Step, find_effects, with_declared
-from ident.discovery.search import Gates
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect
 from ident.effects.position import Counterbalance

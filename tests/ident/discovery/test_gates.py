@@ -17,6 +17,7 @@ from ident.discovery.candidates import SearchProblem, score_candidates
 from ident.discovery.evidence import Evidence, gather, with_effects
 from ident.discovery.gates import (
     MIN_RUNS,
+    Gates,
     RunsLeftOut,
     compare_by_move,
     gain_shifts,
@@ -31,7 +32,6 @@ from ident.discovery.loop import SetAside, find_effects
 from ident.discovery.search import (
     FEWEST_MOVES,
     Finding,
-    Gates,
     effect_key,
     moves_behind,
     rank_effects,

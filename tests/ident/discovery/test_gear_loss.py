@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
 from ident.discovery.evidence import Evidence, with_effects
+from ident.discovery.gates import Gates
 from ident.discovery.gear_loss import GearLoss, driving_shares, gear_losses
 from ident.discovery.loop import Step
-from ident.discovery.search import Gates, rank_effects
+from ident.discovery.search import rank_effects
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.friction import LoadFriction, Stribeck
 from ident.effects.transmission import Efficiency

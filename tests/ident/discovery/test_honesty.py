@@ -12,7 +12,8 @@ from scipy import linalg
 
 from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, Trial, score_candidates
 from ident.discovery.evidence import Evidence
-from ident.discovery.search import Gates, rank_effects, rank_families
+from ident.discovery.gates import Gates
+from ident.discovery.search import rank_effects, rank_families
 from ident.effects.dictionary import EFFECTS
 from ident.effects.electrical import Cogging
 from ident.effects.friction import PositionFriction, Stribeck

@@ -13,8 +13,9 @@ from ident.data.dataset import Dataset
 from ident.data.run import Run
 from ident.discovery.candidates import ColumnCache
 from ident.discovery.evidence import Evidence, with_effects
+from ident.discovery.gates import Gates
 from ident.discovery.loop import find_effects
-from ident.discovery.search import Gates, rank_effects
+from ident.discovery.search import rank_effects
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect, Side
 from ident.errors import RankDeficient, TooFewMoves

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
 from ident.discovery.evidence import Evidence
+from ident.discovery.gates import Gates
 from ident.discovery.loop import find_effects
 from ident.discovery.resonance import propose_resonances
-from ident.discovery.search import Gates
 from ident.effects.dictionary import EFFECTS
 from ident.effects.signals import fitted_signals
 from ident.effects.transmission import Backlash, Elasticity, spring_torque, twist_acceleration

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
 from ident.discovery.evidence import Evidence
+from ident.discovery.gates import Gates
 from ident.discovery.loop import find_effects
 from ident.discovery.ripple import Periodogram, _fast_length, periodogram, propose_orders
-from ident.discovery.search import Gates
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.electrical import Cogging

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
 from ident.discovery.evidence import Evidence, with_effects
+from ident.discovery.gates import Gates
 from ident.discovery.loop import find_effects
-from ident.discovery.search import Finding, Gates, choose_effect, rank_effects, refine_setting
+from ident.discovery.search import Finding, choose_effect, rank_effects, refine_setting
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.electrical import Cogging

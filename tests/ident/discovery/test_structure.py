@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from ident.data.dataset import Dataset
 from ident.discovery import loop
 from ident.discovery.evidence import Evidence, with_effects
+from ident.discovery.gates import Gates
 from ident.discovery.loop import Step, find_effects
-from ident.discovery.search import Gates, choose_effect, detection_limits_nm, rank_effects
+from ident.discovery.search import choose_effect, rank_effects
+from ident.discovery.structure import detection_limits_nm
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.signals import Abscissa

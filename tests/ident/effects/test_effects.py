@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ident.discovery.search import VARIABLES
+from ident.discovery.structure import VARIABLES
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, Property, Side, at_joints, is_placeable
 from ident.effects.electrical import Cogging, Saturation, TimeSkew

@@ -14,7 +14,7 @@ from ident.data.run import Run
 from ident.discovery.evidence import Evidence, gather
 from ident.equations import reduction as reduction_module
 from ident.equations.reduction import Reduction, layout, reduce_runs
-from ident.equations.rows import OF_ROWS
+from ident.equations.rows import OBSERVATION_ROWS
 from ident.equations.system import System
 from ident.equations.triangles import triangle
 from ident.estimators.estimate import Estimate
@@ -95,7 +95,7 @@ def test_rows_kept_by_a_fit_are_those_built_of_its_runs(small_truth: Truth, smal
     for one, other in ((kept.training, built.training), (kept.holdout, built.holdout)):
         assert one is not None
         assert other is not None
-        assert all(np.array_equal(getattr(one, name), getattr(other, name)) for name in OF_ROWS)
+        assert all(np.array_equal(getattr(one, name), getattr(other, name)) for name in OBSERVATION_ROWS)
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4, 5), (5, 4, 3, 2, 1, 0)])

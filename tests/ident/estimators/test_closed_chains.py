@@ -10,7 +10,7 @@ import pytest
 
 from ident.arrays import FloatArray
 from ident.data.dataset import differentiate
-from ident.equations.currents import PreloadedCurrents, without_preload
+from ident.equations.currents import PreloadedCurrents, whitening_transform
 from ident.equations.linearisation import linearise
 from ident.equations.rows import decimate_rows, observe
 from ident.errors import DataUnfit
@@ -79,7 +79,7 @@ def test_what_the_preload_hides_is_taken_out_exactly() -> None:
     rng = np.random.default_rng(1)
     preload, _ = np.linalg.qr(rng.normal(size=(30, 4, 1)))
     gains, noise = np.array([2.0, -1.5, 1.8, 2.2]), np.array([0.02, 0.05, 0.01, 0.03])
-    transform = without_preload(preload, gains, noise)
+    transform = whitening_transform(preload, gains, noise)
     assert np.max(np.abs(transform @ preload)) < 1e-10
     # ‖T y‖² is yᵀA (AᵀD²A)⁻¹ Aᵀy, with A the complement of N.
     complement = np.linalg.qr(preload, mode="complete")[0][:, :, 1:]

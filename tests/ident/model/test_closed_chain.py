@@ -270,6 +270,8 @@ def test_bad_descriptions_are_refused_by_name() -> None:
         _wrong(FIVE_BAR, closures=(LinkPair("tip", "nowhere", "right-tip", ("x",)),))
     with pytest.raises(ModelError, match="the list of motors names joint 'left'"):
         _wrong(FIVE_BAR, motors=("left", "right-crank"))
+    with pytest.raises(ModelError, match="two motors drive left-crank; expected a joint of its own for each"):
+        assemble(_wrong(FIVE_BAR, motors=("left-crank", "right-crank", "left-crank")))
     with pytest.raises(ModelError, match="directions q; expected some of x, y, z, rx, ry, rz"):
         _wrong(FIVE_BAR, closures=(LinkPair("tip", "left-tip", "right-tip", ("q",)),))
 
@@ -284,6 +286,15 @@ def test_motors_of_a_redundant_drive_that_do_not_fit_each_other_are_named() -> N
     # What an encoder or a bent arm makes is no wrong zero.
     shaken = motion.position_rad + np.random.default_rng(0).normal(0.0, 1e-3, turned.shape)
     assert follow(robot, assembly, replace(motion, position_rad=shaken)).to_motors.shape == (30, 4, 3)
+
+
+@pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
+def test_the_assembly_pose_has_the_condition_of_a_motion_there(mechanism: Mechanism) -> None:
+    robot, assembly = mechanism.robot, assemble(mechanism.robot)
+    home = assembly.position_rad[None, list(robot.axis_joints)]
+    found = follow(robot, assembly, Motion(home, 0.0 * home, 0.0 * home))
+    assert found.condition == pytest.approx(assembly.condition)
+    assert reach(robot, assembly, home).condition == pytest.approx(assembly.condition)
 
 
 def test_a_redundant_drive_train_is_diagonal() -> None:

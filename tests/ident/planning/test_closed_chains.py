@@ -10,7 +10,7 @@ from ident.data.dataset import differentiate
 from ident.equations.rows import Observation
 from ident.estimators.identify import identify
 from ident.model.robot import Motion
-from ident.planning.clearance import LARGEST_MISFIT, Capsule, Checker, Scene
+from ident.planning.clearance import LARGEST_PLANNED_MISFIT, Capsule, Checker, Scene
 from ident.planning.excitation import (
     UNSEEN_PERCENT,
     Design,
@@ -161,7 +161,7 @@ def test_motors_of_a_redundant_drive_are_made_to_fit() -> None:
     way = np.linspace(0.0, 1.0, 21)[:, None]
     straight = poses[0] + way * (poses[-1] - poses[0])
     misfit = np.max(np.abs(checker.fitting(straight) - straight))
-    assert (checker.obstruction(poses[0], poses[-1]) is None) == (misfit < LARGEST_MISFIT)
+    assert (checker.obstruction(poses[0], poses[-1]) is None) == (misfit < LARGEST_PLANNED_MISFIT)
 
 
 def test_bodies_of_a_closed_chain_keep_apart() -> None:

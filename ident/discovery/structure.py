@@ -1,0 +1,98 @@
+"""Find structure that no named effect explains, and the size of an effect that would have been found.
+
+Candidates are smooth functions of one variable and periodic ones of the motor's angle (`ident.effects.unnamed`). They
+pass the same gates as named effects (`ident.discovery.search`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from ident.arrays import FloatArray
+from ident.discovery.candidates import SearchProblem
+from ident.discovery.gates import Gates
+from ident.discovery.search import Finding, is_better, rank_families
+from ident.effects.effect import Effect
+from ident.effects.signals import Abscissa
+from ident.effects.unnamed import FOLDED, INTERVALS, Periodic, Smooth
+
+VARIABLES = (
+    (Abscissa.VELOCITY, (0, 1)),
+    (Abscissa.POSITION, (0, 1)),
+    (Abscissa.LOAD, (0, 1)),
+    (Abscissa.TIME, (0, 1)),
+    (Abscissa.SESSION, (0, 1)),
+    (Abscissa.DISTANCE, (1,)),
+    (Abscissa.CURRENT, (0,)),
+    (Abscissa.TORQUE_RATE, (0,)),
+    (Abscissa.LOAD_CURVATURE, (0,)),
+)
+"""Each variable, and whether its function is tried as it is (0) or turning with the direction of motion (1)."""
+MUCH_MORE = 0.15  #: Share by which a term must explain more than a named effect to call the name wrong
+MIN_MOVES_FOR_STRUCTURE = 5 * (INTERVALS + 1)  #: Five moves for each coefficient of a term
+TAIL = 0.005
+"""Share of the samples cut off at either end of a variable's range, where a spline would rest on a handful of them."""
+
+
+def find_structure(
+    search_problem: SearchProblem, axes: Iterable[int], rng: np.random.Generator, gates: Gates
+) -> tuple[Finding, ...]:
+    """Find variables that the residual of some axes depends on, the best on held-out moves first."""
+    if search_problem.folds.moves < MIN_MOVES_FOR_STRUCTURE:
+        return ()  # a term of many coefficients would fit the few moves
+    tested = [
+        found for axis in axes for found in search_problem.test(_families(search_problem, axis), axis, at_rows=True)
+    ]
+    return rank_families(search_problem, tested, rng, gates)
+
+
+def is_inadequate(named: Finding, structure: Finding) -> bool:
+    """Whether a term that fits anything explains clearly and much more than a named effect.
+
+    Then the true effect is only similar to the named one, and the residual counts as unexplained.
+    """
+    more = structure.held_out_fall > (1.0 + MUCH_MORE) * named.held_out_fall
+    return structure.passed and more and bool(is_better(structure.fold_errors, named.fold_errors))
+
+
+def detection_limits_nm(search_problem: SearchProblem, gates: Gates) -> FloatArray:
+    """Compute the torque of a detectable effect at each motor, root mean square over the moving rows, shape (m,).
+
+    It is torque that the declared model cannot mimic: most of an effect that resembles gravity or viscous friction is
+    absorbed by those. The limit holds for effects whose shape the dictionary or a spline can follow; on a short
+    recording noise raises it.
+    """
+    problem = search_problem.folds.linearisation
+    square = np.bincount(problem.motor, problem.residual**2) / np.bincount(problem.motor)
+    noise_a = problem.noise * np.sqrt(square)
+    return np.asarray(noise_a / np.abs(problem.gamma) * np.sqrt(gates.smallest_share))
+
+
+def _families(search_problem: SearchProblem, axis: int) -> tuple[tuple[Effect, ...], ...]:
+    """One family a variable, with the range that it has in these runs."""
+    families: list[tuple[Effect, ...]] = []
+    has_session = any(not np.array_equal(run.time_s, run.session_s) for run in search_problem.rows)
+    for variable, signs in VARIABLES:
+        if variable is Abscissa.SESSION and not has_session:
+            continue
+        term = _ranged(search_problem, Smooth(variable), axis)
+        families.append(tuple(replace(term, signed=sign) for sign in signs))
+    families.append((Periodic(0), Periodic(1)))
+    for other in range(search_problem.axes):
+        if other != axis:
+            term = _ranged(search_problem, Smooth(Abscissa.OTHER_VELOCITY, other_axis=other + 1), axis)
+            families.append((replace(term, signed=1), replace(term, signed=0)))
+    return tuple(families)
+
+
+def _ranged(search_problem: SearchProblem, term: Smooth, axis: int) -> Smooth:
+    other = term.other_axis - 1 if term.other_axis else None
+    x = np.concatenate([run.variable(term.variable, axis, other) for run in search_problem.rows])
+    x = x[search_problem.observation.use[axis]]
+    if term.variable in FOLDED:
+        x = np.abs(x)
+    lower, upper = np.quantile(x, (0.0 if term.variable in FOLDED else TAIL, 1.0 - TAIL))
+    return replace(term, lower=float(lower), upper=float(max(upper, lower + 1e-9)))
