@@ -28,6 +28,7 @@ LARGEST_CONDITION = 500.0
 """Largest condition (Frobenius) of J_d, the derivatives to the joints that follow, and of A for a redundant drive;
 mechanisms stay below 30 in their workspace."""
 CLOSED = 1e-12  #: |φ| at which Newton's iteration ends, in units of the robot's size or radians
+NEARLY_CLOSED = 1e-4  #: The same on the way to other positions: one more step of Newton leaves its square
 SMALLEST_RANK = 1e-7  #: Singular value of J, relative to the largest, that counts as zero
 LARGEST_GAP = 0.3  #: |φ| at the declared assembly pose, in units of the robot's size or radians
 LARGEST_MISFIT = 0.02
@@ -250,7 +251,7 @@ def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
     for step in range(1, steps + 1):
         # On the way, motors of a redundant drive need not fit each other.
         way = start + (axes_rad[coarse] - start) * (step / steps)
-        found, gap, condition = _newton(robot, assembly, found, way, 1e-9 if step == steps else 1e-3)
+        found, gap, condition = _newton(robot, assembly, found, way, on_the_way=step < steps)
     while len(coarse) < samples:
         stride = max(1, stride // 8)
         finer = np.unique(np.append(np.arange(0, samples, stride), samples - 1))
@@ -261,9 +262,13 @@ def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
 
 
 def _newton(
-    robot: Robot, assembly: Assembly, position: FloatArray, axes_rad: FloatArray, tolerance_rad: float = 1e-9
+    robot: Robot, assembly: Assembly, position: FloatArray, axes_rad: FloatArray, *, on_the_way: bool = False
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Close the loops at given positions of the motors' joints, from near by: positions, gaps and conditions."""
+    """Close the loops at given positions of the motors' joints, from near by: positions, gaps and conditions.
+
+    ``on_the_way`` to other positions it is enough to stay near the pose.
+    """
+    closed, settled_rad = (NEARLY_CLOSED, 1e-3) if on_the_way else (CLOSED, 1e-9)
     motors, x, rest = list(robot.axis_joints), list(assembly.independent), list(assembly.dependent)
     position = position.copy()
     redundant = len(motors) > len(x)
@@ -286,7 +291,7 @@ def _newton(
         lost = ~(step < LONGEST_STEP_RAD)  # where there is no pose, Newton's steps become longer and longer
         change[lost] = 0.0
         position += change
-        if np.all(lost | ((gap < CLOSED) & (step < tolerance_rad))):
+        if np.all(lost | ((gap < closed) & (step < settled_rad))):
             break
     return position, gap, _condition(r)
 
@@ -383,6 +388,13 @@ def _check(robot: Robot, start: FloatArray) -> None:
     if len(set(robot.motors)) < len(robot.motors):
         twice = (robot.joints[joint].name for joint in sorted(set(robot.motors)) if robot.motors.count(joint) > 1)
         raise ModelError(f"two motors drive {', '.join(twice)}; expected a joint of its own for each (`motors`)")
+    for joint, position in zip(robot.joints, start, strict=True):
+        # Poses are reached from the assembly pose in small steps, so a turn too many costs time in each of them.
+        if joint.kind is JointKind.REVOLUTE and not abs(position) <= 2.0 * np.pi:
+            raise ModelError(
+                f"the assembly pose has {joint.name} at {np.degrees(position):.6g}°; expected -360° to 360° "
+                "(assembly_deg): whole turns change no pose"
+            )
     for closure in robot.closures:
         if not closure.directions:
             raise ModelError(f"closure {closure.name!r} holds no direction; expected some of x, y, z, rx, ry, rz")

@@ -34,7 +34,7 @@ def loops(robot: Robot, position: FloatArray, size_m: float = 1.0, velocity: Flo
         size_m: that divides lengths.
     """
     placed, samples = poses(robot, position), len(position)
-    axes = [placed.rotation[i + 1] @ joint.axis for i, joint in enumerate(robot.joints)]
+    axes = (placed.rotation[1:] @ np.array([joint.axis for joint in robot.joints])[:, None, :, None])[..., 0]
     moved = None if velocity is None else _spin(robot, placed, axes, position, velocity)
     width = sum(len(closure.directions) for closure in robot.closures)
     residual = np.empty((samples, width))
@@ -63,7 +63,7 @@ class _Spin:
     linear_bias: FloatArray  #: its origin's acceleration
 
 
-def _spin(robot: Robot, placed: Poses, axes: list[FloatArray], position: FloatArray, velocity: FloatArray) -> _Spin:
+def _spin(robot: Robot, placed: Poses, axes: FloatArray, position: FloatArray, velocity: FloatArray) -> _Spin:
     shape = (robot.joint_count + 1, len(position), 3)
     w, v, dw, dv = (np.zeros(shape) for _ in range(4))
     for index, joint in enumerate(robot.joints):
@@ -90,35 +90,30 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(a[..., _AHEAD] * b[..., _BEHIND] - a[..., _BEHIND] * b[..., _AHEAD])
 
 
-def _cross_columns(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross products of columns, shape (k, 3, n), with a vector of each sample, shape (k, 3)."""
-    b = b[:, :, None]
-    return np.asarray(a[:, _AHEAD] * b[:, _BEHIND] - a[:, _BEHIND] * b[:, _AHEAD])
-
-
 def origin(placed: Poses, place: Place) -> FloatArray:
     """Origin of a frame in the base [m], shape (k, 3)."""
     at = place.joint + 1
     return np.asarray(placed.origin_m[at] + placed.rotation[at] @ place.translation_m)
 
 
-def _columns(robot: Robot, placed: Poses, axes: list[FloatArray], place: Place) -> tuple[FloatArray, FloatArray]:
-    """Velocity of a frame's origin, and its angular velocity, per unit of each joint's: shapes (k, 3, n)."""
-    point = origin(placed, place)
-    linear, angular = (np.zeros((len(point), 3, robot.joint_count)) for _ in range(2))
+def _columns(robot: Robot, placed: Poses, axes: FloatArray, place: Place) -> tuple[FloatArray, FloatArray]:
+    """Velocity of a frame's origin, and its angular velocity, per unit of each joint's: shapes (n, k, 3)."""
+    linear, angular = np.zeros_like(axes), np.zeros_like(axes)
+    moved = list[int]()
     joint = place.joint
     while joint >= 0:
         if robot.joints[joint].kind is JointKind.REVOLUTE:
-            angular[:, :, joint] = axes[joint]
-            linear[:, :, joint] = _cross(axes[joint], point - placed.origin_m[joint + 1])
+            moved.append(joint)
         else:
-            linear[:, :, joint] = axes[joint]
+            linear[joint] = axes[joint]
         joint = robot.joints[joint].parent
+    angular[moved] = axes[moved]
+    linear[moved] = _cross(axes[moved], origin(placed, place) - placed.origin_m[1:][moved])
     return linear, angular
 
 
 def _closure(
-    robot: Robot, closure: Closure, placed: Poses, axes: list[FloatArray], moved: _Spin | None
+    robot: Robot, closure: Closure, placed: Poses, axes: FloatArray, moved: _Spin | None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """φ, J and J̇ q̇ of one closure, in m and rad.
 
@@ -135,9 +130,10 @@ def _closure(
     (v1, w1), (v2, w2) = (_columns(robot, placed, axes, place) for place in (first, second))
     residual, jacobian, bias = [], [], []
     gap = np.einsum("kij,kj->ki", turned, apart)
-    lengths = turned @ (v2 - v1 - _cross_columns(w1, apart))
-    turning = turned @ (w2 - w1)
-    parallel = np.swapaxes(frame, 1, 2) @ other
+    lengths = turned @ (v2 - v1 - _cross(w1, apart)).transpose(1, 2, 0)
+    turns = any("r" in direction for direction in closure.directions)
+    turning = turned @ (w2 - w1).transpose(1, 2, 0) if turns else np.empty(0)
+    parallel = turned @ other if turns else np.empty(0)
     if moved is not None:
         motion = [_place_motion(moved, placed, place) for place in (first, second)]
         (u1, o1, du1, do1), (u2, o2, du2, do2) = motion

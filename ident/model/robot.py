@@ -141,18 +141,25 @@ def poses(robot: Robot, position_rad: FloatArray) -> Poses:
     rotation = np.empty((count + 1, samples, 3, 3))
     origin = np.empty((count + 1, samples, 3))
     rotation[0], origin[0] = np.eye(3), 0.0
+    own = _own_rotations(robot, position_rad)
     for index, joint in enumerate(robot.joints):
-        parent, position = rotation[joint.parent + 1], position_rad[:, index, None]
-        origin[index + 1] = origin[joint.parent + 1] + parent @ joint.translation_m
+        parent = rotation[joint.parent + 1]
+        np.add(origin[joint.parent + 1], parent @ joint.translation_m, out=origin[index + 1])
         if joint.kind is JointKind.PRISMATIC:
-            origin[index + 1] += position * (parent @ (joint.rotation @ joint.axis))
-            rotation[index + 1] = parent @ joint.rotation
-        else:
-            outer = np.outer(joint.axis, joint.axis)  # Rodrigues' formula
-            turns = joint.rotation @ np.stack((outer, np.eye(3) - outer, skew(joint.axis)))
-            factors = np.concatenate((np.ones_like(position), np.cos(position), np.sin(position)), axis=1)
-            np.matmul(parent, (factors @ turns.reshape(3, 9)).reshape(-1, 3, 3), out=rotation[index + 1])
+            origin[index + 1] += position_rad[:, index, None] * (parent @ (joint.rotation @ joint.axis))
+        np.matmul(parent, own[index], out=rotation[index + 1])
     return Poses(rotation, origin)
+
+
+def _own_rotations(robot: Robot, position_rad: FloatArray) -> FloatArray:
+    """Rotation of each joint's frame in its parent's, shape (n, k, 3, 3): Rodrigues' formula for all joints at once."""
+    axes = np.array([joint.axis for joint in robot.joints])
+    outer = axes[:, :, None] * axes[:, None]
+    turns = np.stack((outer, np.eye(3) - outer, np.array([skew(axis) for axis in axes])), axis=1)
+    turns = np.array([joint.rotation for joint in robot.joints])[:, None] @ turns
+    turned = position_rad.T * np.array([[joint.kind is JointKind.REVOLUTE] for joint in robot.joints])
+    factors = np.stack((np.ones_like(turned), np.cos(turned), np.sin(turned)), axis=2)
+    return np.asarray((factors @ turns.reshape(-1, 3, 9)).reshape(*turned.shape, 3, 3))
 
 
 def skew(vector: FloatArray) -> FloatArray:

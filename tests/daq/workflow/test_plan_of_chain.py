@@ -45,9 +45,25 @@ def test_the_payload_is_expected_at_the_platform() -> None:
 
 
 @pytest.fixture(scope="module")
-def made(cell: Cell, experiment: Experiment) -> Plan:
+def searched(cell: Cell, experiment: Experiment) -> tuple[Plan, list[tuple[int, float]]]:
+    """The planner's own plan, and what it reported: exchanges so far and σ of the worst gain."""
+    return _searched(cell, experiment, 16)
+
+
+@pytest.fixture(scope="module")
+def made(searched: tuple[Plan, list[tuple[int, float]]]) -> Plan:
     """The planner's own plan."""
-    return plan(cell, seed=4, duration_s=SECONDS, exchanges=16, experiment=experiment)
+    return searched[0]
+
+
+def _searched(cell: Cell, experiment: Experiment, exchanges: int) -> tuple[Plan, list[tuple[int, float]]]:
+    reports = list[tuple[int, float]]()
+
+    def note(done: int, worst: float) -> None:
+        reports.append((done, worst))
+
+    made = plan(cell, seed=4, duration_s=SECONDS, exchanges=exchanges, experiment=experiment, progress=note)
+    return made, reports
 
 
 def test_the_planners_own_plan_shows_every_gain(cell: Cell, experiment: Experiment, made: Plan) -> None:
@@ -102,21 +118,13 @@ def test_the_assembly_pose_that_was_found_is_shown(tmp_path: Path) -> None:
     )
 
 
-def test_an_interrupted_search_is_repeated_by_its_number_of_exchanges(cell: Cell, experiment: Experiment) -> None:
+def test_an_interrupted_search_is_repeated_by_its_number_of_exchanges(
+    cell: Cell, experiment: Experiment, searched: tuple[Plan, list[tuple[int, float]]]
+) -> None:
     """What `plan` says when it is interrupted: the first exchanges do not depend on how many are to come."""
-
-    def reported(tries: int) -> list[tuple[int, float]]:
-        reports = list[tuple[int, float]]()
-
-        def note(done: int, worst: float) -> None:
-            reports.append((done, worst))
-
-        plan(cell, seed=4, duration_s=SECONDS, exchanges=tries, experiment=experiment, progress=note)
-        return reports
-
-    longer = reported(16)
+    longer = searched[1]
     assert [done for done, _ in longer] == [8, 16]
-    assert longer[:1] == reported(8)
+    assert longer[:1] == _searched(cell, experiment, 8)[1]
 
 
 def test_the_same_moves_around_one_pose_hide_gains(cell: Cell, experiment: Experiment, made: Plan) -> None:

@@ -272,6 +272,8 @@ def test_bad_descriptions_are_refused_by_name() -> None:
         _wrong(FIVE_BAR, motors=("left", "right-crank"))
     with pytest.raises(ModelError, match="two motors drive left-crank; expected a joint of its own for each"):
         assemble(_wrong(FIVE_BAR, motors=("left-crank", "right-crank", "left-crank")))
+    with pytest.raises(ModelError, match=r"left-crank at 3.6e\+09°; expected -360° to 360°"):
+        assemble(_wrong(FIVE_BAR, assembly_rad={"left-crank": np.radians(3.6e9), "right-crank": 0.0}))
     with pytest.raises(ModelError, match="directions q; expected some of x, y, z, rx, ry, rz"):
         _wrong(FIVE_BAR, closures=(LinkPair("tip", "left-tip", "right-tip", ("q",)),))
 
