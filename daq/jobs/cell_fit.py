@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import math
 import re
-import stat
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -30,7 +28,7 @@ from daq.errors import (
     exit_code,
     writing,
 )
-from daq.files import follow_links, read_regular, replace_file
+from daq.files import judge_target, read_regular, replace_file
 from daq.jobs.fleet_survey import CellLogs, StoredLog, at_hand, fingerprint
 from daq.workflow.calibration_file import as_document, decode, encode
 from daq.workflow.fit import calibration_of, check_holdout, close_loop, fit
@@ -240,14 +238,11 @@ def open_cache(folder: Path, loop: Loop) -> CalibrationCache:
 
 
 def _check_replaceable(path: Path) -> None:
-    """Refuse a folder, another user's link, and a link to a device or a pipe: what it leads to would be replaced."""
+    """Refuse, before the work is done, what `replace_file` would refuse."""
     try:
-        follow_links(path)
-        mode = path.stat().st_mode
-        foreign = path.is_symlink() and not stat.S_ISREG(mode)
-        found = "a folder" if stat.S_ISDIR(mode) else "a link to something that is no regular file" if foreign else ""
-    except OSError as error:  # another one: nothing is there, or the write will fail with a message
-        found = (error.strerror or "") if error.errno in (errno.ELOOP, errno.EPERM) else ""
+        found = "a folder" if judge_target(path).is_dir() else ""
+    except OSError as error:
+        found = error.strerror or type(error).__name__
     if not found:
         return
     raise UsageError(
