@@ -28,7 +28,7 @@ from hypothesis import strategies as st
 
 from daq.cli import main
 from daq.config.cell_file import bundle
-from daq.errors import ConfigurationMissing, DaqError, ExitCode, LogMissing, OutputFailed, UsageError
+from daq.errors import ConfigurationMissing, DaqError, ExitCode, LogMissing, OutputFailed, UsageError, WorkersLost
 from daq.jobs import fleet as fleet_module
 from daq.jobs.cell_fit import Failure, Fitted, Loop, fit_cell, open_cache
 from daq.jobs.fleet import FleetRow, WorkerPool, each, fit_fleet, worker_pool
@@ -567,7 +567,7 @@ def test_workers_that_have_gone_end_it(cancels: bool, monkeypatch: pytest.Monkey
         return pool.executor.submit(str, piece)
 
     outcomes = each(submit, (1, 2, 3), pool)
-    with pytest.raises(UsageError, match="goes on where it was"):
+    with pytest.raises(WorkersLost, match="goes on where it was"):
         next(outcomes)
 
 
