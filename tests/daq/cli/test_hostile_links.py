@@ -13,7 +13,7 @@ import pytest
 
 from daq.cli.app import VERBS, main
 from daq.config.cell_file import load_cell
-from daq.errors import ConfigurationError, ExitCode
+from daq.errors import ConfigurationError, ExitCode, UsageError
 from daq.files import follow_links, replace_file
 from daq.jobs.cell_fit import _check_replaceable
 from daq.ledger.audit import AuditAction, append
@@ -22,6 +22,7 @@ from daq.workflow.calibration_file import save_calibration
 from tests.daq.calibrations import calibration_for, demo_calibration
 from tests.daq.cli.test_no_regular_file import WRITTEN, arguments
 from tests.daq.histories import RECALIBRATION
+from tests.daq.logs import demo_content, samples, write
 
 NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
 JOB = f"""
@@ -219,3 +220,11 @@ def test_a_demonstration_follows_no_link_in_a_folder_that_another_user_made(tmp_
     with pytest.raises(OSError, match="user 4711 has made"):
         make_room(tmp_path, ())
     assert target.read_bytes() == b"mine"
+
+
+def test_a_log_does_not_begin_under_the_name_of_a_link_that_leads_nowhere(tmp_path: Path, checkout: Path) -> None:
+    """Its last step, the rename, would find the name taken."""
+    (tmp_path / "a.mcap").symlink_to(tmp_path / "gone.mcap")
+    with pytest.raises(UsageError, match="found a file of that name; expected none"):
+        write(tmp_path / "a.mcap", demo_content(checkout), samples([[0] * 6] * 5))
+    assert not (tmp_path / "a.mcap.part").exists()
