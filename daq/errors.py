@@ -9,6 +9,7 @@ DaqError
 │   └── LogUnreadable               LogMissing, LogForeign, LogTruncated, LogCorrupt, LogIncomplete
 ├── ConfigurationError    exit 6    ConfigurationMissing, YamlInvalid, SchemaMismatch, ConfigurationInconsistent
 ├── VirtualBusEmpty       exit 5
+├── WorkersLost           exit 2
 ├── JobHeld               exit 14   NotReleased (exit 11), BusTaken (exit 12), TimeBoundReached (exit 13)
 └── OutputFailed          exit 1    DiskSpaceShort
 
@@ -193,6 +194,10 @@ class VirtualBusEmpty(DaqError):
     """No node answers on a virtual bus, which ends at the program that opened it."""
 
 
+class WorkersLost(DaqError):
+    """The workers of a fleet, or their scheduler, ended before the work was done."""
+
+
 class JobHeld(DaqError):
     """A job may not go on now; nothing was written to a controller, and the next job resumes it."""
 
@@ -246,6 +251,7 @@ EXIT_CODES: tuple[tuple[type[Exception], ExitCode], ...] = (
     (DataError, ExitCode.DATA_UNFIT),
     (ConfigurationError, ExitCode.CONFIGURATION),
     (VirtualBusEmpty, ExitCode.DEVICE_FAULT),
+    (WorkersLost, ExitCode.USAGE),
     (NotReleased, ExitCode.NOT_RELEASED),
     (BusTaken, ExitCode.BUS_TAKEN),
     (TimeBoundReached, ExitCode.TIME_BOUND),

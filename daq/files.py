@@ -19,8 +19,8 @@ def replace_file(
     """Put `content` at `path`: temporary file in the same folder → fsync → read back and check → rename → fsync folder.
 
     Until the rename the old file is untouched, after it the new one is complete: a kill at any point leaves one of the
-    two. Mode, owner and access lists of an existing file are kept. A symbolic link stays: the file behind it is
-    replaced.
+    two. Mode, owner and access lists of an existing file are kept. A symbolic link that `judge_target` trusts stays:
+    the file behind it is replaced.
 
     Args:
         path: file to make or replace; its folder must exist.
@@ -29,12 +29,12 @@ def replace_file(
         like: file whose mode, owner and access lists are used instead.
 
     Raises:
-        OSError: from the file system, also if owner or access lists cannot be kept. Only a failing fsync of the folder
-            leaves the new content in place.
+        OSError: from the file system, also if owner or access lists cannot be kept; as `judge_target`; or a folder is
+            at `path`. Only a failing fsync of the folder leaves the new content in place.
     """
-    target = Path(os.path.realpath(path))
-    if target.is_symlink():
-        raise _circle(path)
+    target = judge_target(path)
+    if target.is_dir():
+        raise IsADirectoryError(errno.EISDIR, "is a directory", str(path))
     model = like or (target if target.exists() else None)
     # For the owner alone until it has the rights of the other file: an open descriptor outlives a later chmod.
     temporary, descriptor = _new_file(target, 0o666 if model is None else 0o600)
@@ -52,6 +52,45 @@ def replace_file(
         temporary.unlink(missing_ok=True)
         raise
     fsync_folder(target.parent)
+
+
+def judge_target(path: Path) -> Path:
+    """Resolve the name of a file or folder to write to, if no other user can choose what it leads to.
+
+    Raises:
+        OSError: as `follow_links`; its links lead into a folder as of `open_folder` (EPERM); or it is neither a file
+            nor a folder (EINVAL). ``strerror`` says so.
+    """
+    target = follow_links(path)
+    if (folder := open_folder(path, target)) is not None:
+        raise OSError(errno.EPERM, f"a symbolic link into {folder}, a folder that everybody may write", str(path))
+    with suppress(FileNotFoundError, NotADirectoryError):
+        mode = target.lstat().st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise OSError(errno.EINVAL, "something that is no regular file", str(path))
+    return target
+
+
+def open_folder(path: Path, target: Path) -> Path | None:
+    """Folder behind the links of a name in which every user may exchange the target; None where there is none.
+
+    In a folder with the sticky bit, such as /tmp, only its owner may exchange a file or folder.
+
+    Args:
+        path: as it was declared.
+        target: as `follow_links` resolves it.
+    """
+    try:
+        folder = target.parent.lstat()
+    except OSError:  # it is gone, or access is denied
+        return None
+    if not folder.st_mode & stat.S_IWOTH or not _links(path):
+        return None
+    if folder.st_mode & stat.S_ISVTX:
+        with suppress(OSError):
+            if target.lstat().st_uid in {0, os.geteuid()}:
+                return None
+    return target.parent
 
 
 def follow_links(path: Path) -> Path:
@@ -83,11 +122,6 @@ def follow_links(path: Path) -> Path:
             whose = f"to a file of user {owner}" if there else f"to {target}, which is not there"
             raise OSError(errno.EPERM, f"a symbolic link{named} that user {made_by} has made, {whose}", str(path))
     return target
-
-
-def has_links(path: Path) -> bool:
-    """Whether a symbolic link is in a name, be it one of a folder."""
-    return bool(_links(path))
 
 
 def _circle(path: Path) -> OSError:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import JsonOption, Verb, print_json
+from daq.cli.verb import JsonOption, Verb, judged_output, print_json
 from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def export_verb() -> None:
 
 def export_log_verb(
     log: Annotated[Path, typer.Argument(help="A log (.mcap).")],
-    out: Annotated[Path, typer.Option("--out", help="Table to write; must not exist.")],
+    out: Annotated[Path, typer.Option("--out", help="Table to write; must not exist.", callback=judged_output)],
     csv: Annotated[bool, typer.Option("--csv", help="Comma-separated text.")] = False,
     parquet: Annotated[bool, typer.Option("--parquet", help="Apache Parquet, needs drivegain[parquet].")] = False,
     json: JsonOption = False,
@@ -58,7 +58,9 @@ def _warn(log: Path, partial: bool, valid: bool, reason: str) -> None:
 
 def export_bag_verb(
     log: Annotated[Path, typer.Argument(help="A log (.mcap).")],
-    out: Annotated[Path, typer.Option("--out", help="Folder to write (rosbag2); must not exist.")],
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder to write (rosbag2); must not exist.", callback=judged_output)
+    ],
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration of the cell; its gains give the effort of the joint states.")
     ] = None,
@@ -85,7 +87,7 @@ def export_bag_verb(
 
 def export_urdf_verb(
     cell: Annotated[Path, typer.Argument(help="Cell file: URDF, gravity, drive train, limits; none with --urdf.")],
-    out: Annotated[Path, typer.Option("--out", help="URDF to write.")],
+    out: Annotated[Path, typer.Option("--out", help="URDF to write.", callback=judged_output)],
     calibration: Annotated[Path | None, typer.Argument(help="calibration.yaml written by `drivegain fit`.")] = None,
     urdf: Annotated[
         Path | None,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CellOption, JsonOption, Verb, print_json, say_next
+from daq.cli.verb import CellOption, JsonOption, Verb, judged_output, print_json, say_next
 from daq.workflow.choices import Known
 from ident.estimators.method import Method
 
@@ -32,8 +32,12 @@ LogsArgument = Annotated[list[Path], typer.Argument(help="Logs: without load, an
 HoldoutOption = Annotated[
     list[Path] | None, typer.Option("--holdout", help="Held-out log, for the final error; repeatable.")
 ]
-OutOption = Annotated[Path | None, typer.Option("--out", help="Calibration file to write (calibration.yaml).")]
-PicturesOption = Annotated[Path | None, typer.Option("--pictures", help="Folder for pictures; it is created.")]
+OutOption = Annotated[
+    Path | None, typer.Option("--out", help="Calibration file to write (calibration.yaml).", callback=judged_output)
+]
+PicturesOption = Annotated[
+    Path | None, typer.Option("--pictures", help="Folder for pictures; it is created.", callback=judged_output)
+]
 AcceptLossesOption = Annotated[
     bool,
     typer.Option("--accept-losses", help="Use logs with lost frames, less those samples; `apply` refuses the result."),
@@ -45,7 +49,10 @@ EssentialOption = Annotated[
     typer.Option(min=1.5, help="Keep only essential parameters, whose relative σ are within this factor (10 to 30)."),
 ]
 CasesOption = Annotated[
-    Path | None, typer.Option("--cases", help="Folder for the paper's cases 1 to 4, the nameplate gains and ml.")
+    Path | None,
+    typer.Option(
+        "--cases", help="Folder for the paper's cases 1 to 4, the nameplate gains and ml.", callback=judged_output
+    ),
 ]
 CompareOption = Annotated[
     bool,
@@ -68,7 +75,9 @@ def fit_verb(
     compare: CompareOption = False,
     holdout: HoldoutOption = None,
     out: OutOption = None,
-    report: Annotated[Path | None, typer.Option("--report", help="Folder for report.html, the certificate.")] = None,
+    report: Annotated[
+        Path | None, typer.Option("--report", help="Folder for report.html, the certificate.", callback=judged_output)
+    ] = None,
     pictures: PicturesOption = None,
     cell: CellOption = None,
     accept_losses: AcceptLossesOption = False,
@@ -173,7 +182,9 @@ def residual_verb(
     holdout: HoldoutOption = None,
     seed: Annotated[int, typer.Option(help="Seed of the significance test, which fixes its verdict.", min=0)] = 0,
     out: OutOption = None,
-    report: Annotated[Path | None, typer.Option("--report", help="Folder for report.html and residual.json.")] = None,
+    report: Annotated[
+        Path | None, typer.Option("--report", help="Folder for report.html and residual.json.", callback=judged_output)
+    ] = None,
     pictures: PicturesOption = None,
     leave_out_runs: Annotated[
         bool, typer.Option("--leave-out-runs", help="Also predict each run from a fit of the others: slow.")

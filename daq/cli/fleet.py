@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.verb import JsonOption, Verb, print_json
+from daq.cli.verb import JsonOption, Verb, judged_output, print_json
 from daq.errors import ExitCode, OutputFailed
 
 
@@ -27,9 +27,15 @@ def fleet_verb(
     residual: Annotated[bool, typer.Option("--residual", help="Also detect missing effects: slow.")] = False,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for a calibration of each cell; a cell is not fitted again from the same logs."),
+        typer.Option(
+            help="Folder for a calibration of each cell; a cell is not fitted again from the same logs.",
+            callback=judged_output,
+        ),
     ] = None,
-    csv: Annotated[Path | None, typer.Option("--csv", help="File for the table; an earlier table is replaced.")] = None,
+    csv: Annotated[
+        Path | None,
+        typer.Option("--csv", help="File for the table; an earlier table is replaced.", callback=judged_output),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Fit the logs of many cells, one task per cell; a cell that cannot be fitted is a line with its error.

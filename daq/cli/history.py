@@ -12,7 +12,7 @@ import typer
 
 from daq.cli.apply import applier
 from daq.cli.terminal import check_replaceable, output_console, say_written, write_output
-from daq.cli.verb import JsonOption, Verb, print_json
+from daq.cli.verb import JsonOption, Verb, judged_output, print_json
 from daq.errors import AuditUnusable, ConfigurationInconsistent, DataError, HistoryUnreadable, UsageError
 from daq.report.text import printable
 
@@ -30,8 +30,12 @@ _PICTURES = {".png": "PNG\r\n", ".svg": "<?xml"}  #: Suffixes of pictures, and t
 def history_verb(
     cell: Annotated[Path, typer.Argument(help="Cell file; it says where its history is.")],
     axis: Annotated[str | None, typer.Option("--axis", help="One axis: every calibration of its gain.")] = None,
-    plot: Annotated[Path | None, typer.Option("--plot", help="Picture to write, .png or .svg.")] = None,
-    csv: Annotated[Path | None, typer.Option("--csv", help="Table to write, for a spreadsheet.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="Picture to write, .png or .svg.", callback=judged_output)
+    ] = None,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", help="Table to write, for a spreadsheet.", callback=judged_output)
+    ] = None,
     add: Annotated[Path | None, typer.Option("--add", help="Enter a calibration by hand.")] = None,
     acknowledge: Annotated[
         str | None, typer.Option("--acknowledge", metavar="AXIS", help="A change is explained; begin a baseline.")

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from daq.cli.terminal import write_output
-from daq.cli.verb import Verb
+from daq.cli.verb import Verb, judged_output
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
 
@@ -60,7 +60,9 @@ def make_folder(folder: Path, *, simulated: bool = False) -> tuple[Path, ...]:
 
 
 def init(
-    folder: Annotated[Path, typer.Argument(help="Folder to create; its name becomes the cell's.")],
+    folder: Annotated[
+        Path, typer.Argument(help="Folder to create; its name becomes the cell's.", callback=judged_output)
+    ],
     simulated: Annotated[bool, typer.Option("--simulated", help="Use the bus of `drivegain simulate demo`.")] = False,
 ) -> None:
     """Create a folder for a new cell, with commented templates to fill in."""

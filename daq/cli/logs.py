@@ -7,9 +7,11 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.verb import JsonOption, Verb, print_json
+from daq.cli.verb import JsonOption, Verb, judged_output, print_json
 
-NewLogOption = Annotated[Path, typer.Option("--out", help="Log to write (.mcap); must not exist.")]
+NewLogOption = Annotated[
+    Path, typer.Option("--out", help="Log to write (.mcap); must not exist.", callback=judged_output)
+]
 
 
 def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: JsonOption = False) -> None:

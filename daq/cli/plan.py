@@ -10,14 +10,14 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.verb import CellArgument, JsonOption, Verb, print_json, say_next
+from daq.cli.verb import CellArgument, JsonOption, Verb, judged_output, print_json, say_next
 from daq.errors import UsageError
 from daq.workflow.choices import EXCHANGES, LARGEST_STD_PERCENT
 
 
 def plan_verb(
     cell: CellArgument,
-    out: Annotated[Path, typer.Option("--out", help="Plan to write (YAML).")],
+    out: Annotated[Path, typer.Option("--out", help="Plan to write (YAML).", callback=judged_output)],
     seed: Annotated[int, typer.Option(help="The same seed gives the same plan.", min=0)] = 1,
     duration: Annotated[float, typer.Option(help="Duration of the run [s].", min=5.0, max=3600.0)] = 40.0,
     payload: Annotated[str | None, typer.Option(help="Payload that will be mounted; the cell's first one.")] = None,
@@ -28,7 +28,9 @@ def plan_verb(
     condition: Annotated[
         float | None, typer.Option(help="Largest condition number; 3500, of a closed chain 1e5.", min=1.0)
     ] = None,
-    preview: Annotated[Path | None, typer.Option(help="Page to write (HTML): the arm moves through the plan.")] = None,
+    preview: Annotated[
+        Path | None, typer.Option(help="Page to write (HTML): the arm moves through the plan.", callback=judged_output)
+    ] = None,
     sigma: Annotated[float, typer.Option(help="Largest σ predicted for a gain [%].", min=0.01)] = LARGEST_STD_PERCENT,
     json: JsonOption = False,
 ) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import JsonOption, Verb, print_json
+from daq.cli.verb import JsonOption, Verb, judged_output, print_json
 from daq.errors import DaqError, ExitCode, UsageError, exit_code
 from drivers.errors import WHILE, DriverError
 from ident.errors import IdentificationError
@@ -115,7 +115,10 @@ _SYSTEM, _OF_USER = Path("/etc/systemd/system"), Path(".config/systemd/user")
 
 def install_units(
     cell: Annotated[Path, typer.Argument(help="Cell file with `recalibration`.")],
-    to: Annotated[Path | None, typer.Option("--to", help="Folder of the units, by default that of systemd.")] = None,
+    to: Annotated[
+        Path | None,
+        typer.Option("--to", help="Folder of the units, by default that of systemd.", callback=judged_output),
+    ] = None,
     user: Annotated[bool, typer.Option("--user", help="Install units of this user, not of the system.")] = False,
     schedule: Annotated[str, typer.Option(help="weekly, daily, or as 'Sun 03:00' (systemd.time).")] = "weekly",
     cron: Annotated[bool, typer.Option("--cron", help="Print a line for crontab instead.")] = False,

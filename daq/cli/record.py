@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CellArgument, JsonOption, Verb, print_json, say_next
+from daq.cli.verb import CellArgument, JsonOption, Verb, judged_output, print_json, say_next
 from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError
 from drivers.errors import POWERED, DriverError, SampleLost
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def record_verb(
     cell: CellArgument,
     plan: Annotated[Path, typer.Argument(help="Plan written by `drivegain plan`.")],
-    out: Annotated[Path, typer.Option("--out", help="Log to write (.mcap); must not exist.")],
+    out: Annotated[Path, typer.Option("--out", help="Log to write (.mcap); must not exist.", callback=judged_output)],
     enable_motion: Annotated[
         bool,
         typer.Option("--enable-motion", help="Allow motion, where the cell's `policy: {motion: allowed}` does not."),
@@ -113,8 +113,8 @@ def record_verb(
 
 def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:
     """Say in notes of an error what became of the samples, and what helps a cell that is too slow for its clock."""
+    from daq.config.bus_checks import SIMULATED_INTERFACES
     from daq.config.cell import PacingMode
-    from daq.config.checks import SIMULATED_INTERFACES
 
     if part.exists():
         error.add_note(
@@ -176,7 +176,7 @@ def _free(out: Path) -> Path:
         (out, "a file of that name", "choose another --out, or move it away"),
         (part, unfinished, f"`fit` does not read it; {_next_command(part)}"),
     ):
-        if path.exists():
+        if path.exists() or path.is_symlink():
             raise UsageError(str(path), found=found, expected="none", remedy=remedy)
     return part
 

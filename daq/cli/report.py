@@ -8,13 +8,16 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
+from daq.cli.verb import CalibrationArgument, JsonOption, Verb, judged_output, print_json
 
 
 def report_verb(
     calibration: CalibrationArgument,
     out: Annotated[
-        Path | None, typer.Option("--out", help="Page to write; by default beside the calibration, as .html.")
+        Path | None,
+        typer.Option(
+            "--out", help="Page to write; by default beside the calibration, as .html.", callback=judged_output
+        ),
     ] = None,
     cell: Annotated[
         Path | None, typer.Option("--cell", help="Cell file: compare with the gains in its controller.")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
+from daq.cli.verb import CalibrationArgument, JsonOption, Verb, judged_output, print_json
 from daq.errors import UsageError
 
 
@@ -21,7 +21,9 @@ def sign_verb() -> None:
 
 def sign_key_verb(
     name: Annotated[str, typer.Option("--name", help="Name of the person, as in the cell file.")],
-    folder: Annotated[Path, typer.Option("--folder", help="Folder for NAME.key and NAME.pub.")] = Path(),
+    folder: Annotated[
+        Path, typer.Option("--folder", help="Folder for NAME.key and NAME.pub.", callback=judged_output)
+    ] = Path(),
     no_password: Annotated[bool, typer.Option("--no-password", help="Only its file's permissions protect it.")] = False,
     json: JsonOption = False,
 ) -> None:

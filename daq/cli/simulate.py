@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import JsonOption, Verb, print_json
+from daq.cli.verb import JsonOption, Verb, judged_output, print_json
 from daq.errors import UsageError
 from daq.files import read_regular
 
@@ -199,7 +199,7 @@ SIMULATE = Verb("simulate", simulate, "drivegain simulate demo --payload disc --
 
 
 def demo(
-    out: Annotated[Path, typer.Option("--out", help="Folder to fill.")] = Path("out/demo"),
+    out: Annotated[Path, typer.Option("--out", help="Folder to fill.", callback=judged_output)] = Path("out/demo"),
     simulation: Annotated[Path | None, typer.Option(help="Another simulation file than the shipped one.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of plans and noise.", min=0)] = 1,
     duration: Annotated[float, typer.Option(help="Duration of each of the five runs [s].", min=10.0, max=600.0)] = 40.0,

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console, RenderableType
 
+from daq.cli.verb import judged_output
 from daq.errors import OutputFailed, UsageError, writing
 from daq.report.text import terminal_text
 
@@ -81,7 +82,11 @@ def check_folder(out: Path | None) -> None:
 
 
 def check_replaceable(out: Path, mark: str, kind: str) -> None:
-    """Refuse to overwrite a file of another kind: one that is not empty and lacks the mark of this kind in its head."""
+    """Refuse to overwrite a file of another kind: one that is not empty and lacks the mark of this kind in its head.
+
+    What `judged_output` refuses is refused too: a file in a folder that the command line names was not judged there.
+    """
+    judged_output(out)
     if out.is_file():
         with out.open("rb") as stream:
             head = stream.read(4096)

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CalibrationArgument, CellOption, JsonOption, Verb, cells_in, print_json, say_next
+from daq.cli.verb import (
+    CalibrationArgument,
+    CellOption,
+    JsonOption,
+    Verb,
+    cells_in,
+    judged_output,
+    print_json,
+    say_next,
+)
 from daq.errors import CalibrationMissing
 
 if TYPE_CHECKING:
@@ -20,12 +29,17 @@ TABLES = "drivegain-validation-tables"  #: Format of the page of tables
 def validate_verb(
     calibration: CalibrationArgument,
     logs: Annotated[list[Path], typer.Argument(help="Logs of the same cell.")],
-    pictures: Annotated[Path | None, typer.Option(help="Folder for pictures of the torques.")] = None,
+    pictures: Annotated[
+        Path | None, typer.Option(help="Folder for pictures of the torques.", callback=judged_output)
+    ] = None,
     beside: Annotated[
         list[Path] | None, typer.Option(help="Another calibration, or a folder of them (`fit --cases`); repeatable.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for tables.md: the same in the form of the paper's Tables 5 to 8.")
+        Path | None,
+        typer.Option(
+            help="Folder for tables.md: the same in the form of the paper's Tables 5 to 8.", callback=judged_output
+        ),
     ] = None,
     cell: CellOption = None,
     json: JsonOption = False,

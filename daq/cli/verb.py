@@ -21,12 +21,36 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from daq.errors import UsageError
+from daq.files import judge_target
 from daq.report.text import json_text
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 CellArgument = Annotated[Path, typer.Argument(help="Cell file.")]
 CellOption = Annotated[Path | None, typer.Option("--cell", help="Another cell file than the one in the logs.")]
 CalibrationArgument = Annotated[Path, typer.Argument(help="calibration.yaml written by `drivegain fit`.")]
+
+
+def judged_output(path: Path | None) -> Path | None:
+    """Refuse, as the command line is parsed, a place to write to that another user has chosen, and a device or pipe.
+
+    The callback of every option and argument that names a file or folder to write; it returns the path as it was given.
+
+    Raises:
+        UsageError: as `judge_target`.
+    """
+    if path is None:
+        return None
+    try:
+        judge_target(path)
+    except OSError as error:
+        raise UsageError(
+            str(path),
+            found=error.strerror or type(error).__name__,
+            expected="a file or folder, or a new name, without links of other users",
+            remedy="choose another name, or name the place itself",
+        ) from error
+    return path
 
 
 HELP_NAMES = ["-h", "--help"]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.verb import CalibrationArgument, CellOption, JsonOption, Verb, print_json
+from daq.cli.verb import CalibrationArgument, CellOption, JsonOption, Verb, judged_output, print_json
 
 
 def weigh_verb(
@@ -49,7 +49,9 @@ def contact_verb(
     quiet: Annotated[
         list[Path] | None, typer.Option("--quiet", help="Log of such motion without contact; repeatable.")
     ] = None,
-    pictures: Annotated[Path | None, typer.Option(help="Folder for a picture of the torques.")] = None,
+    pictures: Annotated[
+        Path | None, typer.Option(help="Folder for a picture of the torques.", callback=judged_output)
+    ] = None,
     cell: CellOption = None,
     json: JsonOption = False,
 ) -> None:

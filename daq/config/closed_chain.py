@@ -74,9 +74,9 @@ def chain_of(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: str) -
 
 
 def platform_frame(robot: ChainModel, urdf: str) -> Place:
-    """Return the frame in which payloads are drawn, in that of the joint that carries them: the platform's link.
+    """Return the platform's frame, in which payloads are drawn, relative to the joint that carries it.
 
-    Without a `platform` both are the same.
+    Without a `platform`, that joint's own frame.
 
     Raises:
         ModelError: the URDF cannot be read.
@@ -113,14 +113,14 @@ def chain_faults(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: st
     given = [key for key in ChainModel.model_fields if getattr(robot, key)]
     if not closures:
         for key in given:
-            yield Fault(("robot", key), "no `closures` beside it", "nothing: only a closed chain has it")
+            yield Fault(("robot", key), "given without `closures`", "no such key in a serial robot")
         return
     for key, what in (
         ("motors", "the joint of each axis"),
         ("mobility", "the maker's degrees of freedom"),
     ):
         if key not in given:
-            yield Fault(("robot", key), "nothing, beside `closures`", what)
+            yield Fault(("robot", key), "missing", what)
     tree = read_urdf(urdf)
     unknown = [*_unknown_names(robot, closures, tree)]
     yield from unknown

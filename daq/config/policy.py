@@ -26,7 +26,7 @@ class Permission(Enum):
 
 
 class AppliedBy(Enum):
-    """Who applies the result of a scheduled job."""
+    """Actor that applies the result of a scheduled job."""
 
     PERSON = "person"  #: The job proposes; a named person applies
     JOB = "job"  #: The job itself, if every gate passes

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import math
 import re
-import stat
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from enum import Enum
@@ -30,15 +28,14 @@ from daq.errors import (
     exit_code,
     writing,
 )
-from daq.files import follow_links, read_regular, replace_file
+from daq.files import judge_target, read_regular, replace_file
 from daq.jobs.fleet_survey import CellLogs, StoredLog, at_hand, fingerprint
 from daq.workflow.calibration_file import as_document, decode, encode
+from daq.workflow.declared_effects import BOOTSTRAP_SEED
 from daq.workflow.fit import calibration_of, check_holdout, close_loop, fit
 from drivers.errors import DriverError
 from ident.calibration import Gain
 from ident.errors import IdentificationError
-
-SEED = 0  #: Seed of the loop's significance test, the same as in `drivegain residual`
 
 
 class Loop(Enum):
@@ -83,11 +80,9 @@ class Fitted:
     seconds: float  #: that it took, reading included
 
 
-def fit_cell(
-    cell: CellLogs, loop: Loop, created: datetime, clock: Callable[[], float] = time.perf_counter
-) -> Fitted | Failure:
+def fit_cell(cell: CellLogs, loop: Loop, created: datetime) -> Fitted | Failure:
     """Fit one cell in this process, as `drivegain fit` (or `residual`) would with the same logs."""
-    begun_s = clock()
+    begun_s = time.perf_counter()
     every_log = (*cell.fit, *cell.holdout)
     paths: dict[Path, StoredLog] = {}
     with tempfile.TemporaryDirectory(prefix="drivegain-fleet-") as folder:
@@ -106,7 +101,7 @@ def fit_cell(
             logs = list(paths)
             fitted = fit(logs[: len(cell.fit)], holdout=logs[len(cell.fit) :], keep_rows=loop is Loop.CLOSED)
             if loop is Loop.CLOSED:
-                fitted = close_loop(fitted, SEED)
+                fitted = close_loop(fitted, BOOTSTRAP_SEED)
                 check_holdout(fitted)
             for seen in every_log:
                 if fingerprint(seen.log) != seen.fingerprint:
@@ -127,7 +122,7 @@ def fit_cell(
                     remedy="report it: it is a fault",
                 )
         except (DaqError, DriverError, IdentificationError) as error:
-            return replace(failure_of(error, paths), seconds=clock() - begun_s)
+            return replace(failure_of(error, paths), seconds=time.perf_counter() - begun_s)
     unseen = calibration.holdout_error_percent
     summary = Summary(
         gains=calibration.gains,
@@ -136,7 +131,7 @@ def fit_cell(
         held_out=unseen is not None,
         partial=any(source.partial for source in calibration.sources),
     )
-    return Fitted(summary, content, clock() - begun_s)
+    return Fitted(summary, content, time.perf_counter() - begun_s)
 
 
 def failure_of(error: BaseException, paths: Mapping[Path, StoredLog] | None = None) -> Failure:
@@ -240,14 +235,11 @@ def open_cache(folder: Path, loop: Loop) -> CalibrationCache:
 
 
 def _check_replaceable(path: Path) -> None:
-    """Refuse a folder, another user's link, and a link to a device or a pipe: what it leads to would be replaced."""
+    """Refuse, before the work is done, what `replace_file` would refuse."""
     try:
-        follow_links(path)
-        mode = path.stat().st_mode
-        foreign = path.is_symlink() and not stat.S_ISREG(mode)
-        found = "a folder" if stat.S_ISDIR(mode) else "a link to something that is no regular file" if foreign else ""
-    except OSError as error:  # another one: nothing is there, or the write will fail with a message
-        found = (error.strerror or "") if error.errno in (errno.ELOOP, errno.EPERM) else ""
+        found = "a folder" if judge_target(path).is_dir() else ""
+    except OSError as error:
+        found = error.strerror or type(error).__name__
     if not found:
         return
     raise UsageError(

@@ -17,7 +17,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
-from daq.errors import ConfigurationMissing, UsageError
+from daq.errors import ConfigurationMissing, UsageError, WorkersLost
 from daq.jobs.cell_fit import CalibrationCache, Failure, Loop, Summary, failure_of, fit_cell
 from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, UnknownLog, by_cell, survey
 
@@ -64,7 +64,7 @@ def worker_pool(scheduler: str, workers: int | None) -> AbstractContextManager[W
 
 @contextmanager
 def _threads(workers: int) -> Iterator[WorkerPool]:
-    """Nothing to install. Much of a fit is Python, of which one thread runs at a time.
+    """Yield a pool of threads; no installation is needed. Much of a fit is Python, of which one thread runs at a time.
 
     At the end, running tasks are waited for and waiting ones are given up.
     """
@@ -245,8 +245,8 @@ def each(
             yield piece, outcome
 
 
-def _gone(found: str) -> UsageError:
-    return UsageError(
+def _gone(found: str) -> WorkersLost:
+    return WorkersLost(
         "--scheduler",
         found=found,
         expected="a scheduler and workers that last until the end",

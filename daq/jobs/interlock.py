@@ -1,4 +1,4 @@
-"""Interlock, mount command and time limit of a job: what may hold a motion back besides the drives."""
+"""Interlock and mount command of a job, which may hold a motion back as the drives may."""
 
 from __future__ import annotations
 
@@ -6,19 +6,16 @@ import os
 import selectors
 import signal
 import subprocess
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from types import FrameType
 
 from daq.config.recalibration import Command, Interlock, PlannedRun, Recalibration
-from daq.errors import JobHeld, NotReleased, TimeBoundReached
+from daq.errors import JobHeld, NotReleased
 from daq.files import open_regular
-from drivers.canopen.network import SignalBlocker
 
 MAX_OUTPUT_CHARACTERS = 400  #: Characters of what a program said that are shown
 _KEPT_BYTES = 4 * MAX_OUTPUT_CHARACTERS  #: As many as those characters may take in UTF-8
@@ -152,50 +149,3 @@ def _held(subject: str, found: str, expected: str) -> NotReleased:
         expected=expected,
         remedy="nothing moves: close the cell, let everyone leave it, set automatic mode; the next job takes it up",
     )
-
-
-AGAIN_S = 1.0  #: After an alarm that came while the axes were being stopped for another reason
-
-
-@contextmanager
-def time_bound(minutes: float) -> Iterator[SignalBlocker]:
-    """Raise TimeBoundReached in the block when its time is up; yields a function that defers it during a stop.
-
-    There is no alarm outside the main thread, where Python handles no signals.
-
-    Raises:
-        TimeBoundReached: in the block.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield nullcontext
-        return
-    stopping = 0
-
-    def up(_number: int, _frame: FrameType | None) -> None:
-        if stopping:
-            signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
-            return
-        raise TimeBoundReached(
-            "the job",
-            found=f"more than {minutes:g} min since it began",
-            expected="its end within max_duration_min",
-            remedy="the axes were commanded to stop; the next job resumes the session; raise max_duration_min, or "
-            "see what takes so long in its log",
-        )
-
-    @contextmanager
-    def block_signals() -> Iterator[None]:
-        nonlocal stopping
-        stopping += 1
-        try:
-            yield
-        finally:
-            stopping -= 1
-
-    before = signal.signal(signal.SIGALRM, up)
-    signal.setitimer(signal.ITIMER_REAL, 60.0 * minutes)
-    try:
-        yield block_signals
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)

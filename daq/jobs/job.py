@@ -15,11 +15,11 @@ from daq.files import sha256_of
 from daq.jobs import session as sessions
 from daq.jobs.context import JobContext, Tools, before_motion, require_clock, section_of, target_of
 from daq.jobs.decision import decide_outcome
-from daq.jobs.interlock import time_bound
 from daq.jobs.journal import Journal, Level
 from daq.jobs.recording import basis_of, calibration_of_session, fit_session, record_runs, verified_runs
 from daq.jobs.reporting import Conclusion, audit_entry, report_failure, report_success
 from daq.jobs.session import Outcome, Session, WatchedGain
+from daq.jobs.time_bound import time_bound
 from daq.ledger.audit import AuditAction
 from daq.ledger.ledger import Ledger
 from daq.ledger.watch import alarm_text, watch

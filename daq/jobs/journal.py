@@ -29,7 +29,7 @@ class Level(IntEnum):
 
 
 class Form(Enum):
-    """Who reads the lines."""
+    """Format of the lines, by their reader."""
 
     TEXT = "text"  #: A person at a terminal
     JSON = "json"  #: A program

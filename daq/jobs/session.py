@@ -20,7 +20,7 @@ from pydantic import Field, ValidationError
 
 from daq.config.yaml_file import StrictModel
 from daq.errors import ConfigurationInconsistent, writing
-from daq.files import follow_links, read_regular, replace_file
+from daq.files import read_regular, replace_file
 
 STATE, CALIBRATION, REPORT = "state.json", "calibration.yaml", "report"
 LARGEST_STATE_BYTES = 4 << 20  # a job writes a few kilobytes
@@ -232,7 +232,7 @@ def save(session: Session) -> Session:
     """
     path = session.folder / STATE
     with writing(path):
-        replace_file(follow_links(path), (session.state.model_dump_json(indent=2) + "\n").encode())
+        replace_file(path, (session.state.model_dump_json(indent=2) + "\n").encode())
     return session
 
 

@@ -33,12 +33,17 @@ RestrictNamespaces=yes
 RestrictSUIDSGID=yes
 LockPersonality=yes
 PrivateMounts=yes
+PrivateDevices=yes
+MemoryDenyWriteExecute=yes
 SystemCallFilter=@system-service
 SystemCallErrorNumber=EPERM
 RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK AF_CAN
-SystemCallArchitectures=native"""
-#: Capabilities of a service of root: to keep the owner of a controller's file, and to lose no frame of the bus.
-_CAPABILITIES = {"root": "CAP_CHOWN CAP_DAC_OVERRIDE CAP_FOWNER CAP_NET_ADMIN CAP_SYS_NICE"}
+SystemCallArchitectures=native
+# The capture may have the lowest real-time priority, by sched(7) without a capability.
+LimitRTPRIO=1"""
+#: Capabilities of a service of root: to keep the owner of a controller's file, and a receive buffer beyond
+#: net.core.rmem_max, which loses no frame of the bus.
+_CAPABILITIES = {"root": "CAP_CHOWN CAP_DAC_OVERRIDE CAP_FOWNER CAP_NET_ADMIN"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -286,16 +286,11 @@ _READ = (SAMPLES_TOPIC, EVENTS_TOPIC, *_QUANTITIES)  #: Topics that a fit needs;
 
 
 class ChunkContents:
-    """Reader of chunks, one after the other: schemas and channels, samples as one array, events one by one.
-
-    Attributes:
-        events: events of all chunks so far, in the order of the log.
-        readings: slow readings of all chunks so far, likewise.
-    """
+    """Reader of chunks, one after the other: schemas and channels, samples as one array, events one by one."""
 
     def __init__(self, file: RecordFile) -> None:
-        self.events: list[CellEvent] = []
-        self.readings: list[SlowReading] = []
+        self.events: list[CellEvent] = []  #: of all chunks so far, in the order of the log
+        self.readings: list[SlowReading] = []  #: likewise
         self._file = file
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}

@@ -88,7 +88,7 @@ def load_run(path: Path | str, cell: Cell | None = None, lossy: LossyLogs = Loss
     """Read a log as a run, with the cell in the log or another description of it.
 
     A given description also replaces the mass of the payload that the log records. Warns of a partial log, of accepted
-    losses, and of a first run below the plan's speed.
+    losses, and of a run slower than planned.
 
     Raises:
         DataError: the log cannot be read, or its samples cannot be used.

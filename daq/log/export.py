@@ -90,6 +90,8 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
     unfinished = out.with_name(out.name + ".part")
     try:
         with ExitStack() as stack:
+            # The rest of an earlier export, or a link that would be followed: the writers make a new file ("x").
+            unfinished.unlink(missing_ok=True)
             stack.callback(unfinished.unlink, missing_ok=True)
             with _WRITERS[kind](unfinished) as write:
                 for columns in tables(LogReader(log), cell, tuple(reader.events), tuple(reader.readings)):
@@ -218,7 +220,7 @@ def _with_last(blocks: Iterable[SampleBlock]) -> Iterator[tuple[SampleBlock, boo
 @contextmanager
 def _csv(path: Path) -> Iterator[Write]:
     """Write a header and rows with comma, decimal point and LF (RFC 4180 except for the end of line)."""
-    with path.open("w", encoding="utf-8", newline="\n") as stream:
+    with path.open("x", encoding="utf-8", newline="\n") as stream:
         begun = False
 
         def write(columns: Columns) -> None:
@@ -239,7 +241,7 @@ def _parquet(path: Path) -> Iterator[Write]:
     arrow: Any = importlib.import_module("pyarrow")
     parquet: Any = importlib.import_module("pyarrow.parquet")
     with ExitStack() as stack:
-        stream = stack.enter_context(path.open("wb"))
+        stream = stack.enter_context(path.open("xb"))
         writer: Any = None
 
         def write(columns: Columns) -> None:

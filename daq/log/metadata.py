@@ -50,7 +50,7 @@ class Timing:
     missing: _Count  #: samples that are missing between the first and the last; interpolated
     resampled: bool  #: whether the samples were moved to a uniform clock
     duplicates: _Count = 0  #: rows left out because they repeat the one before
-    close: _Count = 0  #: samples left out because they are too close to the one before to tell a speed
+    close: _Count = 0  #: samples left out because they are too close to the one before to give a speed
     started_s: FiniteFloat | None = None  #: first stamp by the file's clock [s]; None before zero, as of a trigger's
 
 

@@ -62,26 +62,16 @@ class LogHead:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Log:
-    """A whole log.
+    """A whole log."""
 
-    Attributes:
-        path, digest: path and sha256 (hex) of the file.
-        head: everything before the samples.
-        samples: all samples.
-        events: in the order of the log.
-        readings: torques and temperatures that were read beside the samples, in the order of the log.
-        statistics: the recorder's summary at the end.
-        partial: the end of the recording is unknown: it was salvaged, or never got its final name.
-    """
-
-    path: Path
-    digest: str
-    head: LogHead
-    samples: SampleBlock
-    events: tuple[CellEvent, ...]
-    readings: tuple[SlowReading, ...]
-    statistics: RunStatistics
-    partial: bool
+    path: Path  #: file
+    digest: str  #: its SHA-256, hexadecimal
+    head: LogHead  #: everything before the samples
+    samples: SampleBlock  #: all samples
+    events: tuple[CellEvent, ...]  #: in the order of the log
+    readings: tuple[SlowReading, ...]  #: torques and temperatures read beside the samples, in the order of the log
+    statistics: RunStatistics  #: the recorder's summary at the end
+    partial: bool  #: the end of the recording is unknown: it was salvaged, or never got its final name
 
 
 class SampleChecks:

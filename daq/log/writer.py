@@ -126,7 +126,7 @@ class LogWriter:
 
     def __enter__(self) -> LogWriter:
         """Open the file and write everything before the first sample."""
-        if self.path.exists():
+        if self.path.exists() or self.path.is_symlink():  # of a dangling link, the name would be taken at the end
             raise UsageError(
                 str(self.path),
                 found="a file of that name",

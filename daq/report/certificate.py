@@ -156,7 +156,7 @@ class Certificate:
 
     @property
     def note(self) -> str:
-        """What a difference beyond noise is, as `apply` says it."""
+        """Meaning of a difference beyond noise, as `apply` states it."""
         old = "the nameplate" if self.comparison.edit is None else "the number in the controller"
         return noise_note(self.comparison.changes, self.comparison.known, old)
 

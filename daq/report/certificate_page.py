@@ -12,7 +12,7 @@ from daq.report.gains import diagnosis_texts, partial_note, with_deviation
 from daq.report.html import element, figure, folded, listed, page, pair, paragraph, section, table, terms
 from daq.report.picture import QUANTITY
 from daq.report.svg import Interval, Line, before_after, chart, intervals
-from daq.report.text import percent_text
+from daq.report.text import SHOWN_SIGMAS, percent_text
 from ident.calibration import AcceptedEffect, Calibration
 from ident.estimators.estimate import RelativeError
 
@@ -25,7 +25,6 @@ _SIGN = {
     Verdict.NOT_COMPARED: "•",
     Verdict.REFUSED: "✕",
 }
-_SIGMAS = 2.0
 _FILTERS = {
     "position_cutoff_hz": "cut-off of the positions [Hz]",
     "position_order": "order of that filter",
@@ -83,7 +82,7 @@ def _next(certificate: Certificate, look: str) -> Iterator[str]:
 
 
 def _warnings(certificate: Certificate) -> Iterator[str]:
-    """What to check and what to do about it; checks that failed alike are one entry."""
+    """Checks to make and actions to take; checks that failed alike are one entry."""
     note = partial_note(certificate.calibration)
     texts = (*(() if note is None else (note,)), *diagnosis_texts(certificate.calibration.diagnoses))
     failed: dict[str, list[str]] = {}
@@ -117,7 +116,7 @@ def _gains(certificate: Certificate) -> str:
 def _interval(row: AxisRow, earlier: float = math.nan) -> Interval:
     change, half = row.change, math.nan
     if change.old and math.isfinite(change.std):
-        half = 100.0 * _SIGMAS * change.std / abs(change.old)
+        half = 100.0 * SHOWN_SIGMAS * change.std / abs(change.old)
     known = math.isfinite(change.change_percent) and math.isfinite(half)
     return Interval(
         change.axis,
@@ -278,7 +277,7 @@ def _rival_text(rival: str) -> str:
 
 
 def _evidence(calibration: Calibration) -> Iterator[str]:
-    """What the calibration rests on: ambiguity, parameters, filters and logs."""
+    """Basis of the calibration: ambiguity, parameters, filters and logs."""
     rivals = [
         (effect.axis, accepted_text(effect, calibration), "; ".join(map(_rival_text, effect.ambiguity)))
         for effect in calibration.effects

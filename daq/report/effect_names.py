@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from daq.report.gains import with_deviation
+from daq.report.text import SHOWN_SIGMAS
 from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.effects.effect import Effect, PlacedEffect
@@ -57,7 +58,6 @@ _WHERE = {
     "counterbalance": "with a lever of {ratio:.2g} of its foot's distance",
 }
 """Where or how fast an effect acts, by family, from its searched parameters; other families need no such words."""
-_SIGMAS = 2.0  #: Of the band around a curve
 _POINTS = 61
 
 
@@ -156,7 +156,7 @@ def curve_of(accepted: AcceptedEffect, calibration: Calibration) -> Curve | None
     half_nm = None
     if (covariance := calibration.covariance) is not None and all(name in index for name in words):
         rows = [index[name] for name in words]
-        half_nm = _SIGMAS * np.sqrt(np.einsum("pk,pq,qk->k", shapes, covariance[np.ix_(rows, rows)], shapes))
+        half_nm = SHOWN_SIGMAS * np.sqrt(np.einsum("pk,pq,qk->k", shapes, covariance[np.ix_(rows, rows)], shapes))
     folded = isinstance(effect, Smooth) and effect.variable in FOLDED
     # Of a joint without a motor, which has no gain, a coefficient's unit begins with that of its force.
     units = [gain.unit for gain in calibration.gains]

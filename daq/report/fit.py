@@ -15,8 +15,9 @@ from daq.report.gains import diagnosis_texts, gain_table, partial_note, torque_d
 from daq.report.text import percent_text, picked, plain_table, printable
 from daq.workflow.calibration_file import as_document
 from daq.workflow.cases import CASES, CaseFit
-from daq.workflow.fit import DOUBTFUL_PERCENT, Fit, needed_verdicts
+from daq.workflow.fit import DOUBTFUL_PERCENT, Fit
 from daq.workflow.nameplates import actual_current_note
+from daq.workflow.verdicts import needed_verdicts
 from ident.arrays import FloatArray
 from ident.calibration import Calibration, Parameter
 from ident.discovery.evidence import Evidence, without_effects

@@ -136,7 +136,7 @@ class Skew(StrictModel):
 
 
 class GearLossEntry(StrictModel):
-    """Which side of a gear drives, and its loss."""
+    """Side that drives a gear, and its loss."""
 
     axis: str
     motoring_rows: Figure

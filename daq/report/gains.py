@@ -10,12 +10,11 @@ import numpy as np
 from rich.table import Table
 
 from daq.report.picture import BLUE, GREEN, GREY, legend_below, render, single
-from daq.report.text import plain_table, terminal_text
+from daq.report.text import SHOWN_SIGMAS, plain_table, terminal_text
 from ident.calibration import Calibration, Gain
 from ident.data.torque_channel import TorqueSlope
 from ident.errors import Diagnosis
 
-_SIGMAS = 2.0
 CERTAIN_SIGMAS = 3.0  #: Of the ratio of a drive's own torque to the gain, before a difference is said
 
 
@@ -28,11 +27,18 @@ def plot_gains(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
     figure, place = single(title, 3.2)
     positions = np.arange(len(gains))
     change = np.array([gain.change_percent for gain in gains])
-    width = np.array([_SIGMAS * 100.0 * gain.std / abs(gain.nameplate) for gain in gains])
+    width = np.array([SHOWN_SIGMAS * 100.0 * gain.std / abs(gain.nameplate) for gain in gains])
     place.axhline(0.0, color=GREY, linewidth=1.4, linestyle="--", label="nameplate")
     place.vlines(positions, 0.0, change, color=BLUE, linewidth=5, alpha=0.25)
     place.errorbar(
-        positions, change, yerr=width, fmt="o", color=BLUE, capsize=6, markersize=5, label=f"identified ± {_SIGMAS:g} σ"
+        positions,
+        change,
+        yerr=width,
+        fmt="o",
+        color=BLUE,
+        capsize=6,
+        markersize=5,
+        label=f"identified ± {SHOWN_SIGMAS:g} σ",
     )
     if truth is not None:
         true = [100.0 * (truth[gain.axis] / gain.nameplate - 1.0) for gain in gains]

@@ -21,7 +21,7 @@ from daq.ledger.store import HistoryStore
 from daq.ledger.watch import Series, alarm_text, pattern_of, questions
 from daq.report.gains import with_deviation
 from daq.report.picture import BLUE, GREY, ORANGE, PURPLE, SKY, legend_below, panels, render, unformatted
-from daq.report.text import inert_row, picked, plain_table, printable
+from daq.report.text import SHOWN_SIGMAS, inert_row, picked, plain_table, printable
 from daq.writeback.file_access import resolve_links
 from daq.writeback.formats.document import decode, read_bytes
 from daq.writeback.formats.scalar import Scalar, rewrite_gain
@@ -330,7 +330,6 @@ def _row(series: Series, index: int) -> dict[str, Any]:
     }
 
 
-_SIGMAS = 2.0
 _COLUMNS = 2
 _FIRST_DAY, _LAST_DAY = -719_162.0, 2_932_896.999  #: 1 January 1 and 31 December 9999: matplotlib draws no dates beyond
 
@@ -375,9 +374,11 @@ def plot_history(all_series: Sequence[Series], kind: str, *, title: str) -> byte
 def _draw_gains(place: Axes, series: Series) -> None:
     times = [_days(point.entry.recorded) for point in series.points]
     values = [point.gain.value for point in series.points]
-    widths = [_SIGMAS * series.dispersion * point.gain.std for point in series.points]
+    widths = [SHOWN_SIGMAS * series.dispersion * point.gain.std for point in series.points]
     place.errorbar(times, values, yerr=widths, fmt="none", ecolor=BLUE, elinewidth=1.0, capsize=2)
-    place.plot(times, values, "o", color=BLUE, markerfacecolor="white", markersize=4, label=f"gain ± {_SIGMAS:g} σ")
+    place.plot(
+        times, values, "o", color=BLUE, markerfacecolor="white", markersize=4, label=f"gain ± {SHOWN_SIGMAS:g} σ"
+    )
     held = [(_days(point.entry.recorded), point.gain.value) for point in series.points if point.entry.applied]
     place.plot(*_columns(held), "o", color=BLUE, markersize=4, label="applied")
     alarmed = [(times[i], values[i]) for i in range(len(times)) if series.alarm_at(i) is not None]
@@ -385,7 +386,7 @@ def _draw_gains(place: Axes, series: Series) -> None:
     for stretch in series.stretches:
         drift = stretch.drift
         ends = [times[stretch.began], times[stretch.ended - 1]]
-        low, high = (drift.baseline + sign * _SIGMAS * drift.baseline_std for sign in (-1.0, 1.0))
+        low, high = (drift.baseline + sign * SHOWN_SIGMAS * drift.baseline_std for sign in (-1.0, 1.0))
         place.fill_between(ends, low, high, color=SKY, alpha=0.3, linewidth=0)
         place.plot(ends, [drift.baseline] * 2, color=GREY, linestyle="--", linewidth=1.2, label="baseline")
         if drift.steady:

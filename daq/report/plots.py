@@ -62,6 +62,9 @@ def draw_torques(final: Evidence, cell: Cell) -> tuple[str, ...]:
     )
 
 
+SHOWN_S = 10.0  #: Length of the stretch that is drawn, from the beginning [s]; in a longer one the lines merge
+
+
 def plot_torques(
     time_s: FloatArray,
     measured_nm: FloatArray,
@@ -69,7 +72,6 @@ def plot_torques(
     axes: tuple[str, ...],
     *,
     forces: tuple[str, ...] = (),
-    shown_s: float = 10.0,
 ) -> tuple[str, ...]:
     """Draw τ = V g with the identified gains (wide) and the model's τ (dashed), one panel an axis (paper Fig. 2).
 
@@ -81,9 +83,8 @@ def plot_torques(
         predicted_nm: torque from the model, same shape [forces].
         axes: names of the n axes.
         forces: "Nm" or, along a prismatic joint, "N", for each axis; all are "Nm" when left out.
-        shown_s: length of the stretch that is drawn, from the beginning [s]; in a longer one the lines merge.
     """
-    shown = time_s <= time_s[0] + shown_s
+    shown = time_s <= time_s[0] + SHOWN_S
     drawn = []
     for index, (name, unit) in enumerate(zip(axes, forces or ("Nm",) * len(axes), strict=True)):
         measured, predicted = measured_nm[:, index], predicted_nm[:, index]

@@ -160,7 +160,7 @@ def gains_sentence(fitted: Fit, account: Account) -> str:
 
 
 def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:
-    """What the choice of the effects adds to σ, where it is a third of σ or more: σ is 6 % larger for it then."""
+    """Part of σ that comes from the choice of effects, where it is a third of σ or more (σ is then 6 % larger)."""
     parts = zip(fitted.cell.axis_names, account.total.gains, strict=True)
     shares = [
         f"{100.0 * part.choice_std / part.after_std:.0f} % of it on {axis}"

@@ -164,17 +164,19 @@ def chart(
     return _drawing(parts, title, bottom)
 
 
-def visible(x: FloatArray, y: FloatArray, stretches: int = 2 * round(_WIDTH)) -> tuple[FloatArray, FloatArray]:
+_STRETCHES = 2 * round(_WIDTH)  #: Two a unit of the drawing's width, the dots of a fine screen
+
+
+def visible(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Keep lowest and highest value of each stretch of a curve, and its gaps, so that no peak is lost.
 
     Args:
         x, y: shape (k,), NaN in y leaves a gap.
-        stretches: two a unit of the drawing's width, the dots of a fine screen.
     """
-    if len(x) <= 2 * stretches:
+    if len(x) <= 2 * _STRETCHES:
         return x, y
     kept = []
-    for part in np.array_split(np.arange(len(x)), stretches):
+    for part in np.array_split(np.arange(len(x)), _STRETCHES):
         values = y[part]
         gap = np.flatnonzero(~np.isfinite(values))
         if len(gap) < len(part):
@@ -222,10 +224,13 @@ def ranking(rows: Sequence[tuple[str, float, str]], title: str, unit: str) -> st
     return _drawing(parts, title, scale.bottom + _FOOT)
 
 
-def sheet(drawings: Sequence[str], title: str, columns: int = 2) -> bytes:
+_COLUMNS = 2  #: Drawings beside each other
+
+
+def sheet(drawings: Sequence[str], title: str) -> bytes:
     """Return a file of its own with several drawings under a title, in the colours of paper."""
     heights = [float(found[1]) for one in drawings if (found := re.search(r'viewBox="0 0 \S+ ([\d.]+)"', one))]
-    row, across, gap = max(heights), min(columns, len(drawings)), 24.0
+    row, across, gap = max(heights), min(_COLUMNS, len(drawings)), 24.0
     width, height = across * (_WIDTH + gap) + gap, -(-len(drawings) // across) * (row + gap) + 48.0
     style = re.sub(r"var\(--(\w+)\)", lambda found: LIGHT[found[1]], DRAWING)
     placed = (

@@ -15,6 +15,8 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
+SHOWN_SIGMAS = 2.0  #: Half width of the intervals and bands of reports and pictures, in standard deviations
+
 
 def printable(text: str) -> str:
     """Spell out control characters, which could command a terminal; line ends stay."""

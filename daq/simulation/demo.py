@@ -6,7 +6,6 @@ once it is final.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
+from daq.files import replace_file
 from daq.report.certificate import Comparison
 from daq.report.fit import start_of
 from daq.report.plots import draw_fit
@@ -103,7 +103,7 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     cell = load_cell(cell_file)
     out = settings.out
     logs = tuple(out / f"{name}.mcap" for name, _, _ in RUNS)
-    _make_room(out, logs)
+    make_room(out, logs)
     reporter.step("scan the bus")
     with _simulated(cell, load_simulation(settings.simulation)), network_of(cell) as network:
         nodes = network.scan()
@@ -121,7 +121,7 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     if cell.controller_path is None:
         raise UsageError("the demo cell", found="no controller", expected="one", remedy="install drivegain again")
     target = out / "controller.yaml"
-    shutil.copyfile(cell.controller_path, target)
+    replace_file(target, cell.controller_path.read_bytes())
     proposal = propose(FileTarget.of(cell, target), Request(calibration, now()))
     written = None if proposal.refusals else apply(proposal, now(), audit=out / "audit.jsonl", who="demo")
     reporter.step("draw the pictures")
@@ -172,7 +172,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def _make_room(out: Path, logs: tuple[Path, ...]) -> None:
+def make_room(out: Path, logs: tuple[Path, ...]) -> None:
     """Take a folder, and remove what an earlier demonstration left in it; a folder of anything else is not ours."""
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / MARK).is_file())):
         raise UsageError(
@@ -182,7 +182,7 @@ def _make_room(out: Path, logs: tuple[Path, ...]) -> None:
             remedy="choose another --out",
         )
     out.mkdir(parents=True, exist_ok=True)
-    (out / MARK).write_text("Made by `drivegain demo`, which may replace what is in this folder.\n")
+    replace_file(out / MARK, b"Made by `drivegain demo`, which may replace what is in this folder.\n")
     for log in logs:
         log.unlink(missing_ok=True)
         log.with_name(log.name + ".part").unlink(missing_ok=True)

@@ -78,7 +78,7 @@ def reduce_logs(
         DataError, ConfigurationError, IdentificationError: a log cannot be used, or not with the others.
         UsageError: the cell declares effects.
     """
-    reading = Reading(logs, cell)
+    reading = Reading.of(logs, cell)
     refuse_effects(reading.cell, "--known, --cases")
     model, conditioning = model_of(reading.cell), reading.cell.conditioning
     used = reduce_runs(model, reading.runs(logs, "fit"), conditioning, instruments=instruments)

@@ -18,7 +18,7 @@ from ident.estimators.estimate import Estimate
 from ident.estimators.identify import Identification, estimate_with, require_plausible
 from ident.estimators.method import Method
 
-SEED = 0  #: Of the bootstrap; no decision depends on it here
+BOOTSTRAP_SEED = 0  #: Fixes the verdict of a significance test; no decision depends on it for declared effects
 
 
 def declared_effects(cell: Cell) -> tuple[PlacedEffect, ...]:
@@ -81,7 +81,9 @@ def with_effects_of_cell(
     estimate = start.estimate
     fixed = estimate.gains if estimate.gains_fixed else None
     by_ml = estimate if estimate.method is Method.ML else estimate_with(Method.ML, start.system, fixed)
-    steps = with_declared(replace(gather(start), estimate=by_ml), effects, np.random.default_rng(SEED), axes=axes)
+    steps = with_declared(
+        replace(gather(start), estimate=by_ml), effects, np.random.default_rng(BOOTSTRAP_SEED), axes=axes
+    )
     after = steps[-1].after
     if estimate.method is not Method.ML:
         after = with_declared_again(after, estimate)

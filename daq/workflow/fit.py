@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import chain
@@ -15,15 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.cell import Cell, model_of, robot_of
+from daq.config.policy import DEFAULT_APPLY_POLICY
 from daq.environment import software
-from daq.errors import ConfigurationError, EffectsRefuted, LogRepeated, LogsDiffer, UsageError
+from daq.errors import EffectsRefuted, LogRepeated, LogsDiffer, UsageError
 from daq.log.conversion import load_run
 from daq.log.reader import LossyLogs
-from daq.workflow.declared_effects import declared_effects, refuse_effects, with_declared_again, with_effects_of_cell
-from daq.workflow.experiment import LAG_ONE, experiment_of, extra_moves
+from daq.workflow.declared_effects import (
+    BOOTSTRAP_SEED,
+    declared_effects,
+    refuse_effects,
+    with_declared_again,
+    with_effects_of_cell,
+)
 from ident.calibration import Calibration, Source
 from ident.calibration import calibration_of as identified_calibration
-from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
 from ident.discovery.before_after import error_on, holdout_change
@@ -45,10 +49,7 @@ from ident.estimators.estimate import Estimate, RelativeError, of_squares
 from ident.estimators.identify import Identification, estimate_with, identify
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
-from ident.model.bodies import LINK_PARAMETERS
 from ident.model.urdf import read_urdf
-from ident.planning.excitation import Design, Excitation, Expectation, ExpectedPayload, effective_noise, recorded
-from ident.planning.verdict import GOOD_PERCENT, ExtraMoves, GainVerdict, verdicts
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,16 +90,25 @@ class Fit:
 
 
 class Reading:
-    """Reads logs of one cell, one after the other, and collects their sources."""
+    """Logs of one cell, read one after the other, and their sources."""
 
-    def __init__(self, logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs = LossyLogs.REFUSED) -> None:
-        self._given = cell
-        self._lossy = lossy
-        self._seen: dict[str, Path] = {}
+    def __init__(self, first: dict[Path, Run], cell: Cell, read: Callable[[Path], tuple[Run, Cell]]) -> None:
+        self.cell = cell
         self.sources: list[Source] = []
+        self._first = first  #: read already
+        self._read = read
+        self._seen: dict[str, Path] = {}
         self._torques: list[tuple[TorqueChannel, ...]] = []
-        run, self.cell = load_run(logs[0], cell, lossy)
-        self._first = {logs[0]: run}
+
+    @classmethod
+    def of(cls, logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs = LossyLogs.REFUSED) -> Reading:
+        """Begin with the first log, whose cell is that of all unless another description is given.
+
+        Raises:
+            DataError, ConfigurationError: it cannot be used.
+        """
+        run, declared = load_run(logs[0], cell, lossy)
+        return cls({logs[0]: run}, declared, lambda log: load_run(log, cell, lossy))
 
     def runs(self, logs: Sequence[Path], role: str) -> Iterator[Run]:
         """One run after the other; the first log is not read twice.
@@ -111,7 +121,7 @@ class Reading:
             if log in self._first:
                 run, cell = self._first.pop(log), self.cell
             else:
-                run, cell = load_run(log, self._given, self._lossy)
+                run, cell = self._read(log)
             if cell.digest != self.cell.digest:
                 raise LogsDiffer(
                     str(log),
@@ -140,7 +150,6 @@ class Reading:
         return tuple(torque_slope(channels) for channels in zip(*self._torques, strict=True))
 
 
-BOOTSTRAP_SEED = 0
 _LOG = logging.getLogger("drivegain")
 
 
@@ -201,7 +210,7 @@ def fit(
     """
 
     def attempt(used: Sequence[Path], unseen: Sequence[Path], method: Method) -> Fit:
-        reading = Reading(used, cell, lossy)
+        reading = Reading.of(used, cell, lossy)
         declared = reading.cell
         nameplate = np.array([axis.nameplate_gain for axis in declared.axes])
         effects = declared_effects(declared)
@@ -323,11 +332,15 @@ def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: 
     )
 
 
-DOUBTFUL_PERCENT = 25.0  #: In total; the default limit of `apply`
+DOUBTFUL_PERCENT = DEFAULT_APPLY_POLICY.max_error_percent  #: In total
 
 
 def check_signs(estimate: Estimate, nameplate: NDArray[np.float64]) -> None:
-    """The payload's weight sets the sign of all gains together: taken from the wrong runs it turns them all."""
+    """Refuse gains that all have the wrong sign: the payload was taken from the wrong runs.
+
+    Raises:
+        RolesExchanged: every sign is opposite to that of the nameplate.
+    """
     if np.all(np.sign(estimate.gains) == -np.sign(nameplate)):
         raise RolesExchanged(
             "all drive gains",
@@ -448,62 +461,3 @@ def _nameplate_error(fitted: Fit) -> RelativeError | None:
     moved = size > 0.0
     left = np.where(moved, (np.array(axes) / 100.0) ** 2 * size, 0.0)
     return RelativeError(axes, of_squares(size, left).total)
-
-
-def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
-    """Judge every gain of a fit with free gains, its effects left out; the logs are read again.
-
-    σ is that of the fit, by leaving out moves. Predictions for one source alone, or with further moves, are multiplied
-    by σ of the fit / predicted σ: a plan predicts ratios of σ well, but not the noise level.
-    """
-    found = fitted.identification
-    estimate, system = found.estimate, found.system
-    independent, first = list(system.base.independent), len(system.columns)
-    standard = np.zeros(len(found.model.columns))
-    standard[independent] = estimate.parameters[: len(independent)]
-    payloads = []
-    for payload, indices in zip(system.payloads, system.payload_columns, strict=True):
-        parameters = payload.known_parameters
-        parameters[list(indices)] = estimate.parameters[first : first + len(indices)]
-        first += len(indices)
-        payloads.append(ExpectedPayload(frozenset(payload.known) & frozenset(LINK_PARAMETERS), parameters))
-    # ml's noise is that of the current references, the others' that of the joint torques.
-    noise = estimate.axis_noise / (1.0 if estimate.method.is_of_currents else np.abs(estimate.gains))
-    expectation = Expectation(
-        model=found.model,
-        gains=estimate.gains,
-        parameters=standard,
-        payloads=tuple(payloads),
-        noise_a=effective_noise(noise, LAG_ONE),
-    )
-    extra: tuple[ExtraMoves, ...] = ()
-    with suppress(ConfigurationError):  # the cell does not say enough to plan moves in it
-        extra = extra_moves(experiment_of(fitted.cell))
-    judged = verdicts(Design(expectation, system.base), list(_excitations(fitted)), extra)
-    true = 100.0 * fitted.estimate.gains_std / np.abs(fitted.estimate.gains)
-    return tuple(_scaled(gain, float(std)) for gain, std in zip(judged.gains, true, strict=True))
-
-
-def needed_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
-    """The verdicts, or none where the gains were given or all are known well enough."""
-    estimate = fitted.estimate
-    good = bool(np.all(100.0 * estimate.gains_std <= GOOD_PERCENT * np.abs(estimate.gains)))
-    return () if good else gain_verdicts(fitted)
-
-
-def _excitations(fitted: Fit) -> Iterator[tuple[Excitation, tuple[int | None, ...]]]:
-    found = fitted.identification
-    mountings = [payload.mounting for payload in found.system.payloads]
-    for log in fitted.logs:
-        run, _ = load_run(log, fitted.cell, fitted.lossy)
-        data = differentiate(run, found.model.drive_train, found.conditioning)
-        mounted = None if run.payload is None else mountings.index(run.payload.mounting)
-        yield recorded(found.model, data, found.conditioning), (mounted,)
-
-
-def _scaled(gain: GainVerdict, std_percent: float) -> GainVerdict:
-    factor = std_percent / gain.std_percent if np.isfinite(gain.std_percent) and gain.std_percent else 1.0
-    advice = gain.advice and replace(gain.advice, std_percent=factor * gain.advice.std_percent)
-    alone = {source: factor * alone for source, alone in gain.alone_percent.items()}
-    known = gain.known_preload_percent and factor * gain.known_preload_percent
-    return replace(gain, std_percent=std_percent, known_preload_percent=known, alone_percent=alone, advice=advice)

@@ -151,18 +151,22 @@ def record(
         unguarded: whether axes may move that go on moving when this program is killed, whatever the cell's policy says.
 
     Raises:
-        UsageError: the weighed mass is not the payload's; nothing has moved and no file was made.
+        UsageError: the weighed mass is not the payload's, or a file of that name exists; no file was made.
         MotionRefused: motion is disabled, an axis is unguarded or outside its limits, or the moves leave them; no file
             was made, and nothing has moved, except where an axis was brought back (`daq.workflow.recovery`).
         DiskSpaceShort: before the run, nothing has moved; during it, the axes were stopped, and the log is complete but
             marked invalid.
-        ConfigurationInconsistent, UsageError, OutputFailed: see daq/errors.py.
+        ConfigurationInconsistent, OutputFailed: see daq/errors.py.
         DriverError: from the bus; the axes were stopped. The samples until then stay in an unfinished log (`.part`).
             No fit reads it; `daq.log.salvage` converts it to a partial log.
     """
     clocks = clocks or Clocks()
     if granted_by is None:
-        raise MotionRefused("recording moves the robot and motion is disabled: pass --enable-motion")
+        raise MotionRefused(
+            "a recording without permission to move",
+            expected="an operator who permits motion",
+            remedy="pass --enable-motion",
+        )
     check_entered_mass(cell, payload, entered_kg)
     with defer_full_gc(), network_of(cell, block_signals) as network, _sync_producer(cell, network) as wanted:
         network.prepare()

@@ -11,14 +11,13 @@ import contextlib
 import errno
 import re
 import shlex
-import stat
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 from daq.errors import CalibrationRefused, ControllerUnfit, OutputFailed
-from daq.files import follow_links, has_links, hold_lock, replace_file
+from daq.files import follow_links, hold_lock, open_folder, replace_file
 from daq.writeback.formats.document import read_bytes
 from daq.writeback.request import short_digest
 
@@ -46,13 +45,10 @@ def resolve_links(file: Path) -> Path:
             expected="a link of the file's owner, or of you, that leads to the controller's file",
             remedy="name the file itself, or make the link anew",
         ) from error
-    folder = None
-    with contextlib.suppress(OSError):  # it is gone, or access is denied
-        folder = target.parent.lstat()
-    if folder is not None and folder.st_mode & stat.S_IWOTH and has_links(file):
+    if (folder := open_folder(file, target)) is not None:
         raise ControllerUnfit(
             str(file),
-            found=f"a symbolic link into {target.parent}, a folder that everybody may write",
+            found=f"a symbolic link into {folder}, a folder that everybody may write",
             expected="a folder in which no other user can exchange the file",
             remedy="take that right away (`chmod o-w`), or name the file itself",
         )

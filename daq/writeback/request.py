@@ -25,30 +25,20 @@ _DIGITS = 12
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """The same for a controller's file and for the drives.
+    """Request to write a calibration, the same for a controller's file and for the drives."""
 
-    Attributes:
-        calibration: the identified gains.
-        now: wall-clock time, for the age of the logs.
-        policy: bounds; those of the cell when None.
-        accepts_changed_configuration: the operator accepts that the cell's configuration changed since the recording.
-        entered_kg: masses weighed again for this write, by the payload's name [kg].
-        base: value of --base: `Edit.base` of the reviewed change, or the SHA-256 of the reviewed content alone, for any
-            change of it.
-        appliers: names of the operator, the login last; their own signatures do not count.
-        file: calibration file, beside which signatures are searched; None without one.
-        content: bytes of that file as they were read; None without one.
-    """
-
-    calibration: Calibration
-    now: datetime
-    policy: ApplyPolicy | None = None
+    calibration: Calibration  #: the identified gains
+    now: datetime  #: wall-clock time, for the age of the logs
+    policy: ApplyPolicy | None = None  #: bounds; those of the cell when None
+    #: The operator accepts that the cell's configuration changed since the recording.
     accepts_changed_configuration: bool = False
+    #: Masses weighed again for this write, by the payload's name [kg].
     entered_kg: Mapping[str, float] = field(default_factory=dict)
+    #: Value of --base: `Edit.base` of the reviewed change, or the SHA-256 of its content, for any change.
     base: str | None = None
-    appliers: Collection[str] = ()
-    file: Path | None = None
-    content: bytes | None = None
+    appliers: Collection[str] = ()  #: names of the operator, the login last; their own signatures do not count
+    file: Path | None = None  #: calibration file, beside which signatures are searched; None without one
+    content: bytes | None = None  #: bytes of that file as they were read; None without one
 
     @property
     def signed(self) -> bytes:

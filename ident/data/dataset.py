@@ -200,8 +200,10 @@ def _check(run: Run, count: int, conditioning: Conditioning, refuse: Refusal) ->
     if not lowest > 0.0:
         raise refuse(f"filtered with a cut-off of {lowest:g} Hz; expected above 0 Hz: see Conditioning")
     if not run.rate_hz > 2.5 * highest:
-        needed = f"a cut-off of {highest:g} Hz needs more than {2.5 * highest:g} Hz"
-        raise refuse(f"sampled at {run.rate_hz:g} Hz; {needed}: record faster, or lower the cut-off (`conditioning`)")
+        position = conditioning.position_cutoff_hz >= conditioning.decimation_cutoff_hz
+        key = f"conditioning.{'position' if position else 'decimation'}_cutoff_hz"
+        needed = f"`{key}` of {highest:g} Hz needs more than {2.5 * highest:g} Hz"
+        raise refuse(f"sampled at {run.rate_hz:g} Hz; {needed}: record faster, or lower it")
     if samples < 2.0 * run.rate_hz:
         long = f"only {samples / run.rate_hz:.2g} s long"
         raise refuse(f"{long}; expected at least 2 s, and about 30 moves for one percent")

@@ -42,11 +42,11 @@ class Gate(Enum):
 class Refusal:
     """One failed check: found, expected, and what to do."""
 
-    gate: Gate
-    subject: str
-    found: str
-    expected: str
-    remedy: str
+    gate: Gate  #: the check that failed
+    subject: str  #: thing that was checked
+    found: str  #: its state
+    expected: str  #: state with which the check passes
+    remedy: str  #: advice for the operator
 
     def __str__(self) -> str:
         return f"{self.subject}: found {self.found}; expected {self.expected}; {self.remedy}"

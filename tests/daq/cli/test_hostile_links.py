@@ -1,22 +1,28 @@
-"""Symbolic links in every path that a cell file names or implies: circles and other users' links, refused by name."""
+"""Symbolic links in every path that a verb writes to: circles and other users' links, refused by name."""
 
 from __future__ import annotations
 
 import os
 import shutil
+import stat
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
-from daq.cli.app import main
+from daq.cli.app import VERBS, main
 from daq.config.cell_file import load_cell
-from daq.errors import ConfigurationError, ExitCode
+from daq.errors import ConfigurationError, ExitCode, UsageError
 from daq.files import follow_links, replace_file
 from daq.jobs.cell_fit import _check_replaceable
 from daq.ledger.audit import AuditAction, append
-from tests.daq.calibrations import calibration_for
+from daq.simulation.demo import MARK, make_room
+from daq.workflow.calibration_file import save_calibration
+from tests.daq.calibrations import calibration_for, demo_calibration
+from tests.daq.cli.test_no_regular_file import WRITTEN, arguments
 from tests.daq.histories import RECALIBRATION
+from tests.daq.logs import demo_content, samples, write
 
 NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
 JOB = f"""
@@ -108,3 +114,117 @@ def test_a_fleet_does_not_replace_what_another_users_link_leads_to(tmp_path: Pat
         _check_replaceable(link)
     with pytest.raises(OSError, match="user 4711 has made"):
         follow_links(link)
+
+
+def _outputs() -> Iterator[tuple[str, list[str]]]:
+    """Yield a name and the words of a command line for each place that a verb writes to, PIPE for that place."""
+    for verb in (listed.load() for listed in VERBS if listed.name != "console"):  # which shows the report of a folder
+        for kind in verb.kinds or (verb,):
+            words = [verb.name, kind.name] if verb.kinds else [verb.name]
+            params = kind.command().params
+            for one in params:
+                if "Path" in str(one.type_descriptor.annotation) and one.name in WRITTEN:
+                    yield f"{' '.join(words)} {one.name}", [*words, *arguments(kind, params, one)]
+
+
+OUTPUTS = dict(_outputs())
+
+
+def _device(place: Path) -> None:
+    try:
+        os.mknod(place, stat.S_IFCHR | 0o666, os.makedev(1, 3))
+    except PermissionError:
+        pytest.skip("only root may make a device")
+
+
+def _link_of_another_user(place: Path) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root may give a link away")
+    place.symlink_to(place.parent / "elsewhere")
+    os.lchown(place, 4711, 4711)
+
+
+@pytest.mark.parametrize("line", OUTPUTS)
+@pytest.mark.parametrize(
+    ("make", "found"),
+    [(_link_of_another_user, "user 4711"), (os.mkfifo, "no regular file"), (_device, "no regular file")],
+    ids=["link", "pipe", "device"],
+)
+def test_no_verb_writes_to_a_place_that_another_user_chose_nor_to_a_device(
+    line: str,
+    make: Callable[[Path], None],
+    found: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shipped = Path(__file__).parents[3] / "configs"
+    place, elsewhere = tmp_path / "place.png", tmp_path / "elsewhere"
+    elsewhere.touch()
+    make(place)
+    calibration = tmp_path / "calibration.yaml"
+    save_calibration(demo_calibration(), calibration)
+    before = place.lstat()
+    files = {"PIPE": place, "configs/cells/demo.yaml": shipped / "cells" / "demo.yaml", "calibration.yaml": calibration}
+    assert main([str(files.get(word, word)) for word in OUTPUTS[line]]) not in (ExitCode.OK, ExitCode.UNEXPECTED)
+    assert found in " ".join(capsys.readouterr().err.split())
+    after = place.lstat()
+    assert (after.st_ino, after.st_mode, elsewhere.stat().st_size) == (before.st_ino, before.st_mode, 0)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
+def test_nothing_is_written_through_a_link_that_comes_later(tmp_path: Path) -> None:
+    """Between the command line and the write, and in the folders that it names."""
+    link, target = tmp_path / "report.html", tmp_path / "elsewhere"
+    target.write_bytes(b"mine")
+    link.symlink_to(target)
+    replace_file(link, b"mine, new")
+    os.lchown(link, 4711, 4711)
+    with pytest.raises(OSError, match="user 4711 has made"):
+        replace_file(link, b"theirs")
+    assert target.read_bytes() == b"mine, new"
+
+
+def test_a_link_into_a_folder_that_everybody_may_write_is_followed_for_an_own_file_in_a_sticky_one(
+    tmp_path: Path,
+) -> None:
+    link, folder = tmp_path / "out.yaml", tmp_path / "open"
+    folder.mkdir()
+    link.symlink_to(folder / "gains.yaml")
+    (folder / "gains.yaml").touch()
+    folder.chmod(0o777)
+    with pytest.raises(OSError, match="everybody may write"):
+        replace_file(link, b"x")
+    folder.chmod(0o1777)
+    replace_file(link, b"x")
+    (folder / "gains.yaml").unlink()
+    with pytest.raises(OSError, match="everybody may write"):
+        replace_file(link, b"x")
+    assert list(folder.iterdir()) == []
+
+
+def test_a_pipe_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match="no regular file"):
+        replace_file(tmp_path / "pipe", b"x")
+    assert (tmp_path / "pipe").is_fifo()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
+def test_a_demonstration_follows_no_link_in_a_folder_that_another_user_made(tmp_path: Path) -> None:
+    mark, target = tmp_path / MARK, tmp_path / "elsewhere"
+    target.write_bytes(b"mine")
+    mark.symlink_to(target)
+    os.lchown(mark, 4711, 4711)
+    with pytest.raises(OSError, match="user 4711 has made"):
+        make_room(tmp_path, ())
+    assert target.read_bytes() == b"mine"
+
+
+def test_a_log_does_not_begin_under_the_name_of_a_link_that_leads_nowhere(tmp_path: Path, checkout: Path) -> None:
+    """Its last step, the rename, would find the name taken."""
+    (tmp_path / "a.mcap").symlink_to(tmp_path / "gone.mcap")
+    with pytest.raises(UsageError, match="found a file of that name; expected none"):
+        write(tmp_path / "a.mcap", demo_content(checkout), samples([[0] * 6] * 5))
+    assert not (tmp_path / "a.mcap.part").exists()

@@ -32,8 +32,9 @@ VALID = {
     "key": "ada.key",
 }
 """Values of the other arguments, by name; any other is a name of no file."""
-WRITTEN = {"out", "pictures", "plot", "csv", "report", "preview", "folder", "to", "cases", "data", "payload_from"}
-"""Places to write to, which have refusals of their own, folders, and a file that a verb reads again and again."""
+WRITTEN = {"out", "pictures", "plot", "csv", "report", "preview", "folder", "to", "cases"}
+"""Places to write to, which `test_hostile_links` judges."""
+OTHERS = {"data", "payload_from"}  #: A folder, and a file that a verb reads again and again
 LONGEST_S = 20.0
 
 
@@ -45,11 +46,12 @@ def _command_lines() -> Iterator[tuple[str, list[str]]]:
             words = [verb.name, kind.name] if verb.kinds else [verb.name]
             params = kind.command().params
             for one in params:
-                if "Path" in str(one.type_descriptor.annotation) and one.name not in WRITTEN:
-                    yield f"{' '.join(words)} {one.name}", [*words, *_arguments(kind, params, one)]
+                if "Path" in str(one.type_descriptor.annotation) and one.name not in WRITTEN | OTHERS:
+                    yield f"{' '.join(words)} {one.name}", [*words, *arguments(kind, params, one)]
 
 
-def _arguments(kind: Verb, params: list[Any], one: Any) -> Iterator[str]:
+def arguments(kind: Verb, params: list[Any], one: Any) -> Iterator[str]:
+    """Yield the words for one argument, PIPE, and for those that the verb requires beside it."""
     for param in params:
         if param is one or param.required:
             value = "PIPE" if param is one else VALID.get(param.name, "absent")

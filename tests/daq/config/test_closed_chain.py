@@ -93,13 +93,13 @@ def _cell(folder: Path, *changes: tuple[str, str], name: str = "five-bar") -> Ce
         pytest.param(
             f"  {MOTORS}\n",
             "",
-            "3: robot.motors: found nothing, beside `closures`; expected the joint of each axis",
+            "3: robot.motors: found missing; expected the joint of each axis",
             id="closures without motors",
         ),
         pytest.param(
             "  mobility: 2\n",
             "",
-            "3: robot.mobility: found nothing, beside `closures`; expected the maker's degrees of freedom",
+            "3: robot.mobility: found missing; expected the maker's degrees of freedom",
             id="closures without mobility",
         ),
         pytest.param(
@@ -171,7 +171,7 @@ def test_degrees_of_a_prismatic_joint_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_serial_robot_has_no_key_of_a_closed_chain(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationInconsistent, match=r"6: robot\.motors: found no `closures` beside it") as refusal:
+    with pytest.raises(ConfigurationInconsistent, match=r"6: robot\.motors: found given without `closures`") as refusal:
         _cell(tmp_path, (CLOSURE, ""), ("closures:", "closures: []"))
     assert "found 4 faults" in str(refusal.value)
 

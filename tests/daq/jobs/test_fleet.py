@@ -28,7 +28,7 @@ from hypothesis import strategies as st
 
 from daq.cli import main
 from daq.config.cell_file import bundle
-from daq.errors import ConfigurationMissing, DaqError, ExitCode, LogMissing, OutputFailed, UsageError
+from daq.errors import ConfigurationMissing, DaqError, ExitCode, LogMissing, OutputFailed, UsageError, WorkersLost
 from daq.jobs import fleet as fleet_module
 from daq.jobs.cell_fit import Failure, Fitted, Loop, fit_cell, open_cache
 from daq.jobs.fleet import FleetRow, WorkerPool, each, fit_fleet, worker_pool
@@ -238,19 +238,13 @@ def _only(few: Path, cell: str) -> CellLogs:
 
 
 @pytest.mark.parametrize("ending", [".yaml", ".json"])
-@pytest.mark.parametrize("what", ["pipe", "large"])
-def test_no_file_of_ours_on_the_shelf_is_replaced_and_not_waited_for(
-    ending: str, what: str, few: Path, tmp_path: Path
-) -> None:
+def test_a_file_on_the_shelf_that_is_too_large_is_replaced(ending: str, few: Path, tmp_path: Path) -> None:
     cell, out = _only(few, "cell-003"), tmp_path / "out"
     (first,) = _fitted(few, out)
     file = open_cache(out, Loop.OPEN).file(cell).with_suffix(ending)
     file.unlink()
-    if what == "pipe":
-        os.mkfifo(file)
-    else:
-        with file.open("wb") as stream:
-            stream.truncate(2**40)
+    with file.open("wb") as stream:
+        stream.truncate(2**40)
     assert _reported(_fitted(few, out)) == _reported((first,))
     assert file.is_file()
     assert file.stat().st_size < 2**20
@@ -259,7 +253,7 @@ def test_no_file_of_ours_on_the_shelf_is_replaced_and_not_waited_for(
 
 
 @pytest.mark.parametrize("ending", [".yaml", ".json"])
-@pytest.mark.parametrize("what", ["folder", "link to a folder", "link to a device"])
+@pytest.mark.parametrize("what", ["folder", "pipe", "link to a folder", "link to a pipe"])
 def test_what_cannot_be_replaced_on_the_shelf_is_reported_before_anything_is_fitted(
     ending: str, what: str, few: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -268,8 +262,9 @@ def test_what_cannot_be_replaced_on_the_shelf_is_reported_before_anything_is_fit
     file = open_cache(out, Loop.OPEN).file(cell).with_suffix(ending)
     if what == "folder":
         file.mkdir()
+    elif what == "pipe":
+        os.mkfifo(file)
     else:
-        # No device of the system: if it were replaced after all, everybody would miss it.
         target = tmp_path / "there"
         target.mkdir() if what == "link to a folder" else os.mkfifo(target)
         file.symlink_to(target)
@@ -572,7 +567,7 @@ def test_workers_that_have_gone_end_it(cancels: bool, monkeypatch: pytest.Monkey
         return pool.executor.submit(str, piece)
 
     outcomes = each(submit, (1, 2, 3), pool)
-    with pytest.raises(UsageError, match="goes on where it was"):
+    with pytest.raises(WorkersLost, match="goes on where it was"):
         next(outcomes)
 
 

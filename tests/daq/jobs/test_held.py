@@ -31,10 +31,11 @@ from daq.errors import (
     exit_code,
 )
 from daq.jobs.context import section_of
-from daq.jobs.interlock import MAX_OUTPUT_CHARACTERS, Finished, require_release, run_command, time_bound
+from daq.jobs.interlock import MAX_OUTPUT_CHARACTERS, Finished, require_release, run_command
 from daq.jobs.job import preview
 from daq.jobs.journal import Form, Journal
 from daq.jobs.session import Outcome
+from daq.jobs.time_bound import time_bound
 from daq.ledger.audit import AuditAction
 from daq.workflow.record import Recorded
 from daq.workflow.safeguards import bus_lock, lock_name

@@ -161,3 +161,12 @@ def test_an_invalid_log_is_exported_and_called_invalid(
     )
     assert main(["export", "log", str(log), "--csv", "--out", str(tmp_path / "bad.csv")]) == ExitCode.OK
     assert "INVALID: 2 late answers" in capsys.readouterr().err
+
+
+def test_a_link_in_the_place_of_the_unfinished_table_is_not_followed(log: Path, tmp_path: Path) -> None:
+    target = tmp_path / "elsewhere"
+    target.write_text("mine")
+    (tmp_path / "bare.csv.part").symlink_to(target)
+    assert export_log(log, tmp_path / "bare.csv", TableFormat.CSV).rows == ROWS
+    assert target.read_text() == "mine"
+    assert not (tmp_path / "bare.csv").is_symlink()

@@ -249,7 +249,7 @@ def test_the_reader_is_reported_and_the_calibration_says_so(
         run, _ = load_run(saved)
     assert run.partial
     assert "saved.mcap is PARTIAL" in caplog.text
-    reading = Reading([saved], None)
+    reading = Reading.of([saved], None)
     list(reading.runs([saved], "fit"))
     assert [(source.name, source.partial) for source in reading.sources] == [("saved", True)]
 

@@ -100,7 +100,7 @@ def test_a_source_carries_payload_and_recording(tmp_path: Path, checkout: Path) 
     turning = [[100 * k + axis for axis in range(6)] for k in range(50)]
     bare = write(tmp_path / "bare.mcap", demo_content(checkout), samples(turning))
     loaded = write(tmp_path / "loaded.mcap", demo_content(checkout, DISC), samples(turning[::-1]))
-    reading = Reading([bare, loaded], None)
+    reading = Reading.of([bare, loaded], None)
     runs = list(reading.runs([bare, loaded], "fit"))
     first, second = reading.sources
     assert (first.payload, first.mass_kg, first.recording) == (None, None, runs[0].recording)

@@ -18,11 +18,13 @@ from daq.errors import LogRepeated, LogsDiffer
 from daq.log.reader import LossyLogs
 from daq.report.fit import fit_document, fit_view, paper_note
 from daq.workflow import fit as fit_module
+from daq.workflow import verdicts as verdicts_module
 from daq.workflow.cases import CaseFit
 from daq.workflow.fit import calibration_of, fit
+from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel
-from ident.errors import PayloadUnseen
+from ident.errors import DataUnfit, PayloadUnseen
 from ident.estimators.estimate import RelativeError
 from ident.estimators.method import Method
 from tests.ident.recordings import GAINS, MOUNTED, record, tx40_truth
@@ -89,6 +91,21 @@ def test_logs_of_two_configurations_are_refused(shelf: Shelf, monkeypatch: pytes
         fit(_paths("run0", "run1"))
 
 
+@pytest.mark.parametrize(
+    ("key", "conditioning"),
+    [
+        ("position_cutoff_hz", Conditioning(position_cutoff_hz=900.0)),
+        ("decimation_cutoff_hz", Conditioning(decimation_cutoff_hz=900.0)),
+    ],
+)
+def test_a_cut_off_beyond_the_sampling_rate_is_named_by_its_key(
+    shelf: Shelf, monkeypatch: pytest.MonkeyPatch, key: str, conditioning: Conditioning
+) -> None:
+    monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    with pytest.raises(DataUnfit, match=f"`conditioning.{key}` of 900 Hz needs more than 2250 Hz"):
+        fit(_paths("run0", "run1"), cell=replace(shelf.cell, conditioning=conditioning))
+
+
 @pytest.mark.parametrize("method", [Method.LS, Method.WLS, Method.TLS])
 def test_every_method_hears_of_a_payload_that_was_not_there(
     shelf: Shelf, monkeypatch: pytest.MonkeyPatch, method: Method
@@ -100,6 +117,7 @@ def test_every_method_hears_of_a_payload_that_was_not_there(
 
 def test_an_axis_that_did_not_move_has_a_dash_and_no_number(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    monkeypatch.setattr(verdicts_module, "load_run", shelf.load)
     found = fit(_paths("run0", "run1"))
     calibration = calibration_of(found, datetime(2025, 1, 2, tzinfo=UTC))
     rested = RelativeError((1.0, float("nan"), 3.0, 4.0, 5.0, 6.0), 7.0)
@@ -129,6 +147,7 @@ def test_the_drives_own_torque_is_shown_beside_the_gains_and_changes_none(
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
     without = fit(_paths("run0", "run1"), holdout=_paths("run2"))
     monkeypatch.setattr(fit_module, "load_run", load)
+    monkeypatch.setattr(verdicts_module, "load_run", load)
     found = fit(_paths("run0", "run1"), holdout=_paths("run2"))
     np.testing.assert_array_equal(found.estimate.gains, without.estimate.gains)
     assert without.torque_slopes == ()

@@ -14,8 +14,9 @@ from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.log.reader import LossyLogs
 from daq.workflow import fit as fit_module
-from daq.workflow import fit as verdicts_module
-from daq.workflow.fit import Fit, fit, gain_verdicts, needed_verdicts
+from daq.workflow import verdicts as verdicts_module
+from daq.workflow.fit import Fit, fit
+from daq.workflow.verdicts import gain_verdicts, needed_verdicts
 from ident.data.run import Run
 from ident.planning.verdict import GOOD_PERCENT, Verdict
 from tests.ident.recordings import MOUNTED, record, tx40_truth

@@ -1,0 +1,77 @@
+"""Verdicts on the gains of a fit: which are known well enough, and which moves or payloads would help."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from daq.errors import ConfigurationError
+from daq.log.conversion import load_run
+from daq.workflow.experiment import LAG_ONE, experiment_of, extra_moves
+from daq.workflow.fit import Fit
+from ident.data.dataset import differentiate
+from ident.model.bodies import LINK_PARAMETERS
+from ident.planning.excitation import Design, Excitation, Expectation, ExpectedPayload, effective_noise, recorded
+from ident.planning.verdict import GOOD_PERCENT, ExtraMoves, GainVerdict, verdicts
+
+
+def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
+    """Judge every gain of a fit with free gains, its effects left out; the logs are read again.
+
+    σ is that of the fit, by leaving out moves. Predictions for one source alone, or with further moves, are multiplied
+    by σ of the fit / predicted σ: a plan predicts ratios of σ well, but not the noise level.
+    """
+    found = fitted.identification
+    estimate, system = found.estimate, found.system
+    independent, first = list(system.base.independent), len(system.columns)
+    standard = np.zeros(len(found.model.columns))
+    standard[independent] = estimate.parameters[: len(independent)]
+    payloads = []
+    for payload, indices in zip(system.payloads, system.payload_columns, strict=True):
+        parameters = payload.known_parameters
+        parameters[list(indices)] = estimate.parameters[first : first + len(indices)]
+        first += len(indices)
+        payloads.append(ExpectedPayload(frozenset(payload.known) & frozenset(LINK_PARAMETERS), parameters))
+    # ml's noise is that of the current references, the others' that of the joint torques.
+    noise = estimate.axis_noise / (1.0 if estimate.method.is_of_currents else np.abs(estimate.gains))
+    expectation = Expectation(
+        model=found.model,
+        gains=estimate.gains,
+        parameters=standard,
+        payloads=tuple(payloads),
+        noise_a=effective_noise(noise, LAG_ONE),
+    )
+    extra: tuple[ExtraMoves, ...] = ()
+    with suppress(ConfigurationError):  # the cell does not say enough to plan moves in it
+        extra = extra_moves(experiment_of(fitted.cell))
+    judged = verdicts(Design(expectation, system.base), list(_excitations(fitted)), extra)
+    true = 100.0 * fitted.estimate.gains_std / np.abs(fitted.estimate.gains)
+    return tuple(_scaled(gain, float(std)) for gain, std in zip(judged.gains, true, strict=True))
+
+
+def needed_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
+    """The verdicts, or none where the gains were given or all are known well enough."""
+    estimate = fitted.estimate
+    good = bool(np.all(100.0 * estimate.gains_std <= GOOD_PERCENT * np.abs(estimate.gains)))
+    return () if good else gain_verdicts(fitted)
+
+
+def _excitations(fitted: Fit) -> Iterator[tuple[Excitation, tuple[int | None, ...]]]:
+    found = fitted.identification
+    mountings = [payload.mounting for payload in found.system.payloads]
+    for log in fitted.logs:
+        run, _ = load_run(log, fitted.cell, fitted.lossy)
+        data = differentiate(run, found.model.drive_train, found.conditioning)
+        mounted = None if run.payload is None else mountings.index(run.payload.mounting)
+        yield recorded(found.model, data, found.conditioning), (mounted,)
+
+
+def _scaled(gain: GainVerdict, std_percent: float) -> GainVerdict:
+    factor = std_percent / gain.std_percent if np.isfinite(gain.std_percent) and gain.std_percent else 1.0
+    advice = gain.advice and replace(gain.advice, std_percent=factor * gain.advice.std_percent)
+    alone = {source: factor * alone for source, alone in gain.alone_percent.items()}
+    known = gain.known_preload_percent and factor * gain.known_preload_percent
+    return replace(gain, std_percent=std_percent, known_preload_percent=known, alone_percent=alone, advice=advice)
