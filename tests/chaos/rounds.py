@@ -41,8 +41,8 @@ BUS_OFF = (0x2000_0040, bytes(8))
 FLOOD_HZ = 4000
 START_S, RUN_S = 60.0, 90.0  #: A round is broken off after so long
 CYCLE_S, GUARD_S, LATENESS_S = 0.02, 0.5, 1.0
-ALLOWANCE_S = 1.0
-"""For a guest whose host gives its time to others; a recorder that reads later than that stops by itself."""
+ALLOWANCE_S = 0.4
+"""For a guest whose host gives its time to others; the latest of 42 measured stops came 0.17 s after its bound."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,11 +52,13 @@ class Stop:
     bound_s: float  #: from the fault to the last answer of an enabled axis, without allowance [s]
     least_s: float = 0.0  #: a stopped process must last so long for it [s]
     least_cycles: int = 0  #: a fault of the cell must last so many cycles for it
+    least_times: int = 0  #: so many frames must come for it
     lasts: bool = False  #: the bound counts from the end of the act
 
     def due(self, fault: Fault) -> bool:
         """Whether the fault lasts long enough."""
-        return fault.for_s >= self.least_s and (fault.cycles is None or fault.cycles >= self.least_cycles)
+        enough = fault.cycles is None or fault.cycles >= self.least_cycles
+        return enough and fault.for_s >= self.least_s and fault.times >= self.least_times
 
 
 PROMPT, UNANSWERED_S = Stop(2 * CYCLE_S), 4 * CYCLE_S
@@ -72,7 +74,9 @@ STOPS: dict[Act | FaultKind, Stop] = {
     Act.CELL_PAUSE: Stop(UNANSWERED_S, least_s=0.15, lasts=True),
     Act.CELL_HANG: Stop(UNANSWERED_S, lasts=True),
     Act.CELL_INT: PROMPT,
-    Act.SYNC: PROMPT,
+    # The kernel does not distinguish the SYNC of another program on this machine from the recorder's own: the
+    # recorder notices when there are four or five too many (`drivers.stream.sync.SURPLUS`).
+    Act.SYNC: Stop(7 * CYCLE_S, least_times=6),
     Act.NMT: PROMPT,
     Act.HEARTBEAT: PROMPT,
     Act.EMCY: PROMPT,
@@ -86,7 +90,7 @@ STOPS: dict[Act | FaultKind, Stop] = {
     FaultKind.FALLS_BACK: PROMPT,
     FaultKind.REBOOTS: PROMPT,
     FaultKind.LOSES_POWER: PROMPT,
-    FaultKind.SECOND_MASTER: PROMPT,
+    FaultKind.SECOND_MASTER: Stop(7 * CYCLE_S, least_cycles=6),
     FaultKind.NO_HEARTBEAT: Stop(0.33, least_cycles=25),
     FaultKind.LIMIT: Stop(LIMIT_S + 2 * CYCLE_S, least_cycles=30),
     FaultKind.FROZEN: Stop(0.06 + CYCLE_S, least_cycles=25),

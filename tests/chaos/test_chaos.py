@@ -17,10 +17,10 @@ MOVED_NS, STRUCK_NS, CYCLE_NS = 1_000_000_000, 2_000_000_000, 20_000_000
 ENABLED, DISABLED = 0x0627, 0x0250
 
 
-def fault(kind: Act | FaultKind, for_s: float = 0.2, cycles: int | None = 40) -> Fault:
+def fault(kind: Act | FaultKind, for_s: float = 0.2, cycles: int | None = 40, times: int = 10) -> Fault:
     """A fault in motion; one of the cell begins when an act would strike."""
     at_cycle = (STRUCK_NS - MOVED_NS) // CYCLE_NS
-    return Fault(kind, True, 1.0, for_s, node=3, times=1, gap_s=0.0, value=1, at_cycle=at_cycle, cycles=cycles)
+    return Fault(kind, True, 1.0, for_s, node=3, times=times, gap_s=0.0, value=1, at_cycle=at_cycle, cycles=cycles)
 
 
 def outcome(made: Fault, enabled_s: float, code: int = 5) -> Round:
@@ -78,6 +78,8 @@ def test_a_recording_that_came_to_its_end_after_a_fault_that_must_stop_it_is_fou
         (fault(Act.CELL_PAUSE, for_s=0.1), False),
         (fault(Act.CELL_PAUSE, for_s=0.2), True),
         (fault(Act.TWIN), False),
+        (fault(Act.SYNC, times=5), False),
+        (fault(Act.SYNC, times=6), True),
     ],
 )
 def test_a_stop_is_demanded_where_the_fault_lasts_long_enough(made: Fault, demanded: bool) -> None:
