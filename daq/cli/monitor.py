@@ -41,7 +41,7 @@ def monitor_verb(
     from daq.workflow.validate import check_cell
     from drivers.canopen.network import CanopenNetwork
     from drivers.canopen.sdo import SdoPolicy
-    from drivers.stream.monitor import QUIET_S
+    from drivers.stream.monitor import ABANDONED_S, QUIET_S
 
     declared = load_cell(cell)
     carried = mounted(declared, payload)
@@ -60,6 +60,8 @@ def monitor_verb(
         watch.listen(QUIET_S)
         if once or json or not console.is_terminal:
             document = monitor_document(declared, watch.read(interval))
+            if any(axis["silent"] for axis in document["axes"]):  # it may be a slow one
+                document = monitor_document(declared, watch.read(ABANDONED_S))
             if json:
                 print_json(document)
             else:
@@ -67,7 +69,7 @@ def monitor_verb(
             silent = [axis for axis, shown in zip(network.axes, document["axes"], strict=True) if shown["silent"]]
             heard = tuple(axis["node_id"] for axis in document["axes"] if not axis["silent"])
             if silent:
-                raise no_answer(declared, silent, heard, QUIET_S + interval)
+                raise no_answer(declared, silent, heard, QUIET_S + interval + ABANDONED_S)
             return
         if feed.remark:
             console.print(feed.remark)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from daq.workflow.monitor import WatchedCell
     from drivers.canopen.scan import FoundNode
     from drivers.profiles.profile import Identity
+    from drivers.stream.monitor import AxisReading
 
 
 def scan_view(
@@ -148,6 +149,7 @@ def scan_table(rows: list[dict[str, Any]]) -> Table:
 def monitor_document(cell: Cell, watched: WatchedCell) -> dict[str, Any]:
     """JSON document of one reading of the bus."""
     from drivers.canopen.link import nmt_name  # noqa: PLC0415 - as above
+    from drivers.stream.monitor import ANSWER_S  # noqa: PLC0415 - as above
 
     reading, faults, prediction = watched.reading, watched.faults, watched.prediction
     # While another master prepares, it sends no SYNC, and no axis has to answer.
@@ -173,7 +175,10 @@ def monitor_document(cell: Cell, watched: WatchedCell) -> dict[str, Any]:
                 "statusword": word,
                 "nmt": None if axis.nmt is None else nmt_name(axis.nmt),
                 **picked(axis, "rate_hz", "lost"),
-                "silent": axis.rate_hz == 0.0 and addressed,
+                "silent": addressed and not axis.heard,
+                "delay_s": axis.delay_s,
+                "refused": [{"object": str(one.entry), "abort_code": one.abort_code} for one in axis.refused],
+                "remark": "; ".join(_answer_remarks(axis, ANSWER_S)),
                 "fault": asdict(faults[declared.name]) if state in FAULTY and declared.name in faults else None,
                 "prediction": prediction["axes"][len(axes)] if prediction is not None and prediction["axes"] else None,
             }
@@ -197,6 +202,17 @@ def monitor_document(cell: Cell, watched: WatchedCell) -> dict[str, Any]:
             for event in watched.events
         ],
     }
+
+
+def _answer_remarks(axis: AxisReading, allowed_s: float) -> Iterator[str]:
+    """Describe the answers of an axis that are late or without a value."""
+    for one in axis.refused:
+        if one.abort_code is None:
+            yield f"answers without a value of {one.entry.bits} bits for {one.entry}"
+        else:
+            yield f"answers with abort 0x{one.abort_code:08X} for {one.entry}"
+    if axis.delay_s is not None and axis.delay_s > allowed_s:
+        yield f"answers after {1e3 * axis.delay_s:.0f} ms"
 
 
 _ALARMING = {str(state) for state in (*FAULTY, State.QUICK_STOP_ACTIVE)}
@@ -227,6 +243,8 @@ def monitor_view(document: dict[str, Any]) -> Group:
         state = (axis["state"] or "?").lower() + note
         cells = (printable(axis["axis"]), position, current, state, f"{axis['rate_hz']:.1f}", str(axis["lost"]))
         table.add_row(*map(Text, cells), style=style)
+        if axis["remark"]:
+            faults.append(Text(f"{printable(axis['axis'])} {axis['remark']}", "yellow"))
         if axis["in_fault"]:
             fault = axis["fault"]
             text = _FAULT_UNKNOWN if fault is None else f"{fault['hex']} {fault['text']}; {fault['remedy']}"

@@ -33,6 +33,13 @@ class PredictedCurrent(StrictModel):
     conspicuous: bool = Field(description="it is outside for more than half of at least 2 s of motion")
 
 
+class RefusedObject(StrictModel):
+    """Object that an axis does not give."""
+
+    object: str = Field(description="index and sub-index, as 6041h:00")
+    abort_code: int | None = Field(description="of the SDO abort; null for an answer that is no value of this size")
+
+
 class MonitoredAxis(StrictModel):
     """One axis."""
 
@@ -50,7 +57,10 @@ class MonitoredAxis(StrictModel):
     nmt: str | None = Field(description="NMT state of CiA 301")
     rate_hz: float = Field(description="of complete answers")
     lost: int = Field(description="SYNCs or requests without an answer")
-    silent: bool
+    silent: bool = Field(description="it should answer, and sent nothing at all, not even a heartbeat")
+    delay_s: float | None = Field(description="longest time until an answer; null where nothing was asked or answered")
+    refused: list[RefusedObject]
+    remark: str = Field(description="answers that are late or without a value; empty if there are none")
     fault: ErrorCodeEntry | None = Field(description="of an axis in fault, where its code is known")
     prediction: PredictedCurrent | None
 

@@ -15,7 +15,7 @@ from enum import Enum
 import can
 
 from drivers.canopen.bus import bus_errors
-from drivers.canopen.link import SYNC_COB_ID, Link
+from drivers.canopen.link import EMCY, HEARTBEAT, SYNC_COB_ID, Link
 from drivers.canopen.pdo import feedback_entries
 from drivers.canopen.sdo import SDO_ANSWER, SDO_REQUEST, upload_answer, upload_request
 from drivers.canopen.split_bus import SplitAddress
@@ -25,7 +25,10 @@ from drivers.stream.sample import CellEvent, Sample
 
 QUIET_S = 2.0  #: Silence of other masters after which the axes are read by SDO
 ANSWER_S = 0.3  #: Time allowed for an answer; CiA 301 sets no limit, and drives answer within milliseconds
+ABANDONED_S = 1.0  #: A request without an answer for so long is lost, and the axis is asked anew
 READING_S = 0.1  #: Time between two SDO readings of an axis: six axes then load a bus of 1 Mbit/s by some 5 %
+SENT_BY_NODES = frozenset((EMCY, 0x180, 0x280, 0x380, 0x480, SDO_ANSWER, HEARTBEAT))
+"""COB-IDs of what a node sends, without its node id (CiA 301, predefined connection set)."""
 
 
 class ReadingSource(Enum):
@@ -33,6 +36,14 @@ class ReadingSource(Enum):
 
     OVERHEARD = "overheard"
     ASKED = "asked"
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Answer without the value of an object."""
+
+    entry: ObjectEntry  #: the object
+    abort_code: int | None  #: of the SDO abort; None for an answer that is no value of this size
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +56,9 @@ class AxisReading:
     nmt: int | None  #: state in its last heartbeat, None before the first
     rate_hz: float  #: of complete readings since the last reading
     lost: int  #: SYNCs or requests without an answer since the monitor began
+    heard: bool = True  #: whether the axis sent anything since the last reading, or in the last ABANDONED_S
+    delay_s: float | None = None  #: longest time until an answer to a request since the last reading, None without one
+    refused: tuple[Refusal, ...] = ()  #: objects that its last answers did not give
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +87,28 @@ class _AxisWatch:
         self.readings = self.lost = 0
         self.complete_ns: int | None = None  # when the last complete reading by SDO came
         self.asked = -1
-        self.open_until_ns: int | None = None
+        self.asked_ns: int | None = None  # when the request that waits for its answer was sent
         self.due_ns = 0
+        self.heard_ns: int | None = None
+        self.delay_ns: int | None = None
+        self.refused: dict[int, Refusal] = {}  # by column
+
+    def take(self, nmt: int | None, since_ns: int, now_ns: int) -> AxisReading:
+        """Return a reading and begin the next."""
+        position, current, statusword = self.values
+        reading = AxisReading(
+            position,
+            current,
+            statusword,
+            nmt,
+            self.readings / max((now_ns - since_ns) * 1e-9, 1e-9),
+            self.lost,
+            self.heard_ns is not None and self.heard_ns >= min(since_ns, now_ns - round(ABANDONED_S * 1e9)),
+            None if self.delay_ns is None else self.delay_ns * 1e-9,
+            tuple(self.refused[column] for column in sorted(self.refused)),
+        )
+        self.readings, self.delay_ns = 0, None
+        return reading
 
     def hear(self, cob_id: int, data: bytes) -> None:
         slot = self.slots[cob_id]
@@ -82,6 +116,7 @@ class _AxisWatch:
             return  # another master's mapping: not ours to interpret
         for column, value in zip(slot.columns, slot.layout.unpack(data), strict=True):
             self.values[column] = value
+            self.refused.pop(column, None)
         self.seen.add(cob_id)
         self.readings += self.seen == self.slots.keys()
 
@@ -92,30 +127,39 @@ class _AxisWatch:
         self.seen.clear()
 
     def answer(self, data: bytes, now_ns: int) -> None:
+        """Take an answer to the open request, however late it comes."""
         answer = upload_answer(data, self.entries[self.asked])
-        if self.open_until_ns is None or answer is None:
+        if self.asked_ns is None or answer is None:
             return  # an answer to another program
-        self.open_until_ns = None
-        if answer.value is not None:
-            self.values[self.asked] = answer.value
-            if self.asked == len(self.entries) - 1:
-                self.readings += 1
-                self.complete_ns = now_ns
+        self.delay_ns = max(self.delay_ns or 0, now_ns - self.asked_ns)
+        self.asked_ns = None
+        self.values[self.asked] = answer.value
+        if answer.value is None:
+            self.refused[self.asked] = Refusal(self.entries[self.asked], answer.abort_code)
+        else:
+            self.refused.pop(self.asked, None)
+        if self.asked == len(self.entries) - 1 and not self.refused:
+            self.readings += 1
+            self.complete_ns = now_ns
 
     def next_request(self, now_ns: int) -> ObjectEntry | None:
-        if self.open_until_ns is not None:
-            if now_ns < self.open_until_ns:
+        if self.asked_ns is not None:
+            if now_ns < self.asked_ns + round(ABANDONED_S * 1e9):
                 return None
             self.lost += 1
-            self.open_until_ns, self.asked = None, -1  # start again: the values of a reading belong together
+            self.drop()  # start again: the values of a reading belong together
         following = (self.asked + 1) % len(self.entries)
         if following == 0:
             if now_ns < self.due_ns:
                 return None
             self.due_ns = now_ns + round(READING_S * 1e9)
         self.asked = following
-        self.open_until_ns = now_ns + round(ANSWER_S * 1e9)
+        self.asked_ns = now_ns
         return self.entries[self.asked]
+
+    def drop(self) -> None:
+        """Wait for no answer any more."""
+        self.asked_ns, self.asked = None, -1
 
 
 class CellMonitor:
@@ -176,23 +220,18 @@ class CellMonitor:
                     self._hear(message)
         now_ns = clock()
         lasted_s = max((now_ns - self._since_ns) * 1e-9, 1e-9)
+        axes = tuple(axis.take(self._link.nmt.get(axis.node_id), self._since_ns, now_ns) for axis in self._axes)
         self._since_ns = now_ns
-        axes = []
-        for axis in self._axes:
-            position, current, statusword = axis.values
-            nmt = self._link.nmt.get(axis.node_id)
-            axes.append(AxisReading(position, current, statusword, nmt, axis.readings / lasted_s, axis.lost))
-            axis.readings = 0
         frames = tuple(tuple(self._frames[bus, length] for length in range(9)) for bus in range(len(self._buses)))
         sync_hz, self._syncs = self._syncs / lasted_s, 0
         self._frames.clear()
         events = self._link.take_events(now_ns + self._offset_ns, tuple(self._by_node))
-        return CellReading(self.source, lasted_s, tuple(axes), sync_hz, frames, events)
+        return CellReading(self.source, lasted_s, axes, sync_hz, frames, events)
 
     def pause(self) -> None:
         """Drop open requests: other code reads the bus for a moment."""
         for axis in self._axes:
-            axis.open_until_ns, axis.asked = None, -1
+            axis.drop()
 
     def _ask(self) -> None:
         now_ns = self._link.clock()
@@ -213,6 +252,9 @@ class CellMonitor:
             self._link.dispatch(message)
             return
         identifier = message.arbitration_id
+        axis = self._by_node.get(identifier & 0x7F)
+        if axis is not None and identifier & ~0x7F in SENT_BY_NODES:
+            axis.heard_ns = self._link.clock()
         if identifier == SYNC_COB_ID:
             self._syncs += 1
             self._lead()

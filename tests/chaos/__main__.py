@@ -51,7 +51,7 @@ def main() -> int:
     wanted = parser.parse_args()
     say(f"chaos: seed {wanted.seed}")
     done, values, violated, kinds = 0, 0, [], Counter[str]()
-    codes = Counter[int | None]()
+    codes, late_s = Counter[int | None](), list[tuple[float, str]]()
     with tempfile.TemporaryDirectory(prefix="chaos-") as name:
         folder = Path(name)
         cell, plan = write_cell(folder, PERIOD_US, "timed"), folder / "plan.yaml"
@@ -77,11 +77,14 @@ def main() -> int:
             done, values = done + 1, values + outcome.compared
             kinds.update(fault.name for fault in outcome.injected)
             codes[outcome.code] += 1
+            late_s += [(one_s, name) for name, one_s in outcome.late_s.items()]
             violated += [number] if outcome.violations else []
             shutil.rmtree(place)
     say(f"\nseed {wanted.seed}: {done} rounds, {kinds.total()} faults of {len(kinds)} kinds, {values} values compared")
     say("\n".join(f"{count:4d}  {kind}" for kind, count in sorted(kinds.items())))
     say("exit codes: " + ", ".join(f"{code} ({count})" for code, count in sorted(codes.items(), key=str)))
+    latest = ", ".join(f"{one_s:+.3f} ({name})" for one_s, name in sorted(late_s, reverse=True)[:5])
+    say(f"stops after faults in motion: {len(late_s)}; latest, beside their bounds [s]: {latest}")
     for number in violated:
         say(f"violated: make chaos SEED={wanted.seed} ROUND={number}")
     say(f"{len(violated)} rounds with violations")

@@ -43,6 +43,8 @@ class Act(Enum):
     ERROR_PASSIVE = "error frame: passive"
     BUS_OFF = "error frame: bus-off"
     LINK_DOWN = "interface down and up"
+    LSS = "layer setting service"
+    DISK_FULL = "disk of the log full"
 
 
 INSIDE = (
@@ -79,30 +81,18 @@ EMCY_CODES = (0x2310, 0x3210, 0x4310, 0x5530, 0x7305, 0x8611, 0xFF01)
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault.
+    """One fault."""
 
-    Attributes:
-        kind: an act from outside, or a fault that the cell makes by itself.
-        in_motion: whether `at_s` counts from the first set-point, not from the start of the recorder.
-        at_s: moment of an act [s].
-        for_s: how long a process is stopped or the interface down, or how long a flood lasts [s].
-        node: node id that it concerns.
-        times: number of frames.
-        gap_s: time between two of them [s].
-        value: EMCY code, NMT command, or any number that makes the data of a frame.
-        at_cycle, cycles: of a fault of the cell; None is without end.
-    """
-
-    kind: Act | FaultKind
-    in_motion: bool
-    at_s: float
-    for_s: float
-    node: int
-    times: int
-    gap_s: float
-    value: int
-    at_cycle: int
-    cycles: int | None
+    kind: Act | FaultKind  #: an act from outside, or a fault that the cell makes by itself
+    in_motion: bool  #: whether `at_s` counts from the first set-point, not from the start of the recorder
+    at_s: float  #: moment of an act [s]
+    for_s: float  #: how long a process is stopped, the interface down, a flood or a full disk lasts [s]
+    node: int  #: node id that it concerns
+    times: int  #: number of frames
+    gap_s: float  #: time between two of them [s]
+    value: int  #: EMCY code, NMT command, or any number that makes the data of a frame
+    at_cycle: int  #: SYNC since power-on at which a fault of the cell begins
+    cycles: int | None  #: how many SYNCs a fault of the cell lasts; None is without end
 
     @property
     def name(self) -> str:
@@ -152,7 +142,7 @@ def _draw(random: Random, kind: Act | FaultKind) -> Fault:
         kind,
         in_motion,
         at_s=random.uniform(0.0, MOTION_S if in_motion else RUN_S),
-        for_s=5.0 if hang else random.uniform(0.03, 0.3) if kind is not Act.FLOOD else random.uniform(0.5, 4.0),
+        for_s=5.0 if hang else random.uniform(*((0.5, 4.0) if kind in (Act.FLOOD, Act.DISK_FULL) else (0.03, 0.3))),
         node=random.choice(NODES),
         times=1 if random.random() < 0.5 else random.randrange(2, 30),
         gap_s=random.choice((0.0, 0.003, 0.02)),

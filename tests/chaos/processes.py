@@ -44,17 +44,11 @@ def warm_up(simulation: Path) -> None:
 
 @dataclass
 class Verb:
-    """A verb of drivegain in a process of its own.
+    """A verb of drivegain in a process of its own."""
 
-    Attributes:
-        pid: of the process; also of its group.
-        words: file with what it says.
-        code: exit code, minus the signal that ended it, None while it runs.
-    """
-
-    pid: int
-    words: Path
-    code: int | None = None
+    pid: int  #: of the process; also of its group
+    words: Path  #: file with what it says
+    code: int | None = None  #: exit code, minus the signal that ended it, None while it runs
 
     @classmethod
     def start(cls, words: Path, arguments: Sequence[str]) -> Verb:

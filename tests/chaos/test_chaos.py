@@ -7,27 +7,31 @@ from itertools import islice
 
 import pytest
 
+from drivers.simulation.faults import FaultKind
 from tests.chaos.faults import CYCLES, INSIDE, Act, Fault, rounds
-from tests.chaos.rounds import ALLOWANCE_S, BOUND_S, Round, judge_end, judge_stop
+from tests.chaos.rounds import ALLOWANCE_S, STOPS, Round, judge_end, judge_stop
 from tests.vcan.judgement import FEEDBACK, SYNC, TPDO1
 from tests.vcan.listener import Frame
 
-MOVED_NS, STRUCK_NS = 1_000_000_000, 2_000_000_000
+MOVED_NS, STRUCK_NS, CYCLE_NS = 1_000_000_000, 2_000_000_000, 20_000_000
 ENABLED, DISABLED = 0x0627, 0x0250
 
 
-def fault(kind: Act) -> Fault:
-    return Fault(kind, in_motion=True, at_s=1.0, for_s=0.1, node=3, times=1, gap_s=0.0, value=1, at_cycle=1, cycles=1)
+def fault(kind: Act | FaultKind, for_s: float = 0.2, cycles: int | None = 40, times: int = 10) -> Fault:
+    """A fault in motion; one of the cell begins when an act would strike."""
+    at_cycle = (STRUCK_NS - MOVED_NS) // CYCLE_NS
+    return Fault(kind, True, 1.0, for_s, node=3, times=times, gap_s=0.0, value=1, at_cycle=at_cycle, cycles=cycles)
 
 
-def outcome(act: Act, enabled_s: float, code: int = 5) -> Round:
-    """A round in which axis 3 answers that it is enabled for so long after an act, and then that it is not."""
+def outcome(made: Fault, enabled_s: float, code: int = 5) -> Round:
+    """A round in which axis 5 answers that it is enabled for so long after a fault, and then that it is not."""
     end_ns = STRUCK_NS + round(enabled_s * 1e9)
-    frames = [
-        Frame(time_ns, TPDO1 + 3, FEEDBACK.pack(7, 0, ENABLED if time_ns <= end_ns else DISABLED))
-        for time_ns in range(MOVED_NS, STRUCK_NS + 4_000_000_000, 20_000_000)
-    ]
-    return Round((fault(act),), struck=[(act, STRUCK_NS)], moved_ns=MOVED_NS, frames=frames, code=code)
+    frames = []
+    for time_ns in range(MOVED_NS, STRUCK_NS + 8_000_000_000, CYCLE_NS):
+        frames.append(Frame(time_ns, SYNC, b""))
+        frames.append(Frame(time_ns, TPDO1 + 5, FEEDBACK.pack(7, 0, ENABLED if time_ns <= end_ns else DISABLED)))
+    struck = [(made, STRUCK_NS)] if isinstance(made.kind, Act) else []
+    return Round((made,), struck=struck, moved_ns=MOVED_NS - 1, frames=frames, code=code)
 
 
 def test_a_seed_gives_the_same_rounds_and_every_kind_comes_once_in_a_turn() -> None:
@@ -40,20 +44,74 @@ def test_a_seed_gives_the_same_rounds_and_every_kind_comes_once_in_a_turn() -> N
     assert next(rounds(1)) != next(rounds(2))
 
 
-@pytest.mark.parametrize("act", BOUND_S)
-def test_an_axis_that_is_enabled_beyond_the_bound_is_found(act: Act) -> None:
-    late = 1.0 if act is Act.CAPTURE_HANG else 0.0
-    for enabled_s, expected in (
-        (BOUND_S[act] + ALLOWANCE_S + late - 0.05, 0),
-        (BOUND_S[act] + ALLOWANCE_S + late + 0.05, 1),
-    ):
-        judged = outcome(act, enabled_s)
+@pytest.mark.parametrize("kind", STOPS, ids=lambda kind: kind.name)
+def test_an_axis_that_is_enabled_beyond_the_bound_is_found(kind: Act | FaultKind) -> None:
+    made = fault(kind)
+    bound_s = STOPS[kind].bound_s + (made.for_s if STOPS[kind].lasts else 0.0) + ALLOWANCE_S
+    for enabled_s, expected in ((bound_s - 0.05, 0), (bound_s + 0.05, 1)):
+        judged = outcome(made, enabled_s)
         judge_stop(judged)
         assert len(judged.violations) == expected, judged.violations
 
 
+@pytest.mark.parametrize("kind", STOPS, ids=lambda kind: kind.name)
+@pytest.mark.parametrize("code", [0, 4])
+def test_a_recording_that_came_to_its_end_after_a_fault_that_must_stop_it_is_found(
+    kind: Act | FaultKind, code: int
+) -> None:
+    judged = outcome(fault(kind), 0.01, code)
+    judge_end(judged)
+    assert [line[:27] for line in judged.violations] == [f"(e) exit code {code} after {judged.faults[0].name}"[:27]]
+    before = outcome(fault(kind), 0.01, code)
+    before.moved_ns = STRUCK_NS + 1
+    judge_end(before)
+    assert before.violations == []
+
+
+@pytest.mark.parametrize(
+    ("made", "demanded"),
+    [
+        (fault(FaultKind.LOST, cycles=2), False),
+        (fault(FaultKind.LOST, cycles=6), True),
+        (fault(FaultKind.EMERGENCY, cycles=None), True),
+        (fault(FaultKind.DUPLICATE, cycles=50), False),
+        (fault(Act.CELL_PAUSE, for_s=0.1), False),
+        (fault(Act.CELL_PAUSE, for_s=0.2), True),
+        (fault(Act.TWIN), False),
+        (fault(Act.SYNC, times=5), False),
+        (fault(Act.SYNC, times=6), True),
+    ],
+)
+def test_a_stop_is_demanded_where_the_fault_lasts_long_enough(made: Fault, demanded: bool) -> None:
+    assert bool(outcome(made, 0.01).stopping) is demanded
+
+
+@pytest.mark.parametrize(("other", "excused"), [(Act.CAPTURE_HANG, True), (Act.NOISE, False)])
+def test_a_stopped_process_delays_the_stop_of_another_fault_but_not_its_own(other: Act, excused: bool) -> None:
+    late_s = STOPS[Act.EMCY].bound_s + ALLOWANCE_S + 0.5
+    judged = outcome(fault(Act.EMCY), late_s)
+    judged.struck.append((fault(other), STRUCK_NS))
+    judge_stop(judged)
+    assert (judged.violations == []) is excused
+
+
+def test_the_repeated_answers_of_an_axis_are_no_power() -> None:
+    judged = outcome(fault(FaultKind.STALE), 0.03)
+    judged.frames.append(Frame(STRUCK_NS + 3_000_000_000, TPDO1 + 3, FEEDBACK.pack(8, 0, ENABLED)))
+    judge_stop(judged)
+    assert judged.violations == []
+    assert judged.late_s["cell: stale"] < 0.0
+
+
+def test_a_sync_after_the_end_of_the_recorder_makes_no_fault_of_the_cell() -> None:
+    judged = outcome(fault(FaultKind.LOST), 0.01)
+    assert judged.kinds == {FaultKind.LOST}
+    judged.ended_ns = STRUCK_NS
+    assert judged.kinds == set()
+
+
 def test_the_answers_of_a_second_node_are_not_the_axis() -> None:
-    judged = outcome(Act.EMCY, 0.01)
+    judged = outcome(fault(Act.EMCY), 0.01)
     twin = FEEDBACK.pack(8, 0, ENABLED)
     judged.frames.append(Frame(STRUCK_NS + 3_000_000_000, TPDO1 + 3, twin))
     judged.twins.add(twin)
@@ -61,9 +119,13 @@ def test_the_answers_of_a_second_node_are_not_the_axis() -> None:
     assert judged.violations == []
 
 
-def changed(**fields: object) -> Callable[[], Round]:
+LEFT = "settings of J1 (node 1) not restored; switch these drives off"
+GAVE_UP = "settings not restored (asked a second time): J1: TPDO1, 1016h; J2: 1017h; switch these drives off"
+
+
+def changed(kind: Act | FaultKind = Act.EMCY, **fields: object) -> Callable[[], Round]:
     def make() -> Round:
-        made = outcome(Act.EMCY, 0.01)
+        made = outcome(fault(kind), 0.01)
         for name, value in fields.items():
             setattr(made, name, value)
         return made
@@ -84,7 +146,12 @@ def changed(**fields: object) -> Callable[[], Round]:
         (changed(enabled=[2]), "(c) after its end nodes [2] are enabled"),
         (changed(powered=[4]), "(c) after its end nodes [] are enabled, nodes [4] have power"),
         (changed(unrestored=[1]), "(d) nodes [1] have other settings"),
-        (changed(unrestored=[1], said="settings not restored (node 1)"), ""),
+        (changed(Act.NMT, unrestored=[1]), ""),
+        (changed(unrestored=[1], said=LEFT), "(d) nodes [1] were left"),
+        (changed(Act.LINK_DOWN, unrestored=[1], said=LEFT), ""),
+        (changed(FaultKind.SILENT, unrestored=[1, 2], said=GAVE_UP), ""),
+        (changed(Act.LINK_DOWN, unrestored=[1, 3], said=GAVE_UP), "(d) nodes [3] have other settings"),
+        (changed(Act.DISK_FULL, code=1), ""),
         (changed(silent=[1]), "(d) nodes [1] do not answer"),
         (changed(scanned=(5, "no")), "(d) scan ended with 5"),
     ],

@@ -23,7 +23,6 @@ VALIDATION_MOVES = 3
 CONFIGS = Path("configs")
 POLICY = "policy: {apply: {max_age_days: null, max_error_percent: 60.0, max_axis_error_percent: 100.0}}\n"
 CELL = "press.yaml"
-SYNC_US = "us: 2000"
 
 
 def drivegain(folder: Path, *arguments: str) -> None:

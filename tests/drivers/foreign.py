@@ -16,15 +16,32 @@ import pytest
 from canopen import LocalNode, Network
 from canopen.objectdictionary import ODVariable
 
+from daq.config.drive import drive_from_text
+from daq.environment import shipped_configurations
 from drivers.canopen.needs import Profiles
 from drivers.canopen.network import Bounds, CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
+from drivers.motion.move import Move
 from drivers.profiles.profile import Axis, DriveProfile
 from tests.daq.config.data_sheet import data_sheet
 from tests.drivers.scripted import ADDRESS, FakeClock, ScriptedBus, ScriptedNode
 
 RATED_MA = 2000
 _READ_ONLY = 0x06010002
+MAKES = {  # shipped profile by data sheet
+    "pilz_prbt_0_1.dcf": "schunk-pilz-prbt",
+    "Schunk_0_63_cob.dcf": "schunk-pilz-prbt",
+    "Elmo_cob.dcf": "elmo-gold",
+    "ElmoSimplIQ_cob.dcf": "elmo-gold",
+    "maxon_epos4.eds": "maxon-epos4",
+}
+MOVE = Move((3000, -2000), (100_000, 80_000), (1_000_000, 800_000))
+
+
+def shipped(name: str) -> DriveProfile:
+    """Return a shipped drive profile."""
+    path = shipped_configurations() / "drives" / f"{name}.yaml"
+    return drive_from_text(path.read_bytes(), path.name)
 
 
 class _Wire(Network):

@@ -34,7 +34,6 @@ class World:
 
 WORLDS = {"measurement": World(1.59, 0.0), "loop3": World(1.0, 3.0), "loop8": World(1.0, 8.0)}
 """The first leaves a relative error of 3.5 % without any effect (docs/evidence/estimators.md)."""
-MEASUREMENT = WORLDS["measurement"]
 CORRELATION_S = (0.002, 0.050)
 """Range of the disturbance's correlation time, drawn for each axis, logarithmically uniform [s]."""
 GAIN_SPREAD = 0.10

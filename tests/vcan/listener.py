@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 SO_TIMESTAMPNS, SO_RCVBUFFORCE, SO_RXQ_OVFL = 35, 33, 40  # asm-generic/socket.h
-CAN_ERR_FLAG, EXTENDED_OR_REMOTE = 0x2000_0000, 0xC000_0000  # linux/can.h
+CAN_ERR_FLAG = 0x2000_0000  # linux/can.h
 KEPT = tuple((base, 0xC000_0780) for base in range(0, 0x780, 0x80))
 """struct can_filter, identifier and mask: base data frames below 780h; tests flood the bus with 7F0h."""
 BUFFER_BYTES = 8 << 20

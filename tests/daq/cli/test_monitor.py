@@ -5,10 +5,11 @@ from __future__ import annotations
 import io
 import json
 import struct
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import can
 import numpy as np
@@ -37,7 +38,16 @@ from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
 from drivers.profiles.profile import Axis
 from drivers.simulation.cell import SimulatedCell
-from drivers.stream.monitor import ANSWER_S, QUIET_S, READING_S, AxisReading, CellMonitor, CellReading, ReadingSource
+from drivers.simulation.spec import SdoAbort
+from drivers.stream.monitor import (
+    ABANDONED_S,
+    QUIET_S,
+    READING_S,
+    AxisReading,
+    CellMonitor,
+    CellReading,
+    ReadingSource,
+)
 from drivers.stream.sample import CellEvent, EventKind, Sample
 from ident.arrays import FloatArray
 from ident.calibration import Calibration
@@ -50,7 +60,6 @@ from tests.drivers.scripted import FakeClock
 CHECKOUT = Path(__file__).parents[3]
 CELL = load_cell(CHECKOUT / "configs/cells/demo.yaml")
 ADDRESS = BusAddress("virtual", "monitored")
-WATCH_S = 1.0
 
 
 class QuietBus(can.BusABC):
@@ -175,11 +184,12 @@ def test_a_quiet_bus_is_asked_by_uploads_alone_and_silence_is_counted(bus: Quiet
     monitor = _monitor(bus)
     monitor.watch(QUIET_S - 0.01)
     assert bus.sent == []
-    reading = monitor.watch(10 * ANSWER_S)
+    reading = monitor.watch(9.5 * ABANDONED_S)
     assert {message.arbitration_id for message in bus.sent} == {0x600 + node for node in range(1, 7)}
     assert {message.data[0] for message in bus.sent} == {0x40}
     assert reading.source is ReadingSource.ASKED
     assert all(8 <= axis.lost <= 10 and axis.position_counts is None and axis.rate_hz == 0 for axis in reading.axes)
+    assert not any(axis.heard for axis in reading.axes)
 
 
 def test_asking_leaves_the_bus_to_others(bus: QuietBus, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -260,7 +270,7 @@ def _reading(counts: list[int | None]) -> CellReading:
 
 def test_what_is_not_known_is_shown_as_that() -> None:
     out = io.StringIO()
-    dead = AxisReading(None, None, None, None, 0.0, 3)
+    dead = AxisReading(None, None, None, None, 0.0, 3, heard=False)
     reading = _reading([0] * 6)
     reading = CellReading(reading.source, 0.5, (*reading.axes[:5], dead), 0.0, ((0,) * 9,), ())
     event = CellEvent(0, None, EventKind.CONTROLLER, 0, "a\x1b[2Jb")
@@ -328,6 +338,122 @@ def test_a_cell_that_is_not_there_is_a_device_fault(cell: Path, capsys: pytest.C
     streams = capsys.readouterr()
     assert "(SILENT)" in streams.out
     assert "start `drivegain simulate demo`" in streams.err
+
+
+def test_a_node_that_aborts_is_not_called_silent(
+    cell: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither its position nor its answers are lost, and the reason is shown."""
+    with open_bus(ADDRESS) as bus, SimulatedCell(load_simulation(shipped_simulation("clean")), bus) as simulated:
+        node = simulated.nodes[2]
+        sound = node.read
+
+        def read(index: int, subindex: int) -> bytes:
+            if index == 0x6041:
+                raise SdoAbort(0x06020000)
+            return sound(index, subindex)
+
+        monkeypatch.setattr(node._sdo, "_read", read)
+        assert main(["monitor", str(cell), "--json", "--interval", "0.5"]) == ExitCode.OK
+    document = json.loads(capsys.readouterr().out)
+    MonitorReport.model_validate(document)
+    refusing = document["axes"][2]
+    assert (refusing["silent"], refusing["rate_hz"], refusing["state"]) == (False, 0.0, None)
+    assert refusing["position"] == pytest.approx(90.0, abs=1e-2)
+    assert refusing["current_a"] is not None
+    assert refusing["refused"] == [{"object": "6041h:00", "abort_code": 0x06020000}]
+    assert refusing["remark"].startswith("answers with abort 0x06020000 for 6041h:00")
+    assert "J3 answers with abort 0x06020000 for 6041h:00" in _view(document)
+    assert document["axes"][1]["refused"] == []
+
+
+@pytest.mark.parametrize(
+    ("answer", "remark"),
+    [
+        (bytes.fromhex("4f41600000000000"), "answers without a value of 16 bits for 6041h:00"),
+        (bytes.fromhex("8041600000000206"), "answers with abort 0x06020000 for 6041h:00"),
+    ],
+)
+def test_a_refused_object_is_no_value_and_forgotten_when_it_is_given(
+    bus: QuietBus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: bytes, remark: str
+) -> None:
+    answers = [answer]
+    _answering(bus, monkeypatch, lambda data: answers[0] if data[1:3] == b"\x41\x60" else None)
+    watch = _watch(bus, tmp_path / "cell.yaml")
+    watch.listen(QUIET_S)
+    document = monitor_document(CELL, watch.read(0.5))
+    assert [axis["remark"] for axis in document["axes"]] == [remark] * 6
+    assert {(axis["statusword"], axis["rate_hz"], axis["lost"]) for axis in document["axes"]} == {(None, 0.0, 0)}
+    answers[0] = bytes.fromhex("4b41600050020000")
+    document = monitor_document(CELL, watch.read(0.5))
+    assert {(axis["remark"], axis["statusword"]) for axis in document["axes"]} == {("", 0x250)}
+    assert document["axes"][0]["rate_hz"] > 5.0
+
+
+def test_a_node_that_answers_after_400_ms_is_called_slow(
+    bus: QuietBus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _answering(bus, monkeypatch, lambda _: None, slow={1: 400_000_000})
+    watch = _watch(bus, tmp_path / "cell.yaml")
+    watch.listen(QUIET_S)
+    documents = [monitor_document(CELL, watch.read(0.5)) for _ in range(10)]
+    slow = [document["axes"][0] for document in documents]
+    assert {axis["remark"] for axis in slow} == {"answers after 400 ms"}
+    assert 0.5 * sum(axis["rate_hz"] for axis in slow) >= 3  # in 5 s; a reading has three objects
+    assert {(axis["silent"], axis["lost"]) for axis in slow} == {(False, 0)}
+    assert slow[-1]["position_counts"] == 0
+    assert {document["axes"][1]["remark"] for document in documents} == {""}
+    assert "J1 answers after 400 ms" in _view(documents[-1])
+
+
+def test_a_cell_that_is_slower_than_one_reading_gets_more_time(
+    cell: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with open_bus(ADDRESS) as bus, SimulatedCell(load_simulation(shipped_simulation("clean")), bus) as simulated:
+        prompt = simulated.nodes[0].request
+
+        def late(data: bytes) -> None:
+            time.sleep(0.3)
+            prompt(data)
+
+        monkeypatch.setattr(simulated.nodes[0], "request", late)
+        for node in simulated.nodes:
+            node.write(0x1017, 0, bytes(2))  # no heartbeat
+        assert main(["monitor", str(cell), "--json", "--interval", "0.1"]) == ExitCode.OK
+    assert json.loads(capsys.readouterr().out)["axes"][0]["remark"].startswith("answers after ")
+
+
+@pytest.mark.parametrize("identifier", [0x081, 0x181, 0x701])
+def test_a_node_that_only_sends_by_itself_is_not_silent(bus: QuietBus, identifier: int) -> None:
+    monitor = _monitor(bus)
+    monitor.watch(QUIET_S)
+    bus.coming.append((bus.clock.now_ns + 200_000_000, _frame(identifier, b"\x05")))
+    assert [axis.heard for axis in monitor.watch(1.5).axes] == [True, *[False] * 5]
+    assert not any(axis.heard for axis in monitor.watch(0.5).axes)  # longer ago than ABANDONED_S
+
+
+def _answering(
+    bus: QuietBus,
+    monkeypatch: pytest.MonkeyPatch,
+    own: Callable[[bytes], bytes | None],
+    slow: dict[int, int] | None = None,
+) -> None:
+    """Let all nodes answer with 0 or with an answer of their own, one of them later by so many nanoseconds."""
+
+    def answer(msg: can.Message, timeout: float | None = None) -> None:
+        data = bytes(msg.data)
+        reply = own(data) or bytes((0x43, *data[1:4])) + bytes(4)
+        at_ns = bus.clock.now_ns + (slow or {}).get(msg.arbitration_id & 0x7F, 0)
+        bus.coming.append((at_ns, _frame(msg.arbitration_id - 0x80, reply)))
+        bus.coming.sort(key=lambda one: one[0])
+
+    monkeypatch.setattr(bus, "send", answer)
+
+
+def _view(document: dict[str, Any]) -> str:
+    out = io.StringIO()
+    Console(file=out, width=200).print(monitor_view(document))
+    return out.getvalue()
 
 
 def test_our_own_recorder_is_no_other_master(tmp_path: Path) -> None:
@@ -472,6 +598,6 @@ def test_each_reading_publishes_the_load_of_the_buses(
     watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), feed)
     watch.listen(QUIET_S)
     for _ in range(2):
-        watch.read(0.5)
+        watch.read(1.1)
     assert [list(load) for load in loads] == [[one.name for one in CELL.buses]] * 2
     assert all(0.0 < load < 0.06 for one in loads for load in one.values())

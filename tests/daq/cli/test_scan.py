@@ -26,6 +26,7 @@ from drivers.canopen.scan import FoundNode
 from drivers.profiles.profile import Identity
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import ErrorCode, PowerState
+from drivers.simulation.spec import SdoAbort
 from ident.model.model import DriveTrain
 from tests.two_buses import on_two_buses
 
@@ -123,6 +124,29 @@ def test_two_devices_and_a_profile_that_does_not_fit_are_said(cell: Cell) -> Non
     said = [str(part) for part in scan_view(rows, {})]
     assert said[1].startswith("J1 (node 1): found two answers to one request; two devices have this node id")
     assert said[2] == "J2 (node 2): found no object 6074h:00"
+
+
+def test_a_drive_without_an_object_of_its_profile_is_found_on_the_bus(
+    checkout: Path, cell: Cell, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with (
+        open_bus(bus_address(cell)) as bus,
+        SimulatedCell(load_simulation(shipped_simulation("clean")), bus) as simulated,
+    ):
+        server = simulated.nodes[2]._sdo
+        sound = server._read
+
+        def read(index: int, subindex: int) -> bytes:
+            if index == 0x6075:
+                raise SdoAbort(0x06020000)
+            return sound(index, subindex)
+
+        monkeypatch.setattr(server, "_read", read)
+        assert main(["scan", str(checkout / "configs/cells/demo.yaml"), "--json"]) == ExitCode.OK
+    rows = json.loads(capsys.readouterr().out)["nodes"]
+    assert [row["verdict"] for row in rows] == ["ok", "ok", "profile does not fit", "ok", "ok", "ok"]
+    (remark,) = rows[2]["remarks"]
+    assert "no object 6075h:00 (scale of the current)" in remark
 
 
 def test_a_fault_is_named_beside_what_else_is_wrong(cell: Cell) -> None:

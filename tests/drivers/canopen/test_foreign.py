@@ -6,31 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from daq.config.drive import drive_from_text
-from daq.environment import shipped_configurations
 from drivers.canopen.pdo import Direction, PdoRecord, fixed_setpoints
 from drivers.errors import SetupRefused
 from drivers.motion.execute import execute
-from drivers.motion.move import Move
-from drivers.profiles.profile import DriveProfile
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync
-from tests.drivers.foreign import ForeignNode, foreign_cell
+from tests.drivers.foreign import MAKES, MOVE, ForeignNode, foreign_cell, shipped
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, permission
-
-MAKES = {
-    "pilz_prbt_0_1.dcf": "schunk-pilz-prbt",
-    "Schunk_0_63_cob.dcf": "schunk-pilz-prbt",
-    "Elmo_cob.dcf": "elmo-gold",
-    "ElmoSimplIQ_cob.dcf": "elmo-gold",
-    "maxon_epos4.eds": "maxon-epos4",
-}
-MOVE = Move((3000, -2000), (100_000, 80_000), (1_000_000, 800_000))
-
-
-def shipped(name: str) -> DriveProfile:
-    path = shipped_configurations() / "drives" / f"{name}.yaml"
-    return drive_from_text(path.read_bytes(), path.name)
 
 
 def written(bus: ScriptedBus) -> list[str]:

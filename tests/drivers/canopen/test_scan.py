@@ -5,7 +5,6 @@ from __future__ import annotations
 import binascii
 import re
 import struct
-from collections.abc import Callable
 
 import can
 import pytest
@@ -14,74 +13,11 @@ from drivers.canopen.link import Link
 from drivers.canopen.network import CanopenNetwork
 from drivers.errors import ObjectAccessError, SetupRefused
 from drivers.profiles.profile import ObjectEntry
+from tests.drivers.hostile import HOSTILE, NAME, Answer, Hostile, about, endless
 from tests.drivers.scripted import ScriptedBus, ScriptedNode, cell, lose_first_answer
 
-NAME = 0x1008
-STATUSWORD = 0x6041
-Answer = Callable[[bytes, ScriptedBus], bytes | None]
 
-
-class Hostile(ScriptedNode):
-    """A node that answers some requests in a way of its own; an answer of None is that of a sound node."""
-
-    def __init__(self, node_id: int, bus: ScriptedBus, answer: Answer) -> None:
-        super().__init__(node_id)
-        self._bus, self._own = bus, answer
-
-    def sdo(self, data: bytes) -> bytes | None:
-        own = self._own(data, self._bus)
-        return super().sdo(data) if own is None else own or None
-
-
-def about(data: bytes) -> int:
-    return int.from_bytes(data[1:3], "little")
-
-
-def endless(data: bytes, _: ScriptedBus) -> bytes | None:
-    """Send a name of seven bytes after the other."""
-    if data[0] >> 5 == 3:
-        return bytes((data[0] & 0x10,)) + b"endless"
-    return bytes((0x40, *data[1:4])) + bytes(4) if about(data) == NAME else None
-
-
-def huge(data: bytes, _: ScriptedBus) -> bytes | None:
-    """Announce a name of 4 GB."""
-    return bytes((0x41, *data[1:4])) + b"\xff" * 4 if about(data) == NAME else None
-
-
-def one_byte(data: bytes, _: ScriptedBus) -> bytes | None:
-    return bytes((0x4F, *data[1:4])) + bytes(4) if about(data) == STATUSWORD else None
-
-
-def nonsense(data: bytes, _: ScriptedBus) -> bytes | None:
-    return bytes((0xE7, *data[1:4])) + b"\xff" * 4 if about(data) != 0x1000 else None
-
-
-def flood(data: bytes, bus: ScriptedBus) -> bytes | None:
-    """Answer every request with answers about something else."""
-    if about(data) == 0x1000:
-        return None
-    for _ in range(200):
-        other = can.Message(arbitration_id=0x582, is_extended_id=False, data=bytes.fromhex("4399999900000000"))
-        bus.inject(other)
-    return b""
-
-
-def silent(data: bytes, _: ScriptedBus) -> bytes | None:
-    return None if about(data) == 0x1000 else b""
-
-
-@pytest.mark.parametrize(
-    ("answer", "problem"),
-    [
-        (endless, r"1008h:00: found \d+ bytes and no end, expected at most 256 bytes"),
-        (huge, "1008h:00: found 4294967295 bytes and no end"),
-        (one_byte, "6041h:00: has 8 bits, expected 16"),
-        (nonsense, "1018h:01: Unexpected response 0xE7"),
-        (flood, "1018h:01: 64 answers to other requests"),
-        (silent, "1018h:01: no answer within 0.5 s"),
-    ],
-)
+@pytest.mark.parametrize(("answer", "problem"), HOSTILE)
 def test_every_node_is_reported_whatever_one_of_them_does(answer: Answer, problem: str) -> None:
     network, bus = cell(3)
     bus.nodes = (bus.nodes[0], Hostile(2, bus, answer), bus.nodes[2])
