@@ -36,7 +36,7 @@ from drivers.profiles.cia402 import (
 )
 from drivers.profiles.profile import ObjectEntry
 from drivers.stream.sample import CellEvent, EventKind, Sample
-from drivers.stream.stream import SyncStream, nothing_to_send
+from drivers.stream.stream import MAX_MISSING_CYCLES, SyncStream, nothing_to_send
 from drivers.stream.sync import LockstepSync
 
 _NEW_SETPOINT = Command.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
@@ -325,6 +325,6 @@ class _Execution:
             powered = [axis for axis in self._axes if missing >> axis & 1 or self._state(axis) not in POWERLESS]
             self._network.powered -= {self._nodes[axis].node_id for axis in self._axes if axis not in powered}
             lockstep_silent = self._stream.silent and isinstance(self._stream.pacing, LockstepSync)
-            if not powered or silent > (0 if lockstep_silent else self._stream.max_missing_cycles):
+            if not powered or silent > (0 if lockstep_silent else MAX_MISSING_CYCLES):
                 break
         return tuple(powered)

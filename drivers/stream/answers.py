@@ -39,11 +39,11 @@ class StreamStatistics:
 class Slot:
     """Place of the values of one TPDO; column = field × axes + axis, with fields position, current, statusword."""
 
-    axis: int
-    bit: int
-    length: int
-    layout: Struct
-    columns: tuple[int, ...]
+    axis: int  #: index
+    bit: int  #: of this slot in the masks
+    length: int  #: of its data [bytes]
+    layout: Struct  #: of its data
+    columns: tuple[int, ...]  #: in `Answers.values`
 
 
 def slots_of(axes: Sequence[Axis], pdos: Sequence[AxisPdos] | None = None) -> dict[int, Slot]:
