@@ -399,27 +399,47 @@ class SyncStream:
             self._watch.faults.append(DriveFault(axis, reason, remedy=remedy))
         self._last_wrong_length[identifier] = self._cycles
 
-    def read_on(self, seconds: float) -> None:
-        """Count the frames left after the last cycle, and losses that are reported late. Sends nothing.
+    def read_on(self, seconds: float, lag_s: float = 0.0) -> None:
+        """Count the frames left after the last cycle, and losses that are reported late. Sends no SYNC.
 
-        Answers after the first such call, or after the next followed SYNC, do not count: another SYNC may have been
-        sent by then, to stop axes by SDO.
+        The first call stops the SYNC that is followed. An answer more than SYNCs shows that earlier ones were late
+        (answers.py). Answers after the first call do not count: another SYNC may have been sent by then, to stop axes
+        by SDO.
+
+        Args:
+            seconds: to read on; counted from the last SYNC, if more SYNCs come.
+            lag_s: longest further time to wait for these SYNCs, and for a capture process that has not received what
+                came in time.
 
         Raises:
             BusError: the bus is lost, and with it the last reports.
             NodeMisplaced: as `next`.
         """
-        clock, followed = self.pacing.clock, isinstance(self.pacing, FollowedSync)
-        over = self._cycle_over or self._early_sync is not None
-        end_ns = clock() + round(seconds * 1e9)
+        clock, bus, answers, pacing = self.pacing.clock, self._link.bus, self._answers, self.pacing
+        counted, self._cycle_over = not self._cycle_over, True
+        begun = self._early_sync is not None  # a cycle without a sample
+        if begun:
+            answers.begin()
+        last_ns = (end_ns := clock() + round(seconds * 1e9)) + round(lag_s * 1e9)
         with bus_errors(self._link.address):
-            while (left_ns := end_ns - clock()) > 0:
-                if (late := self._link.bus.recv(left_ns * 1e-9)) is None:
+            if counted and isinstance(pacing, FollowedSync) and pacing.stop is not None:
+                pacing.stop()
+            while (now_ns := clock()) < end_ns or (now_ns < last_ns and (read_until_ns(bus) or end_ns) < end_ns):
+                self._link.beat()
+                late = bus.recv((end_ns - now_ns) * 1e-9 if now_ns < end_ns else PATIENCE_S)
+                if late is None:
                     continue
-                over = over or (followed and _is_sync(late))
-                if not (over and late.arbitration_id in self._answers.slots):
+                if _is_sync(late) and (isinstance(pacing, FollowedSync) or not late.is_rx):
+                    if begun:
+                        answers.leave()
+                    answers.begin()
+                    begun = True
+                    end_ns = min(last_ns, max(end_ns, clock() + round(seconds * 1e9)))
+                slot = answers.slots.get(late.arbitration_id) if _is_plain(late) else None
+                if slot is None or (counted and not begun):
                     self._between_cycles(late)
-        self._cycle_over = True
+                elif counted and len(late.data) == slot.length:
+                    answers.take(late.arbitration_id, slot, late.data)
         self._note_losses()
         self._watch.note_events(self.time_ns)
 

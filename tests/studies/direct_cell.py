@@ -207,7 +207,7 @@ class DirectStream:
     def check(self) -> None:
         """No fault waits: a drive that leaves OPERATION ENABLED is seen in its statusword."""
 
-    def read_on(self, seconds: float) -> None:
+    def read_on(self, seconds: float, lag_s: float = 0.0) -> None:
         """Nothing comes behind the last cycle."""
 
     def emit(self, event: CellEvent) -> None:
