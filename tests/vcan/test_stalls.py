@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pytest
 
+from daq.cli.terminal import ONE_KEY_S
 from daq.errors import ExitCode
 from daq.log.reader import read_log
 from drivers.profiles.cia402 import State
@@ -224,6 +225,18 @@ def test_ctrl_c_stops_the_axes_on_a_flooded_bus(tmp_path: Path, figure: Callable
         assert closing_s < CLOSING_S
         with raw(INTERFACE) as end:
             assert states_after(end, 1) == [State.SWITCH_ON_DISABLED] * len(NODES)
+
+
+def test_a_second_ctrl_c_ends_at_once(tmp_path: Path, figure: Callable[[str], None]) -> None:
+    with recording(tmp_path) as run, flooded():
+        run.send(signal.SIGINT)
+        time.sleep(1.1 * ONE_KEY_S)
+        run.send(signal.SIGINT)
+        said, closing_s = run.end()
+        figure(f"flood of {FLOOD_HZ} frames/s, Ctrl-C twice: ended after {closing_s:.1f} s")
+        assert run.process.returncode == ExitCode.INTERRUPTED, said
+        assert "settings not restored (asked a second time)" in said
+        assert closing_s < CLOSING_S / 4
 
 
 def test_a_fault_stops_the_axes_on_a_flooded_bus(tmp_path: Path, figure: Callable[[str], None]) -> None:
