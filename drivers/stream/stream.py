@@ -97,7 +97,7 @@ class SyncStream:
         self._unlooked = 0
         self._behind = self._waited = self._cycle_over = False
         self._base = self._counted = self._losses = Losses()
-        self._watch = Watch(network, on_event)
+        self._watch = Watch(network, on_event, real_time=not isinstance(pacing, LockstepSync))
         self._cycles = self._skipped = self._reads_past_deadline = self._incomplete_cycles = self._silent_cycles = 0
         self._counts = self._answers.counts
 
