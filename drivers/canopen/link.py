@@ -147,10 +147,10 @@ class Link:
 
     def narrow(self) -> None:
         """Receive from now on only what concerns our axes, or is a command: a flood of others costs nothing."""
-        services = (EMCY, *range(0x180, SDO_REQUEST, 0x80))
+        services = (EMCY, *range(0x180, SDO_REQUEST, 0x80), HEARTBEAT)
         wanted = [(service + node_id, 0x7FF) for service in services for node_id in self.names]
         wanted += [(number, 0x7FF) for number in (NMT_COB_ID, SYNC_COB_ID, *LSS)]
-        wanted += [(SDO_REQUEST, 0x780), (HEARTBEAT, 0x780), (self.own_id or NMT_COB_ID, 0x7F)]
+        wanted += [(SDO_REQUEST, 0x780), (self.own_id or NMT_COB_ID, 0x7F)]
         receive_only(self.bus, wanted)
 
     def close(self) -> None:
