@@ -167,7 +167,7 @@ def record(
     with defer_full_gc(), network_of(cell, block_signals) as network, _sync_producer(cell, network) as wanted:
         network.prepare()
         _require_guarded(cell, network, unguarded)
-        polling = Polling(network, beside_stream=polling_fits(cell))
+        polling = Polling.found(network, beside_stream=polling_fits(cell))
         scales = network.scales()
         check_nameplates(cell_file, cell, scales)
         warnings = (
