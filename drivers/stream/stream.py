@@ -474,7 +474,7 @@ class SyncStream:
             if self._incomplete_cycles > MAX_MISSING_CYCLES:
                 # A reader that is late takes many cycles at once; those waited for no answer by the clock.
                 silent_ns = max(self.pacing.clock() - self._answered_ns, self._silent_cycles * self.pacing.period_ns)
-                silent_s = silent_ns * 1e-9 if len(silent) == axes else None
+                silent_s = silent_ns * 1e-9 if self.silent else None  # doubtful answers are answers
                 self._watch.faults.append(SampleLost(cycle, silent, names, silent_s))
         self._note_losses()
         statuswords = tuple(values[2 * axes :])

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.socketcan import CapturedMessage
 from drivers.canopen.split_bus import BusPart, SplitAddress, SplitBus
-from drivers.errors import BusError, DriverError
+from drivers.errors import BusError, DriverError, SampleLost
 from drivers.stream.answers import StreamStatistics
 from drivers.stream.sample import Sample
 from drivers.stream.stream import MAX_MISSING_CYCLES, SyncStream
@@ -182,6 +182,14 @@ def test_each_bus_of_two_has_its_own_order(delays_ns: list[list[int]], stops_ns:
         (s.cycle, s.position_counts, s.missing) for s in plain
     ]
     assert counts_stopped == counts
+
+
+def test_axes_whose_answers_are_doubtful_are_not_called_silent() -> None:
+    delays_ns = [300_000] * 4 + [NEVER] * 3 + [300_000] * (CYCLES - 7)
+    _, _, faults = run([delays_ns] * 2, (), producer=True)
+    assert [str(fault) for fault in faults if isinstance(fault, SampleLost)] == [
+        "cycle 7: no answer from J1 (node 1), J2 (node 2)"
+    ]
 
 
 @pytest.mark.parametrize("producer", [True, False])
