@@ -4,7 +4,8 @@ An answer belongs to the SYNC before it on the bus. A TPDO carries no cycle numb
 one may be the missing one, late. If two come, the first is the late one. If one comes, it is doubtful: its sample is
 marked missing too, and the next cycle waits for two again. If only one comes there too, the missing answer counts as
 lost. Should it and all answers since have been late, then one more comes than SYNCs were sent, at the latest after the
-last SYNC: a duplicate, which no fit accepts. For this `SyncStream.read_on` stops the SYNC that the stream follows.
+last SYNC (unless one is really lost meanwhile): a duplicate, which no fit accepts. For this `SyncStream.read_on` stops
+the SYNC that the stream follows.
 """
 
 from __future__ import annotations
