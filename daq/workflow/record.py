@@ -171,7 +171,7 @@ def record(
     with defer_full_gc(), network_of(cell, block_signals) as network, _sync_producer(cell, network) as wanted:
         network.prepare()
         _require_guarded(cell, network, unguarded)
-        polling = Polling(network, beside_stream=polling_fits(cell))
+        polling = Polling.found(network, beside_stream=polling_fits(cell))
         scales = network.scales()
         check_nameplates(cell_file, cell, scales)
         warnings = (
@@ -490,7 +490,8 @@ def _pacing(cell: Cell, start_ns: int, clocks: Clocks, producer: SyncProducer | 
         producer.start()  # again: it may have ended while nothing was recorded
         seen = producer.seen if isinstance(producer, KernelProducer) else None  # a drive keeps its period by itself
         silence_s = max(SYNC_SILENCE_S, SYNC_SILENCE_PERIODS * period_ns * 1e-9)
-        return FollowedSync(period_ns, producer.name, seen is not None, silence_s, seen, start_ns, clock)
+        stop = producer.pause
+        return FollowedSync(period_ns, producer.name, seen is not None, silence_s, seen, stop, start_ns, clock)
     if sync.pacing is declared.PacingMode.LOCKSTEP:
         return LockstepSync(period_ns, timeout_s=LOCKSTEP_TIMEOUT_S, start_ns=start_ns, clock=clock)
     return TimedSync(period_ns, start_ns=start_ns, clock=clock)

@@ -17,7 +17,7 @@ import can
 from drivers.canopen.bus import bus_errors, send_burst
 from drivers.canopen.emcy import describe
 from drivers.canopen.sdo import SDO_ANSWER, SDO_REQUEST, Clock, ObjectAccess, SdoPolicy, SynchronousSdoClient
-from drivers.canopen.socketcan import receive_only
+from drivers.canopen.socketcan import CapturedMessage, receive_only
 from drivers.canopen.split_bus import BUS_OFF, BUS_OFF_REASON, CellAddress, open_cell_bus
 from drivers.errors import BusError, StateRefused, node_label
 from drivers.stream.sample import CellEvent, EventKind
@@ -30,7 +30,11 @@ _RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))  #: Set-points of a drive (CiA 
 _LSS_NAME = "a layer setting service, which changes node ids"
 _NAMES = {NMT_COB_ID: "an NMT command", SYNC_COB_ID: "a SYNC", **dict.fromkeys(LSS, _LSS_NAME)}
 BOOTS_S = 0.5  #: Two boot-up messages in this time are those of two devices
-SURPLUS_BEATS = 2  #: A change of the NMT state may have one of its own
+BEATS_KEPT = 8  #: Heartbeats of each node by which a second device is found
+BEATS_JUDGED, JUDGED_PERIODS = 4, 2.2
+"""So many heartbeats of one device last three periods; those of two that have one node id, two at most."""
+BEATS_S = 3.0  #: Longest time to listen for the heartbeats of a second device
+PERIODS_HEARD = 3.0  #: Periods in which two devices send `BEATS_JUDGED` heartbeats, and then at least one more
 PUMP_S = 0.1  #: Longest time spent on frames that have already arrived, however fast more arrive
 # linux/can/error.h: classes of an error frame, and the controller's state in its second byte.
 _CONTROLLER, _RESTARTED = 0x004, 0x100
@@ -90,6 +94,11 @@ def command_name(identifier: int, names: Mapping[int, str]) -> str:
     return f"{name} {shown}"
 
 
+def _sent_ns(message: can.Message, now_ns: int) -> int:
+    """Return the time of a frame by its own stamp where it has one, however late it is read; one clock for one bus."""
+    return message.monotonic_ns if isinstance(message, CapturedMessage) else round(message.timestamp * 1e9) or now_ns
+
+
 class Link:
     """An open bus and the last known state of its nodes. Methods that use the bus raise BusError when it is lost."""
 
@@ -109,7 +118,7 @@ class Link:
         self.boots: Counter[int] = Counter()  #: Boot-up messages of each node id right after another
         self.twice: dict[int, str] = {}  #: Node ids whose request was answered twice, and by what
         self.asked_by: dict[int, object] = {}  #: Client of the last SDO request to each node; none where it had none
-        self._beats: dict[int, tuple[int, int]] = {}  # number of heartbeats, and since when [ns]
+        self._beats: dict[int, deque[tuple[int, int]]] = {}  # times [ns] and states of the last heartbeats
         self.silent: set[int] = set()  #: Nodes that did not answer their last request, and sent nothing since
         self.heard: set[int] = set()  #: Node ids of which any frame arrived since the bus was opened
         #: Number of frames by identifier that only we should send (NMT, SYNC, LSS, SDO request, set-point of one of our
@@ -138,10 +147,10 @@ class Link:
 
     def narrow(self) -> None:
         """Receive from now on only what concerns our axes, or is a command: a flood of others costs nothing."""
-        services = (EMCY, *range(0x180, SDO_REQUEST, 0x80))
+        services = (EMCY, *range(0x180, SDO_REQUEST, 0x80), HEARTBEAT)
         wanted = [(service + node_id, 0x7FF) for service in services for node_id in self.names]
         wanted += [(number, 0x7FF) for number in (NMT_COB_ID, SYNC_COB_ID, *LSS)]
-        wanted += [(SDO_REQUEST, 0x780), (HEARTBEAT, 0x780), (self.own_id or NMT_COB_ID, 0x7F)]
+        wanted += [(SDO_REQUEST, 0x780), (self.own_id or NMT_COB_ID, 0x7F)]
         receive_only(self.bus, wanted)
 
     def close(self) -> None:
@@ -232,14 +241,7 @@ class Link:
         self.heard.add(node_id)
         self.silent.discard(node_id)
         if service == HEARTBEAT and message.data:
-            previous, state = self.nmt.get(node_id), message.data[0] & 0x7F
-            now_ns = self.clock()
-            self._note_boot(node_id, state, now_ns)
-            count, since_ns = self._beats.get(node_id, (0, now_ns))
-            self._beats[node_id] = (count + 1, since_ns)
-            self.nmt[node_id], self.heard_ns[node_id] = state, now_ns
-            if previous != state:
-                self._events.append((node_id, EventKind.NMT, state, f"NMT {nmt_name(previous)} -> {nmt_name(state)}"))
+            self._note_heartbeat(node_id, message)
         elif service == EMCY and len(message.data) == 8:
             code, register, data = struct.unpack("<HB5s", message.data)
             # CiA 301: codes 00xxh report the end of an error.
@@ -282,6 +284,17 @@ class Link:
             seen = command_name(identifier, self.names)
             self._events.append((0, EventKind.BUS_BUSY, identifier, f"{seen} that we did not send"))
 
+    def _note_heartbeat(self, node_id: int, message: can.Message) -> None:
+        previous, state, now_ns = self.nmt.get(node_id), message.data[0] & 0x7F, self.clock()
+        self._note_boot(node_id, state, now_ns)
+        if state == NmtState.BOOT_UP:
+            self.count_beats(node_id)
+        else:
+            self._beats.setdefault(node_id, deque(maxlen=BEATS_KEPT)).append((_sent_ns(message, now_ns), state))
+        self.nmt[node_id], self.heard_ns[node_id] = state, now_ns
+        if previous != state:
+            self._events.append((node_id, EventKind.NMT, state, f"NMT {nmt_name(previous)} -> {nmt_name(state)}"))
+
     def _note_boot(self, node_id: int, state: int, now_ns: int) -> None:
         again = state == NmtState.BOOT_UP == self.nmt.get(node_id)
         if again and now_ns - self.heard_ns[node_id] < BOOTS_S * 1e9:
@@ -295,24 +308,38 @@ class Link:
             self.twice.setdefault(node_id, f"two answers to one request for {entry} ({values})")
 
     def count_beats(self, node_id: int) -> None:
-        """Count the heartbeats of a node from now on: its period has changed."""
-        self._beats[node_id] = (0, self.clock())
+        """Forget the heartbeats of a node: its period has changed, or it has booted."""
+        self._beats.pop(node_id, None)
+
+    def hear_beats(self, period_ms: int) -> None:
+        """Listen for as long as `shared_id` needs, where the slowest node has this period."""
+        self.wait(min(BEATS_S, PERIODS_HEARD * period_ms * 1e-3))
 
     def shared_id(self, node_id: int, period_ms: int) -> str:
         """Describe the evidence that two devices have a node id; empty without any.
 
         Args:
             node_id: of the node.
-            period_ms: of its heartbeat since `count_beats`, or since its first one; 0 where that is unknown.
+            period_ms: of its heartbeat since `count_beats`, or since its first one; 0 where that is unknown. One late
+                heartbeat is no evidence.
         """
         if node_id in self.twice:
             return self.twice[node_id]
         if self.boots[node_id]:
             return f"{self.boots[node_id] + 1} boot-up messages within {BOOTS_S:g} s"
-        count, since_ns = self._beats.get(node_id, (0, 0))
-        elapsed_ms = (self.clock() - since_ns) * 1e-6
-        if period_ms and count > SURPLUS_BEATS + 1.5 * elapsed_ms / period_ms:
-            return f"{count} heartbeats in {elapsed_ms:.0f} ms, its period is {period_ms} ms"
+        beats = tuple(self._beats.get(node_id, ()))
+        times_ns, states = [at_ns for at_ns, _ in beats], [state for _, state in beats]
+        lasting = [end - begin for begin, end in zip(times_ns, times_ns[BEATS_JUDGED - 1 :], strict=False)]
+        if sum(each_ns < JUDGED_PERIODS * 1e6 * period_ms for each_ns in lasting) > 1:
+            elapsed_ms = (times_ns[-1] - times_ns[0]) * 1e-6
+            return f"{len(beats)} heartbeats in {elapsed_ms:.0f} ms, its period is {period_ms} ms"
+        between = [
+            (before, state)
+            for before, state, after in zip(states, states[1:], states[2:], strict=False)
+            if before == after != state
+        ]
+        if len(between) > 1:
+            return f"heartbeats {nmt_name(between[0][0])} and {nmt_name(between[0][1])} in turn"
         return ""
 
     def take_events(self, time_ns: int, node_ids: Sequence[int]) -> tuple[CellEvent, ...]:

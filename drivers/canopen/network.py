@@ -274,6 +274,10 @@ class CanopenNetwork:
         for axis, identity, scale in zip(self.axes, identities, self.scales(), strict=True):
             self._readback[axis.name] = self._setups[axis.node_id].describe(identity, scale, self.guard_ms)
         self._command_all(NmtCommand.START, NmtState.OPERATIONAL)
+        for node_id in self.node_ids:
+            # SYNC has been sent meanwhile: with it a cell in lockstep, and its heartbeats, may be faster than time.
+            self.link.count_beats(node_id)
+        self.link.hear_beats(self.heartbeat_ms)
         self._require_own_ids(self.heartbeat_ms)
         self.link.narrow()
 

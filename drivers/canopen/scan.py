@@ -75,21 +75,23 @@ def scan_link(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[Found
     answered = answering(link, node_ids, wait_s)
     several = {n for n in answered if link.answered[n] > 1 and SDO_REQUEST + n not in link.foreign}
     alive = sorted(set(answered) | (set(link.nmt) & set(node_ids)))
-    found = []
-    for node_id in alive:
-        if node_id not in answered:
-            shared = link.shared_id(node_id, 0)
-            found.append(FoundNode(node_id, None, None, None, link.nmt.get(node_id), None, shared))
-            continue
-        node = _describe(link, node_id)
-        if node_id in several and not node.shared:
-            node = replace(node, shared="two answers to one request for 1000h:00")
-        found.append(node)
-    return tuple(found)
+    nothing = (None, None, None, None, None)
+    found = [_describe(link, n) if n in answered else (FoundNode(n, *nothing), 0) for n in alive]
+    link.hear_beats(max((period_ms for _, period_ms in found), default=0))  # of all nodes at once
+    nodes = []
+    for node, period_ms in found:
+        shared = link.shared_id(node.node_id, period_ms)
+        if node.node_id in several and not shared:
+            shared = "two answers to one request for 1000h:00"
+        nodes.append(replace(node, nmt=link.nmt.get(node.node_id), shared=shared))
+    return tuple(nodes)
 
 
-def _describe(link: Link, node_id: int) -> FoundNode:
-    """Read what a node reports of itself; an object that it reports badly does not keep the others from it."""
+def _describe(link: Link, node_id: int) -> tuple[FoundNode, int]:
+    """Read what a node reports of itself, and the period of its heartbeat [ms]; 0 for none.
+
+    An object that it reports badly does not keep the others from it.
+    """
     access, problems = link.objects(node_id, SCAN_POLICY), list[str]()
     end_ns = link.clock() + round(NODE_S * 1e9)
 
@@ -109,8 +111,7 @@ def _describe(link: Link, node_id: int) -> FoundNode:
     revision, statusword, period_ms = (
         reported(partial(access.read, entry)) for entry in (REVISION, STATUSWORD, HEARTBEAT_TIME)
     )
-    shared = link.shared_id(node_id, period_ms or 0)
-    return FoundNode(node_id, identity, revision, name, link.nmt.get(node_id), statusword, shared, tuple(problems))
+    return FoundNode(node_id, identity, revision, name, None, statusword, problems=tuple(problems)), period_ms or 0
 
 
 def read_identity(access: ObjectAccess) -> Identity:

@@ -47,6 +47,13 @@ def upload_request(node_id: int, entry: ObjectEntry) -> can.Message:
     return can.Message(arbitration_id=SDO_REQUEST + node_id, is_extended_id=False, data=data)
 
 
+def download_request(node_id: int, entry: ObjectEntry, value: int) -> can.Message:
+    """Return the request to write an object of at most four bytes."""
+    command = _INITIATE_DOWNLOAD << 5 | (4 - entry.bits // 8) << 2 | 0x03  # expedited, with its size
+    data = _HEAD.pack(command, entry.index, entry.subindex) + struct.pack("<L", value)
+    return can.Message(arbitration_id=SDO_REQUEST + node_id, is_extended_id=False, data=data)
+
+
 def upload_answer(data: bytes, entry: ObjectEntry) -> UploadAnswer | None:
     """Read an SDO answer (CiA 301, SDO upload initiate); None for one that is not about this object.
 

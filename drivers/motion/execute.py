@@ -36,7 +36,7 @@ from drivers.profiles.cia402 import (
 )
 from drivers.profiles.profile import ObjectEntry
 from drivers.stream.sample import CellEvent, EventKind, Sample
-from drivers.stream.stream import SyncStream, nothing_to_send
+from drivers.stream.stream import LARGEST_LAG_NS, MAX_MISSING_CYCLES, SyncStream, nothing_to_send
 from drivers.stream.sync import LockstepSync
 
 _NEW_SETPOINT = Command.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
@@ -274,8 +274,9 @@ class _Execution:
         unconfirmed = tuple(self._axes)
         try:
             unconfirmed = yield from self._stop_by_pdo()
-            # The rest of the last cycle is counted before SDO answers are read.
-            self._stream.read_on(self._stream.pacing.period_ns * 1e-9)
+            # What is left is counted before SDO answers are read; axes that may have power do not wait for it.
+            periods, lag_s = (1, 0.0) if unconfirmed else (MAX_MISSING_CYCLES + 2, LARGEST_LAG_NS * 1e-9)
+            self._stream.read_on(periods * self._stream.pacing.period_ns * 1e-9, lag_s)
         except DriverError as error:
             # One of several buses may have failed, or a node is misplaced: the others are stopped by SDO.
             self.emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop by PDO: {error}")
@@ -325,6 +326,6 @@ class _Execution:
             powered = [axis for axis in self._axes if missing >> axis & 1 or self._state(axis) not in POWERLESS]
             self._network.powered -= {self._nodes[axis].node_id for axis in self._axes if axis not in powered}
             lockstep_silent = self._stream.silent and isinstance(self._stream.pacing, LockstepSync)
-            if not powered or silent > (0 if lockstep_silent else self._stream.max_missing_cycles):
+            if not powered or silent > (0 if lockstep_silent else MAX_MISSING_CYCLES):
                 break
         return tuple(powered)

@@ -95,9 +95,15 @@ class ToggleBits:
 
 
 class Watch:
-    """Last reports of a network's drives."""
+    """Last reports of a network's drives.
 
-    def __init__(self, network: CanopenNetwork, on_event: EventSink) -> None:
+    Args:
+        network: of the drives.
+        on_event: receives what they report.
+        real_time: whether the drives' time is that of the clock; in lockstep their heartbeats may come faster.
+    """
+
+    def __init__(self, network: CanopenNetwork, on_event: EventSink, *, real_time: bool) -> None:
         self.faults: deque[DriverError] = deque()  #: Not raised yet, in the order in which they were seen
         self._network = network
         self._link = network.link
@@ -107,6 +113,8 @@ class Watch:
         self._begun = False
         self._allowed_silence_ns = round(network.heartbeat_ms * 1e6 * HEARTBEAT_PERIODS)
         self._next_heartbeat_check_ns = 0
+        self._real_time = real_time
+        self._shared: set[int] = set()  # nodes of which it was reported
         self._heard_at: dict[int, tuple[int, int, int]] = {}
         self._limited_since_ns: dict[int, int] = {}
         self._toggle_bits = ToggleBits(network.axes)
@@ -183,6 +191,13 @@ class Watch:
             elif event.kind is EventKind.NMT and event.code != NmtState.OPERATIONAL and self._begun:
                 self.faults.append(DriveFault(node, f"left OPERATIONAL, is {nmt_name(event.code)}"))
 
+    def _check_node_id(self, axis: int, node: Axis) -> None:
+        """Report a second device with the node id of an axis."""
+        if shared := self._link.shared_id(node.node_id, self._network.heartbeat_ms):
+            self._shared.add(node.node_id)
+            remedy = "two devices have this node id: give one of them another"
+            self.faults.append(DriveFault(node, shared, remedy=remedy))
+
     def _check_heartbeats(self, time_ns: int, clock_ns: int) -> None:
         """Report nodes that are silent by the clock *and* in the time of the samples.
 
@@ -190,6 +205,8 @@ class Watch:
         """
         for axis, node in enumerate(self._network.axes):
             node_id = node.node_id
+            if self._real_time and node_id not in self._shared:
+                self._check_node_id(axis, node)
             # Silence counts from the first cycle on: before it the bus was not read.
             heard_ns = self._link.heard_ns.get(node_id, 0)
             known_ns, since_clock_ns, since_time_ns = self._heard_at.get(node_id, (-1, 0, 0))

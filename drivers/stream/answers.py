@@ -1,9 +1,11 @@
 """The answers of the axes to SYNC: the values in each TPDO, and the SYNC to which it belongs.
 
-An answer belongs to the SYNC before it on the bus. But a TPDO carries no cycle number: after a missing answer, the next
-one may be that answer, late. Only if two come is it known which is which. If one comes, it is doubtful: its sample says
-that it is missing too, and counts as such. In the cycle after that, two are waited for once more. If all later answers
-were one cycle late, a cycle with two would end that, and these count as a duplicate, which no fit accepts.
+An answer belongs to the SYNC before it on the bus. A TPDO carries no cycle number, so after a missing answer the next
+one may be the missing one, late. If two come, the first is the late one. If one comes, it is doubtful: its sample is
+marked missing too, and the next cycle waits for two again. If only one comes there too, the missing answer counts as
+lost. Should it and all answers since have been late, then one more comes than SYNCs were sent, at the latest after the
+last SYNC (unless one is really lost meanwhile): a duplicate, which no fit accepts. For this `SyncStream.read_on` stops
+the SYNC that the stream follows.
 """
 
 from __future__ import annotations
@@ -39,11 +41,11 @@ class StreamStatistics:
 class Slot:
     """Place of the values of one TPDO; column = field × axes + axis, with fields position, current, statusword."""
 
-    axis: int
-    bit: int
-    length: int
-    layout: Struct
-    columns: tuple[int, ...]
+    axis: int  #: index
+    bit: int  #: of this slot in the masks
+    length: int  #: of its data [bytes]
+    layout: Struct  #: of its data
+    columns: tuple[int, ...]  #: in `Answers.values`
 
 
 def slots_of(axes: Sequence[Axis], pdos: Sequence[AxisPdos] | None = None) -> dict[int, Slot]:
@@ -123,16 +125,20 @@ class Answers:
         else:
             self.counts["duplicate"] += 1
 
+    def leave(self) -> None:
+        """End a cycle of which no sample is made, or begin to end one."""
+        self._missed_slots = self._all & ~self._answered_slots
+        self._owed_slots = self._missed_slots | sum(self._before)
+
     def end(self) -> int:
         """End a cycle; returns the axes without a complete answer, bit i for axis i."""
-        self._missed_slots = self._owed_slots = self._all & ~self._answered_slots
-        if not (self._owed_slots or self._before):
+        self.leave()
+        if not self._owed_slots:
             self.counts["frames"] += self._answered_slots.bit_count()
             return 0
         absent = 0
         for slot in self.slots.values():
             if slot.bit in self._before:
-                self._owed_slots |= slot.bit
                 for column, value in zip(slot.columns, self._before[slot.bit], strict=True):
                     self.values[column] = value
                 self.counts["late"] += 1

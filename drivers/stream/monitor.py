@@ -180,8 +180,8 @@ class CellMonitor:
             axes: of the cell.
             on_sample: receives every sample while the bus is watched. An axis that did not answer is marked missing.
             wall_minus_monotonic_ns: offset of the stamps of samples and events from the link's clock [ns].
-            taken: whether a recorder has taken the bus and listens before it sends; from then on nothing is sent, since
-                it would refuse to begin.
+            taken: whether a recorder has taken the bus and listens before it sends; from then on nothing is sent,
+                because the recorder refuses a bus on which it hears requests.
         """
         self.period_ns: int | None = None
         """Period of SYNC; SYNCs that this program missed then leave a gap in the samples' cycles. None counts SYNCs."""

@@ -1,10 +1,10 @@
 """Torque and temperature of the drives, read a few times a second by SDO beside the stream.
 
 Nothing waits for an answer. At most one request is on its way; it is sent in a cycle without set-points, and its answer
-is taken from the frames that the stream reads anyway. SDO has the lowest priority on the bus, so a request or an answer
-delays the frames of a cycle by its own length at most; `daq.config.bus` decides whether a period has room for both. A
-lost answer is a missing reading, and so is an abort: the object is read again at its next turn, unless the drive says
-that it has none.
+is taken from the frames that the stream reads anyway. SDO has a lower priority than SYNC and PDOs, so a request or an
+answer delays the frames of a cycle by its own length at most; `daq.config.bus` decides whether a period has room for
+both. A lost answer is a missing reading, and so is an abort: the object is read again at its next turn, unless the
+drive says that it has none.
 """
 
 from __future__ import annotations
@@ -45,18 +45,14 @@ class _Source:
 
 
 class Polling:
-    """The slow objects of a prepared network."""
+    """The slow objects of a prepared network; `found` finds them.
+
+    Args:
+        network: prepared.
+        beside_stream: whether the bus has room for requests while a stream runs.
+    """
 
     def __init__(self, network: CanopenNetwork, *, beside_stream: bool = True) -> None:
-        """Find the objects that the drives really have.
-
-        Args:
-            network: prepared; no stream of it runs yet.
-            beside_stream: whether the bus has room for requests while a stream runs.
-
-        Raises:
-            BusError: the bus is lost.
-        """
         self._network, self._beside_stream = network, beside_stream
         self._stream: SyncStream | None = None
         self._keep: Callable[[SlowReading], None] = lambda _: None
@@ -64,6 +60,15 @@ class Polling:
         self._asked_ns = 0
         self._sources: list[_Source] = []
         self._remarks: list[str] = []
+
+    @classmethod
+    def found(cls, network: CanopenNetwork, *, beside_stream: bool = True) -> Polling:
+        """Find the objects that the drives really have; no stream of the network runs yet.
+
+        Raises:
+            BusError: the bus is lost.
+        """
+        polling = cls(network, beside_stream=beside_stream)
         for number, (axis, scale) in enumerate(zip(network.axes, network.scales(), strict=True)):
             for quantity, (entry, per_unit) in slow_objects(axis, scale).items():
                 try:
@@ -71,17 +76,18 @@ class Polling:
                 except ObjectAccessError as error:
                     if error.abort_code is None or error.abort_code in NO_SUCH_OBJECT:
                         why = "" if error.abort_code is not None else f" that can be read ({error.reason})"
-                        self._remarks.append(
+                        polling._remarks.append(
                             f"{axis.name}: the drive has no {quantity.value} in {entry}{why}; it is not logged"
                         )
                         continue
-                    self._remarks.append(
+                    polling._remarks.append(
                         f"{axis.name}: the drive refused its {quantity.value} in {entry} at first "
                         f"({error.reason}); it is asked again in the run"
                     )
-                source = _Source(self, number, axis.node_id, entry, quantity, per_unit)
-                self._sources.append(source)
+                source = _Source(polling, number, axis.node_id, entry, quantity, per_unit)
+                polling._sources.append(source)
                 network.link.listen(axis.node_id, source)
+        return polling
 
     @property
     def remarks(self) -> tuple[str, ...]:

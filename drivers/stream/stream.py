@@ -27,6 +27,7 @@ from drivers.stream.sync import FollowedSync, LockstepSync, Pacing, SyncRate, Ti
 SHORTENED, STRAGGLING = 16, 4
 """Divisors of a lockstep time-out: if no axis answered the last SYNC, and once another axis has answered this one."""
 
+MAX_MISSING_CYCLES = 3  #: Tolerated incomplete cycles in a row; they are counted, and marked in the samples
 LARGEST_LAG_NS = 1_000_000_000  #: Largest delay of the reader behind the bus; older data cannot protect moving axes
 LOOK_EVERY = 64  #: Frames between two looks at the clock while frames are waiting: each is a system call
 PATIENCE_S = 0.02  #: Time between two looks whether the capture process has received what came before a deadline
@@ -54,10 +55,9 @@ class SyncStream:
         network: a prepared network; only the stream may read its bus meanwhile.
         pacing: schedule of SYNC.
         on_event: receives EMCY, NMT and CiA 402 changes and losses before the sample of their cycle is returned.
-        max_missing_cycles: tolerated number of incomplete cycles in a row; they are counted, and marked in the samples.
 
     Raises:
-        SampleLost: by ``next``, as all of these: more incomplete cycles in a row than tolerated.
+        SampleLost: by ``next``, as all of these: more incomplete cycles in a row than `MAX_MISSING_CYCLES`.
         DriveFault: an EMCY, a new fault or following error, a node that left OPERATIONAL or sends no heartbeat for two
             of its periods, an active limit, stale data, or a PDO of wrong length twice in a row.
         BusBusy: another master sends SYNC, NMT commands or set-points of an axis.
@@ -71,11 +71,9 @@ class SyncStream:
         network: CanopenNetwork,
         pacing: Pacing,
         on_event: EventSink = lambda _event: None,
-        max_missing_cycles: int = 3,
     ) -> None:
         self.network = network
         self.pacing: Pacing = pacing
-        self.max_missing_cycles = max_missing_cycles
         #: Takes the events; a caller inserts its own here.
         self.emit = on_event
         self.silent = False  #: Whether no axis answered the last SYNC
@@ -95,11 +93,11 @@ class SyncStream:
         # None where SYNC does not come back.
         self._sent: deque[tuple[int, int]] | None = None
         self._rate = SyncRate(pacing.period_ns)
-        self._take: Callable[[], can.Message | None] | None = None
+        self._take_batched: Callable[[], can.Message | None] | None = None
         self._unlooked = 0
         self._behind = self._waited = self._cycle_over = False
         self._base = self._counted = self._losses = Losses()
-        self._watch = Watch(network, on_event)
+        self._watch = Watch(network, on_event, real_time=not isinstance(pacing, LockstepSync))
         self._cycles = self._skipped = self._reads_past_deadline = self._incomplete_cycles = self._silent_cycles = 0
         self._counts = self._answers.counts
 
@@ -155,7 +153,7 @@ class SyncStream:
     def _begin(self) -> None:
         """Discard the frames from before the first SYNC; losses before it do not count."""
         bus, begun_ns = self._link.bus, self.pacing.clock()
-        self._take = getattr(bus, "take", None)
+        self._take_batched = getattr(bus, "take", None)
         if isinstance(self.pacing, TimedSync) and read_until_ns(bus) is not None:
             self._sent = deque()
         for message in self._waiting():
@@ -187,9 +185,9 @@ class SyncStream:
             self._watch.faults.append(BusError(str(self._link.address), reason))
         return late
 
-    def _until_sync(self, pacing: FollowedSync, end_ns: int) -> can.Message | None:
+    def _next_arrived(self, pacing: FollowedSync, end_ns: int) -> can.Message | None:
         """Return the next frame that arrived before a deadline, even if it is read late; None without any."""
-        if (taken := self._taken()) is not None:
+        if (taken := self._batched()) is not None:
             return taken
         bus = self._link.bus
         self._link.beat()
@@ -207,10 +205,10 @@ class SyncStream:
             now_ns = pacing.clock()
         return message
 
-    def _taken(self) -> can.Message | None:
+    def _batched(self) -> can.Message | None:
         """Return a frame that was received with the one before, without a look at the clock; now and then None."""
         self._unlooked = (self._unlooked + 1) % LOOK_EVERY
-        return None if self._take is None or self._unlooked == 0 else self._take()
+        return None if self._take_batched is None or self._unlooked == 0 else self._take_batched()
 
     def _follow_sync(self, pacing: FollowedSync) -> int:
         """Send waiting frames, and read until the next SYNC; returns the deadline of the SYNC after it."""
@@ -222,7 +220,7 @@ class SyncStream:
         # A cycle that waited in vain for answers waited for this SYNC too: half of the time-out is enough.
         end_ns = pacing.clock() + round(pacing.timeout_s * 1e9) // (2 if self._waited else 1)
         while sync is None:
-            message = self._until_sync(pacing, end_ns)
+            message = self._next_arrived(pacing, end_ns)
             if message is None:
                 return self._lose_sync(pacing)
             if _is_sync(message):
@@ -291,7 +289,7 @@ class SyncStream:
     def _read_and_send(self) -> can.Message | None:
         """Return the next frame, and send SYNC when it is due; None once SYNC does not come back."""
         sent = self._sent
-        if sent is not None and (taken := self._taken()) is not None:
+        if sent is not None and (taken := self._batched()) is not None:
             return taken
         while sent is not None:
             self._link.beat()
@@ -347,7 +345,7 @@ class SyncStream:
         recv, clock = self._link.bus.recv, self.pacing.clock
         if isinstance(self.pacing, FollowedSync):
             # Only the order on the bus counts: frames that have arrived are read first, whatever the clock shows.
-            message = self._until_sync(self.pacing, deadline_ns)
+            message = self._next_arrived(self.pacing, deadline_ns)
             self._waited = message is None
             if message is not None and _is_sync(message):
                 self._early_sync = message
@@ -401,27 +399,47 @@ class SyncStream:
             self._watch.faults.append(DriveFault(axis, reason, remedy=remedy))
         self._last_wrong_length[identifier] = self._cycles
 
-    def read_on(self, seconds: float) -> None:
-        """Count the frames left after the last cycle, and losses that are reported late. Sends nothing.
+    def read_on(self, seconds: float, lag_s: float = 0.0) -> None:
+        """Count the frames left after the last cycle, and losses that are reported late. Sends no SYNC.
 
-        Answers after the first such call, or after the next followed SYNC, do not count: another SYNC may have been
-        sent by then, to stop axes by SDO.
+        The first call stops the SYNC that is followed. An answer more than SYNCs shows that earlier ones were late
+        (answers.py). Answers after the first call do not count: another SYNC may have been sent by then, to stop axes
+        by SDO.
+
+        Args:
+            seconds: to read on; counted from the last SYNC, if more SYNCs come.
+            lag_s: longest further time to wait for these SYNCs, and for a capture process that has not received what
+                came in time.
 
         Raises:
             BusError: the bus is lost, and with it the last reports.
             NodeMisplaced: as `next`.
         """
-        clock, followed = self.pacing.clock, isinstance(self.pacing, FollowedSync)
-        over = self._cycle_over or self._early_sync is not None
-        end_ns = clock() + round(seconds * 1e9)
+        clock, bus, answers, pacing = self.pacing.clock, self._link.bus, self._answers, self.pacing
+        counted, self._cycle_over = not self._cycle_over, True
+        begun = self._early_sync is not None  # a cycle without a sample
+        if begun:
+            answers.begin()
+        last_ns = (end_ns := clock() + round(seconds * 1e9)) + round(lag_s * 1e9)
         with bus_errors(self._link.address):
-            while (left_ns := end_ns - clock()) > 0:
-                if (late := self._link.bus.recv(left_ns * 1e-9)) is None:
+            if counted and isinstance(pacing, FollowedSync) and pacing.stop is not None:
+                pacing.stop()
+            while (now_ns := clock()) < end_ns or (now_ns < last_ns and (read_until_ns(bus) or end_ns) < end_ns):
+                self._link.beat()
+                late = bus.recv((end_ns - now_ns) * 1e-9 if now_ns < end_ns else PATIENCE_S)
+                if late is None:
                     continue
-                over = over or (followed and _is_sync(late))
-                if not (over and late.arbitration_id in self._answers.slots):
+                if _is_sync(late) and (isinstance(pacing, FollowedSync) or not late.is_rx):
+                    if begun:
+                        answers.leave()
+                    answers.begin()
+                    begun = True
+                    end_ns = min(last_ns, max(end_ns, clock() + round(seconds * 1e9)))
+                slot = answers.slots.get(late.arbitration_id) if _is_plain(late) else None
+                if slot is None or (counted and not begun):
                     self._between_cycles(late)
-        self._cycle_over = True
+                elif counted and len(late.data) == slot.length:
+                    answers.take(late.arbitration_id, slot, late.data)
         self._note_losses()
         self._watch.note_events(self.time_ns)
 
@@ -453,10 +471,10 @@ class SyncStream:
             for axis, name in zip(silent, names, strict=True):
                 text = f"no complete answer from {name} to cycle {cycle}"
                 self.emit(CellEvent(self.time_ns, axis, EventKind.SAMPLE_LOST, cycle, text))
-            if self._incomplete_cycles > self.max_missing_cycles:
+            if self._incomplete_cycles > MAX_MISSING_CYCLES:
                 # A reader that is late takes many cycles at once; those waited for no answer by the clock.
                 silent_ns = max(self.pacing.clock() - self._answered_ns, self._silent_cycles * self.pacing.period_ns)
-                silent_s = silent_ns * 1e-9 if len(silent) == axes else None
+                silent_s = silent_ns * 1e-9 if self.silent else None  # doubtful answers are answers
                 self._watch.faults.append(SampleLost(cycle, silent, names, silent_s))
         self._note_losses()
         statuswords = tuple(values[2 * axes :])

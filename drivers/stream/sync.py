@@ -28,7 +28,7 @@ from drivers.canopen.bus import BusAddress
 from drivers.canopen.capture import FRAME
 from drivers.canopen.link import SYNC_COB_ID
 from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.sdo import Clock
+from drivers.canopen.sdo import Clock, download_request
 from drivers.errors import WHILE, BusError, DriverError
 from drivers.profiles.profile import ObjectEntry
 
@@ -91,6 +91,7 @@ class FollowedSync:
     #: Called with the monotonic time of each SYNC [ns], and the number of periods since the one before, where the
     #: producer must be steered.
     seen: Callable[[int, int], None] | None = None
+    stop: Callable[[], None] | None = None  #: stops the producer after the last cycle, without waiting for an answer
     start_ns: int = 0  #: wall time of the first SYNC [ns since 1970]
     clock: Clock = time.monotonic_ns  #: monotonic [ns]; the time since the first SYNC is added to start_ns
 
@@ -179,11 +180,16 @@ class KernelProducer(AbstractContextManager["KernelProducer"]):
             self._interval_us = interval_us
             self._socket.send(setup_message(_SET_TIMER, interval_us))
 
-    def stop(self) -> None:
-        """Stop sending, if started."""
+    def pause(self) -> None:
+        """Stop sending; SYNCs on their way are still the kernel's."""
         if self._socket is not None:
             self._socket.close()
-        self._socket, self._link.sync_producer = None, None
+        self._socket = None
+
+    def stop(self) -> None:
+        """Stop sending, if started."""
+        self.pause()
+        self._link.sync_producer = None
 
 
 class DriveProducer(AbstractContextManager["DriveProducer"]):
@@ -195,6 +201,7 @@ class DriveProducer(AbstractContextManager["DriveProducer"]):
         self._node_id = network.node_ids[axis]
         self._period_us = period_us
         self._before: tuple[int, int] | None = None
+        self._produces = False
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -210,19 +217,27 @@ class DriveProducer(AbstractContextManager["DriveProducer"]):
 
     def start(self) -> None:
         """Let the drive send SYNC; nothing happens if it does."""
-        if self._before is not None:
+        if self._produces:
             return
         access = self._network.link.objects(self._node_id)
-        self._before = (access.read(SYNC_COB_ID_OBJECT), access.read(CYCLE_PERIOD))
+        if self._before is None:
+            self._before = (access.read(SYNC_COB_ID_OBJECT), access.read(CYCLE_PERIOD))
         self._network.link.sync_producer = self.name
         # CiA 301: the period may be refused while the drive produces, so production begins last and ends first.
         access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID)
         access.write(CYCLE_PERIOD, self._period_us)
         access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID | PRODUCES)
+        self._produces = True
+
+    def pause(self) -> None:
+        """Tell the drive to stop, without waiting for its answer; `stop` restores its objects."""
+        if self._before is not None:
+            self._network.link.send((download_request(self._node_id, SYNC_COB_ID_OBJECT, SYNC_COB_ID),))
+            self._produces = False
 
     def stop(self) -> None:
         """Restore both objects, if started and if the drive still answers."""
-        before, self._before = self._before, None
+        before, self._before, self._produces = self._before, None, False
         try:
             if before is not None and self._node_id not in self._network.link.silent:
                 access = self._network.link.objects(self._node_id)

@@ -155,7 +155,7 @@ class DirectStream:
     Attributes:
         network: what the walk asks of a network: its nodes and the names of its axes.
         pacing: of the samples' time.
-        max_missing_cycles, silent: none is ever missing, and a node always answers.
+        silent: never, a node always answers.
         events: in their order.
         time_ns: of the last sample.
         demand_counts: position demand of each sample, with the samples.
@@ -166,7 +166,6 @@ class DirectStream:
         if cell.sync is None or cell.sync.period_us != spec.sync_period_us:
             raise ValueError(f"cell {cell.name}: its sync period is not the simulated one, {spec.sync_period_us} us")
         self.pacing = LockstepSync(spec.sync_period_us * 1000)
-        self.max_missing_cycles = 0
         self.silent = False
         self.events: list[CellEvent] = []
         self.time_ns = 0
@@ -208,7 +207,7 @@ class DirectStream:
     def check(self) -> None:
         """No fault waits: a drive that leaves OPERATION ENABLED is seen in its statusword."""
 
-    def read_on(self, seconds: float) -> None:
+    def read_on(self, seconds: float, lag_s: float = 0.0) -> None:
         """Nothing comes behind the last cycle."""
 
     def emit(self, event: CellEvent) -> None:

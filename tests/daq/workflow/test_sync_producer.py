@@ -10,8 +10,9 @@ import pytest
 from daq.config.cell import KERNEL, RECORDER
 from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent
-from daq.workflow.record import _verdict
+from daq.workflow.record import Clocks, _pacing, _sync_producer, _verdict, network_of
 from drivers.stream.answers import StreamStatistics
+from drivers.stream.sync import DriveProducer, FollowedSync, KernelProducer
 
 CONFIGURATIONS = Path(__file__).parents[3] / "configs"
 EXPLAINED = ("cycles", "frames", "foreign")
@@ -57,6 +58,19 @@ def test_a_producer_that_there_is(
 def test_a_producer_that_there_is_not(tmp_path: Path, interface: str, pacing: str, producer: str, message: str) -> None:
     with pytest.raises(ConfigurationInconsistent, match=message):
         load_cell(cell_with(tmp_path, interface, pacing, producer))
+
+
+@pytest.mark.parametrize("producer", ["kernel", "J3"])
+def test_the_stream_can_stop_the_sync_that_it_follows(
+    tmp_path: Path, producer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = load_cell(cell_with(tmp_path, "socketcan", "timed", producer))
+    sender = _sync_producer(cell, network_of(cell))
+    assert isinstance(sender, KernelProducer | DriveProducer)
+    monkeypatch.setattr(type(sender), "start", lambda _: None)
+    pacing = _pacing(cell, 0, Clocks(), sender)
+    assert isinstance(pacing, FollowedSync)
+    assert pacing.stop == sender.pause
 
 
 @pytest.mark.parametrize("name", [field.name for field in fields(StreamStatistics)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -376,6 +377,23 @@ def test_closing_has_one_time_limit_and_names_what_it_left(asked: bool) -> None:
         assert "settings not restored (asked a second time): J1: TPDO1" in said
         assert "6060h, 1016h, 1017h; switch these drives off and on" in said
     assert "not confirmed without power" not in said  # none of them ever had it
+
+
+def test_asked_a_second_time_nothing_more_is_restored_and_every_axis_is_named() -> None:
+    network, bus = cell(3)
+    network.bounds = replace(network.bounds, closing_s=10.0)
+
+    @contextmanager
+    def block_signals() -> Iterator[Callable[[], bool]]:
+        yield lambda: True
+
+    network.block_signals = block_signals
+    with pytest.raises(BusError, match=r"settings not restored \(asked a second time\)") as left, network:
+        network.prepare()
+        bus.sent.clear()
+    writes = [(m.arbitration_id, bytes(m.data)) for m in bus.sent if 0x600 < m.arbitration_id < 0x680]
+    assert [index for _, data in writes if data[0] >> 5 == 1 and (index := data[2] << 8 | data[1]) != 0x6040] == []
+    assert re.findall(r"(J\d): TPDO1", str(left.value)) == ["J1", "J2", "J3"]
 
 
 def test_an_axis_that_had_power_and_fell_silent_is_named_alone() -> None:

@@ -5,16 +5,20 @@ from __future__ import annotations
 import binascii
 import re
 import struct
+from collections.abc import Callable
+from contextlib import nullcontext
 
 import can
 import pytest
 
 from drivers.canopen.link import Link
 from drivers.canopen.network import CanopenNetwork
-from drivers.errors import ObjectAccessError, SetupRefused
+from drivers.errors import DriveFault, ObjectAccessError, SetupRefused
 from drivers.profiles.profile import ObjectEntry
+from drivers.stream.stream import SyncStream
+from drivers.stream.sync import LockstepSync, TimedSync
 from tests.drivers.hostile import HOSTILE, NAME, Answer, Hostile, about, endless
-from tests.drivers.scripted import ScriptedBus, ScriptedNode, cell, lose_first_answer
+from tests.drivers.scripted import PERIOD_NS, ScriptedBus, ScriptedNode, cell, lose_first_answer
 
 
 @pytest.mark.parametrize(("answer", "problem"), HOSTILE)
@@ -155,7 +159,90 @@ def test_two_heartbeats_a_period_are_two_devices(every_ms: int, shared: bool) ->
     with network:
         link = listen(network, bus, [5] * 30, every_ms * 1_000_000)
         assert bool(link.shared_id(2, 100)) is shared
-        assert (link.shared_id(2, 100) == "30 heartbeats in 1500 ms, its period is 100 ms") is shared
+        assert (link.shared_id(2, 100) == "8 heartbeats in 350 ms, its period is 100 ms") is shared
+
+
+def test_one_late_heartbeat_is_no_second_device() -> None:
+    network, bus = cell(2)
+    with network:
+        for every_ms in (100, 100, 190, 10, 100, 100, 100):
+            link = listen(network, bus, [5], every_ms * 1_000_000)
+        assert link.shared_id(2, 100) == ""
+
+
+def test_heartbeats_of_two_states_in_turn_are_two_devices() -> None:
+    network, bus = cell(2)
+    with network:
+        assert listen(network, bus, [5, 127, 5], 100_000_000).shared_id(2, 0) == ""  # it was told to
+        assert listen(network, bus, [127, 5], 100_000_000).shared_id(2, 0) == (
+            "heartbeats OPERATIONAL and PRE-OPERATIONAL in turn"
+        )
+
+
+class Beating(ScriptedNode):
+    """A device that sends heartbeats, and answers nothing."""
+
+    def __init__(self, node_id: int, period_ms: int) -> None:
+        super().__init__(node_id)
+        self.store(0x1017, 0, period_ms)
+        self.next_beat_ns = 1_000_000_000 + 300_000 * period_ms
+
+    def sdo(self, data: bytes) -> bytes | None:
+        return None
+
+    def on_sync(self, cycle: int) -> list[can.Message]:
+        return []
+
+
+def silent_twin(period_ms: int) -> tuple[CanopenNetwork, ScriptedBus]:
+    """Axes 1 and 2 with this period, and beside axis 2 a device that sends its heartbeats as well."""
+    network, bus = cell(2)
+    for node in bus.nodes:
+        node.store(0x1017, 0, period_ms)
+    bus.nodes = (*bus.nodes, Beating(2, period_ms))
+    return network, bus
+
+
+@pytest.mark.parametrize("period_ms", [100, 500, 1000])
+def test_a_silent_twin_is_found_by_its_heartbeats(period_ms: int) -> None:
+    network, bus = silent_twin(period_ms)
+    begun_ns = bus.clock.now_ns
+    with network:
+        found = network.scan(wait_s=0.05)
+    assert [(node.node_id, "heartbeats in" in node.shared) for node in found] == [(1, False), (2, True)]
+    assert bus.clock.now_ns - begun_ns < 4_000_000_000
+
+
+def test_a_scan_does_not_wait_for_ever_for_a_slow_heartbeat() -> None:
+    network, bus = silent_twin(60_000)
+    begun_ns = bus.clock.now_ns
+    with network:
+        assert len(network.scan(wait_s=0.05)) == 2
+    assert bus.clock.now_ns - begun_ns < 4_000_000_000
+
+
+def test_a_silent_twin_is_refused_before_motion() -> None:
+    network, bus = silent_twin(20)
+    with network, pytest.raises(SetupRefused, match=r"J2 \(node 2\): found \d heartbeats in .* two have it"):
+        network.prepare()
+    assert [node.powered_cycles for node in bus.nodes] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_a_silent_twin_that_comes_in_a_run_stops_it(timed: bool) -> None:
+    network, bus = cell(2)
+    with network:
+        network.prepare()
+        twin = Beating(2, 20)
+        bus.nodes, twin.nmt = (*bus.nodes, twin), 5
+        pacing = TimedSync(PERIOD_NS, 0, bus.clock) if timed else LockstepSync(PERIOD_NS, clock=bus.clock)
+        stream = SyncStream(network, pacing)
+        for _ in range(300):
+            stream.advance()
+        # In lockstep the cell's time is not that of the clock.
+        with pytest.raises(DriveFault, match="two devices have this node id") if timed else nullcontext():
+            stream.check()
+            assert not timed
 
 
 def test_an_answer_to_another_program_is_no_second_device() -> None:

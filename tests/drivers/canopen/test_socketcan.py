@@ -23,7 +23,7 @@ from drivers.canopen.sdo import SdoPolicy
 from drivers.canopen.socketcan import CapturedMessage, Losses, SocketcanBus, losses_of, open_socketcan, remarks_of
 from drivers.errors import BusError
 from drivers.stream.sample import EventKind
-from tests.drivers.scripted import FakeClock
+from tests.drivers.scripted import FakeClock, cell
 
 ADDRESS = BusAddress("socketcan", "pair")
 WAIT_S = 10.0
@@ -305,6 +305,24 @@ def test_a_full_transmit_queue_is_waited_for_and_then_named(
     with pytest.raises(can.CanOperationError, match="does any node acknowledge"):
         bus.send(can.Message(arbitration_id=1, is_extended_id=False), timeout=0.001)
     monkeypatch.undo()
+
+
+def test_the_filter_passes_all_that_is_watched(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, bus = cell(2)
+    filters = list[tuple[int, int]]()
+    monkeypatch.setattr(bus, "receive_only", filters.extend, raising=False)
+    with network:
+        network.prepare()
+    commands = {0x000, 0x080, 0x7E4, 0x7E5, *range(0x601, 0x680)}
+    of_axes = {service + node for service in (0x080, *range(0x180, 0x600, 0x80), 0x700) for node in (1, 2)}
+    own = {service + network.recorder_id for service in range(0x080, 0x780, 0x80)}
+    passed = {number for number in range(0x800) if any((number ^ wanted) & mask == 0 for wanted, mask in filters)}
+    assert (commands | of_axes | own) - passed == set()
+    assert {
+        0x181 + 0x20,
+        0x732,
+        0x7F0,
+    } & passed == set()  # of other devices
 
 
 def test_an_interface_that_is_not_there() -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext, suppress
+from dataclasses import replace
 
 import can
 import pytest
@@ -23,7 +24,7 @@ from drivers.motion.execute import MotionBounds, execute
 from drivers.motion.move import AxisLimits, Move, synchronised_move
 from drivers.profiles.profile import Axis
 from drivers.stream.sample import CellEvent, EventKind, Sample
-from drivers.stream.stream import SyncStream
+from drivers.stream.stream import MAX_MISSING_CYCLES, SyncStream
 from drivers.stream.sync import LockstepSync
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell, permission
 
@@ -342,6 +343,22 @@ def test_every_axis_that_could_not_be_stopped_is_reported(moving: Moving, monkey
             run(moving, near)
     assert ["node 2" in note for note in error.value.__notes__] == [True]
     bus.on_cycle = lambda _cycle: None
+
+
+@pytest.mark.parametrize(("confirmed", "periods"), [(True, MAX_MISSING_CYCLES + 2), (False, 1)])
+def test_late_answers_are_waited_for_once_no_axis_has_power(
+    moving: Moving, monkeypatch: pytest.MonkeyPatch, confirmed: bool, periods: int
+) -> None:
+    _, stream, bus, _ = moving
+    waits = list[tuple[int, bool]]()
+    monkeypatch.setattr(
+        stream, "read_on", lambda seconds, lag_s: waits.append((round(seconds * 1e9) // PERIOD_NS, lag_s > 0))
+    )
+    bus.nodes[0].quick_stop_stays = not confirmed
+    near = Move((500, 500), (100_000, 100_000), (10_000_000, 10_000_000))
+    with suppress(StateRefused):
+        list(execute(moving[0], stream, (near,), permission(), replace(BOUNDS, standstill_cycles=10_000)))
+    assert waits == [(periods, confirmed)]
 
 
 def test_a_stop_that_cannot_be_said_is_noted_on_the_error(moving: Moving) -> None:

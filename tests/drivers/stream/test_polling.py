@@ -39,7 +39,7 @@ class Bench:
 
     def poll(self, *, beside_stream: bool = True) -> Polling:
         """Begin."""
-        polling = Polling(self.network, beside_stream=beside_stream)
+        polling = Polling.found(self.network, beside_stream=beside_stream)
         polling.begin(self.stream, self.readings.append)
         self.begun = len(self.bus.sent)
         return polling

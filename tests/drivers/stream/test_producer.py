@@ -41,6 +41,25 @@ def test_a_drive_produces_last_and_gets_its_objects_back(cob_id: int, period_us:
         assert (node.value(0x1005, 0), node.value(0x1006, 0)) == (cob_id, period_us)
 
 
+def test_a_drive_pauses_without_being_waited_for_and_starts_again() -> None:
+    network, bus = cell()
+    node = with_sync_objects(bus.nodes[1], 0x80, 500)
+    with network:
+        with DriveProducer(network, 1, PERIOD_US) as producer:
+            producer.pause()
+            assert bus.sent == []  # it was not started
+            producer.start()
+            bus.sent.clear()
+            begun_ns = bus.clock.now_ns
+            producer.pause()
+            assert bus.clock.now_ns == begun_ns
+            assert node.value(0x1005, 0) == 0x80
+            assert network.link.sync_producer == "J2"  # a SYNC on its way is no foreign one
+            producer.start()
+            assert node.value(0x1005, 0) == 0x80 | PRODUCES
+        assert (node.value(0x1005, 0), node.value(0x1006, 0)) == (0x80, 500)
+
+
 def test_a_drive_that_cannot_produce_says_so_and_is_given_back() -> None:
     network, bus = cell()
     node = with_sync_objects(bus.nodes[0], period_us=7)

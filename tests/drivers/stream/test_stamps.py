@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.socketcan import CapturedMessage
 from drivers.canopen.split_bus import BusPart, SplitAddress, SplitBus
-from drivers.errors import BusError, DriverError
+from drivers.errors import BusError, DriverError, SampleLost
 from drivers.stream.answers import StreamStatistics
 from drivers.stream.sample import Sample
-from drivers.stream.stream import SyncStream
+from drivers.stream.stream import MAX_MISSING_CYCLES, SyncStream
 from drivers.stream.sync import FollowedSync, TimedSync
 from tests.drivers.scripted import PERIOD_NS, FakeClock, cell
 
@@ -67,7 +67,7 @@ class Timeline(can.BusABC):
         self._put(at_ns, 0x80, b"", is_rx=is_rx)
         self.sent_ns.append(at_ns)
         for node in self.nodes:
-            delay_ns = self.delays_ns[node - 1][self.syncs] if self.syncs < CYCLES else 1
+            delay_ns = self.delays_ns[node - 1][min(self.syncs, CYCLES - 1)]
             data = self.syncs.to_bytes(4, "little") + b"\0\0\x50\x02"
             if delay_ns < NEVER:
                 self._put(at_ns + 1 + delay_ns, 0x180 + node, data)
@@ -78,13 +78,19 @@ class Timeline(can.BusABC):
         message.kernel_ns, message.monotonic_ns, message.local = at_ns, at_ns, True
         heappush(self._frames, (at_ns, len(self.sent_ns) * 10 + identifier % 0x80, message))
 
+    def pause(self) -> None:
+        """Stop the producer."""
+        self.producer = False
+
     def _readable_ns(self, at_ns: int) -> int:
         return max([at_ns, *(self.begun_ns + end for begin, end in self.stops_ns if begin <= at_ns - self.begun_ns)])
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         end_ns = self.clock.now_ns + (max(1, round(timeout * 1e9)) if timeout else 0)
-        while self.producer and self.begun_ns + self.syncs * PERIOD_NS <= end_ns:
-            self._sync(self.begun_ns + self.syncs * PERIOD_NS, is_rx=True)
+        while self.producer and (due_ns := self.begun_ns + self.syncs * PERIOD_NS) <= end_ns:
+            if self._frames and self._readable_ns(self._frames[0][0]) < due_ns:
+                break
+            self._sync(due_ns, is_rx=True)
         if self._frames and (readable_ns := self._readable_ns(self._frames[0][0])) <= end_ns:
             self.clock.now_ns = max(self.clock.now_ns, readable_ns)
             return heappop(self._frames)[2]
@@ -93,7 +99,12 @@ class Timeline(can.BusABC):
 
 
 def run(
-    delays_ns: Sequence[Sequence[int]], stops_ns: Sequence[tuple[int, int]], *, producer: bool, buses: int = 1
+    delays_ns: Sequence[Sequence[int]],
+    stops_ns: Sequence[tuple[int, int]],
+    *,
+    producer: bool,
+    buses: int = 1,
+    to_the_end: bool = False,
 ) -> tuple[list[Sample], StreamStatistics, list[DriverError]]:
     """Samples, statistics and faults of the bus of a stream; on two buses the capture process of the first stops."""
     network, scripted = cell()
@@ -108,9 +119,11 @@ def run(
         bus = SplitBus(SplitAddress(tuple(parts)), ends, lambda: clock.now_ns * 1e-9)
     network.link._bus = bus
     network.link.sync_producer = "J1" if producer else None
-    pacing = FollowedSync(PERIOD_NS, "J1", timeout_s=0.1, clock=clock) if producer else TimedSync(PERIOD_NS, 0, clock)
-    stream = SyncStream(network, pacing)
+    followed = FollowedSync(PERIOD_NS, "J1", timeout_s=0.1, stop=ends[0].pause, clock=clock)
+    stream = SyncStream(network, followed if producer else TimedSync(PERIOD_NS, 0, clock))
     samples = [stream.advance() for _ in range(CYCLES)]
+    if to_the_end:
+        stream.read_on((MAX_MISSING_CYCLES + 2) * PERIOD_NS * 1e-9, lag_s=1.0)
     found = stream.statistics
     while True:
         try:
@@ -171,6 +184,14 @@ def test_each_bus_of_two_has_its_own_order(delays_ns: list[list[int]], stops_ns:
     assert counts_stopped == counts
 
 
+def test_axes_whose_answers_are_doubtful_are_not_called_silent() -> None:
+    delays_ns = [300_000] * 4 + [NEVER] * 3 + [300_000] * (CYCLES - 7)
+    _, _, faults = run([delays_ns] * 2, (), producer=True)
+    assert [str(fault) for fault in faults if isinstance(fault, SampleLost)] == [
+        "cycle 7: no answer from J1 (node 1), J2 (node 2)"
+    ]
+
+
 @pytest.mark.parametrize("producer", [True, False])
 def test_two_answers_late_in_a_row_are_in_no_other_sample(producer: bool) -> None:
     late = [300_000] * 4 + [PERIOD_NS + 200_000, PERIOD_NS + 200_000] + [300_000] * (CYCLES - 6)
@@ -178,6 +199,24 @@ def test_two_answers_late_in_a_row_are_in_no_other_sample(producer: bool) -> Non
     assert [sample.missing for sample in samples] == [0] * 4 + [3, 3] + [0] * (CYCLES - 6)
     assert [sample.position_counts[0] for sample in samples if not sample.missing] == [0, 1, 2, 3, *range(6, CYCLES)]
     assert (counts.missing, counts.duplicate) == (4, 0)
+
+
+@pytest.mark.parametrize("producer", [True, False], ids=["producer", "own"])
+@pytest.mark.parametrize("late_ns", [200_000, 900_000, PERIOD_NS + 400_000])
+def test_answers_that_stay_late_are_not_accepted(late_ns: int, producer: bool) -> None:
+    delays_ns = [[300_000] * 4 + [PERIOD_NS + late_ns] * (CYCLES - 4), [300_000] * CYCLES]
+    # The capture process is stopped at the end: what it has not received yet counts too.
+    samples, counts, _ = run(delays_ns, [(12_500_000, 90_000_000)], producer=producer, to_the_end=True)
+    assert [sample.position_counts[1] for sample in samples] == list(range(CYCLES))
+    assert counts.duplicate >= 1
+
+
+@pytest.mark.parametrize("producer", [True, False], ids=["producer", "own"])
+def test_an_answer_that_was_lost_is_no_reason_against_those_after_it(producer: bool) -> None:
+    delays_ns = [[300_000] * 4 + [NEVER] + [300_000] * (CYCLES - 5), [300_000] * CYCLES]
+    samples, counts, _ = run(delays_ns, (), producer=producer, to_the_end=True)
+    assert [sample.missing for sample in samples] == [0] * 4 + [1, 1] + [0] * (CYCLES - 6)
+    assert counts == StreamStatistics(cycles=CYCLES, frames=2 * CYCLES - 2, missing=2, late=1)
 
 
 @pytest.mark.parametrize("producer", [True, False])

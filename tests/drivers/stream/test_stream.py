@@ -307,9 +307,8 @@ def test_a_timed_cycle_does_not_wait_beyond_its_period(timed: Prepared) -> None:
 @given(st.sets(st.tuples(st.integers(0, 29), st.sampled_from((0x181, 0x182))), max_size=12))
 def test_every_dropped_frame_is_exactly_one_bit(dropped: set[tuple[int, int]]) -> None:
     for stream, bus, _ in prepared():
-        stream.max_missing_cycles = 30
         bus.tamper = lambda m, bus=bus: () if (bus.cycle, m.arbitration_id) in dropped else (m,)  # type: ignore[misc]
-        samples = [next(stream) for _ in range(30)]
+        samples = [stream.advance() for _ in range(30)]
         for sample in samples:
             expected = sum(axis for axis, cob in ((1, 0x181), (2, 0x182)) if (sample.cycle, cob) in dropped)
             assert sample.missing == expected
@@ -643,12 +642,11 @@ def test_after_an_answer_dropped_from_a_followed_cycle_the_next_is_doubtful(
     dropped: set[tuple[int, int]],
 ) -> None:
     for stream, bus, producer, _ in followed_stream():
-        stream.max_missing_cycles = 40
         next(stream)
         bus.tamper = lambda m, p=producer: () if (p.pulses - 1, m.arbitration_id) in dropped else (m,)  # type: ignore[misc]
         for _ in range(31):
             producer.pulse()
-        samples = [next(stream) for _ in range(30)]
+        samples = [stream.advance() for _ in range(30)]
         for number, sample in enumerate(samples):
             expected = sum(
                 axis for axis, cob in ((1, 0x181), (2, 0x182)) if {(number, cob), (number - 1, cob)} & dropped
