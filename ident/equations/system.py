@@ -9,7 +9,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.equations.currents import Currents, OwnCurrents, PreloadedCurrents
-from ident.equations.triangles import Triangles, solve, triangle
+from ident.equations.triangles import Triangles, singular_values, solve, triangle
 from ident.errors import DataUnfit, RankDeficient
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, Payload
@@ -71,6 +71,26 @@ class System(Equations):
     def leading(self) -> int:
         """How many columns of the motors' rows belong to currents: the own one, or with preload those of all motors."""
         return self.axis_count if self.model.is_redundant else 1
+
+    def weighted_singular_values(self, solution: FloatArray, free: int, *, gains: bool) -> FloatArray:
+        """Singular values of W_r with rows of a joint divided by its residual's deviation (paper Table 5).
+
+        An effect's coefficient may have any unit, such as rad/Nm beside kg m². Its column is scaled to the median norm
+        of the base parameters' columns: otherwise the condition would depend on that unit.
+
+        Args:
+            solution: (g, χ, χ_uL, 1) of eq. (17).
+            free: number of estimated parameters.
+            gains: whether the columns V belong to the unknowns.
+        """
+        count = self.axis_count
+        matrix = self.joints.stacked(1.0 / self.joints.residual_std(solution, free))
+        norms = np.linalg.norm(matrix, axis=0)
+        base = np.array([column.name in self.base.names for column in self.columns], dtype=np.bool_)
+        if base.any():
+            size, effects = np.median(norms[count + np.flatnonzero(base)]), count + np.flatnonzero(~base)
+            matrix[:, effects] *= size / np.where(norms > 0.0, norms, 1.0)[effects]
+        return singular_values(matrix[:, 0 if gains else count : -1])
 
     def preload_of(self, cluster: int) -> FloatArray:
         """N of a cluster's rows, shape (rows, m, m − d); empty where no motor works against another."""

@@ -43,17 +43,6 @@ class Triangles:
         """‖R x‖² of each axis, shape (m,)."""
         return np.array([float(np.sum((factor @ vector) ** 2)) for factor in self.factors])
 
-    def weighted_singular_values(self, solution: FloatArray, free: int, *, gains: bool) -> FloatArray:
-        """Singular values of W_r with rows of a joint divided by its residual's deviation (paper Table 5).
-
-        Args:
-            solution: (g, χ, χ_uL, 1) of eq. (17).
-            free: number of estimated parameters.
-            gains: whether the columns V belong to the unknowns.
-        """
-        first = 0 if gains else len(self.factors)
-        return singular_values(self.stacked(1.0 / self.residual_std(solution, free))[:, first:-1])
-
 
 def triangle(parts: Iterable[FloatArray], columns: int) -> FloatArray:
     """R of rows that come in pieces below each other, shape (≤columns, columns).

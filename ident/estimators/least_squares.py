@@ -51,7 +51,7 @@ def _solve(system: System, weight: FloatArray, method: Method, fixed: FloatArray
     covariance = np.zeros((len(full) - 1, len(full) - 1))
     first = 0 if fixed is None else count
     covariance[first:, first:] = variance * inverse
-    weighted = triangles.weighted_singular_values(full, matrix.shape[1], gains=fixed is None)
+    weighted = system.weighted_singular_values(full, matrix.shape[1], gains=fixed is None)
     return Estimate(
         method=method,
         gains=full[:count],
@@ -95,7 +95,7 @@ def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
         weight = 1.0 / triangles.residual_std(first, len(first) - 1)
     vector, covariance, singular = _smallest(triangles, weight, columns)
     count = system.axis_count
-    weighted = triangles.weighted_singular_values(vector, len(vector) - 1, gains=True)
+    weighted = system.weighted_singular_values(vector, len(vector) - 1, gains=True)
     return Estimate(
         method=Method.TLS,
         gains=vector[:count],

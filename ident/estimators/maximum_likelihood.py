@@ -85,7 +85,7 @@ def _maximum_likelihood(system: System, recorded: System, method: Method, fixed_
     free = len(system.unknowns) + (0 if fixed_gains is not None else system.axis_count)
     parameters, noise = system.currents.settled(gains, free)
     full = np.concatenate((gains, parameters, [1.0]))
-    weighted = system.joints.weighted_singular_values(full, free, gains=fixed_gains is None)
+    weighted = system.weighted_singular_values(full, free, gains=fixed_gains is None)
     covariance = jackknife_covariance(
         system, gains, parameters, noise, gains_fixed=fixed_gains is not None, recorded=recorded
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import binascii
 import re
 import struct
-from collections.abc import Callable
 from contextlib import nullcontext
 
 import can

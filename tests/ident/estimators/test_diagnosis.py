@@ -22,8 +22,10 @@ from ident.estimators.diagnosis import (
 )
 from ident.estimators.estimate import RelativeError
 from ident.estimators.identify import identify, require_plausible
+from ident.estimators.least_squares import wls
 from ident.estimators.method import Method
 from ident.estimators.payload_diagnosis import payload_differences
+from ident.model.model import Column
 from ident.plausible import UNIT_RATIO
 from tests.ident.mistaken import AXES, BODY, SMALL, diagnosed, small_recordings, turned, with_currents
 from tests.ident.recordings import MOUNTED, FloatArray, Truth, record
@@ -173,6 +175,22 @@ def test_axes_that_never_move_apart_leave_no_parameters(small_truth: Truth) -> N
     run = record(small_truth, "tied", np.random.default_rng(0), seconds=16.0, noise_a=0.05, rate_hz=200.0, bend=tied)
     (found,) = diagnosed(small_truth, [run], fixed=True, method=Method.WLS)
     assert found.name == "ill-conditioned"
+
+
+def test_the_unit_of_an_effect_is_no_bad_condition(small_truth: Truth) -> None:
+    """A coefficient in rad/Nm is some 1e-5, and its column some 1e5 times as large as those of masses."""
+    runs = small_recordings(small_truth, 0, count=2)
+    found = identify(small_truth.model, runs, SMALL, fixed_gains=small_truth.gains, keep_rows=True)
+    assert found.gathered is not None
+    _, rows = found.gathered
+    effect = np.zeros((3, 1, rows.current.shape[1]))
+    effect[1, 0] = np.random.default_rng(0).standard_normal(rows.current.shape[1])
+    conditions = [
+        wls(rows.extended((Column("effect", "1"),), unit * effect).system(), small_truth.gains).condition
+        for unit in (1.0, 1e6)
+    ]
+    assert conditions == pytest.approx([found.estimate.condition] * 2, rel=0.1)
+    assert conditions[1] == pytest.approx(conditions[0], rel=1e-6)
 
 
 def test_another_estimator_far_from_ml(small_truth: Truth, clean: list[Run]) -> None:
