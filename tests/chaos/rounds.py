@@ -42,7 +42,7 @@ FLOOD_HZ = 4000
 START_S, RUN_S = 60.0, 90.0  #: A round is broken off after so long
 CYCLE_S, GUARD_S, LATENESS_S = 0.02, 0.5, 1.0
 ALLOWANCE_S = 0.4
-"""For a guest whose host gives its time to others; the latest of 42 measured stops came 0.17 s after its bound."""
+"""For a guest whose host gives its time to others; the latest of some 50 measured stops came 0.17 s after its bound."""
 
 
 @dataclass(frozen=True, slots=True)
