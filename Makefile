@@ -11,11 +11,12 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-vcan chaos guard-study vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study coverage-study paper planning-study robot-study crash-study kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study weigh-study words wheel lock clean
+.PHONY: help setup demo test test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study coverage-study paper planning-study robot-study crash-study kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study weigh-study words wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
 	@echo "make test    set up, then lint, types, import contracts and tests"
+	@echo "make test-processes  whole jobs in several processes: the tutorial followed to the letter, jobs that are killed"
 	@echo "make test-vcan  the main job over real SocketCAN (vcan), under User-Mode Linux where this kernel has none"
 	@echo "make chaos    random faults at random moments on SocketCAN for 10 minutes; SEED=1 MINUTES=10 or ROUND=7 (docs/evidence/socketcan.md)"
 	@echo "make test-console  the live console in headless Chromium beside whole recordings; screenshots in out/console"
@@ -69,7 +70,10 @@ demo: setup
 	$(BIN)/drivegain demo --out out/demo
 
 test: check
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not processes"
+
+test-processes: setup
+	$(BIN)/python -m pytest -q -m processes tests/pipeline tests/daq/jobs
 
 test-vcan: setup vcan-tools
 	@if command -v npm >/dev/null; then npm ci --prefix tests/vcan/foreign --no-audit --no-fund; \

@@ -34,8 +34,13 @@ settings.load_profile("drivegain")
 CHECKOUT = Path(__file__).resolve().parent.parent
 
 
-LONG = ("test_guide.py", "test_main_job.py", "test_any_robot.py")
+LONG = ("test_main_job.py", "test_any_robot.py", "test_tx40.py")
 """Files that take a minute and more: begun last, they would keep one processor busy after the other has ended."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Register what `make test` leaves to a target of its own."""
+    config.addinivalue_line("markers", "processes: a whole job in several processes (make test-processes)")
 
 
 def pytest_sessionstart() -> None:

@@ -19,6 +19,8 @@ from daq.cli.app import main
 from tests.pipeline.next_step import next_step
 from tests.pipeline.transcript import Command, commands_of, shows
 
+pytestmark = pytest.mark.processes
+
 PORT = 29536
 """Of the hub, as the page and `init --simulated` say."""
 LONGEST_S, STARTED_S = 300, 60

@@ -17,6 +17,8 @@ import pytest
 from daq.cli.app import main
 from daq.errors import ExitCode
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> Iterator[Path]:

@@ -15,10 +15,14 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from daq.jobs.session import Outcome
 from daq.log.container import UNFINISHED
 from tests.daq.jobs.made import Made
 from tests.daq.jobs.rig import Rig, make_rig
+
+pytestmark = pytest.mark.processes
 
 SHARE = 0.5  #: Of the size of a whole log that is written when the job is killed: the axes move
 
