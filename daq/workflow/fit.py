@@ -262,8 +262,9 @@ def fit(
             )
             break
         raise PayloadUnseen(error.std_percent, error.runs, contradicting) from error
-    if gains_fixed or OF_CHANNELS & {one.name for one in fitted.diagnoses if not one.runs}:
-        require_own_channels(logs, cell, lossy)
+    suspect = bool(OF_CHANNELS & {one.name for one in fitted.diagnoses if not one.runs})
+    if gains_fixed or suspect:
+        require_own_channels(logs, cell, lossy, each=suspect)
     if any(one.name == "axis-error" and one.runs for one in fitted.diagnoses):
         exchanged = ((log, channels_of((log,), cell, lossy)) for log in holdout)
         named = tuple(replace(one, runs=(log.stem,)) for log, one in exchanged if one is not None)
@@ -297,16 +298,24 @@ def channels_of(logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs) -> Di
     return exchanged_channels(model_of(declared), runs, declared.conditioning, declared.axis_names)
 
 
-def require_own_channels(logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs) -> None:
+def require_own_channels(logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs, *, each: bool = True) -> None:
     """Refuse logs in which the currents of some axes are each other's; they are read again.
 
+    Args:
+        logs: of the fit.
+        cell: in place of the one in the logs.
+        lossy: how logs with losses are read.
+        each: look into each log alone, too: in one of several, an exchange is hidden by the others.
+
     Raises:
-        ChannelsExchanged: they are.
+        ChannelsExchanged: they are, in all logs together or in one of them.
     """
-    found = channels_of(logs, cell, lossy)
-    if found is not None:
-        subject = f"the currents of {' and '.join(found.axes)}"
-        raise ChannelsExchanged(subject, found=found.found, expected=found.expected, remedy=found.remedy)
+    for part in (logs, *((log,) for log in logs if each and len(logs) > 1)):
+        found = channels_of(part, cell, lossy)
+        if found is not None:
+            where = "" if part is logs else f"log {part[0].stem}: "
+            subject = f"{where}the currents of {' and '.join(found.axes)}"
+            raise ChannelsExchanged(subject, found=found.found, expected=found.expected, remedy=found.remedy)
 
 
 def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: None) -> Comparison:

@@ -98,6 +98,12 @@ def test_exchanged_currents_in_the_fit_are_an_error(shelf: Shelf) -> None:
         shelf.runs.update({n: replace(run, current_a=run.current_a[:, CROSSED]) for n, run in crossed.items()})
 
 
+@pytest.mark.parametrize("fixed", [False, True])
+def test_exchanged_currents_in_one_log_of_the_fit_name_it(shelf: Shelf, fixed: bool) -> None:
+    with pytest.raises(ChannelsExchanged, match="log crossed: the currents of J2 and J3"):
+        fit([*FIT, Path("crossed")], gains_fixed=fixed)
+
+
 def test_exchanged_currents_in_a_held_out_run_are_named(shelf: Shelf) -> None:
     first = fit(FIT, holdout=[Path("crossed")]).diagnoses[0]
     assert (first.name, first.runs, first.axes) == ("channels-exchanged", ("crossed",), ("J2", "J3"))
