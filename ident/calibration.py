@@ -71,6 +71,11 @@ class AcceptedEffect:
     error_after_percent: float  #: the same with the effect
     ambiguity: tuple[str, ...] = ()  #: families whose held-out score does not differ from this one's
 
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether it lowers the error on data that the fit did not use."""
+        return self.error_after_percent < self.error_before_percent
+
 
 @dataclass(frozen=True, slots=True)
 class Source:

@@ -193,7 +193,10 @@ def residual_verb(
     accept_losses: AcceptLossesOption = False,
     accept_worse_holdout: Annotated[
         bool,
-        typer.Option("--accept-worse-holdout", help="Write effects that raise the error of held-out logs, too."),
+        typer.Option(
+            "--accept-worse-holdout",
+            help="Write effects that raise the error of held-out logs by more than its noise, too.",
+        ),
     ] = False,
     json: JsonOption = False,
 ) -> None:
