@@ -134,6 +134,11 @@ class Calibration:
         return (*(gain.axis for gain in self.gains), *self.passive_joints)
 
     @property
+    def gains_fixed(self) -> bool:
+        """Whether the fit held every gain: none was identified."""
+        return all(gain.std == 0.0 for gain in self.gains)
+
+    @property
     def covariance(self) -> FloatArray | None:
         """Covariance of (gains, parameters), shape (m + p, m + p); None where the calibration has none.
 

@@ -132,6 +132,7 @@ def fit_verb(
         print_view(fit_view(found, calibration, comparison), out, report, pictures)
         same = [word for log in holdout or () for word in ("--holdout", log)]
         same += [] if cell is None else ["--cell", cell]
+        same += ["--gains", gains.value] if fixed else []
         say_next("drivegain", "residual", *logs, *same, "--out", out or "calibration.yaml", "--report", "report")
 
 
