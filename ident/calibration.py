@@ -71,6 +71,11 @@ class AcceptedEffect:
     error_after_percent: float  #: the same with the effect
     ambiguity: tuple[str, ...] = ()  #: families whose held-out score does not differ from this one's
 
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether it lowers the error on data that the fit did not use."""
+        return self.error_after_percent < self.error_before_percent
+
 
 @dataclass(frozen=True, slots=True)
 class Source:
@@ -127,6 +132,11 @@ class Calibration:
     def places(self) -> tuple[str, ...]:
         """Names of the axes, then of the joints without a motor, as in `Robot.places`."""
         return (*(gain.axis for gain in self.gains), *self.passive_joints)
+
+    @property
+    def gains_fixed(self) -> bool:
+        """Whether the fit held every gain: none was identified."""
+        return all(gain.std == 0.0 for gain in self.gains)
 
     @property
     def covariance(self) -> FloatArray | None:

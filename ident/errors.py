@@ -3,6 +3,7 @@
 IdentificationError
 ├── ModelError            the URDF or drive train does not describe this robot
 ├── DataUnfit             the recording cannot be used: NaN, too short, too slow, wrong shape
+│   └── PayloadMissing    no run has a payload of known mass, which free gains need
 ├── ModelContradicted     the declared model explains less of the data than it leaves
 │   ├── RolesExchanged    loaded and unloaded runs are mistaken for each other
 │   ├── ChannelsExchanged the currents of some axes are each other's
@@ -43,6 +44,17 @@ class DataUnfit(IdentificationError):
         super().__init__(f"runs {run}: {reason}" if ", " in run else f"run {run!r}: {reason}" if run else reason)
         self.run = run
         self.reason = reason
+
+
+class PayloadMissing(DataUnfit):
+    """No run has a payload of known mass, which free gains need."""
+
+    def __init__(self, runs: tuple[str, ...]) -> None:
+        self.subject = f"{'runs' if len(runs) > 1 else 'run'} {', '.join(runs)}"
+        self.found = "no run with a payload of known mass"
+        self.expected = "at least one; without it all gains could be scaled at will"
+        self.remedy = "record one (`record --payload NAME --mass KG`), or hold the gains (`--gains fixed`)"
+        super().__init__(", ".join(runs), f"found {self.found}; expected {self.expected}; {self.remedy}")
 
 
 class ModelContradicted(IdentificationError):

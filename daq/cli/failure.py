@@ -192,7 +192,7 @@ def may_have_power(error: BaseException | None) -> str:
 
 def _parts(error: Exception) -> tuple[str, str, str, str]:
     """Subject, found, expected and remedy."""
-    if isinstance(error, DaqError | identification.ModelContradicted):
+    if isinstance(error, DaqError | identification.ModelContradicted | identification.PayloadMissing):
         return error.subject, error.found, error.expected, error.remedy
     if isinstance(error, driver.BusError):
         known = _BY_NUMBER.get(_number(error) or 0)

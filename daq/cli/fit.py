@@ -132,6 +132,7 @@ def fit_verb(
         print_view(fit_view(found, calibration, comparison), out, report, pictures)
         same = [word for log in holdout or () for word in ("--holdout", log)]
         same += [] if cell is None else ["--cell", cell]
+        same += ["--gains", gains.value] if fixed else []
         say_next("drivegain", "residual", *logs, *same, "--out", out or "calibration.yaml", "--report", "report")
 
 
@@ -193,7 +194,10 @@ def residual_verb(
     accept_losses: AcceptLossesOption = False,
     accept_worse_holdout: Annotated[
         bool,
-        typer.Option("--accept-worse-holdout", help="Write effects that raise the error of held-out logs, too."),
+        typer.Option(
+            "--accept-worse-holdout",
+            help="Write effects that raise the error of held-out logs by more than its noise, too.",
+        ),
     ] = False,
     json: JsonOption = False,
 ) -> None:

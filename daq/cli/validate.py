@@ -82,7 +82,8 @@ def validate_verb(
         print_json({**validation_document(known, found.validations, drawn), **cross_document(found)})
     else:
         print_view(validation_view(known, found), *drawn.values(), page_file)
-        say_next("drivegain", "apply", cell or cell_of(known, logs), calibration)
+        if not known.gains_fixed:  # every gate of such gains is closed
+            say_next("drivegain", "apply", cell or cell_of(known, logs), calibration)
 
 
 def cell_of(calibration: Calibration, logs: list[Path]) -> Path:

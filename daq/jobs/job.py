@@ -93,8 +93,7 @@ def preview(
     if (early := _not_due(section, cell, now)) is not None:
         return Preview((), early.remark)
     with bus_lock(cell, lock_folder):
-        found = sessions.sessions(section.folder, cell.name)
-        session = sessions.resumable_session(found, basis_of(cell, section), now, section.resume_within_h)
+        session = _open_session(section, cell, sessions.sessions(section.folder, cell.name), now)
         made = () if session is None else tuple(run.name for run in verified_runs(session).state.runs)
         left = [run for run in section.runs if run.name not in made]
         if left:
@@ -137,16 +136,24 @@ def _not_due(section: Recalibration, cell: Cell, now: datetime) -> Conclusion | 
     left = timedelta(0) if good is None else good.began + timedelta(hours=section.every_h) - now
     if good is None or left <= timedelta(0):
         return None
+    if _open_session(section, cell, found, now) is not None:  # begun with --now
+        return None
     hours = left.total_seconds() / 3600.0
     remark = f"The calibration of session {good.state.session} is good for another {hours:.1f} h (every_h)."
     return Conclusion(Outcome.NOT_DUE, ExitCode.OK, None, remark)
 
 
+def _open_session(section: Recalibration, cell: Cell, found: tuple[Session, ...], now: datetime) -> Session | None:
+    """Session that a job would resume; plans are read only where one is unfinished."""
+    if not found or found[-1].finished:
+        return None
+    return sessions.resumable_session(found, basis_of(cell, section), now, section.resume_within_h)
+
+
 def _resumed_or_new(section: Recalibration, cell: Cell, now: datetime, journal: Journal) -> Session:
-    found, basis = sessions.sessions(section.folder, cell.name), basis_of(cell, section)
-    session = sessions.resumable_session(found, basis, now, section.resume_within_h)
+    session = _open_session(section, cell, sessions.sessions(section.folder, cell.name), now)
     if session is None:
-        session = sessions.begin(section.folder, basis, now)
+        session = sessions.begin(section.folder, basis_of(cell, section), now)
         replace(journal, session=session.state.session).say(Level.INFO, "session begun", folder=str(session.folder))
         return session
     attempt = session.state.attempt + 1

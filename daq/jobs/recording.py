@@ -224,7 +224,7 @@ def fit_session(context: JobContext, session: Session) -> tuple[Session, Calibra
         save_calibration(calibration, path)
         report.mkdir(exist_ok=True)
     context.tools.save_report(closed, changed, calibration, report)
-    fit = Fitted(calibration_sha256=sha256_of(path) or "", sentences=summary(closed, changed))
+    fit = Fitted(calibration_sha256=sha256_of(path) or "", sentences=summary(closed, changed, calibration.effects))
     for sentence in fit.sentences:
         context.journal.say(Level.INFO, "found", text=sentence)
     return session.update(fitted=fit), calibration

@@ -182,6 +182,8 @@ class Certificate:
         every = len(differing) == len(self.rows)
         count = f"all {len(self.rows)} gains" if every else f"{len(differing)} of {len(self.rows)} gains"
         match self.verdict:
+            case Verdict.REFUSED if self.calibration.gains_fixed:
+                return "Must not be written: the gains were held fixed (`--gains fixed`), so there is nothing to write."
             case Verdict.REFUSED:
                 failed = [refusal for refusal in refusals if refusal.gate not in _OPERATORS]
                 more = "" if len(failed) == 1 else f" (and {len(failed) - 1} more, below)"

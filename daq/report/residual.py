@@ -19,7 +19,7 @@ from daq.report.gains import diagnosis_texts, gain_table, partial_note
 from daq.report.text import picked, plain_table
 from daq.workflow.calibration_file import as_document
 from daq.workflow.fit import Fit
-from ident.calibration import Calibration
+from ident.calibration import AcceptedEffect, Calibration
 from ident.discovery.before_after import Account, BeforeAfter, Errors
 from ident.discovery.gates import runs_to_leave_out
 from ident.discovery.gear_loss import CERTAIN, GearLoss, gear_losses, is_gear_loss
@@ -60,7 +60,7 @@ def residual_view(fitted: Fit, account: Account, calibration: Calibration) -> It
         rivals = ", ".join(effect.ambiguity[:_SHOWN_RIVALS]) + (f" and {more} more" if more > 0 else "")
         rivals = f"; not distinguishable from {rivals}" if rivals else ""
         yield f"{effect.axis}: {effect.name}: {size_text(effect, calibration)}{rivals}"
-    yield from summary(fitted, account)
+    yield from summary(fitted, account, calibration.effects)
     yield ""
     yield before_after_table(account, fitted.cell.axis_names)
     yield ""
@@ -79,7 +79,7 @@ def turns_view(fitted: Fit) -> Iterator[RenderableType]:
     for number, step in enumerate((step for step in fitted.steps if not step.declared), start=1):
         headings = ("effect", "axis", "p", "folds", "explains", "left-out error", "gates")
         table = plain_table(headings, title=f"Turn {number}: best candidates on left-out moves")
-        for finding in step.findings[:_SHOWN]:
+        for finding in step.ranked(_SHOWN):
             table.add_row(
                 finding.effect.name,
                 fitted.cell.place_names[finding.axis],
@@ -105,8 +105,14 @@ def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
     return error_table("Relative error ‖e‖/‖v‖ of the motor currents by ml [%]", axes, dict(error_rows(account)))
 
 
-def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
-    """Summarise in sentences: what to check first, each accepted effect, the whole, the gains, the limit."""
+def summary(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -> tuple[str, ...]:
+    """Summarise in sentences: what to check first, each accepted effect, the whole, the gains, the limit.
+
+    Args:
+        fitted: with the turns of the loop.
+        account: of these turns.
+        effects: of the calibration, with the errors that the gate of an effect compares.
+    """
     kept = fitted.steps[-1].after.effects
     first = diagnosis_texts(fitted.diagnoses)
     found = tuple(
@@ -137,9 +143,30 @@ def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
     ending[:0] = [sentence for step in fitted.steps for sentence in _set_aside(fitted, step)]
     if not found:
         return (*first, f"No structure found: the error {where} is {after.total:.1f} %{noise}.", *ending)
-    whole = f"All axes together: the error {where} {error_change_text(before.total, after.total)}{noise}."
+    change = error_change_text(before.total, after.total)
+    whole = f"All axes together: the error {where} {change}{noise}{_unconfirmed(account)}."
     gains = gains_sentence(fitted, account)
-    return (*first, *found, whole, *((gains,) if gains else ()), *ending)
+    return (*first, *found, whole, *_to_be_refused(effects), *((gains,) if gains else ()), *ending)
+
+
+def _unconfirmed(account: Account) -> str:
+    """Say of a rise of the held-out error that it is within its noise; empty for a fall, or a rise by more."""
+    change = account.holdout_change
+    if change is None or change.rise <= 0.0 or change.is_rise:
+        return ""
+    size = f" ({change.rise / change.std:.1f} σ)" if change.std else ""
+    return f", within its noise{size}: the effects are kept, but not confirmed"
+
+
+def _to_be_refused(effects: Sequence[AcceptedEffect]) -> Iterator[str]:
+    """Name the effects with which `apply` refuses a calibration (`daq.writeback.gates.fit.effect`)."""
+    for one in effects:
+        if not one.is_confirmed:
+            yield (
+                f"`apply` refuses a calibration with {one.name} on {one.axis}: on data that the fit did not use, the "
+                f"torque error is {one.error_after_percent:.2f} % with it, {one.error_before_percent:.2f} % without. "
+                "Record more runs for the fit, or take `drivegain fit`, which adds no effects."
+            )
 
 
 def gains_sentence(fitted: Fit, account: Account) -> str:
@@ -353,7 +380,7 @@ def residual_document(fitted: Fit, account: Account, calibration: Calibration) -
     axes, skew = fitted.cell.axis_names, time_skew(fitted)
     return {
         **as_document(calibration),
-        "summary": list(summary(fitted, account)),
+        "summary": list(summary(fitted, account, calibration.effects)),
         "axes": list(axes),
         "metric": _METRIC,
         "noise_floor": {

@@ -65,7 +65,7 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration, compa
             sections += [_effect(fitted, before, step, turn, placed) for placed in turn.added]
         before = step.after
     details = (
-        folded("What was found, in sentences", listed(summary(fitted, account))),
+        folded("What was found, in sentences", listed(summary(fitted, account, calibration.effects))),
         folded(
             "Errors without and with the effects",
             table("Relative error ‖e‖/‖v‖ [%]", ("", *axes, "total"), errors, "names"),
@@ -164,7 +164,9 @@ def _gains(fitted: Fit, account: Account) -> str:
 
 def _turn(fitted: Fit, number: int, step: Step) -> str:
     axes, added = fitted.cell.place_names, step.accepted
-    shown = (*step.findings[:_SHOWN], *(finding for finding in step.structures[:_SHOWN] if finding.passed))
+    named = step.ranked(_SHOWN)
+    own = [(one.effect, one.axis) for one in named]
+    shown = (*named, *(o for o in step.structures[:_SHOWN] if o.passed and (o.effect, o.axis) not in own))
     outcome = "Nothing passed every check and nothing was added."
     if added is not None:
         outcome = f"Added to {axes[added.axis]}: {effect_text(added.effect, axes)}."

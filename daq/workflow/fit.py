@@ -225,6 +225,7 @@ def fit(
             fixed_gains=nameplate if gains_fixed else None,
             keep_rows=keep_rows or bool(effects),
             judge=not effects,
+            axes=declared.axis_names,
         )
         steps = with_effects_of_cell(result, effects, declared.place_names) if effects else ()
         last = steps[-1].after.identification if steps else result

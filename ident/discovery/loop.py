@@ -87,6 +87,13 @@ class Step:
     choice_std: FloatArray | None = None
     declared: bool = False  #: the cell declares the effect that joined: it was not searched for
 
+    def ranked(self, count: int) -> tuple[Finding, ...]:
+        """The best findings on named effects, and the accepted one wherever it ranks."""
+        best, added = self.findings[:count], self.accepted
+        if added is None or any((one.effect, one.axis) == (added.effect, added.axis) for one in best):
+            return best
+        return (*best, added)
+
 
 def find_effects(
     start: Evidence,

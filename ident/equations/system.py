@@ -10,7 +10,7 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.equations.currents import Currents, OwnCurrents, PreloadedCurrents
 from ident.equations.triangles import Triangles, singular_values, solve, triangle
-from ident.errors import DataUnfit, RankDeficient
+from ident.errors import DataUnfit, PayloadMissing, RankDeficient
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, Payload
 from ident.model.model import Column, DriveTrain, Model
@@ -91,6 +91,11 @@ class System(Equations):
             size, effects = np.median(norms[count + np.flatnonzero(base)]), count + np.flatnonzero(~base)
             matrix[:, effects] *= size / np.where(norms > 0.0, norms, 1.0)[effects]
         return singular_values(matrix[:, 0 if gains else count : -1])
+
+    @property
+    def seen_runs(self) -> tuple[str, ...]:
+        """Names of the runs that have rows here; `runs` may name others of the same observation."""
+        return tuple(self.runs[index] for index in sorted({run for run, _ in self.cluster_runs}))
 
     def preload_of(self, cluster: int) -> FloatArray:
         """N of a cluster's rows, shape (rows, m, m − d); empty where no motor works against another."""
@@ -186,14 +191,10 @@ def require_known_payload(system: System) -> None:
     """Refuse a system without a known payload: it is homogeneous, so gains have no scale.
 
     Raises:
-        DataUnfit: no run carries one.
+        PayloadMissing: no run carries one.
     """
     if not system.knows_payload:
-        raise DataUnfit(
-            ", ".join(system.runs),
-            "no run carries a payload of known mass, so all gains could be scaled at will; "
-            "record a run with a weighed payload, or hold the gains fixed",
-        )
+        raise PayloadMissing(system.runs)
 
 
 def require_distinct(system: System, *, gains: bool) -> None:

@@ -84,7 +84,7 @@ def diagnose(
             likeliest = ml(system, estimate.gains if estimate.gains_fixed else None)
         diagnoses += estimator_diagnoses(estimate, likeliest, axes)
     held = len(estimate.gains) if estimate.gains_fixed else 0
-    for rows, runs in ((system, ()), (found.holdout, () if found.holdout is None else found.holdout.runs)):
+    for rows, runs in ((system, ()), (found.holdout, () if found.holdout is None else found.holdout.seen_runs)):
         if rows is not None:
             of_fit = held if rows is system else None
             payloads = [] if of_fit is None else list(weight_diagnoses(rows, estimate))

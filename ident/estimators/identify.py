@@ -83,6 +83,7 @@ def identify(
     fixed_gains: FloatArray | None = None,
     keep_rows: bool = False,
     judge: bool = True,
+    axes: Sequence[str] | None = None,
 ) -> Identification:
     """Identify all gains and parameters in one global step; runs are read one after the other.
 
@@ -95,6 +96,7 @@ def identify(
         fixed_gains: known gains, shape (m,).
         keep_rows: keep all runs and their rows, for a search for effects by ``ml``; otherwise no run is kept.
         judge: refuse a fit that its data contradict; False where effects are declared that the model lacks here.
+        axes: name of each axis in messages, shape (m,); that of its joint when None.
 
     Raises:
         ModelError: an argument is of another type, there is no such method, or no gain for each motor.
@@ -122,7 +124,7 @@ def identify(
         with suppress(IdentificationError):
             jackknifed = estimate if method.is_of_currents else ml(system)
         require_seen_payload(jackknifed, system)
-    axes = [joint.name for joint in model.robot.axes]
+    axes = axes or [joint.name for joint in model.robot.axes]
     if fixed_gains is not None:
         require_weight(system, estimate)
         require_signs(system, estimate, axes)

@@ -55,11 +55,22 @@ def test_an_earlier_calibration_and_its_certificate_may_be_replaced(
     said = capsys.readouterr()
     assert f"Written: {report}/" in said.out
     assert next_step(said.err.splitlines()[-1]) == "residual"
+    assert "--gains fixed" in said.err.splitlines()[-1]
     page = (report / "report.html").read_text()
     assert all(f"{gain.value:.4g}" in page for gain in load_calibration(out).gains)
     (report / "report.html").write_text("mine")
     assert main(fit) == ExitCode.USAGE
     assert (report / "report.html").read_text() == "mine"
+
+
+def test_gains_without_a_payload_of_known_mass_have_a_remedy(
+    copied_log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["fit", str(copied_log)]) == ExitCode.DATA_UNFIT
+    said = capsys.readouterr().err
+    assert f"error:    run {copied_log.stem}\n" in said
+    assert "found:    no run with a payload of known mass\n" in said
+    assert "or hold the gains (`--gains fixed`)" in said
 
 
 def test_one_recording_counts_once(copied_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -156,7 +156,7 @@ def holdout_motion(context: GateContext) -> Iterator[GateFinding]:
 def effect(context: GateContext) -> Iterator[GateFinding]:
     """Require that each effect lowers the error on held-out data."""
     for one in context.calibration.effects:
-        if not one.error_after_percent < one.error_before_percent:
+        if not one.is_confirmed:
             yield (
                 f"effect {one.name} on {one.axis}",
                 f"{one.error_after_percent:.2f} % on held-out data with it, {one.error_before_percent:.2f} % without",

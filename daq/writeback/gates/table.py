@@ -32,6 +32,7 @@ class GateRow:
 
 
 GATES: tuple[GateRow, ...] = (
+    GateRow(Gate.NOT_IDENTIFIED, (target.identified,), "fit with a loaded run and free gains"),
     GateRow(Gate.CELL, (fit.cell,), "use its own `--cell`"),
     GateRow(Gate.CONFIGURATION, (fit.configuration,), "record again, or review and pass `--configuration-changed`"),
     GateRow(Gate.NOT_FINITE, (fit.finite_errors, target.finite_gains), "fit again"),
@@ -75,7 +76,6 @@ GATES: tuple[GateRow, ...] = (
         "have them review and `drivegain sign`",
         f"`signatures: {_LIMITS.signatures}`",
     ),
-    GateRow(Gate.NOT_IDENTIFIED, (target.identified,), "fit with a loaded run and free gains"),
     GateRow(
         Gate.UNCERTAINTY,
         (target.uncertainty,),

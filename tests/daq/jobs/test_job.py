@@ -10,6 +10,8 @@ import yaml
 
 from daq.cli.app import main
 from daq.errors import ExitCode
+from daq.jobs import session as sessions
+from daq.jobs.recording import basis_of
 from daq.jobs.session import Outcome
 from daq.ledger.audit import AuditAction
 from daq.ledger.store import HistoryStore
@@ -83,6 +85,23 @@ def test_the_payload_was_changed_between_the_runs(whole_job: tuple[Rig, Made]) -
     mounted = [event["payload"] for event in rig.events if event["event"] == "mounted"]
     assert mounted == ["none", "disc", "disc"]
     assert made.closed.final.training_error.total < 10.0
+
+
+def test_a_session_that_was_begun_with_now_is_taken_up_by_a_plain_job(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, every_h=144, resume_within_h=12)
+    assert rig.job().outcome is Outcome.APPLIED
+    section, cell = rig.cell.recalibration, rig.cell
+    assert section is not None
+    rig.clock.go_on(hours=1)
+    stopped = sessions.begin(section.folder, basis_of(cell, section), rig.clock())
+    rig.clock.go_on(minutes=10)
+    stopped.update(outcome=Outcome.STOPPED, ended=rig.clock().isoformat())
+    rig.clock.go_on(hours=13)
+    assert rig.job().outcome is Outcome.NOT_DUE
+    rig.clock.go_on(hours=-12)
+    assert rig.job().outcome is Outcome.UNCHANGED
+    last = rig.sessions[-1].state
+    assert (last.session, last.attempt) == (stopped.state.session, 2)
 
 
 def test_nothing_is_due_while_the_last_good_calibration_is_young(tmp_path: Path, made: Made) -> None:

@@ -18,6 +18,7 @@ from daq.report.certificate_page import certificate_page
 from daq.report.effect_names import curve_of, size_text
 from daq.report.gains import with_deviation
 from daq.workflow.calibration_file import save_calibration
+from daq.writeback.gates.gate import Gate
 from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.effects.effect import PlacedEffect
 from ident.effects.signals import Abscissa
@@ -149,6 +150,17 @@ def test_the_verdict_is_that_of_the_gates() -> None:
     assert refused.verdict is Verdict.REFUSED
     assert refused.sentence.startswith("Must not be written: J1: σ 14.75 %, expected at most 3 %")
     assert "refused: σ 14.75 %" in Reader(certificate_page(refused)).texts
+
+
+def test_gains_that_were_held_are_the_first_reason() -> None:
+    calibration = demo_calibration()
+    held = replace(calibration, gains=tuple(replace(one, value=one.nameplate, std=0.0) for one in calibration.gains))
+    worse = replace(held, effects=(replace(held.effects[0], error_after_percent=6.2),))
+    certificate = certify(worse, without_controller(worse, "", NOW))
+    assert certificate.sentence == (
+        "Must not be written: the gains were held fixed (`--gains fixed`), so there is nothing to write."
+    )
+    assert certificate.comparison.refusals[0].gate is Gate.NOT_IDENTIFIED
 
 
 def test_a_page_beside_an_earlier_one_shows_what_changed() -> None:

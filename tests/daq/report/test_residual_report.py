@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.table import Table
 
 from daq.cli.app import main
 from daq.cli.fit import check_report
@@ -25,11 +26,12 @@ from daq.report.effect_names import WORDS, effect_text, other_axis
 from daq.report.fit_schemas import ResidualReport
 from daq.report.html import page, paragraph, table
 from daq.report.plots import draw_fit
-from daq.report.residual import _gear_sentence, error_change_text, residual_document, summary
+from daq.report.residual import _gear_sentence, error_change_text, residual_document, summary, turns_view
 from daq.report.residual_page import DOCUMENT, PAGE, residual_page, save_report
 from daq.report.text import json_text
 from daq.workflow import fit as fit_module
 from daq.workflow.fit import Fit, calibration_of, fit
+from ident.calibration import AcceptedEffect
 from ident.discovery import before_after as before_after_module
 from ident.discovery.before_after import Account, account
 from ident.discovery.evidence import with_effects
@@ -231,9 +233,9 @@ def test_an_effect_that_hardly_lowers_the_error_is_called_small(closed: Closed) 
     assert turn.before.holdout is not None
     nearly = replace(turn.before.holdout, axes=tuple(0.95 * error for error in turn.before.holdout.axes))
     small = replace(turn, after=replace(turn.after, holdout=nearly))
-    sentences = summary(closed.fitted, replace(closed.account, turns=(small, *others)))
+    sentences = summary(closed.fitted, replace(closed.account, turns=(small, *others)), ())
     assert any(one.startswith("J3 has a spring, a small effect: the error of J3 on held-out") for one in sentences)
-    assert not any("a small effect" in one for one in summary(closed.fitted, closed.account))
+    assert not any("a small effect" in one for one in summary(closed.fitted, closed.account, ()))
 
 
 def test_what_files_say_is_escaped(closed: Closed) -> None:
@@ -292,8 +294,8 @@ def test_what_the_choice_of_effects_adds_to_sigma_is_said_where_it_counts(closed
     )
     changed = replace(closed.account, total=replace(closed.account.total, gains=chosen))
     sentence = "σ of the gains includes the choice of the effects (squares add): 50 % of it on J2."
-    assert sentence in summary(closed.fitted, changed)
-    assert not any("choice of the effects" in text for text in summary(closed.fitted, closed.account))
+    assert sentence in summary(closed.fitted, changed, ())
+    assert not any("choice of the effects" in text for text in summary(closed.fitted, closed.account, ()))
     document = Closed(closed.fitted, changed).document()
     assert document["gain_changes"][1]["choice_std"] == chosen[1].choice_std
 
@@ -328,7 +330,7 @@ def test_a_noise_floor_above_the_error_of_the_model_is_reported_with_its_cause(c
         *(None,) * 3,
     )
     refuted = Closed(closed.fitted, replace(closed.account, floors=floors))
-    first, second = (line for line in summary(refuted.fitted, refuted.account) if "no noise floor" in line)
+    first, second = (line for line in summary(refuted.fitted, refuted.account, ()) if "no noise floor" in line)
     assert first.startswith("J1 has no noise floor: its current at standstill scatters 4.0 times as much as")
     assert second.startswith("J2 has no noise floor: its current between repeated moves scatters 2.0 times")
     motors = refuted.document()["noise_floor"]["motors"]
@@ -348,7 +350,7 @@ def test_a_skew_of_time_within_its_noise_is_not_said(closed: Closed) -> None:
         )
         skewed = replace(closed.fitted, steps=(first, replace(last, findings=(skew,))))
         sentence = "Currents were sampled 0.40 ± 0.06 ms before the positions"
-        assert any(text.startswith(sentence) for text in summary(skewed, closed.account)) is said
+        assert any(text.startswith(sentence) for text in summary(skewed, closed.account, ())) is said
         assert residual_document(skewed, closed.account, calibration_of(skewed, CREATED))["time_skew"] == {
             "seconds": seconds,
             "std": 6e-5,
@@ -367,7 +369,7 @@ def test_the_summary_says_what_the_effects_change(closed: Closed) -> None:
     ):
         marked = (replace(gains[0], significant=significant), *(replace(gain, significant=False) for gain in gains[1:]))
         changed = replace(closed.account, total=replace(closed.account.total, gains=marked))
-        assert sentence in summary(closed.fitted, changed)
+        assert sentence in summary(closed.fitted, changed, ())
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -375,13 +377,13 @@ def test_silence_is_reported_with_its_size(closed: Closed) -> None:
     last = closed.fitted.steps[-1]
     start = closed.fitted.evidence()
     silent = replace(closed.fitted, steps=(replace(last, after=start),))
-    outcome, limits, *_ = summary(silent, account(start, silent.steps))
+    outcome, limits, *_ = summary(silent, account(start, silent.steps), ())
     assert outcome.startswith("No structure found")
     assert "1.2 Nm on J2" in limits
     assert "no common clock: a warm-up over the session cannot be seen" in limits
     timed = tuple(replace(data, started_s=100.0 * index) for index, data in enumerate(start.datasets))
     clocked = replace(silent, steps=(replace(last, after=replace(start, datasets=timed)),))
-    assert "clock" not in " ".join(summary(clocked, account(start, silent.steps)))
+    assert "clock" not in " ".join(summary(clocked, account(start, silent.steps), ()))
     nothing_tried = replace(silent, steps=(replace(silent.steps[0], findings=(), structures=()),))
     text = Closed(nothing_tried, account(start, silent.steps)).page()
     assert "No structure found" in Reader(text).text
@@ -395,7 +397,7 @@ def test_what_did_not_join_is_reported_with_the_reason(closed: Closed) -> None:
     replaced = SetAside(_finding(PlacedEffect(LoadFriction(0), 1)), "{rival} explains more", SPRING)
     steps = (replace(first, set_aside=(replaced, aside)), replace(last, set_aside=(aside,)))
     made = Closed(replace(closed.fitted, steps=steps), closed.account)
-    sentences = summary(made.fitted, made.account)
+    sentences = summary(made.fitted, made.account, ())
     assert sum("and was not added: it has no name, and would move the gain of J4 by 2.9 σ" in s for s in sentences) == 1
     assert any("J2 may have friction that grows with the load: it would" in one for one in sentences)
     assert any("added: spring on J3 explains more." in one for one in sentences)
@@ -429,6 +431,30 @@ def test_effects_that_held_out_runs_refute_are_not_written(
     assert json.loads((folder / DOCUMENT).read_text(encoding="utf-8"))["worse_holdout"] is True
     with pytest.raises(EffectsRefuted, match="20 moves"):
         fit_module.check_holdout(closed.fitted)
+
+
+def test_a_rise_within_noise_is_said_with_what_apply_will_refuse(closed: Closed) -> None:
+    worse = AcceptedEffect("spring", "J3", {}, (), 2.98, 3.11)
+    change = PairedChange(1.3, 1.0, 20)
+    sentences = summary(closed.fitted, replace(closed.account, holdout_change=change), (worse,))
+    (whole,) = (one for one in sentences if one.startswith("All axes together"))
+    assert whole.endswith(", within its noise (1.3 σ): the effects are kept, but not confirmed.")
+    (refused,) = (one for one in sentences if one.startswith("`apply` refuses"))
+    assert "with spring on J3: on data that the fit did not use, the torque error is 3.11 % with it, 2.98 %" in refused
+    better = replace(worse, error_after_percent=2.97)
+    said = summary(closed.fitted, replace(closed.account, holdout_change=replace(change, rise=-1.0)), (better,))
+    assert not any("within its noise" in one or "`apply` refuses" in one for one in said)
+
+
+def test_the_candidate_that_was_added_is_listed_wherever_it_ranks(closed: Closed) -> None:
+    first = closed.fitted.steps[0]
+    rivals = tuple(_finding(PlacedEffect(LoadFriction(0), axis), passed=False) for axis in range(6)) * 3
+    late = replace(first, findings=(*rivals, first.findings[0]), structures=())
+    (table, *_) = turns_view(replace(closed.fitted, steps=(late,)))
+    assert isinstance(table, Table)
+    assert list(table.columns[0].cells)[-1] == "spring"
+    assert list(table.columns[-1].cells)[-1] == "pass"
+    assert table.row_count == 7
 
 
 def test_what_rises_is_not_said_to_fall() -> None:

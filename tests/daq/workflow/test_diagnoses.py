@@ -11,7 +11,7 @@ import pytest
 
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
-from daq.report.validation import cross_document
+from daq.report.validation import cross_document, validation_view
 from daq.workflow import fit as fit_module
 from daq.workflow import validate as validate_module
 from daq.workflow.calibration_file import decode, encode
@@ -85,6 +85,15 @@ def test_validate_names_the_log(
     assert {one.name for one in found.diagnoses} == {name}
     assert (found.diagnoses[0].runs, found.diagnoses[0].axes) == ((log,), axes)
     assert cross_document(found)["diagnoses"][0]["name"] == name
+
+
+def test_a_diagnosis_that_is_made_again_is_shown_once(shelf: Shelf, calibration: Calibration) -> None:
+    found = cross_validate({"one": calibration}, [Path("thousandfold")])
+    other = replace(found.diagnoses[0], runs=("another",))
+    shown = list(validation_view(replace(calibration, diagnoses=(*found.diagnoses, other)), found))
+    checks = [str(one) for one in shown if str(one).startswith("CHECK ")]
+    assert len(checks) == len(found.diagnoses) + 1
+    assert checks[-1].startswith("CHECK another, ")
 
 
 def test_exchanged_currents_in_the_fit_are_an_error(shelf: Shelf) -> None:

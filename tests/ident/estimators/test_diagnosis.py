@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ident.data.run import Run
+from ident.discovery.evidence import gather
 from ident.errors import CurrentReversed, ModelContradicted, PayloadDiffers, UnitsMistaken
 from ident.estimators.diagnosis import (
     axis_error_diagnoses,
@@ -108,9 +109,11 @@ def test_a_reversed_current_only_turns_a_free_gain(small_truth: Truth, clean: li
 
 @pytest.mark.parametrize("signs", [s for s in itertools.product((1.0, -1.0), repeat=3) if 0 < s.count(-1.0) < 3])
 def test_a_reversed_current_with_fixed_gains(small_truth: Truth, clean: list[Run], signs: tuple[float, ...]) -> None:
-    names = [joint.name for joint, sign in zip(small_truth.model.robot.joints, signs, strict=True) if sign < 0.0]
+    axes = ("base", "arm", "wrist")  # not the joints' names in the URDF
+    names = [axis for axis, sign in zip(axes, signs, strict=True) if sign < 0.0]
+    runs = with_currents(clean[:1], np.array(signs))
     with pytest.raises(CurrentReversed, match=f"axis {', '.join(names)}: "):
-        diagnosed(small_truth, with_currents(clean[:1], np.array(signs)), fixed=True, method=Method.WLS)
+        identify(small_truth.model, runs, SMALL, fixed_gains=small_truth.gains, method=Method.WLS, axes=axes)
 
 
 @pytest.mark.parametrize("fixed", [False, True])
@@ -152,6 +155,17 @@ def test_an_error_on_one_axis(small_truth: Truth, clean: list[Run]) -> None:
     noisy = [replace(run, current_a=run.current_a + one) for run, one in zip(clean, noise, strict=True)]
     (found,) = diagnosed(small_truth, noisy[:2], fixed=True)
     assert (found.name, found.runs, found.axes) == ("axis-error", (), ("J3",))
+
+
+def test_an_error_of_a_held_out_run_is_that_runs_alone(small_truth: Truth, clean: list[Run]) -> None:
+    """The rows of a search for effects name all runs, those of the fit first."""
+    noise = np.random.default_rng(0).standard_normal(clean[2].current_a.shape) * np.array([0.0, 0.0, 1.0])
+    noisy = replace(clean[2], current_a=clean[2].current_a + noise)
+    gains = small_truth.gains
+    found = identify(small_truth.model, clean[:2], SMALL, holdout=[noisy], fixed_gains=gains, keep_rows=True)
+    for identified in (found, gather(found).identification):
+        (one,) = diagnose(identified, AXES, gains)
+        assert (one.name, one.runs, one.axes) == ("axis-error", ("r2",), ("J3",))
 
 
 def test_a_tiny_torque_is_no_error(small_truth: Truth) -> None:
