@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from math import hypot
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib import import_module
+from math import hypot, sqrt
 from xml.etree import ElementTree
 
 import numpy as np
@@ -24,15 +25,25 @@ from drivers.profiles.profile import DriveProfile
 from ident.errors import ModelError
 from ident.model.robot import Joint, JointKind, Robot
 from ident.plausible import (
+    ACCELERATION,
+    FARTHEST_CENTRE_M,
     FARTHEST_DEG,
     FARTHEST_MM,
+    GAIN,
     GRAVITY_M_S2,
     HEAVIEST_PAYLOAD_KG,
+    LARGEST_GYRATION_M,
+    LIGHTEST_PAYLOAD_KG,
     PAYLOAD_RATIO,
+    RATIO,
+    RAW_GAIN,
     SHORTEST_DEG,
     SHORTEST_MM,
     SHORTEST_OF_ALL_DEG,
+    SMALLEST_COUPLING,
+    SPEED,
     TOLERANCE_SHARE,
+    within,
 )
 
 LARGEST_CONDITION = 1e8  #: Largest condition number of R; above it, joint positions do not follow from motor positions
@@ -62,13 +73,13 @@ def check(
         *producer_faults(model),
         *_axis_faults(model, joints),
         *_list_faults(model),
-        *_effect_faults(model, () if robot is None else robot.passive_names),
+        *_effect_faults(model, robot),
         *signer_faults(model.policy.apply.signers),
         *clearance_faults(model.workspace, model.clearance, [*names, *(() if robot is None else robot.passive_names)]),
         *max_change_faults(model.policy.apply, names),
     ]
     if not logged:
-        faults += [*_mass_faults(model), *_si_faults(model, urdf)]
+        faults += [*_mass_faults(model), *_size_faults(model), *_si_faults(model, urdf)]
     if robot is not None:
         faults += _frame_faults(model, urdf)
     if faults:
@@ -82,6 +93,8 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
     if not GRAVITY_M_S2[0] < gravity < GRAVITY_M_S2[1]:
         found = f"{gravity:.4g} m/s² in all"
         faults.append(Fault(("robot", "gravity_m_s2"), found, "9.78 to 9.83 m/s², anywhere on Earth"))
+    if not urdf.strip():
+        return None, [*faults, Fault(("robot", "urdf"), "an empty file", "a URDF of an arm")]
     try:
         of_chain = [*chain_faults(model.robot, model.closures, urdf)]
         if of_chain:
@@ -104,6 +117,12 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
             expected += f"; joints that are no axes are held at a position [deg; m if prismatic]: `hold: {{{held}}}`"
         faults.append(Fault(("axes",), f"{len(model.axes)} axes", expected))
     axes = [axis.name for axis in model.axes]
+    driven = [joint.name for joint in joints]
+    for index, (name, joint) in enumerate(zip(axes, driven, strict=False)):
+        if name != joint and name in driven:
+            path = ("robot", "motors", index) if model.robot.motors else ("axes", index, "name")
+            found = f"{joint} as the joint of axis {name}, and {name} as that of another axis"
+            faults.append(Fault(path, found, f"{name}, or another name of that axis (`axes[{index}].name`)"))
     for index, name in enumerate(axes[: len(model.robot.motors)]):
         # Either the list has the wrong joint or the axis the wrong name; both cannot stay: an effect may name either.
         if name in robot.passive_names:
@@ -119,6 +138,15 @@ def _ratio_faults(model: CellModel) -> Iterator[Fault]:
     if len(ratio) != n or any(len(row) != n for row in ratio):
         shape = f"{len(ratio)} rows of {', '.join(map(str, sorted({len(row) for row in ratio})))} numbers"
         yield Fault(path, shape, f"{n} × {n}, a row for each motor")
+        return
+    implausible = False
+    for motor, row in enumerate(np.abs(ratio_of(model)).tolist()):
+        if any(0.0 < one < SMALLEST_COUPLING for one in row) or (any(row) and not within(max(row), RATIO)):
+            implausible = True
+            found = ", ".join(f"{number:g}" for number in ratio[motor])
+            expected = f"a reduction of {RATIO[0]:g} to {RATIO[1]:g} rad/rad (rad/m), and no smaller coupling than "
+            yield Fault((*path, motor), found, f"{expected}{SMALLEST_COUPLING:g}")
+    if implausible:
         return
     condition = float(np.linalg.cond(ratio_of(model)))
     if not np.isfinite(condition) or condition > LARGEST_CONDITION:
@@ -159,7 +187,13 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
         yield from _inertia_faults(payload, index)
 
 
-def _effect_faults(model: CellModel, passive: Collection[str]) -> Iterator[Fault]:
+def _effect_faults(model: CellModel, robot: Robot | None) -> Iterator[Fault]:
+    """Find effects that do not exist, are twice in one place, or cannot be there with these settings."""
+    if not model.effects:
+        return
+    # The dictionary of effects loads scipy, which most verbs do without: for the few cells that declare effects alone.
+    place: Callable[[str, int, Mapping[str, float], Robot], object] = import_module("daq.config.effects").place_effect
+    passive = () if robot is None else robot.passive_names
     names = [*(axis.name for axis in model.axes), *passive]
     placed = [(effect.name, effect.axis) for effect in model.effects]
     for index, effect in enumerate(model.effects):
@@ -167,6 +201,10 @@ def _effect_faults(model: CellModel, passive: Collection[str]) -> Iterator[Fault
             yield Fault(("effects", index, "axis"), repr(effect.axis), f"one of {', '.join(names)}")
         elif placed.index((effect.name, effect.axis)) < index:
             yield Fault(("effects", index), f"{effect.name} on {effect.axis} twice", "each effect once on an axis")
+        elif robot is not None and len(names) == len(robot.places):
+            found = place(effect.name, names.index(effect.axis), effect.settings, robot)
+            if isinstance(found, Fault):
+                yield replace(found, path=("effects", index, *found.path))
 
 
 def _frame_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
@@ -193,9 +231,37 @@ def _mass_faults(model: CellModel) -> Iterator[Fault]:
         elif rated_kg is None and payload.mass_kg > HEAVIEST_PAYLOAD_KG:
             expected = f"at most {HEAVIEST_PAYLOAD_KG:g} kg, or a `robot.rated_payload_kg`; is this in g?"
             yield Fault(path, found, expected)
+        elif 0.0 < payload.mass_kg < LIGHTEST_PAYLOAD_KG:
+            yield Fault(path, found, f"at least {LIGHTEST_PAYLOAD_KG:g} kg; is this in t?")
         elif payload.mass_kg > PAYLOAD_RATIO * lightest_kg > 0.0:
             found += f", {payload.mass_kg / lightest_kg:.3g} times another payload"
             yield Fault(path, found, f"at most {PAYLOAD_RATIO:g} times; is one of them in g?")
+
+
+def _size_faults(model: CellModel) -> Iterator[Fault]:
+    """Find payloads that are larger than any arm carries: mm for m, kg mm² for kg m²."""
+    for index, payload in enumerate(model.payloads):
+        path: Location = ("payloads", index)
+        mass_kg = payload.mass_kg if payload.mass_kg > 0.0 else np.inf
+        if payload.centre_m is not None and not within(hypot(*payload.centre_m), (0.0, FARTHEST_CENTRE_M)):
+            found = f"a centre of mass {hypot(*payload.centre_m):.4g} m from the origin"
+            yield Fault((*path, "centre_m"), found, f"at most {FARTHEST_CENTRE_M:g} m; is this in mm?")
+        if payload.inertia_kg_m2 is not None:
+            yield from _gyration_fault((*path, "inertia_kg_m2"), payload.inertia_kg_m2, mass_kg)
+        for name, value in ({} if payload.known is None else payload.known.model_dump(exclude_none=True)).items():
+            if name.startswith("I"):
+                yield from _gyration_fault((*path, "known", name), (value,), mass_kg)
+            elif not within(abs(value) / mass_kg, (0.0, FARTHEST_CENTRE_M)):
+                found = f"{value:g} kg m, a centre of mass {abs(value) / mass_kg:.4g} m from the origin"
+                yield Fault((*path, "known", name), found, f"at most {FARTHEST_CENTRE_M:g} m; is this in kg mm?")
+
+
+def _gyration_fault(path: Location, inertia_kg_m2: Sequence[float], mass_kg: float) -> Iterator[Fault]:
+    """Find an inertia of a body of many metres, by its radius of gyration √(I/m)."""
+    radius_m = sqrt(max(map(abs, inertia_kg_m2)) / mass_kg)
+    if not within(radius_m, (0.0, LARGEST_GYRATION_M)):
+        found = f"a radius of gyration √(I/m) of {radius_m:.4g} m"
+        yield Fault(path, found, f"at most {LARGEST_GYRATION_M:g} m; is this in kg mm²?")
 
 
 def _inertia_faults(payload: PayloadModel, index: int) -> Iterator[Fault]:
@@ -203,6 +269,8 @@ def _inertia_faults(payload: PayloadModel, index: int) -> Iterator[Fault]:
     if payload.inertia_kg_m2 is None:
         return
     xx, xy, xz, yy, yz, zz = payload.inertia_kg_m2
+    if not np.abs(payload.inertia_kg_m2).max() < 1e100:
+        return  # `_size_faults` refuses it; beyond, the eigenvalues overflow
     least, middle, largest = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
     margin = 1e-9 * abs(largest)
     if least < -margin or largest > least + middle + margin:
@@ -244,6 +312,7 @@ def _axis_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
         if index < len(joints):
             yield from _kind_faults(path, axis, joints[index])
         yield from _limit_faults((*path, "limits", f"position_{axis.limits.unit.name}"), axis)
+        yield from _speed_faults((*path, "limits"), axis)
         for unit, offset in ((DEGREE, axis.zero_offset_deg), (MILLIMETRE, axis.zero_offset_mm)):
             farthest = _PLAUSIBLE[unit].farthest
             if offset is not None and abs(offset) > farthest:
@@ -278,8 +347,10 @@ def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
     for index, axis in enumerate(model.axes):
         keys = ("nameplate_gain", "nameplate_gain_nm_per_a", "nameplate_gain_n_per_a")
         key = next(key for key in keys if getattr(axis, key) is not None)
-        if not getattr(axis, key):
-            yield Fault(("axes", index, key), "0", "the manufacturer's gain, signed, not zero")
+        gain, bounds = getattr(axis, key), RAW_GAIN if key == "nameplate_gain" else GAIN
+        if not within(abs(gain), bounds):
+            expected = f"the manufacturer's gain, signed, not zero: {bounds[0]:g} to {bounds[1]:g} in size"
+            yield Fault(("axes", index, key), f"{gain:g}", expected)
         if index >= len(gained) or gained[index] >= len(joints):
             continue
         joint = joints[gained[index]]
@@ -307,6 +378,17 @@ def _limit_faults(path: Location, axis: AxisModel) -> Iterator[Fault]:
         yield Fault(
             path, found, f"a range of at least {plausible.shortest:g} {unit.name}; are these {plausible.too_short}?"
         )
+
+
+def _speed_faults(path: Location, axis: AxisModel) -> Iterator[Fault]:
+    """Find limits of speed and acceleration that no axis has."""
+    unit = axis.limits.unit.name
+    for key, value, bounds, per in (
+        (f"velocity_{unit}_s", axis.limits.velocity, SPEED, "/s"),
+        (f"acceleration_{unit}_s2", axis.limits.acceleration, ACCELERATION, "/s²"),
+    ):
+        if not within(value, bounds):
+            yield Fault((*path, key), f"{value:g} {unit}{per}", f"{bounds[0]:g} to {bounds[1]:g} {unit}{per}")
 
 
 def _si_faults(model: CellModel, urdf: str) -> Iterator[Fault]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import radians
 from typing import Annotated, Literal
+from xml.etree import ElementTree
 
 import numpy as np
 from pydantic import Field
@@ -130,12 +131,34 @@ def chain_faults(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: st
             if kinds.get(name, kind) is not kind:
                 found = f"joint {name}, which is {kinds[name].value}"
                 yield Fault(("robot", key, name), found, f"a {kind.value} joint")
+    yield from _mimic_faults(urdf)
+    yield from _repeated(closures)
     if {"motors", "mobility"} <= set(given) and not unknown:
         try:
             assemble(robot_with(chain_of(robot, closures, urdf), urdf, (0.0, 0.0, -9.81)), robot.mobility)
         except ModelError as error:
             found, _, expected = str(error).partition("; expected ")
             yield Fault(("closures",), found, expected or "a mechanism that closes, and that its motors move")
+
+
+def _mimic_faults(urdf: str) -> Iterator[Fault]:
+    """Find joints that follow another one by the URDF: the equations of a closed chain do not read that."""
+    for joint in ElementTree.fromstring(urdf).findall("{*}joint"):
+        leader = joint.find("{*}mimic")
+        if leader is not None and joint.get("type") != "fixed":
+            found = f"joint {joint.get('name')} mimics {leader.get('joint')} in the URDF"
+            yield Fault(("robot", "urdf"), found, "no <mimic>: describe the mechanism that couples them in `closures`")
+
+
+def _repeated(closures: tuple[ClosureModel, ...]) -> Iterator[Fault]:
+    """Find closures of the same links in the same directions: the second one adds nothing but rank deficiency."""
+    seen: dict[object, str] = {}
+    for index, one in enumerate(closures):
+        key = frozenset((one.first, one.second)), frozenset(one.directions)
+        if key in seen:
+            found = f"{one.name}, which closes {one.first} and {one.second} as {seen[key]} does"
+            yield Fault(("closures", index), found, "each closure once")
+        seen.setdefault(key, one.name)
 
 
 def _unknown_names(robot: ChainModel, closures: tuple[ClosureModel, ...], tree: UrdfRobot) -> Iterator[Fault]:
