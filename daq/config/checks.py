@@ -6,14 +6,15 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
-from math import hypot, sqrt
+from math import hypot
 from xml.etree import ElementTree
 
 import numpy as np
 
+from daq.config.bodies import centre_faults, gyration_faults, moment_faults
 from daq.config.bus_checks import bus_faults, producer_faults
 from daq.config.cell import DEGREE, MILLIMETRE, joint_unit
-from daq.config.cell_schema import AxisModel, CellModel, PayloadModel, gain_joints, ratio_of
+from daq.config.cell_schema import AxisModel, CellModel, gain_joints, ratio_of
 from daq.config.clearance import clearance_faults
 from daq.config.closed_chain import chain_faults, chain_of, platform_frame, robot_with
 from daq.config.controller import controller_faults
@@ -26,13 +27,11 @@ from ident.errors import ModelError
 from ident.model.robot import Joint, JointKind, Robot
 from ident.plausible import (
     ACCELERATION,
-    FARTHEST_CENTRE_M,
     FARTHEST_DEG,
     FARTHEST_MM,
     GAIN,
     GRAVITY_M_S2,
     HEAVIEST_PAYLOAD_KG,
-    LARGEST_GYRATION_M,
     LIGHTEST_PAYLOAD_KG,
     PAYLOAD_RATIO,
     RATIO,
@@ -184,7 +183,8 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
                 f"{payload.mounting}, used {mountings[payload.mounting]} times",
                 "each mounting a name of its own: it denotes one body in one place",
             )
-        yield from _inertia_faults(payload, index)
+        if payload.inertia_kg_m2 is not None:
+            yield from moment_faults(("payloads", index, "inertia_kg_m2"), payload.inertia_kg_m2)
 
 
 def _effect_faults(model: CellModel, robot: Robot | None) -> Iterator[Fault]:
@@ -243,42 +243,15 @@ def _size_faults(model: CellModel) -> Iterator[Fault]:
     for index, payload in enumerate(model.payloads):
         path: Location = ("payloads", index)
         mass_kg = payload.mass_kg if payload.mass_kg > 0.0 else np.inf
-        if payload.centre_m is not None and not within(hypot(*payload.centre_m), (0.0, FARTHEST_CENTRE_M)):
-            found = f"a centre of mass {hypot(*payload.centre_m):.4g} m from the origin"
-            yield Fault((*path, "centre_m"), found, f"at most {FARTHEST_CENTRE_M:g} m; is this in mm?")
+        if payload.centre_m is not None:
+            yield from centre_faults((*path, "centre_m"), payload.centre_m)
         if payload.inertia_kg_m2 is not None:
-            yield from _gyration_fault((*path, "inertia_kg_m2"), payload.inertia_kg_m2, mass_kg)
+            yield from gyration_faults((*path, "inertia_kg_m2"), payload.inertia_kg_m2, mass_kg)
         for name, value in ({} if payload.known is None else payload.known.model_dump(exclude_none=True)).items():
             if name.startswith("I"):
-                yield from _gyration_fault((*path, "known", name), (value,), mass_kg)
-            elif not within(abs(value) / mass_kg, (0.0, FARTHEST_CENTRE_M)):
-                found = f"{value:g} kg m, a centre of mass {abs(value) / mass_kg:.4g} m from the origin"
-                yield Fault((*path, "known", name), found, f"at most {FARTHEST_CENTRE_M:g} m; is this in kg mm?")
-
-
-def _gyration_fault(path: Location, inertia_kg_m2: Sequence[float], mass_kg: float) -> Iterator[Fault]:
-    """Find an inertia of a body of many metres, by its radius of gyration √(I/m)."""
-    radius_m = sqrt(max(map(abs, inertia_kg_m2)) / mass_kg)
-    if not within(radius_m, (0.0, LARGEST_GYRATION_M)):
-        found = f"a radius of gyration √(I/m) of {radius_m:.4g} m"
-        yield Fault(path, found, f"at most {LARGEST_GYRATION_M:g} m; is this in kg mm²?")
-
-
-def _inertia_faults(payload: PayloadModel, index: int) -> Iterator[Fault]:
-    """Find inertias of no body: a principal moment below zero, or above the sum of the other two."""
-    if payload.inertia_kg_m2 is None:
-        return
-    xx, xy, xz, yy, yz, zz = payload.inertia_kg_m2
-    if not np.abs(payload.inertia_kg_m2).max() < 1e100:
-        return  # `_size_faults` refuses it; beyond, the eigenvalues overflow
-    least, middle, largest = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-    margin = 1e-9 * abs(largest)
-    if least < -margin or largest > least + middle + margin:
-        yield Fault(
-            ("payloads", index, "inertia_kg_m2"),
-            f"principal moments {least:.4g}, {middle:.4g}, {largest:.4g} kg m²",
-            "those of a body about its centre of mass: none below 0, none above the sum of the other two",
-        )
+                yield from gyration_faults((*path, "known", name), (value,), mass_kg)
+            else:
+                yield from centre_faults((*path, "known", name), (value / mass_kg,))
 
 
 @dataclass(frozen=True, slots=True)
