@@ -16,7 +16,7 @@ from daq.config.bus_checks import bus_faults, producer_faults
 from daq.config.cell import DEGREE, MILLIMETRE, joint_unit
 from daq.config.cell_schema import AxisModel, CellModel, gain_joints, ratio_of
 from daq.config.clearance import clearance_faults
-from daq.config.closed_chain import chain_faults, chain_of, platform_frame, robot_with
+from daq.config.closed_chain import chain_faults, chain_of, mechanism_faults, platform_frame, robot_with
 from daq.config.controller import controller_faults
 from daq.config.policy import max_change_faults
 from daq.config.signers import signer_faults
@@ -63,7 +63,8 @@ def check(
     Raises:
         ConfigurationInconsistent: with every contradiction and its line.
     """
-    robot, faults = _robot(model, urdf)
+    beforehand = [] if logged else [*mechanism_faults(model.closures, urdf)]
+    robot, faults = (None, beforehand) if beforehand else _robot(model, urdf)
     joints = () if robot is None else robot.axes
     names = [axis.name for axis in model.axes]
     faults += [
@@ -72,13 +73,14 @@ def check(
         *producer_faults(model),
         *_axis_faults(model, joints),
         *_list_faults(model),
-        *_effect_faults(model, robot),
+        *_effect_faults(model, robot, logged=logged),
         *signer_faults(model.policy.apply.signers),
         *clearance_faults(model.workspace, model.clearance, [*names, *(() if robot is None else robot.passive_names)]),
         *max_change_faults(model.policy.apply, names),
     ]
     if not logged:
-        faults += [*_mass_faults(model), *_size_faults(model), *_si_faults(model, urdf)]
+        faults += [*_mass_faults(model), *_size_faults(model), *_range_faults(model), *_si_faults(model, urdf)]
+        faults += _order_faults(model, joints)
     if robot is not None:
         faults += _frame_faults(model, urdf)
     if faults:
@@ -116,12 +118,6 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
             expected += f"; joints that are no axes are held at a position [deg; m if prismatic]: `hold: {{{held}}}`"
         faults.append(Fault(("axes",), f"{len(model.axes)} axes", expected))
     axes = [axis.name for axis in model.axes]
-    driven = [joint.name for joint in joints]
-    for index, (name, joint) in enumerate(zip(axes, driven, strict=False)):
-        if name != joint and name in driven:
-            path = ("robot", "motors", index) if model.robot.motors else ("axes", index, "name")
-            found = f"{joint} as the joint of axis {name}, and {name} as that of another axis"
-            faults.append(Fault(path, found, f"{name}, or another name of that axis (`axes[{index}].name`)"))
     for index, name in enumerate(axes[: len(model.robot.motors)]):
         # Either the list has the wrong joint or the axis the wrong name; both cannot stay: an effect may name either.
         if name in robot.passive_names:
@@ -129,6 +125,18 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
             expected = f"{name}, or another name of that axis (`axes[{index}].name`)"
             faults.append(Fault(("robot", "motors", index), found, expected))
     return robot, faults
+
+
+def _order_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
+    """Find axes with the name of another axis's joint: they are in another order than their joints."""
+    driven = [joint.name for joint in joints]
+    if len(driven) != len(model.axes):
+        return
+    for index, (axis, joint) in enumerate(zip(model.axes, driven, strict=True)):
+        if axis.name != joint and axis.name in driven:
+            path = ("robot", "motors", index) if model.robot.motors else ("axes", index, "name")
+            found = f"{joint} as the joint of axis {axis.name}, and {axis.name} as that of another axis"
+            yield Fault(path, found, f"{axis.name}, or another name of that axis (`axes[{index}].name`)")
 
 
 def _ratio_faults(model: CellModel) -> Iterator[Fault]:
@@ -187,8 +195,11 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
             yield from moment_faults(("payloads", index, "inertia_kg_m2"), payload.inertia_kg_m2)
 
 
-def _effect_faults(model: CellModel, robot: Robot | None) -> Iterator[Fault]:
-    """Find effects that do not exist, are twice in one place, or cannot be there with these settings."""
+def _effect_faults(model: CellModel, robot: Robot | None, *, logged: bool) -> Iterator[Fault]:
+    """Find effects that are nowhere or twice in one place; in a file, also those that cannot be there.
+
+    A log is read whatever its effects are: the fit refuses those that cannot be.
+    """
     if not model.effects:
         return
     # The dictionary of effects loads scipy, which most verbs do without: for the few cells that declare effects alone.
@@ -201,7 +212,7 @@ def _effect_faults(model: CellModel, robot: Robot | None) -> Iterator[Fault]:
             yield Fault(("effects", index, "axis"), repr(effect.axis), f"one of {', '.join(names)}")
         elif placed.index((effect.name, effect.axis)) < index:
             yield Fault(("effects", index), f"{effect.name} on {effect.axis} twice", "each effect once on an axis")
-        elif robot is not None and len(names) == len(robot.places):
+        elif not logged and robot is not None and len(names) == len(robot.places):
             found = place(effect.name, names.index(effect.axis), effect.settings, robot)
             if isinstance(found, Fault):
                 yield replace(found, path=("effects", index, *found.path))
@@ -285,7 +296,6 @@ def _axis_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
         if index < len(joints):
             yield from _kind_faults(path, axis, joints[index])
         yield from _limit_faults((*path, "limits", f"position_{axis.limits.unit.name}"), axis)
-        yield from _speed_faults((*path, "limits"), axis)
         for unit, offset in ((DEGREE, axis.zero_offset_deg), (MILLIMETRE, axis.zero_offset_mm)):
             farthest = _PLAUSIBLE[unit].farthest
             if offset is not None and abs(offset) > farthest:
@@ -312,18 +322,21 @@ def _kind_faults(path: Location, axis: AxisModel, joint: Joint) -> Iterator[Faul
         yield Fault((*path, "lead_mm"), f"a lead, and {what}", "nothing: only a prismatic joint has a lead")
 
 
+def _gain_key(axis: AxisModel) -> str:
+    """Return the key by which an axis states its gain; the schema requires one."""
+    keys = ("nameplate_gain", "nameplate_gain_nm_per_a", "nameplate_gain_n_per_a")
+    return next(key for key in keys if getattr(axis, key) is not None)
+
+
 def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
     try:
         gained = gain_joints(ratio_of(model))
     except ValueError:
         gained = ()  # _ratio_faults refuses the drive train
     for index, axis in enumerate(model.axes):
-        keys = ("nameplate_gain", "nameplate_gain_nm_per_a", "nameplate_gain_n_per_a")
-        key = next(key for key in keys if getattr(axis, key) is not None)
-        gain, bounds = getattr(axis, key), RAW_GAIN if key == "nameplate_gain" else GAIN
-        if not within(abs(gain), bounds):
-            expected = f"the manufacturer's gain, signed, not zero: {bounds[0]:g} to {bounds[1]:g} in size"
-            yield Fault(("axes", index, key), f"{gain:g}", expected)
+        key = _gain_key(axis)
+        if not getattr(axis, key):
+            yield Fault(("axes", index, key), "0", "the manufacturer's gain, signed, not zero")
         if index >= len(gained) or gained[index] >= len(joints):
             continue
         joint = joints[gained[index]]
@@ -353,15 +366,18 @@ def _limit_faults(path: Location, axis: AxisModel) -> Iterator[Fault]:
         )
 
 
-def _speed_faults(path: Location, axis: AxisModel) -> Iterator[Fault]:
-    """Find limits of speed and acceleration that no axis has."""
-    unit = axis.limits.unit.name
-    for key, value, bounds, per in (
-        (f"velocity_{unit}_s", axis.limits.velocity, SPEED, "/s"),
-        (f"acceleration_{unit}_s2", axis.limits.acceleration, ACCELERATION, "/s²"),
-    ):
-        if not within(value, bounds):
-            yield Fault((*path, key), f"{value:g} {unit}{per}", f"{bounds[0]:g} to {bounds[1]:g} {unit}{per}")
+def _range_faults(model: CellModel) -> Iterator[Fault]:
+    """Find speeds, accelerations and gains that no axis has."""
+    for index, axis in enumerate(model.axes):
+        unit, key = axis.limits.unit.name, _gain_key(axis)
+        for where, value, bounds, shown in (
+            (("limits", f"velocity_{unit}_s"), axis.limits.velocity, SPEED, f" {unit}/s"),
+            (("limits", f"acceleration_{unit}_s2"), axis.limits.acceleration, ACCELERATION, f" {unit}/s²"),
+            ((key,), abs(getattr(axis, key)), RAW_GAIN if key == "nameplate_gain" else GAIN, " in size"),
+        ):
+            if value != 0.0 and not within(value, bounds):
+                found = f"{value:g}{shown}"
+                yield Fault(("axes", index, *where), found, f"{bounds[0]:g} to {bounds[1]:g}{shown}")
 
 
 def _si_faults(model: CellModel, urdf: str) -> Iterator[Fault]:

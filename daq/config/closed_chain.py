@@ -131,8 +131,6 @@ def chain_faults(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: st
             if kinds.get(name, kind) is not kind:
                 found = f"joint {name}, which is {kinds[name].value}"
                 yield Fault(("robot", key, name), found, f"a {kind.value} joint")
-    yield from _mimic_faults(urdf)
-    yield from _repeated(closures)
     if {"motors", "mobility"} <= set(given) and not unknown:
         try:
             assemble(robot_with(chain_of(robot, closures, urdf), urdf, (0.0, 0.0, -9.81)), robot.mobility)
@@ -141,9 +139,17 @@ def chain_faults(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: st
             yield Fault(("closures",), found, expected or "a mechanism that closes, and that its motors move")
 
 
-def _mimic_faults(urdf: str) -> Iterator[Fault]:
-    """Find joints that follow another one by the URDF: the equations of a closed chain do not read that."""
-    for joint in ElementTree.fromstring(urdf).findall("{*}joint"):
+def mechanism_faults(closures: tuple[ClosureModel, ...], urdf: str) -> Iterator[Fault]:
+    """Find closures that are there twice, and joints of a closed chain that follow another one by the URDF.
+
+    The equations of a closed chain do not read `<mimic>`; a second closure of the same frames only costs rank.
+    """
+    yield from _repeated(closures)
+    try:
+        joints = ElementTree.fromstring(urdf).findall("{*}joint") if closures else []
+    except ElementTree.ParseError:
+        return  # the check of the robot says so
+    for joint in joints:
         leader = joint.find("{*}mimic")
         if leader is not None and joint.get("type") != "fixed":
             found = f"joint {joint.get('name')} mimics {leader.get('joint')} in the URDF"
@@ -151,7 +157,7 @@ def _mimic_faults(urdf: str) -> Iterator[Fault]:
 
 
 def _repeated(closures: tuple[ClosureModel, ...]) -> Iterator[Fault]:
-    """Find closures of the same links in the same directions: the second one adds nothing but rank deficiency."""
+    """Find closures of the same links in the same directions."""
     seen: dict[object, str] = {}
     for index, one in enumerate(closures):
         key = frozenset((one.first, one.second)), frozenset(one.directions)

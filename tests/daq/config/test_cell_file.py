@@ -90,6 +90,13 @@ def test_a_log_with_an_implausible_cell_can_be_read(configurations: Path) -> Non
     files = bundle(path)
     heavy = {**files, "cell.yaml": files["cell.yaml"].replace(b"mass_kg: 4.59", b"mass_kg: 4590")}
     assert cell_from_bundle(heavy).payloads[0].mass_kg == 4590.0
+    for old, new in (
+        (b"mass_kg: 4.59", b"mass_kg: 4.59\n    centre_m: [-20, 30, 50]"),
+        (b"velocity_deg_s: 200", b"velocity_deg_s: 1.0e15"),
+        (b"payloads:", b"effects: [{name: sprung, axis: J1}]\npayloads:"),
+    ):
+        assert old in files["cell.yaml"]
+        assert cell_from_bundle({**files, "cell.yaml": files["cell.yaml"].replace(old, new, 1)}).name == "demo"
 
 
 def test_a_bundle_takes_the_data_sheet_along_that_a_profile_names(checkout: Path, tmp_path: Path) -> None:
