@@ -68,6 +68,14 @@ def read_mat(path: Path, _wanted: ImportDescription, columns: tuple[Column, ...]
             expected="as many in each",
             remedy="are they of one run? the longer side of a matrix is taken for time",
         )
+    begun = [numbers.ctypes.data for numbers in found]  # they are views of what was read
+    if twice := [name for index, name in enumerate(names) if begun[index] in begun[:index]]:
+        raise TableUnfit(
+            str(path),
+            found=f"column {twice[0]} a second time, under another name",
+            expected="a column of its own for each quantity of each axis",
+            remedy="correct `columns` in the import description",
+        )
     values = require_finite(Table(path, names, np.column_stack([one.astype(np.float64) for one in found]), "")).values
     values, clock = values[:, : len(columns)], None if time is None else _stamps(path, found[-1], time)
     return Table(path, columns, values, digest_of(values, clock), clock)

@@ -233,3 +233,10 @@ def test_stamps_and_numbers_of_columns_without_end_are_refused(tmp_path: Path) -
             read(path, "q.1", time=TimeColumn(file="run.mat", column=column, unit=unit))
     with pytest.raises(TableUnfit, match=r"VARIABLE|no variable"):
         read(path, "q." + 5000 * "1")
+
+
+def test_a_column_under_two_names_is_one(tmp_path: Path) -> None:
+    path = tmp_path / "run.mat"
+    savemat(path, {"q": Q[:, :1], "i": CURRENT[:, :1]})
+    with pytest.raises(TableUnfit, match=r"column q\.1 a second time"):
+        read(path, "q", "i", "q.1")
