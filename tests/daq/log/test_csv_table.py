@@ -223,14 +223,6 @@ def test_a_delimiter_in_quotes_belongs_to_its_field(tmp_path: Path, delimiter: s
     np.testing.assert_array_equal(_read(tmp_path, data, (2, 3), delimiter=delimiter).values, VALUES)
 
 
-def test_a_decimal_comma_in_quotes_is_no_delimiter(tmp_path: Path) -> None:
-    rows = [",".join(f'"{field}"'.replace(".", ",") for field in row.split(",")) for row in ROWS]
-    table = _read(
-        tmp_path, _text(*rows, header="q;i").replace('","', '";"').encode(), ("q", "i"), delimiter=";", decimal=","
-    )
-    np.testing.assert_array_equal(table.values, VALUES)
-
-
 @pytest.mark.parametrize("row", ['"run,0.25,1.25', '"0.25"0,1.25'])
 def test_a_quote_that_is_not_closed_is_refused(tmp_path: Path, row: str) -> None:
     with pytest.raises(TableUnfit, match=r"run\.csv:3") as caught:
