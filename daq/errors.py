@@ -50,10 +50,18 @@ class ExitCode(IntEnum):
     INTERRUPTED = 130
 
 
+LONGEST = 4000  #: Characters of one part of a message; what was found may be a field of a damaged file, of any size
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}... ({len(text) - LONGEST} more characters)"
+
+
 class DaqError(Exception):
     """Root of the tree; its message names subject, what was found, what was expected, and what to do."""
 
     def __init__(self, subject: str, *, found: str, expected: str, remedy: str) -> None:
+        subject, found, expected = _cut(subject), _cut(found), _cut(expected)
         super().__init__(f"{subject}: found {found}; expected {expected}; {remedy}")
         self.subject = subject
         self.found = found

@@ -214,10 +214,19 @@ class MotionRefused(DriverError):
 
 
 class MotionTimeout(DriverError):
-    """A move did not end in time; `acknowledge` is the value of statusword bit 12 where that did not come."""
+    """A move did not end in time.
+
+    `acknowledge` is the value of statusword bit 12 where that did not come, `other_master` the description of one.
+    """
 
     def __init__(
-        self, move: int, axes: tuple[int, ...], nodes: Sequence[Node], waited_s: float, acknowledge: int | None = None
+        self,
+        move: int,
+        axes: tuple[int, ...],
+        nodes: Sequence[Node],
+        waited_s: float,
+        acknowledge: int | None = None,
+        other_master: str = "",
     ) -> None:
         names = ", ".join(map(node_label, nodes))
         if acknowledge is None:
@@ -225,6 +234,8 @@ class MotionTimeout(DriverError):
         else:
             found = f"did not {'set' if acknowledge else 'clear'} statusword bit 12 (set-point acknowledge)"
             remedy = "check that the drive is in profile position mode (6061h = 1) and accepts set-points by RPDO"
+        if other_master:
+            found, remedy = f"{found}, and {other_master},", f"end the other program first; else {remedy}"
         super().__init__(f"move {move}: {names} {found} within {waited_s:g} s; stopping all axes; {remedy}")
         self.move = move
         self.axes = axes

@@ -19,3 +19,18 @@ SHORTEST_DEG, SHORTEST_MM = 0.2, 5.0  #: Smallest range of a joint
 SHORTEST_OF_ALL_DEG = 12.6
 """Smallest range of the widest joint: four π, so that ±2π rad written as degrees are below it. No moves within a few
 degrees on every axis identify a gain."""
+SPEED, ACCELERATION = (0.01, 1e5), (0.1, 1e7)
+"""Largest speed and acceleration of a joint, from the slowest positioner to a spindle [deg/s and deg/s², or mm]."""
+RATIO = (0.01, 1e7)  #: Reduction of a motor [rad/rad, or rad/m: a fine screw behind a gear box has a million]
+SMALLEST_COUPLING = 1e-6  #: Any other number of its row, in the same unit
+LEAD_MM = (0.01, 1e4)  #: Travel of one turn of a screw or pinion
+GAIN = (1e-5, 1e7)  #: Size of a drive gain [Nm/A or N/A]
+RAW_GAIN = (1e-9, 1e9)  #: The same per unit of another current, such as thousandths or increments
+LIGHTEST_PAYLOAD_KG = 1e-3  #: Mass of a payload; lighter ones show no gain
+FARTHEST_CENTRE_M = 3.0  #: Distance of a payload's centre of mass from its frame: longer than any tool
+LARGEST_GYRATION_M = 5.0  #: Radius of gyration √(I/m) of a payload, also about the joint that carries it
+
+
+def within(value: float, bounds: tuple[float, float]) -> bool:
+    """Whether a number is in a range; NaN is in none."""
+    return bounds[0] <= value <= bounds[1]

@@ -21,6 +21,7 @@ from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistorySection,
 from daq.config.recalibration import RecalibrationSection
 from daq.config.yaml_file import FileName, Name, Positive, StrictModel, not_in_file
 from ident.arrays import FloatArray
+from ident.plausible import LEAD_MM, SPEED, within
 
 ONE_BUS, SEVERAL_BUSES = not_in_file("one bus"), not_in_file("several buses")
 U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
@@ -31,7 +32,7 @@ class RobotModel(ChainModel):
 
     urdf: FileName
     gravity_m_s2: tuple[float, float, float] = (0.0, 0.0, -9.81)
-    rated_payload_kg: Positive | None = None
+    rated_payload_kg: Annotated[float, Field(gt=0, le=1e5)] | None = None
 
 
 class DriveTrainModel(StrictModel):
@@ -123,8 +124,11 @@ class AxisModel(StrictModel):
 
     @model_validator(mode="after")
     def _check_lead(self) -> AxisModel:
-        if self.lead_mm == 0.0:
-            raise ValueError("a lead_mm that is not zero: the travel of one turn, negative for a left-handed screw")
+        if self.lead_mm is not None and not within(abs(self.lead_mm), LEAD_MM):
+            raise ValueError(
+                "a lead_mm that is not zero: the travel of one turn, negative for a left-handed screw; "
+                f"{LEAD_MM[0]:g} to {LEAD_MM[1]:g} mm in size"
+            )
         return self
 
     @model_validator(mode="after")
@@ -194,8 +198,8 @@ class ConditioningModel(StrictModel):
     position_cutoff_hz: _CutOff = 40.0
     position_order: Annotated[int, Field(ge=FILTER_ORDER[0], le=FILTER_ORDER[1])] = 4
     decimation_cutoff_hz: _CutOff = 20.0
-    standstill_rad_s: tuple[Annotated[float, Field(ge=0)] | None, ...] = ()
-    standstill_mm_s: tuple[Annotated[float, Field(ge=0)] | None, ...] = ()
+    standstill_rad_s: tuple[Annotated[float, Field(ge=0, le=1e3)] | None, ...] = ()
+    standstill_mm_s: tuple[Annotated[float, Field(ge=0, le=SPEED[1])] | None, ...] = ()
     standstill_share: Annotated[float, Field(gt=0, le=1)] = 0.1
 
 

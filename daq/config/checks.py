@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib import import_module
 from math import hypot
 from xml.etree import ElementTree
 
 import numpy as np
 
+from daq.config.bodies import centre_faults, gyration_faults, moment_faults
 from daq.config.bus_checks import bus_faults, producer_faults
 from daq.config.cell import DEGREE, MILLIMETRE, joint_unit
-from daq.config.cell_schema import AxisModel, CellModel, PayloadModel, gain_joints, ratio_of
+from daq.config.cell_schema import AxisModel, CellModel, gain_joints, ratio_of
 from daq.config.clearance import clearance_faults
-from daq.config.closed_chain import chain_faults, chain_of, platform_frame, robot_with
+from daq.config.closed_chain import chain_faults, chain_of, mechanism_faults, platform_frame, robot_with
 from daq.config.controller import controller_faults
 from daq.config.policy import max_change_faults
 from daq.config.signers import signer_faults
@@ -24,15 +26,23 @@ from drivers.profiles.profile import DriveProfile
 from ident.errors import ModelError
 from ident.model.robot import Joint, JointKind, Robot
 from ident.plausible import (
+    ACCELERATION,
     FARTHEST_DEG,
     FARTHEST_MM,
+    GAIN,
     GRAVITY_M_S2,
     HEAVIEST_PAYLOAD_KG,
+    LIGHTEST_PAYLOAD_KG,
     PAYLOAD_RATIO,
+    RATIO,
+    RAW_GAIN,
     SHORTEST_DEG,
     SHORTEST_MM,
     SHORTEST_OF_ALL_DEG,
+    SMALLEST_COUPLING,
+    SPEED,
     TOLERANCE_SHARE,
+    within,
 )
 
 LARGEST_CONDITION = 1e8  #: Largest condition number of R; above it, joint positions do not follow from motor positions
@@ -53,7 +63,8 @@ def check(
     Raises:
         ConfigurationInconsistent: with every contradiction and its line.
     """
-    robot, faults = _robot(model, urdf)
+    beforehand = [] if logged else [*mechanism_faults(model.closures, urdf)]
+    robot, faults = (None, beforehand) if beforehand else _robot(model, urdf)
     joints = () if robot is None else robot.axes
     names = [axis.name for axis in model.axes]
     faults += [
@@ -62,13 +73,14 @@ def check(
         *producer_faults(model),
         *_axis_faults(model, joints),
         *_list_faults(model),
-        *_effect_faults(model, () if robot is None else robot.passive_names),
+        *_effect_faults(model, robot, logged=logged),
         *signer_faults(model.policy.apply.signers),
         *clearance_faults(model.workspace, model.clearance, [*names, *(() if robot is None else robot.passive_names)]),
         *max_change_faults(model.policy.apply, names),
     ]
     if not logged:
-        faults += [*_mass_faults(model), *_si_faults(model, urdf)]
+        faults += [*_mass_faults(model), *_size_faults(model), *_range_faults(model), *_si_faults(model, urdf)]
+        faults += _order_faults(model, joints)
     if robot is not None:
         faults += _frame_faults(model, urdf)
     if faults:
@@ -82,6 +94,8 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
     if not GRAVITY_M_S2[0] < gravity < GRAVITY_M_S2[1]:
         found = f"{gravity:.4g} m/s² in all"
         faults.append(Fault(("robot", "gravity_m_s2"), found, "9.78 to 9.83 m/s², anywhere on Earth"))
+    if not urdf.strip():
+        return None, [*faults, Fault(("robot", "urdf"), "an empty file", "a URDF of an arm")]
     try:
         of_chain = [*chain_faults(model.robot, model.closures, urdf)]
         if of_chain:
@@ -113,12 +127,33 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
     return robot, faults
 
 
+def _order_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
+    """Find axes with the name of another axis's joint: they are in another order than their joints."""
+    driven = [joint.name for joint in joints]
+    if len(driven) != len(model.axes):
+        return
+    for index, (axis, joint) in enumerate(zip(model.axes, driven, strict=True)):
+        if axis.name != joint and axis.name in driven:
+            path = ("robot", "motors", index) if model.robot.motors else ("axes", index, "name")
+            found = f"{joint} as the joint of axis {axis.name}, and {axis.name} as that of another axis"
+            yield Fault(path, found, f"{axis.name}, or another name of that axis (`axes[{index}].name`)")
+
+
 def _ratio_faults(model: CellModel) -> Iterator[Fault]:
     path = ("drive_train", "ratio")
     ratio, n = model.drive_train.ratio, len(model.axes)
     if len(ratio) != n or any(len(row) != n for row in ratio):
         shape = f"{len(ratio)} rows of {', '.join(map(str, sorted({len(row) for row in ratio})))} numbers"
         yield Fault(path, shape, f"{n} × {n}, a row for each motor")
+        return
+    implausible = False
+    for motor, row in enumerate(np.abs(ratio_of(model)).tolist()):
+        if any(0.0 < one < SMALLEST_COUPLING for one in row) or (any(row) and not within(max(row), RATIO)):
+            implausible = True
+            found = ", ".join(f"{number:g}" for number in ratio[motor])
+            expected = f"a reduction of {RATIO[0]:g} to {RATIO[1]:g} rad/rad (rad/m), and no smaller coupling than "
+            yield Fault((*path, motor), found, f"{expected}{SMALLEST_COUPLING:g}")
+    if implausible:
         return
     condition = float(np.linalg.cond(ratio_of(model)))
     if not np.isfinite(condition) or condition > LARGEST_CONDITION:
@@ -156,10 +191,20 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
                 f"{payload.mounting}, used {mountings[payload.mounting]} times",
                 "each mounting a name of its own: it denotes one body in one place",
             )
-        yield from _inertia_faults(payload, index)
+        if payload.inertia_kg_m2 is not None:
+            yield from moment_faults(("payloads", index, "inertia_kg_m2"), payload.inertia_kg_m2)
 
 
-def _effect_faults(model: CellModel, passive: Collection[str]) -> Iterator[Fault]:
+def _effect_faults(model: CellModel, robot: Robot | None, *, logged: bool) -> Iterator[Fault]:
+    """Find effects that are nowhere or twice in one place; in a file, also those that cannot be there.
+
+    A log is read whatever its effects are: the fit refuses those that cannot be.
+    """
+    if not model.effects:
+        return
+    # The dictionary of effects loads scipy, which most verbs do without: for the few cells that declare effects alone.
+    place: Callable[[str, int, Mapping[str, float], Robot], object] = import_module("daq.config.effects").place_effect
+    passive = () if robot is None else robot.passive_names
     names = [*(axis.name for axis in model.axes), *passive]
     placed = [(effect.name, effect.axis) for effect in model.effects]
     for index, effect in enumerate(model.effects):
@@ -167,6 +212,10 @@ def _effect_faults(model: CellModel, passive: Collection[str]) -> Iterator[Fault
             yield Fault(("effects", index, "axis"), repr(effect.axis), f"one of {', '.join(names)}")
         elif placed.index((effect.name, effect.axis)) < index:
             yield Fault(("effects", index), f"{effect.name} on {effect.axis} twice", "each effect once on an axis")
+        elif not logged and robot is not None and len(names) == len(robot.places):
+            found = place(effect.name, names.index(effect.axis), effect.settings, robot)
+            if isinstance(found, Fault):
+                yield replace(found, path=("effects", index, *found.path))
 
 
 def _frame_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
@@ -193,24 +242,27 @@ def _mass_faults(model: CellModel) -> Iterator[Fault]:
         elif rated_kg is None and payload.mass_kg > HEAVIEST_PAYLOAD_KG:
             expected = f"at most {HEAVIEST_PAYLOAD_KG:g} kg, or a `robot.rated_payload_kg`; is this in g?"
             yield Fault(path, found, expected)
+        elif 0.0 < payload.mass_kg < LIGHTEST_PAYLOAD_KG:
+            yield Fault(path, found, f"at least {LIGHTEST_PAYLOAD_KG:g} kg; is this in t?")
         elif payload.mass_kg > PAYLOAD_RATIO * lightest_kg > 0.0:
             found += f", {payload.mass_kg / lightest_kg:.3g} times another payload"
             yield Fault(path, found, f"at most {PAYLOAD_RATIO:g} times; is one of them in g?")
 
 
-def _inertia_faults(payload: PayloadModel, index: int) -> Iterator[Fault]:
-    """Find inertias of no body: a principal moment below zero, or above the sum of the other two."""
-    if payload.inertia_kg_m2 is None:
-        return
-    xx, xy, xz, yy, yz, zz = payload.inertia_kg_m2
-    least, middle, largest = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-    margin = 1e-9 * abs(largest)
-    if least < -margin or largest > least + middle + margin:
-        yield Fault(
-            ("payloads", index, "inertia_kg_m2"),
-            f"principal moments {least:.4g}, {middle:.4g}, {largest:.4g} kg m²",
-            "those of a body about its centre of mass: none below 0, none above the sum of the other two",
-        )
+def _size_faults(model: CellModel) -> Iterator[Fault]:
+    """Find payloads that are larger than any arm carries: mm for m, kg mm² for kg m²."""
+    for index, payload in enumerate(model.payloads):
+        path: Location = ("payloads", index)
+        mass_kg = payload.mass_kg if payload.mass_kg > 0.0 else np.inf
+        if payload.centre_m is not None:
+            yield from centre_faults((*path, "centre_m"), payload.centre_m)
+        if payload.inertia_kg_m2 is not None:
+            yield from gyration_faults((*path, "inertia_kg_m2"), payload.inertia_kg_m2, mass_kg)
+        for name, value in ({} if payload.known is None else payload.known.model_dump(exclude_none=True)).items():
+            if name.startswith("I"):
+                yield from gyration_faults((*path, "known", name), (value,), mass_kg)
+            else:
+                yield from centre_faults((*path, "known", name), (value / mass_kg,))
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,14 +322,19 @@ def _kind_faults(path: Location, axis: AxisModel, joint: Joint) -> Iterator[Faul
         yield Fault((*path, "lead_mm"), f"a lead, and {what}", "nothing: only a prismatic joint has a lead")
 
 
+def _gain_key(axis: AxisModel) -> str:
+    """Return the key by which an axis states its gain; the schema requires one."""
+    keys = ("nameplate_gain", "nameplate_gain_nm_per_a", "nameplate_gain_n_per_a")
+    return next(key for key in keys if getattr(axis, key) is not None)
+
+
 def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
     try:
         gained = gain_joints(ratio_of(model))
     except ValueError:
         gained = ()  # _ratio_faults refuses the drive train
     for index, axis in enumerate(model.axes):
-        keys = ("nameplate_gain", "nameplate_gain_nm_per_a", "nameplate_gain_n_per_a")
-        key = next(key for key in keys if getattr(axis, key) is not None)
+        key = _gain_key(axis)
         if not getattr(axis, key):
             yield Fault(("axes", index, key), "0", "the manufacturer's gain, signed, not zero")
         if index >= len(gained) or gained[index] >= len(joints):
@@ -307,6 +364,20 @@ def _limit_faults(path: Location, axis: AxisModel) -> Iterator[Fault]:
         yield Fault(
             path, found, f"a range of at least {plausible.shortest:g} {unit.name}; are these {plausible.too_short}?"
         )
+
+
+def _range_faults(model: CellModel) -> Iterator[Fault]:
+    """Find speeds, accelerations and gains that no axis has."""
+    for index, axis in enumerate(model.axes):
+        unit, key = axis.limits.unit.name, _gain_key(axis)
+        for where, value, bounds, shown in (
+            (("limits", f"velocity_{unit}_s"), axis.limits.velocity, SPEED, f" {unit}/s"),
+            (("limits", f"acceleration_{unit}_s2"), axis.limits.acceleration, ACCELERATION, f" {unit}/s²"),
+            ((key,), abs(getattr(axis, key)), RAW_GAIN if key == "nameplate_gain" else GAIN, " in size"),
+        ):
+            if value != 0.0 and not within(value, bounds):
+                found = f"{value:g}{shown}"
+                yield Fault(("axes", index, *where), found, f"{bounds[0]:g} to {bounds[1]:g}{shown}")
 
 
 def _si_faults(model: CellModel, urdf: str) -> Iterator[Fault]:

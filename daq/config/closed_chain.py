@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import radians
 from typing import Annotated, Literal
+from xml.etree import ElementTree
 
 import numpy as np
 from pydantic import Field
@@ -136,6 +137,34 @@ def chain_faults(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: st
         except ModelError as error:
             found, _, expected = str(error).partition("; expected ")
             yield Fault(("closures",), found, expected or "a mechanism that closes, and that its motors move")
+
+
+def mechanism_faults(closures: tuple[ClosureModel, ...], urdf: str) -> Iterator[Fault]:
+    """Find closures that are there twice, and joints of a closed chain that follow another one by the URDF.
+
+    The equations of a closed chain do not read `<mimic>`; a second closure of the same frames only costs rank.
+    """
+    yield from _repeated(closures)
+    try:
+        joints = ElementTree.fromstring(urdf).findall("{*}joint") if closures else []
+    except ElementTree.ParseError:
+        return  # the check of the robot says so
+    for joint in joints:
+        leader = joint.find("{*}mimic")
+        if leader is not None and joint.get("type") != "fixed":
+            found = f"joint {joint.get('name')} mimics {leader.get('joint')} in the URDF"
+            yield Fault(("robot", "urdf"), found, "no <mimic>: describe the mechanism that couples them in `closures`")
+
+
+def _repeated(closures: tuple[ClosureModel, ...]) -> Iterator[Fault]:
+    """Find closures of the same links in the same directions."""
+    seen: dict[object, str] = {}
+    for index, one in enumerate(closures):
+        key = frozenset((one.first, one.second)), frozenset(one.directions)
+        if key in seen:
+            found = f"{one.name}, which closes {one.first} and {one.second} as {seen[key]} does"
+            yield Fault(("closures", index), found, "each closure once")
+        seen.setdefault(key, one.name)
 
 
 def _unknown_names(robot: ChainModel, closures: tuple[ClosureModel, ...], tree: UrdfRobot) -> Iterator[Fault]:

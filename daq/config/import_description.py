@@ -15,7 +15,8 @@ from daq.errors import ConfigurationInconsistent
 
 Column = Annotated[str, Field(min_length=1)] | Annotated[int, Field(ge=1)]
 """Name in the header, or number counted from 1."""
-Rate = Annotated[float, Field(ge=1.0, le=1e6)]
+RATES_HZ = (1.0, 1e6)  #: Least and largest sampling rate, stated or by the stamps
+Rate = Annotated[float, Field(ge=RATES_HZ[0], le=RATES_HZ[1])]
 Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
 SMALLEST_FACTOR = 1e-9
 SomeColumns = Annotated[tuple[Column, ...], Field(min_length=1)]

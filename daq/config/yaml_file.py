@@ -357,7 +357,7 @@ def _fault(item: Any, model: type[BaseModel]) -> Fault:
         return Fault(path, f"unknown key {path[-1]!r}", hint)
     if item["type"] == "missing":
         return Fault(path, "nothing", "this key, it is required")
-    expected = re.sub(r"^(Input|Value) should (be|have) |^Value error, ", "", item["msg"])
+    expected = re.sub(r"^\w+ should (be|have) |^Value error, | after validation, not .*$", "", item["msg"])
     return Fault(path, _show(item["input"]), expected)
 
 

@@ -22,7 +22,7 @@ from daq.config.import_description import Column, ImportDescription, TimeColumn,
 from daq.errors import LogForeign, LogTruncated, LogUnreadable, TableUnfit
 from daq.log.container import RecordFile
 from daq.log.message import JOINTS_SCHEMA, SAMPLES_TOPIC
-from daq.log.table import Table, digest_of, require_finite, stamps_of_ns
+from daq.log.table import LATEST_NS, Table, digest_of, require_finite, stamps_of_ns
 
 STAMP = "header.stamp"  #: Name of the time column
 FIELDS = ("position", "velocity", "effort")
@@ -215,9 +215,12 @@ class _Rows:
 
         Raises:
             TableUnfit: it has fewer values than joints.
-            ValueError: the time of its recording is beyond 63 bits.
+            ValueError: no log can hold the time of its recording.
         """
         if state.names not in self._places:
+            if len(set(state.names)) < len(state.names):
+                twice = next(name for name in state.names if state.names.count(name) > 1)
+                raise _unfit(self._path, f"joint {twice} twice in one message", "each joint once", "mend its publisher")
             self._places[state.names] = [
                 (field, state.names.index(joint), column)
                 for column, (field, joint) in enumerate(self._columns)
@@ -228,7 +231,7 @@ class _Rows:
             return  # joints of something else
         self._unstamped += state.stamp_ns == 0
         stamp_ns = state.stamp_ns or log_time_ns
-        if stamp_ns >= 2**63:
+        if stamp_ns >= LATEST_NS:
             raise ValueError(f"a time of {stamp_ns} ns")
         row = self._begun.get(stamp_ns)
         if row is None or any(self._present[row * width + column] for _, _, column in places):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import math
 import re
@@ -18,12 +19,13 @@ import numpy as np
 from daq.config.import_description import Column, CsvLayout, ImportDescription, TimeColumn, TimeUnit
 from daq.errors import TableUnfit
 from daq.files import read_regular
-from daq.log.table import Stamps, Table, stamps_of_ns, stamps_of_numbers
+from daq.log.table import Stamps, Table, check_reach, stamps_of_ns, stamps_of_numbers
 from ident.arrays import FloatArray
 
 ABSOLUTE_S = 1e8  #: Stamps above this are since 1970, and floats are too coarse for them: 0.2 µs
 LARGEST_BYTES = 2**30  #: Largest file; an hour of six axes at 1 kHz has half of it
 LARGEST_JUMP = 3.0  #: Largest step to a last number that may be cut off, in multiples of the largest step before it
+_UNUSED = "\x1e"  #: Delimiter of fields that are split already; it ends a line, so no field has it
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d{1,9})\d*)?(Z|[+-]\d\d:?\d\d)")
 
 
@@ -55,9 +57,17 @@ class _Lines:
     first_line: int  #: line number of the first row, from 1
 
     def fields(self, row: str) -> list[str]:
-        """Split a line into fields without quotes and white space."""
-        parts = row.split() if self.table.delimiter == " " else row.split(self.table.delimiter)
-        return [part.strip().strip('"').strip() for part in parts]
+        """Split a line into fields without quotes and white space; a delimiter between quotes belongs to its field.
+
+        Raises:
+            csv.Error: a quote is not closed.
+        """
+        delimiter = self.table.delimiter
+        if '"' not in row:
+            return row.split() if delimiter == " " else [part.strip() for part in row.split(delimiter)]
+        text = " ".join(row.split()) if delimiter == " " else row.strip(" ")
+        reader = csv.reader([text], delimiter=delimiter, skipinitialspace=True, strict=True)
+        return [part.strip() for part in next(reader)]
 
     def place(self, row: int, index: int) -> str:
         """Name a field in a message: `run.csv:42, column i3`."""
@@ -101,6 +111,7 @@ def _read_lines(path: Path, table: CsvLayout) -> tuple[_Lines, tuple[str, ...]]:
             remedy="was the export interrupted?",
         )
     bare = _Lines(path, table, (), rows, start + 1)
+    _check_quotes(bare, lines)
     names = tuple(bare.fields(lines[table.skip_rows])) if table.header else ()
     _check_header(bare, names)
     _check_shape(bare, len(names))
@@ -128,6 +139,22 @@ def _decoded(path: Path, data: bytes) -> tuple[str, ...]:
             remedy="is this a CSV file? if so, save it as UTF-8",
         )
     return decoded
+
+
+def _check_quotes(file: _Lines, lines: Sequence[str]) -> None:
+    """Refuse a quote that is not closed: where the fields of such a line end is a guess."""
+    for number, line in enumerate(lines[file.table.skip_rows :], start=file.table.skip_rows + 1):
+        if '"' not in line:
+            continue
+        try:
+            file.fields(line)
+        except csv.Error as error:
+            raise TableUnfit(
+                f"{file.path}:{number}",
+                found=f"a quote that does not enclose a whole field, in {line[:40]!r}",
+                expected="quotes around whole fields, closed on the same line",
+                remedy="export the table without quotes, or without that column",
+            ) from error
 
 
 def _check_header(file: _Lines, names: tuple[str, ...]) -> None:
@@ -161,6 +188,7 @@ def _check_last(file: _Lines) -> None:
 
 def _stamps(file: _Lines, time: TimeColumn, values: FloatArray) -> Stamps:
     """Return the stamps of a column of numbers; those since 1970 are read again, digit by digit."""
+    check_reach(values * time.unit.seconds, lambda row: f"{file.path}:{file.first_line + row}, column {time.column}")
     if abs(values[0]) * time.unit.seconds < ABSOLUTE_S:
         return stamps_of_numbers(values, time.unit)
     to_ns, index = Decimal(10) ** (9 - time.unit.digits), _index(file, time.column)
@@ -182,6 +210,8 @@ def _dates(file: _Lines, time: TimeColumn) -> Stamps:
                 remedy="correct `unit` of `time` in the import description, or add the zone to the file",
             )
         stamp_ns.append(date_ns)
+    seconds = np.array([1e-9 * date_ns for date_ns in stamp_ns])
+    check_reach(seconds, lambda row: f"{file.path}:{file.first_line + row}, column {time.column}")
     return stamps_of_ns(stamp_ns)
 
 
@@ -206,19 +236,25 @@ def _numbers(file: _Lines, columns: Sequence[str | int]) -> FloatArray:
     """
     indices = [_index(file, column) for column in columns]
     table = file.table
-    rows = [row.replace(",", ".") for row in file.rows] if table.decimal == "," else file.rows
-    try:
-        values = np.loadtxt(
-            rows,
-            delimiter=None if table.delimiter == " " else table.delimiter,
-            usecols=indices,
-            ndmin=2,
-            comments=None,
-            quotechar='"',
+    if twice := [column for number, column in enumerate(columns) if indices[number] in indices[:number]]:
+        raise TableUnfit(
+            str(file.path),
+            found=f"column {twice[0]} a second time, once by name and once by number",
+            expected="a column of its own for each quantity of each axis",
+            remedy="correct `columns` in the import description",
         )
+    rows, usecols, delimiter = file.rows, indices, None if table.delimiter == " " else table.delimiter
+    if any('"' in row for row in rows):  # as `fields` has it, for quotes are read in one place alone
+        split = (file.fields(row) for row in rows)
+        rows = tuple(_UNUSED.join(fields[index] for index in indices) for fields in split)
+        usecols, delimiter = [*range(len(indices))], _UNUSED
+    if table.decimal == ",":
+        rows = tuple(row.replace(",", ".") for row in rows)
+    try:
+        values = np.loadtxt(rows, delimiter=delimiter, usecols=usecols, ndmin=2, comments=None, quotechar=None)
     except ValueError as error:
         raise _not_numeric(file, indices) from error
-    if not np.isfinite(values).all():
+    if len(values) != len(rows) or not np.isfinite(values).all():  # loadtxt leaves empty lines out
         raise _not_numeric(file, indices)
     _check_points(file, indices)
     for index, column in zip(indices, values.T, strict=True):

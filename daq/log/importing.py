@@ -50,7 +50,6 @@ FEWEST_ROWS = 3  #: Rows of a recording; fewer have neither a rate nor a motion
 TORQUE_HZ, TEMPERATURE_HZ = 20.0, 1.0
 """Rates at which the controller's own torque and temperatures are kept: enough for a slope and for a warm-up."""
 UNIX_NS = range(10**18, 3 * 10**18)  #: Stamps from 2001 to 2065 are since 1970; any others since some start
-LATEST_NS = 9 * 10**18  #: The latest stamp that a log holds, roughly
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,23 +205,12 @@ def _readings(slow: list[tuple[Quantity, int, FloatArray]], cycle: int, time_ns:
 
 
 def _start(wanted: ImportDescription, files: dict[str, Table], clock: Clock | None) -> tuple[int, int, Timing | None]:
-    """Return the first stamp of the log and the time of day [ns; 0 where unknown], and the timing with the former.
-
-    Raises:
-        TableUnfit: the first stamp is later than a log can hold.
-    """
+    """Return the first stamp of the log and the time of day [ns; 0 where unknown], and the timing with the former."""
     if wanted.time is None or clock is None:
         return 0, 0, None
     file = files[wanted.time.file]
     assert file.stamps is not None  # clock_of has used them
     first_ns = file.stamps.first_ns
-    if first_ns >= LATEST_NS:
-        raise TableUnfit(
-            file.place(0, wanted.time.column),
-            found=f"a stamp of {first_ns * 1e-9:.4g} s",
-            expected="seconds since 1970, or since some start",
-            remedy="correct `unit` of `time` in the import description: is it ms, us or ns?",
-        )
     if first_ns < 0:
         return 0, 0, clock.timing
     return first_ns, first_ns if first_ns in UNIX_NS else 0, replace(clock.timing, started_s=first_ns * 1e-9)
@@ -283,8 +271,26 @@ def _payload(wanted: ImportDescription, cell: Cell) -> Payload | None:
     )
 
 
+def _check_columns(wanted: ImportDescription, description: Path) -> None:
+    """Refuse a column that is read as two quantities, or as that of two axes: one of them would be made up."""
+    read: dict[tuple[Path, str], str] = {}
+    timed = [] if wanted.time is None else [("time.column", wanted.time.file, wanted.time.column)]
+    for key, section in wanted.sections():
+        timed += [(f"{key}.columns[{index}]", section.file, column) for index, column in enumerate(section.columns)]
+    for key, file, column in timed:
+        first = read.setdefault((Path(file), str(column)), key)
+        if first != key:
+            raise ConfigurationInconsistent(
+                f"{description}: {key}",
+                found=f"column {column} of {file}, which is also {first}",
+                expected="a column of its own for each quantity of each axis",
+                remedy="correct `columns` in the import description",
+            )
+
+
 def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> None:
     n = len(cell.axes)
+    _check_columns(wanted, description)
     for key, section in wanted.sections():
         if len(section.columns) != n:
             raise ConfigurationInconsistent(

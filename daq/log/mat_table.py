@@ -9,6 +9,7 @@ the bytes that are there, nothing is followed deeper than the fields of a struct
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from collections.abc import Iterator
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from daq.config.import_description import Column, ImportDescription, TimeColumn, TimeUnit
 from daq.errors import TableUnfit
 from daq.files import read_regular
-from daq.log.table import Stamps, Table, digest_of, require_finite, stamps_of_ns, stamps_of_numbers
+from daq.log.table import Stamps, Table, check_reach, digest_of, require_finite, stamps_of_ns, stamps_of_numbers
 
 MAGIC = b"MATLAB 5.0 MAT-file"
 LARGEST_BYTES = 2**31 - 1  #: Largest file and variable; the format has no larger ones
@@ -67,14 +68,24 @@ def read_mat(path: Path, _wanted: ImportDescription, columns: tuple[Column, ...]
             expected="as many in each",
             remedy="are they of one run? the longer side of a matrix is taken for time",
         )
+    begun = [numbers.ctypes.data for numbers in found]  # they are views of what was read
+    if twice := [name for index, name in enumerate(names) if begun[index] in begun[:index]]:
+        raise TableUnfit(
+            str(path),
+            found=f"column {twice[0]} a second time, under another name",
+            expected="a column of its own for each quantity of each axis",
+            remedy="correct `columns` in the import description",
+        )
     values = require_finite(Table(path, names, np.column_stack([one.astype(np.float64) for one in found]), "")).values
-    values, clock = values[:, : len(columns)], None if time is None else _stamps(found[-1], time)
+    values, clock = values[:, : len(columns)], None if time is None else _stamps(path, found[-1], time)
     return Table(path, columns, values, digest_of(values, clock), clock)
 
 
-def _stamps(values: NDArray[Any], time: TimeColumn) -> Stamps:
+def _stamps(path: Path, values: NDArray[Any], time: TimeColumn) -> Stamps:
     factor = round(time.unit.seconds * 1e9)
-    if values.dtype.kind in "iu" and np.abs(values.astype(np.float64)).max() * factor < 2.0**62:
+    seconds = values.astype(np.float64) * time.unit.seconds
+    check_reach(seconds, lambda row: f"{path}, row {row + 1}, column {time.column}")
+    if values.dtype.kind in "iu":
         return stamps_of_ns((values.astype(np.int64) * factor).tolist())
     return stamps_of_numbers(values.astype(np.float64), time.unit)
 
@@ -153,7 +164,7 @@ class _MatFile:
             TableUnfit: it is not there, or holds no real numbers.
         """
         parts = str(column).split(".")
-        number = int(parts.pop()) if len(parts) > 1 and parts[-1].isascii() and parts[-1].isdigit() else None
+        number = int(parts.pop()) if len(parts) > 1 and re.fullmatch("[0-9]{1,9}", parts[-1]) else None
         name = ".".join(parts)
         if name not in self._read:
             try:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy  # loads scipy.interpolate when it is first used: half of the time of an import without a spline
 
-from daq.config.import_description import TimeColumn
+from daq.config.import_description import RATES_HZ, TimeColumn
 from daq.errors import TableUnfit
 from daq.log.metadata import Timing
 from daq.log.table import Table
@@ -69,8 +69,8 @@ def clock_of(table: Table, wanted: TimeColumn, numbers: FloatArray) -> Clock:
 
     Raises:
         TableUnfit: a stamp is earlier than the one before, or repeats it with other numbers; a step is longer than
-            `largest_gap_periods`; the rate changes by more than RATE_CHANGE; or the stated rate is far from that of
-            the stamps.
+            `largest_gap_periods`; the rate is outside RATES_HZ, or changes by more than RATE_CHANGE; or the stated rate
+            is far from that of the stamps.
     """
     assert table.stamps is not None  # its reader was asked for them
     row = np.flatnonzero(_distinct(table, wanted, numbers))
@@ -87,6 +87,13 @@ def clock_of(table: Table, wanted: TimeColumn, numbers: FloatArray) -> Clock:
             remedy="correct `column` and `unit` of `time` in the import description, or give rate_hz instead",
         )
     timing = replace(check_stamps(time_s), rows=len(numbers), duplicates=duplicates, close=int(np.count_nonzero(~far)))
+    if not RATES_HZ[0] * (1.0 - EVEN) <= timing.rate_hz <= RATES_HZ[1] * (1.0 + EVEN):
+        raise TableUnfit(
+            f"{table.path}, column {wanted.column}",
+            found=f"stamps at {timing.rate_hz:.4g} Hz with `unit: {wanted.unit.value}`",
+            expected=f"{RATES_HZ[0]:g} to {RATES_HZ[1]:g} Hz",
+            remedy="correct `unit` of `time` in the import description: is it s, ms, us or ns?",
+        )
     _check_gaps(table, wanted, row, time_s, timing)
     _check_rate(table, wanted, time_s)
     if wanted.rate_hz is not None:

@@ -17,6 +17,8 @@ from daq.config.import_description import Column, ImportDescription, TimeColumn,
 from daq.errors import TableUnfit
 from ident.arrays import FloatArray
 
+LATEST_NS = 9 * 10**18  #: The latest stamp that a log holds, roughly
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stamps:
@@ -49,6 +51,27 @@ class Table:
 
 
 Reader = Callable[[Path, ImportDescription, tuple[Column, ...], TimeColumn | None], Table]
+
+
+def check_reach(time_s: FloatArray, place: Callable[[int], str]) -> None:
+    """Refuse stamps that no log can hold, before they are converted.
+
+    Args:
+        time_s: finite stamps as the file has them [s], shape (k,).
+        place: name of a row's stamp in a message.
+
+    Raises:
+        TableUnfit: a stamp is beyond ±LATEST_NS.
+    """
+    wrong = np.flatnonzero(~(np.abs(time_s) < LATEST_NS * 1e-9))
+    if wrong.size:
+        row = int(wrong[0])
+        raise TableUnfit(
+            place(row),
+            found=f"a stamp of {time_s[row]:.4g} s",
+            expected="seconds since 1970, or since some start",
+            remedy="correct `unit` of `time` in the import description: is it ms, us or ns?",
+        )
 
 
 def stamps_of_numbers(values: FloatArray, unit: TimeUnit) -> Stamps:

@@ -12,16 +12,21 @@ from xml.etree import ElementTree
 import numpy as np
 from pydantic import Field, model_validator
 
+from daq.config.bodies import centre_faults, gyration_faults, moment_faults
 from daq.config.cell import DEGREE, MILLIMETRE
-from daq.config.yaml_file import Document, Fault, StrictModel, describe, parse_yaml, read_bytes, read_model
+from daq.config.yaml_file import Document, Fault, Location, StrictModel, describe, parse_yaml, read_bytes, read_model
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent, ConfigurationMissing, UsageError
 from drivers.simulation.faults import FaultKind, FaultSpec
 from drivers.simulation.spec import AxisSpec, Body, CellSpec, Closure, PassiveFriction, UndeclaredEffect
+from ident.plausible import GAIN, RATIO, within
 
 AxisName = Annotated[str, Field(pattern=r"^J[1-9][0-9]?$")] | Annotated[int, Field(ge=1)]  #: J3, or 3
 
 LONGEST_S = 1e6
+MASS_KG = (1e-6, 1e5)  #: Mass of a payload
+CURRENT_A = (1e-6, 1e6)  #: Rated and peak current of an amplifier
+LARGEST_NUMBER = 1e9  #: Any other number, in its own unit: far beyond any robot, far below an overflow
 LAST_CYCLE = 10**12  #: No simulated cell runs for that long; beyond 2⁶³ periods nothing could count them
 
 
@@ -247,8 +252,48 @@ def _check(document: Document, model: SimulationModel) -> None:
         if effect.axis is not None and axis_index(effect.axis) >= n
     ]
     faults += absent_axes(model.faults, n)
+    faults += _implausible(model)
     if faults:
         raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the simulation file")
+
+
+def _implausible(model: SimulationModel) -> Iterator[Fault]:
+    """Find numbers by which the plant overflows, and payloads that are no bodies."""
+    for name, body in model.payloads.items():
+        path = ("payloads", name)
+        if not within(body.mass_kg, MASS_KG):
+            yield Fault((*path, "mass_kg"), f"{body.mass_kg:g} kg", f"{MASS_KG[0]:g} to {MASS_KG[1]:g} kg")
+            continue
+        yield from centre_faults((*path, "centre_m"), body.centre_m)
+        yield from gyration_faults((*path, "inertia_kg_m2"), body.inertia_kg_m2, body.mass_kg)
+        yield from moment_faults((*path, "inertia_kg_m2"), body.inertia_kg_m2)
+    for index, axis in enumerate(model.axes):
+        for key, value, bounds in (
+            ("gain_nm_per_a", abs(axis.gain_nm_per_a) or GAIN[0], GAIN),  # `_check` refuses 0
+            ("rated_current_a", axis.rated_current_a, CURRENT_A),
+            ("peak_current_a", axis.peak_current_a, CURRENT_A),
+        ):
+            if not within(value, bounds):
+                yield Fault(("axes", index, key), f"{value:g}", f"{bounds[0]:g} to {bounds[1]:g} in size")
+    for index, row in enumerate(model.ratio):
+        if not all(abs(number) <= RATIO[1] for number in row):
+            yield Fault(("ratio", index), ", ".join(f"{number:g}" for number in row), f"at most ±{RATIO[1]:g}")
+    bounded = {"gain_nm_per_a", "rated_current_a", "peak_current_a"}
+    for where, number in _numbers((), model.model_dump(exclude={"payloads", "ratio"})):
+        if where[-1] not in bounded and not abs(number) <= LARGEST_NUMBER:
+            yield Fault(where, f"{number:g}", f"at most ±{LARGEST_NUMBER:g}")
+
+
+def _numbers(path: Location, value: object) -> Iterator[tuple[Location, float]]:
+    """Yield the floating-point numbers of a document, each with its path."""
+    if isinstance(value, float):
+        yield path, value
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _numbers((*path, key), inner)
+    elif isinstance(value, list | tuple):
+        for index, inner in enumerate(value):
+            yield from _numbers((*path, index), inner)
 
 
 def _closed_chain_faults(model: SimulationModel, urdf: str) -> Iterator[Fault]:

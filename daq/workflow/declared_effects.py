@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from daq.config.cell import Cell, model_of
+from daq.config.effects import place_effect
+from daq.config.yaml_file import Fault
 from daq.errors import ConfigurationInconsistent, UsageError
 from ident.discovery.evidence import Evidence, gather, with_effects, without_effects
 from ident.discovery.loop import Step, with_declared
-from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import PlacedEffect, check_settings, is_placeable
-from ident.errors import EffectRefused
+from ident.effects.effect import PlacedEffect
 from ident.estimators.estimate import Estimate
 from ident.estimators.identify import Identification, estimate_with, require_plausible
 from ident.estimators.method import Method
@@ -27,31 +27,18 @@ def declared_effects(cell: Cell) -> tuple[PlacedEffect, ...]:
     Raises:
         ConfigurationInconsistent: there is no such effect, or it has no such setting, on this axis.
     """
-    families = {family[0].name: family[0] for family in EFFECTS}
     robot, placed = model_of(cell).robot, []
     for declared in cell.effects:
-        subject = f"effects of cell {cell.name!r}: {declared.name} on {cell.place_names[declared.axis]}"
-        if declared.name not in families:
-            raise _wrong(subject, "no such effect", f"one of {', '.join(families)}")
-        known = families[declared.name]
-        unknown = sorted(set(declared.settings) - set(known.settings))
-        if unknown:
-            raise _wrong(subject, f"settings {', '.join(unknown)}", ", ".join(known.settings) or "no settings")
-        settings = {**known.settings, **declared.settings}
-        try:
-            check_settings(known, settings, declared.axis, len(cell.axes))
-        except EffectRefused as error:
-            raise _wrong(subject, str(error), "settings in their range") from error
-        # A file knows one kind of number; an order is whole.
-        effect = known.with_settings({name: type(known.settings[name])(value) for name, value in settings.items()})
-        if not is_placeable(effect, declared.axis, robot):
-            raise _wrong(subject, "an effect that this axis cannot have", "another axis, or the pair the other way")
-        placed.append(PlacedEffect(effect, declared.axis))
+        found = place_effect(declared.name, declared.axis, declared.settings, robot)
+        if isinstance(found, Fault):
+            raise ConfigurationInconsistent(
+                f"effects of cell {cell.name!r}: {declared.name} on {cell.place_names[declared.axis]}",
+                found=found.found,
+                expected=found.expected,
+                remedy="correct the cell file",
+            )
+        placed.append(found)
     return tuple(placed)
-
-
-def _wrong(subject: str, found: str, expected: str) -> ConfigurationInconsistent:
-    return ConfigurationInconsistent(subject, found=found, expected=expected, remedy="correct the cell file")
 
 
 def refuse_effects(cell: Cell, option: str) -> None:

@@ -338,10 +338,10 @@ def plan(
     predicted, found = experiment.design.std_percent(information), experiment.design.condition(information)
     worst = int(np.argmax(predicted))
     remedy = "allow a longer run, more exchanges, wider joint limits or higher speed"
-    if found > largest_condition:
+    if not found <= largest_condition:
         words = f"condition {found:.0f} of the weighted observation matrix after {exchanges} exchanges"
         raise _unfit(cell, duration_s, words, f"at most {largest_condition:.0f}", remedy)
-    if predicted[worst] > largest_std_percent:
+    if not predicted[worst] <= largest_std_percent:
         words = f"{predicted[worst]:.1f} % predicted for the gain of {cell.axes[worst].name}"
         judged = verdicts(experiment.design, [(experiment.excitation(draft.paths)[0], RUNS)])
         remedy = ". ".join((remedy, *judged.sentences(cell.axis_names)))

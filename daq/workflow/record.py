@@ -233,6 +233,8 @@ def record(
         kept.feed.finish()
         if short is not None:
             raise short
+        if other := network.other_master():
+            warnings = (*warnings, f"{other}; it only read, but end that program before the next run")
         return Recorded(out, log.statistics, stream.statistics, (*warnings, *remarks, *recovered, *polling.remarks))
 
 

@@ -150,7 +150,7 @@ class VirtualEnd(BurstBus, VirtualBus):
         self._check_if_open()
         with suppress(Empty):
             self._received.append(self.queue.get(timeout=timeout_s))
-            while True:
+            for _ in range(self.queue.qsize()):  # not until it is empty: in a flood it never is
                 self._received.append(self.queue.get_nowait())
 
 

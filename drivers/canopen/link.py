@@ -27,6 +27,7 @@ NMT_COB_ID = 0x000
 EMCY, HEARTBEAT = 0x080, 0x700
 LSS = frozenset((0x7E4, 0x7E5))  #: Layer setting services (CiA 305): a device gets another node id or bit rate
 _RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))  #: Set-points of a drive (CiA 301, predefined connection set)
+_WRITES = frozenset((0, 1, 6))  #: Command specifiers (upper three bits) of downloads: segment, begin, block
 _LSS_NAME = "a layer setting service, which changes node ids"
 _NAMES = {NMT_COB_ID: "an NMT command", SYNC_COB_ID: "a SYNC", **dict.fromkeys(LSS, _LSS_NAME)}
 BOOTS_S = 0.5  #: Two boot-up messages in this time are those of two devices
@@ -124,6 +125,7 @@ class Link:
         #: Number of frames by identifier that only we should send (NMT, SYNC, LSS, SDO request, set-point of one of our
         #: axes, any frame with our own node id) and that we did not send.
         self.foreign: dict[int, int] = {}
+        self.written: dict[int, str] = {}  #: Downloads to our axes that we did not send, by identifier
         self.own_id: int | None = None  #: Node id of our heartbeat, None before one was chosen
         self.names: Mapping[int, str] = {}  #: Of our axes by node id
         #: Time by the clock at which everything that waits must end [ns]; None while the network is not closed.
@@ -235,6 +237,8 @@ class Link:
         if message.arbitration_id in (NMT_COB_ID, SYNC_COB_ID) or (service == SDO_REQUEST and node_id) or ours:
             if message.arbitration_id != SYNC_COB_ID or self.sync_producer is None:
                 self.note_foreign(message.arbitration_id)
+            if service == SDO_REQUEST and node_id in self.names and message.data and message.data[0] >> 5 in _WRITES:
+                self._note_write(message.arbitration_id)
             return True
         if node_id == 0:
             return False
@@ -282,6 +286,13 @@ class Link:
         self.foreign[identifier] = self.foreign.get(identifier, 0) + 1
         if self.foreign[identifier] == 1:  # once: a master would fill the log
             seen = command_name(identifier, self.names)
+            self._events.append((0, EventKind.BUS_BUSY, identifier, f"{seen} that we did not send"))
+
+    def _note_write(self, identifier: int) -> None:
+        """Report, once, that another master writes to one of our axes by SDO: that can move it, or stop a move."""
+        if identifier not in self.written:
+            seen = command_name(identifier, self.names).replace("an SDO request", "an SDO download (it writes)")
+            self.written[identifier] = seen
             self._events.append((0, EventKind.BUS_BUSY, identifier, f"{seen} that we did not send"))
 
     def _note_heartbeat(self, node_id: int, message: can.Message) -> None:

@@ -13,11 +13,11 @@ from typing import Self
 import can
 
 from drivers.canopen.bus import BusAddress
-from drivers.canopen.link import Link, NmtCommand, NmtState, command_name, never
+from drivers.canopen.link import HEARTBEAT, LSS, Link, NmtCommand, NmtState, command_name, never
 from drivers.canopen.needs import Profiles
 from drivers.canopen.pdo import CONTROLWORD, HEARTBEAT_MS, STATUSWORD, AxisPdos, wanted_pdos
 from drivers.canopen.scan import FoundNode, answering, free_ids, read_identity, scan_link
-from drivers.canopen.sdo import Clock, SdoPolicy
+from drivers.canopen.sdo import SDO_REQUEST, Clock, SdoPolicy
 from drivers.canopen.setup import AxisSetup, Guard, producer_of, read_consumers
 from drivers.canopen.split_bus import CellAddress, open_cell_bus
 from drivers.errors import (
@@ -322,6 +322,7 @@ class CanopenNetwork:
             BusBusy: another master commands this bus.
         """
         self.link.foreign.clear()
+        self.link.written.clear()
         self.link.wait(self.bounds.listen_s)
         self.require_alone()
 
@@ -334,6 +335,12 @@ class CanopenNetwork:
         if self.link.foreign:
             seen = ", ".join(command_name(identifier, self.link.names) for identifier in sorted(self.link.foreign))
             raise BusBusy.by_master(self.link.address, seen)
+
+    def other_master(self) -> str:
+        """Describe SDO requests of another master since `require_quiet`; empty without any."""
+        asked = [number for number in sorted(self.link.foreign) if SDO_REQUEST < number < HEARTBEAT]
+        seen = [command_name(number, self.link.names) for number in asked if number not in LSS]
+        return f"another master was on the bus: {', '.join(seen)}" if seen else ""
 
     def guard(self) -> None:
         """Start our heartbeat: from now on the amplifiers quick stop by themselves when we fall silent.

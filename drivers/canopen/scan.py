@@ -26,6 +26,7 @@ T = TypeVar("T")
 SCAN_POLICY = SdoPolicy(attempts=2, transfer_s=1.0, most_bytes=256)
 """One node that never ends must not keep the others from being found."""
 NODE_S = 3.0  #: After this time, nothing more is asked of a node
+SCAN_S = 30.0  #: After this time, nothing more is asked of any node
 _DEVICE_TYPE = ObjectEntry(0x1000, 0, 32, signed=False)
 
 
@@ -72,11 +73,12 @@ def scan(
 
 def scan_link(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[FoundNode, ...]:
     """Find all nodes that answer an SDO request or send a heartbeat within a time."""
+    end_ns = link.clock() + round((wait_s + SCAN_S) * 1e9)
     answered = answering(link, node_ids, wait_s)
     several = {n for n in answered if link.answered[n] > 1 and SDO_REQUEST + n not in link.foreign}
     alive = sorted(set(answered) | (set(link.nmt) & set(node_ids)))
     nothing = (None, None, None, None, None)
-    found = [_describe(link, n) if n in answered else (FoundNode(n, *nothing), 0) for n in alive]
+    found = [_describe(link, n, end_ns) if n in answered else (FoundNode(n, *nothing), 0) for n in alive]
     link.hear_beats(max((period_ms for _, period_ms in found), default=0))  # of all nodes at once
     nodes = []
     for node, period_ms in found:
@@ -87,13 +89,15 @@ def scan_link(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[Found
     return tuple(nodes)
 
 
-def _describe(link: Link, node_id: int) -> tuple[FoundNode, int]:
-    """Read what a node reports of itself, and the period of its heartbeat [ms]; 0 for none.
+def _describe(link: Link, node_id: int, scan_end_ns: int) -> tuple[FoundNode, int]:
+    """Read what a node reports of itself until the scan ends, and the period of its heartbeat [ms]; 0 for none.
 
     An object that it reports badly does not keep the others from it.
     """
     access, problems = link.objects(node_id, SCAN_POLICY), list[str]()
-    end_ns = link.clock() + round(NODE_S * 1e9)
+    if link.clock() >= scan_end_ns:
+        problems.append(f"nothing was asked of it: the scan was over after {SCAN_S:g} s; is the bus flooded?")
+    end_ns = min(link.clock() + round(NODE_S * 1e9), scan_end_ns)
 
     def reported(read: Callable[[], T]) -> T | None:
         if link.clock() >= end_ns:

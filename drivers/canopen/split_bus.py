@@ -25,6 +25,7 @@ from drivers.canopen.socketcan import CapturedMessage, Losses, losses_of, read_u
 from drivers.errors import BusError, NodeMisplaced, node_label
 
 ALTERNATION_S = 0.0005  #: Time to wait at one bus while another may receive, where one of them has no file descriptor
+LONGEST_LEFT_OUT_S = 0.1  #: Time after a time-out in which frames that are left out may still be read: a flood of them
 LARGEST_RUN = 64  #: Frames of one bus in a row while another has one too: a lagging clock must not silence the others
 BUS_OFF = 0x40  # linux/can/error.h, class CAN_ERR_BUSOFF of an error frame
 BUS_OFF_REASON = "bus-off: the CAN controller disconnected itself; check the wiring"
@@ -189,6 +190,8 @@ class SplitBus(can.BusABC):
                 message, self._waiting[oldest] = self._waiting[oldest], None
                 if message is not None and self._belongs(message, oldest):
                     return message
+                if end_s is not None and self._clock() > end_s + LONGEST_LEFT_OUT_S:
+                    return None
                 continue  # an end may hold more frames without a ready file descriptor
             left_s = None if end_s is None else end_s - self._clock()
             if left_s is not None and left_s <= 0:

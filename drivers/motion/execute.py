@@ -246,7 +246,8 @@ class _Execution:
     def _timeout(
         self, number: int, late: tuple[int, ...], waited_s: float, acknowledge: int | None = None
     ) -> MotionTimeout:
-        return MotionTimeout(number, late, [self._nodes[axis] for axis in late], waited_s, acknowledge)
+        nodes = [self._nodes[axis] for axis in late]
+        return MotionTimeout(number, late, nodes, waited_s, acknowledge, self._network.other_master())
 
     def _arrived(self, axis: int, start: int) -> bool:
         """Return whether bit 10 is set near the target; on a short way it may be that of the move before."""

@@ -178,9 +178,11 @@ class Watch:
             self._on_event(event)
             if event.kind is EventKind.BUS_BUSY and self._link.is_own(event.code):
                 self.faults.append(BusBusy.by_own_id(self._link.address, event.code))
-            elif event.kind is EventKind.BUS_BUSY and (event.code < SDO_REQUEST or event.code in LSS):
-                # A reader only disturbs, and is reported; a device that sends commands could move the robot.
-                seen = command_name(event.code, self._link.names)
+            elif event.kind is EventKind.BUS_BUSY and (
+                event.code < SDO_REQUEST or event.code in LSS or event.code in self._link.written
+            ):
+                # A reader only disturbs, and is reported; a device that commands or writes could move the robot.
+                seen = self._link.written.get(event.code) or command_name(event.code, self._link.names)
                 self.faults.append(BusBusy.by_master(self._link.address, seen))
             if event.axis is None:
                 continue

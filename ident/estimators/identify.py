@@ -155,7 +155,7 @@ def require_seen_payload(estimate: Estimate, system: System) -> None:
     relative, rows = estimate.gains_std / np.abs(estimate.gains), system.joints.factors
     torque = [LEAST_WEIGHT * np.linalg.norm(factor[:, : len(relative)] @ estimate.gains) for factor in rows]
     weightless = all(np.linalg.norm(factor[:, -1]) < least for factor, least in zip(rows, torque, strict=True))
-    if weightless or float(np.min(relative)) > LARGEST_STD:
+    if weightless or not float(np.min(relative)) <= LARGEST_STD:
         raise PayloadUnseen(tuple(float(100.0 * value) for value in relative), system.runs)
 
 
@@ -183,8 +183,8 @@ def require_plausible(
         excess[idle & ~unknown] = 0.0
     size = np.abs(estimate.gains)
     excess[size < COLLAPSED_GAIN * size.max()] = np.inf
-    worst = int(np.nanargmax(excess))
-    if error.total > LARGEST_TOTAL_PERCENT or excess[worst] > 1.0:
+    worst = 0 if np.isnan(excess).all() else int(np.nanargmax(excess))
+    if not (error.total <= LARGEST_TOTAL_PERCENT and excess[worst] <= 1.0):
         raise ModelContradicted(
             "the fit",
             found=f"a relative error of {error.total:.3g} % in total, {error.axes[worst]:.3g} % on axis {axes[worst]}, "

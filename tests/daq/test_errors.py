@@ -50,3 +50,9 @@ def test_an_error_carries_its_evidence() -> None:
     error = UsageError("here", found="this", expected="that", remedy="do so")
     assert (error.subject, error.found, error.expected, error.remedy) == ("here", "this", "that", "do so")
     assert str(error) == "here: found this; expected that; do so"
+
+
+def test_a_message_does_not_repeat_a_damaged_file() -> None:
+    error = UsageError("here", found="x" * 10**6, expected="that", remedy="do so")
+    assert len(str(error)) < 5000
+    assert "996000 more characters" in str(error)

@@ -59,7 +59,7 @@ def error(context: GateContext) -> Iterator[GateFinding]:
         return
     trained, held = calibration.relative_error_percent, calibration.holdout_error_percent
     judged = trained if held is None else held
-    if judged.total > policy.max_error_percent:
+    if not judged.total <= policy.max_error_percent:
         yield (
             "calibration",
             f"a relative error of {judged.total:.1f} % of the torques",

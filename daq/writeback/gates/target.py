@@ -37,7 +37,7 @@ def uncertainty(context: GateContext) -> Iterator[GateFinding]:
     """Bound σ, relative to the gain."""
     bound = context.policy.max_std_percent
     for change in _finite_changes(context):
-        if change.std_percent > bound:
+        if not change.std_percent <= bound:
             remedy = "record longer or more exciting moves, or a heavier payload"
             yield change.axis, f"σ {change.std_percent:.2f} %", f"at most {bound:g} %", remedy
 
@@ -58,11 +58,11 @@ def change_bound(context: GateContext) -> Iterator[GateFinding]:
     """Bound the change from the number in the controller."""
     policy = context.policy
     for change in filter(_keeps_sign, _finite_changes(context)):
-        if abs(change.change_percent) > policy.max_change_percent:
+        if not abs(change.change_percent) <= policy.max_change_percent:
             found = f"a change of {change.change_percent:+.1f} % from the gain now"
             yield change.axis, found, f"at most ±{policy.max_change_percent:g} %", _CURRENT_SCALE
         bound = policy.max_change.get(change.axis)
-        if bound is not None and abs(change.new - change.old) > bound:
+        if bound is not None and not abs(change.new - change.old) <= bound:
             found = f"a change of {change.new - change.old:+.4g} {change.unit} from the gain now"
             yield change.axis, found, f"at most ±{bound:g} {change.unit}", _CURRENT_SCALE
 
@@ -71,7 +71,7 @@ def nameplate_bound(context: GateContext) -> Iterator[GateFinding]:
     """Bound the distance from the nameplate."""
     bound = context.policy.max_nameplate_percent
     for change in filter(_keeps_sign, _finite_changes(context)):
-        if abs(change.nameplate_percent) > bound:
+        if not abs(change.nameplate_percent) <= bound:
             yield (
                 change.axis,
                 f"{change.nameplate_percent:+.1f} % from the nameplate",

@@ -90,6 +90,13 @@ def test_a_log_with_an_implausible_cell_can_be_read(configurations: Path) -> Non
     files = bundle(path)
     heavy = {**files, "cell.yaml": files["cell.yaml"].replace(b"mass_kg: 4.59", b"mass_kg: 4590")}
     assert cell_from_bundle(heavy).payloads[0].mass_kg == 4590.0
+    for old, new in (
+        (b"mass_kg: 4.59", b"mass_kg: 4.59\n    centre_m: [-20, 30, 50]"),
+        (b"velocity_deg_s: 200", b"velocity_deg_s: 1.0e15"),
+        (b"payloads:", b"effects: [{name: sprung, axis: J1}]\npayloads:"),
+    ):
+        assert old in files["cell.yaml"]
+        assert cell_from_bundle({**files, "cell.yaml": files["cell.yaml"].replace(old, new, 1)}).name == "demo"
 
 
 def test_a_bundle_takes_the_data_sheet_along_that_a_profile_names(checkout: Path, tmp_path: Path) -> None:
@@ -152,6 +159,38 @@ def test_the_digest_follows_every_file(configurations: Path) -> None:
         ("mass_kg: 4.59", "mass_kg: -4.59", "positive mass"),
         ("gain_nm_per_a: 25.65", "gain_nm_per_a: 0", "not zero"),
         ("-9.81]", "-9810]", "9810 m/s²"),
+        ("mass_kg: 4.59", "mass_kg: 1.0e-9", "is this in t"),
+        ("mass_kg: 4.59", "mass_kg: 4.59\n    centre_m: [-20, 30, 50]", "61.64 m from the origin; .*in mm"),
+        ("mass_kg: 4.59", "mass_kg: 4.59\n    centre_m: [1.0e200, 0, 0]", "1e.200 m from the origin"),
+        (
+            "mass_kg: 4.59",
+            "mass_kg: 4.59\n    centre_m: [0, 0, 0]\n    inertia_kg_m2: [6000, 0, 0, 6000, 0, 6000]",
+            r"inertia_kg_m2: found a radius of gyration √\(I/m\) of 36.* m; expected at most 5 m; is this in kg mm²",
+        ),
+        (
+            "mass_kg: 4.59",
+            "mass_kg: 4.59\n    centre_m: [0, 0, 0]\n    inertia_kg_m2: [1.0e200, 0, 0, 1.0e200, 0, 1.0e200]",
+            "radius of gyration",
+        ),
+        ("mass_kg: 4.59", "mass_kg: 4.59\n    known: {mx: 459}", "100 m from the origin"),
+        ("mass_kg: 4.59", "mass_kg: 4.59\n    known: {Ixx: 1.0e308}", r"known.Ixx: found a radius of gyration"),
+        ("velocity_deg_s: 200", "velocity_deg_s: 1.0e-322", "velocity_deg_s: .*expected 0.01 to 100000 deg/s"),
+        ("velocity_deg_s: 200", "velocity_deg_s: 1.0e15", "velocity_deg_s: .*expected 0.01 to 100000 deg/s"),
+        ("acceleration_deg_s2: 800", "acceleration_deg_s2: 1.0e308", r"acceleration_deg_s2: .*deg/s²"),
+        ("[32, 0, 0, 0, 0, 0]", "[1.0e-300, 0, 0, 0, 0, 0]", r"ratio\[0\]: found 1e-300, 0, .*0.01 to 1e.07"),
+        ("[32, 0, 0, 0, 0, 0]", "[1.0e200, 0, 0, 0, 0, 0]", r"ratio\[0\]: found 1e.200, 0, .*0.01 to 1e.07"),
+        ("[32, 0, 0, 0, 0, 0]", "[32, 1.0e-9, 0, 0, 0, 0]", "no smaller coupling than 1e-06"),
+        ("gain_nm_per_a: 25.65", "gain_nm_per_a: 5.0e-324", "1e-05 to 1e.07 in size"),
+        ("gain_nm_per_a: 25.65", "gain_nm_per_a: 1.0e100", "1e-05 to 1e.07 in size"),
+        ("payloads:", "effects: [{name: sprung, axis: J1}]\npayloads:", "no such effect; expected one of stribeck"),
+        ("payloads:", "effects: [{name: cogging, axis: J1, settings: {order: 2.5}}]\npayloads:", "2.5; .*whole number"),
+        ("payloads:", "effects: [{name: stribeck, axis: J1, settings: {gap: 1}}]\npayloads:", "found settings gap"),
+        ("payloads:", "effects: [{name: passive-spring, axis: J1}]\npayloads:", "without a motor"),
+        (
+            "payloads:",
+            "effects: [{name: inertial-coupling, axis: J3, settings: {other_axis: 2}}]\npayloads:",
+            r"effects\[0\].axis: .* the pair the other way",
+        ),
         ("[0.03, 0.03, ", "[0.03, ", "5 speeds"),
         ("[drives.J1.gain, ", "[", "5 keys"),
         ("tx40.urdf", "../simulation/demo.yaml", "a URDF of an arm"),
@@ -164,6 +203,27 @@ def test_the_digest_follows_every_file(configurations: Path) -> None:
 def test_a_cell_that_contradicts_itself_is_refused(configurations: Path, old: str, new: str, message: str) -> None:
     path = _spoil(configurations / "cells/demo.yaml", old, new)
     with pytest.raises(ConfigurationInconsistent, match=message):
+        load_cell(path)
+
+
+def test_axes_in_another_order_than_their_joints_are_refused(configurations: Path) -> None:
+    urdf = configurations / "robots/tx40.urdf"
+    text = urdf.read_text().replace('"J1"', '"J0"').replace('"J2"', '"J1"').replace('"J0"', '"J2"')
+    urdf.write_text(text)
+    with pytest.raises(ConfigurationInconsistent, match=r"axes\[0\]\.name: found J2 as the joint of axis J1"):
+        load_cell(configurations / "cells/demo.yaml")
+
+
+def test_an_empty_urdf_is_no_robot(configurations: Path) -> None:
+    (configurations / "robots/tx40.urdf").write_text(" \n")
+    with pytest.raises(ConfigurationInconsistent, match=r"robot\.urdf: found an empty file; expected a URDF of an arm"):
+        load_cell(configurations / "cells/demo.yaml")
+
+
+@pytest.mark.parametrize("lead", ["5.0e-324", "1.0e300"])
+def test_a_lead_that_no_screw_has_is_refused(configurations: Path, lead: str) -> None:
+    path = _spoil(configurations / "cells/gantry.yaml", "lead_mm: 20.0", f"lead_mm: {lead}")
+    with pytest.raises(SchemaMismatch, match=r"0\.01 to 10000 mm in size"):
         load_cell(path)
 
 

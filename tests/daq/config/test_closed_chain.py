@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from daq.config.cell import DEGREE, Cell, DeclaredEffect, robot_of
 from daq.config.cell_file import load_cell
-from daq.errors import ConfigurationInconsistent
+from daq.errors import ConfigurationInconsistent, SchemaMismatch
 from daq.workflow.declared_effects import declared_effects
 from ident.model.bodies import LINK_PARAMETERS
 from ident.model.urdf import read_urdf
@@ -19,6 +19,7 @@ from tests.conftest import CHECKOUT
 MOTORS, JOINTS = "motors: [crank-1, crank-2]", "crank-1, elbow-1, crank-2, elbow-2"
 ASSEMBLY = "crank-1: 0, elbow-1: 0, crank-2: 0, elbow-2: 0"
 CLOSURE = "  - {name: tip, first: rod-1-tip, second: rod-2-tip, directions: [x, y]}\n"
+AGAIN = "  - {name: too, first: rod-2-tip, second: rod-1-tip, directions: [x, y]}\n"
 #: The cranks meet each other, and the rods lie on each other: they turn about the elbows freely.
 SINGULAR = "crank-1: 81.87, elbow-1: -128.436, crank-2: -81.87, elbow-2: 128.436"
 
@@ -110,6 +111,12 @@ def _cell(folder: Path, *changes: tuple[str, str], name: str = "five-bar") -> Ce
             id="axis named as a joint without a motor",
         ),
         pytest.param(
+            CLOSURE,
+            CLOSURE + AGAIN,
+            "13: closures[1]: found too, which closes rod-2-tip and rod-1-tip as tip does; expected each closure once",
+            id="a closure twice",
+        ),
+        pytest.param(
             MOTORS,
             "motors: [crank-1, elbow-2]",
             "6: robot.motors[1]: found elbow-2 as the joint of axis crank-2, and joint crank-2 without a motor; "
@@ -147,6 +154,26 @@ def test_a_coupled_drive_train_of_a_redundant_robot_is_refused(tmp_path: Path) -
         "zeros off the diagonal: 4 motors for 3 degrees of freedom; correct the cell file"
     )
     assert _cell(tmp_path, ("- [0, -50]", "- [10, -50]")).ratio[1, 0] == 10.0  # two motors, two degrees of freedom
+
+
+def test_motors_in_another_order_than_their_axes_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationInconsistent, match=r"motors\[0\]: found crank-2 as the joint of axis crank-1"):
+        _cell(tmp_path, (MOTORS, "motors: [crank-2, crank-1]"))
+
+
+def test_a_joint_that_mimics_another_is_refused(tmp_path: Path) -> None:
+    text = (CHECKOUT / "configs/robots/five-bar.urdf").read_text(encoding="utf-8")
+    head = '<joint name="elbow-1" type="revolute">'
+    assert head in text
+    text = text.replace(head, f'{head}<mimic joint="crank-1"/>')
+    (tmp_path / "mimic.urdf").write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigurationInconsistent, match="joint elbow-1 mimics crank-1 in the URDF"):
+        _cell(tmp_path, (f"{CHECKOUT}/configs/robots/five-bar.urdf", "mimic.urdf"))
+
+
+def test_a_list_that_is_too_short_is_refused_in_words(tmp_path: Path) -> None:
+    with pytest.raises(SchemaMismatch, match=r"directions: found list \[\]; expected at least 1 item; "):
+        _cell(tmp_path, ("directions: [x, y]", "directions: []"))
 
 
 def test_a_singular_start_is_refused(tmp_path: Path) -> None:
@@ -196,9 +223,9 @@ def test_an_effect_is_declared_on_a_joint_without_a_motor(tmp_path: Path) -> Non
         ConfigurationInconsistent, match="'elbow-3'; expected one of crank-1, crank-2, elbow-1, elbow-2"
     ):
         _cell(tmp_path, ("conditioning:", wrong))
-    on_axis = _cell(tmp_path, ("conditioning:", declared.replace("elbow-2", "crank-2")))
-    with pytest.raises(ConfigurationInconsistent, match="passive-friction on crank-2: found an effect that this axis"):
-        declared_effects(on_axis)
+    message = r"effects\[0\]\.axis: found a place that this effect cannot have; expected a joint .* without a motor"
+    with pytest.raises(ConfigurationInconsistent, match=message):
+        _cell(tmp_path, ("conditioning:", declared.replace("elbow-2", "crank-2")))
 
 
 def test_a_payload_is_drawn_in_the_frame_of_the_platform(tmp_path: Path) -> None:

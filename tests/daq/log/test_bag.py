@@ -324,3 +324,9 @@ def test_a_message_of_the_other_byte_order_is_read() -> None:
     )  # fmt: skip
     state = joint_state_from_cdr(big)
     assert (state.stamp_ns, state.names, state.position, state.effort) == (5_000_000_006, ("J1", "J2"), (1.5, -2.5), ())
+
+
+def test_a_joint_twice_in_one_message_is_refused(tmp_path: Path) -> None:
+    twice = message(0, name=["J1", "J1", *JOINTS[2:]])
+    with pytest.raises(TableUnfit, match="joint J1 twice"):
+        read(write_bag(tmp_path / "run.mcap", [("/joint_states", twice)]))

@@ -202,3 +202,39 @@ def test_stamps_since_some_start_are_those_of_the_file(tmp_path: Path) -> None:
     assert stamps is not None
     assert stamps.first_ns == 512_300_000_000
     assert stamps.time_s == pytest.approx([0.0, 0.010, 0.022], abs=1e-9)
+
+
+@pytest.mark.parametrize("last", [TimeUnit.SECOND, TimeUnit.NANOSECOND])
+def test_stamps_that_no_log_holds_are_refused(tmp_path: Path, last: TimeUnit) -> None:
+    with pytest.raises(TableUnfit, match=r"run\.csv:3, column 1"):
+        _stamped(tmp_path, last, ["1", "1e308", "3"])
+    with pytest.raises(TableUnfit, match=r"run\.csv:2, column 1"):
+        _stamped(tmp_path, TimeUnit.ISO_8601, ["9999-01-01T00:00:00Z"] * 2)
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t", " "])
+def test_a_delimiter_in_quotes_belongs_to_its_field(tmp_path: Path, delimiter: str) -> None:
+    def line(*fields: str) -> str:
+        return delimiter.join((f'"state{delimiter}mode"', *fields))
+
+    rows = [line(*row.split(",")).replace("state", "run auto") for row in ROWS]
+    data = "\n".join((line('"q 1"', "i"), *rows, "")).encode()
+    np.testing.assert_array_equal(_read(tmp_path, data, ("q 1", "i"), delimiter=delimiter).values, VALUES)
+    np.testing.assert_array_equal(_read(tmp_path, data, (2, 3), delimiter=delimiter).values, VALUES)
+
+
+@pytest.mark.parametrize("row", ['"run,0.25,1.25', '"0.25"0,1.25'])
+def test_a_quote_that_is_not_closed_is_refused(tmp_path: Path, row: str) -> None:
+    with pytest.raises(TableUnfit, match=r"run\.csv:3") as caught:
+        _read(tmp_path, _text(ROWS[0], row, ROWS[2], header="q,i").encode(), ("q", "i"))
+    assert "quote" in caught.value.found
+
+
+def test_an_empty_line_is_no_sample_of_a_single_column(tmp_path: Path) -> None:
+    with pytest.raises(TableUnfit, match=r"run\.csv:3"):
+        _read(tmp_path, b"q\n1.5\n\n2.5\n3.5\n", ("q",))
+
+
+def test_a_column_by_name_and_by_number_is_one(tmp_path: Path) -> None:
+    with pytest.raises(TableUnfit, match="a second time"):
+        _read(tmp_path, _text(*ROWS, header="q,i").encode(), ("q", 1))

@@ -789,3 +789,25 @@ def test_an_import_without_them_has_neither(bench: Bench) -> None:
     run, _ = load_run(bench.out)
     assert run.torque_channels == ()
     assert run.temperature_c is None
+
+
+@pytest.mark.parametrize(
+    ("key", "columns"), [("position", [*NAMES[:5], "q1"]), ("current", NAMES[:6]), ("temperature", NAMES[6:])]
+)
+def test_a_column_is_read_as_one_thing(checkout: Path, tmp_path: Path, key: str, columns: list[str]) -> None:
+    bench = Bench(checkout, tmp_path).prepare()
+    section = {"position": {"unit": "deg", "side": "joint"}, "current": {"unit": "A"}}.get(key, {})
+    bench.describe(**{key: {"file": "run.csv", "columns": columns, **section}})
+    with pytest.raises(ConfigurationInconsistent, match="which is also"):
+        import_recording(bench.description, bench.data, bench.out, software="test")
+
+
+@pytest.mark.parametrize("step", [4_000_000, 4_000, 4])
+def test_stamps_in_another_unit_have_no_rate_of_a_robot(checkout: Path, tmp_path: Path, step: int) -> None:
+    bench = Bench(checkout, tmp_path).prepare()
+    rows = np.hstack((step * np.arange(300.0)[:, None], bench.joint_deg, bench.current_a))
+    lines = [",".join(("t", *NAMES)), *(",".join(map(repr, row)) for row in rows.tolist())]
+    (bench.data / "run.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    bench.describe(rate_hz=None, time={"file": "run.csv", "column": "t", "unit": "s"})
+    with pytest.raises(TableUnfit, match="Hz with `unit: s`"):
+        import_recording(bench.description, bench.data, bench.out, software="test")

@@ -223,3 +223,20 @@ def test_a_matrix_is_imported_with_its_columns_as_axes(
     (tmp_path / "run.mat").write_bytes(b"SQLite format 3\0 and so on")
     assert main(["import", str(description), "--data", str(tmp_path), "--out", str(tmp_path / "x.mcap")]) == 4
     assert "ros2 bag convert" in " ".join(capfd.readouterr().err.split())
+
+
+def test_stamps_and_numbers_of_columns_without_end_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.mat"
+    savemat(path, {"q": Q, "t": np.linspace(0.0, 1e300, ROWS), "n": np.full(ROWS, 2**62)})
+    for column, unit in (("t", TimeUnit.SECOND), ("n", TimeUnit.MICROSECOND)):
+        with pytest.raises(TableUnfit, match="a stamp of"):
+            read(path, "q.1", time=TimeColumn(file="run.mat", column=column, unit=unit))
+    with pytest.raises(TableUnfit, match=r"VARIABLE|no variable"):
+        read(path, "q." + 5000 * "1")
+
+
+def test_a_column_under_two_names_is_one(tmp_path: Path) -> None:
+    path = tmp_path / "run.mat"
+    savemat(path, {"q": Q[:, :1], "i": CURRENT[:, :1]})
+    with pytest.raises(TableUnfit, match=r"column q\.1 a second time"):
+        read(path, "q", "i", "q.1")

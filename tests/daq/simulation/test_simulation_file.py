@@ -40,6 +40,20 @@ def test_an_unknown_payload_is_refused(checkout: Path) -> None:
         ("serial: 1001", "serail: 1001", SchemaMismatch, "serial"),
         ("serial: 1001", "serial: 1001, torque_disturbance_percent: 11", SchemaMismatch, "torque_disturbance_percent"),
         ("gain_nm_per_a: 33.9", "gain_nm_per_a: 0.0", ConfigurationInconsistent, "not zero"),
+        ("gain_nm_per_a: 33.9", "gain_nm_per_a: -1.0e308", ConfigurationInconsistent, r"axes\[0\].gain_nm_per_a"),
+        ("rated_current_a: 2.0", "rated_current_a: 1.0e-300", ConfigurationInconsistent, "rated_current_a"),
+        ("motor_inertia_kg_m2: 0.35", "motor_inertia_kg_m2: 1.0e300", ConfigurationInconsistent, "at most ±1e.09"),
+        (
+            "coefficient: 0.12",
+            "coefficient: 1.0e300",
+            ConfigurationInconsistent,
+            "parameters.coefficient",
+        ),
+        ("[32, 0, 0, 0, 0, 0]", "[1.0e200, 0, 0, 0, 0, 0]", ConfigurationInconsistent, r"ratio\[0\]"),
+        ("mass_kg: 4.59", "mass_kg: 1.0e308", ConfigurationInconsistent, "payloads.disc.mass_kg"),
+        ("centre_m: [-0.06", "centre_m: [1.0e200", ConfigurationInconsistent, "payloads.disc.centre_m: .* mm"),
+        ("[0.016, 0.0, 0.0, 0.016, 0.0,", "[-1, 0.0, 0.0, -1, 0.0,", ConfigurationInconsistent, "none below 0"),
+        ("[0.016, 0.0, 0.0, 0.016, 0.0,", "[1.0e200, 0.0, 0.0, 1, 0.0,", ConfigurationInconsistent, "of gyration"),
     ],
 )
 def test_a_wrong_file_is_refused(

@@ -42,6 +42,7 @@ def test_settings_that_are_not_given_are_those_of_the_dictionary() -> None:
         (DeclaredEffect("counterweight", 1, {}), "no such effect; expected one of stribeck"),
         (DeclaredEffect("counterbalance", 1, {"length": 0.2}), "settings length; expected ratio, phase_rad"),
         (DeclaredEffect("counterbalance", 1, {"ratio": 1.4}), "ratio = 1.4; it lies between 0.05 and 0.95"),
+        (DeclaredEffect("cogging", 1, {"order": 2.5}), "2.5; expected a whole number"),
         (DeclaredEffect("coupling", 1, {"other_axis": 9}), "number of another of the 6 axes"),
     ],
 )

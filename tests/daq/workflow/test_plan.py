@@ -19,6 +19,7 @@ from daq.workflow.experiment import Experiment, experiment_of, paths_of
 from daq.workflow.plan import Plan, plan, slowed
 from drivers.motion.move import Trapezoid
 from ident.planning.clearance import Box
+from ident.planning.excitation import Design
 
 FloatArray = NDArray[np.float64]
 CELLS = Path(__file__).parents[3] / "configs" / "cells"
@@ -146,3 +147,11 @@ def test_a_slower_plan_keeps_its_ways(demo: Cell, experiment: Experiment) -> Non
     assert [move.target_rad for move in slow.moves] == [move.target_rad for move in made.moves]
     dwells = sum(move.dwell_s for move in made.moves)
     assert slow.duration_s - dwells == pytest.approx(4.0 * (made.duration_s - dwells))
+
+
+def test_a_prediction_that_is_no_number_is_no_plan(
+    demo: Cell, experiment: Experiment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Design, "std_percent", lambda _self, _information: np.full(6, np.nan))
+    with pytest.raises(UsageError, match="nan % predicted"):
+        plan(demo, seed=1, exchanges=0, experiment=experiment)

@@ -313,3 +313,14 @@ def test_axes_that_are_stopped_by_sdo_leave_no_doubt_about_the_samples(
     monkeypatch.setattr(network, "unguard", late_answers)
     done = timed.run()
     assert (done.log.valid, done.log.reason) == (True, "")
+
+
+def test_another_master_that_reads_meanwhile_is_named_at_the_end(lockstep: Rig) -> None:
+    reading = can.Message(arbitration_id=0x602, is_extended_id=False, data=bytes((0x40, 0x41, 0x60, *bytes(5))))
+    lockstep.bus.on_cycle = lambda cycle: lockstep.bus.inject(reading) if cycle == 200 else None
+    done = lockstep.run()
+    assert done.log.valid
+    assert [text for text in done.warnings if "another master" in text] == [
+        "another master was on the bus: an SDO request to J2 (node 2) (602h); it only read, but end that program "
+        "before the next run"
+    ]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from queue import Queue, SimpleQueue
+from typing import cast
 
 import can
 import pytest
@@ -12,7 +14,7 @@ from can.interfaces.socketcand import SocketCanDaemonBus
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivers.canopen.bus import BusAddress, SocketcandBus, open_bus
+from drivers.canopen.bus import BusAddress, SocketcandBus, VirtualEnd, open_bus
 from drivers.canopen.hub import HOST, Hub
 from drivers.canopen.link import Link
 from drivers.canopen.sdo import SdoPolicy
@@ -34,6 +36,27 @@ class TestVirtual(BusContract):
     @pytest.fixture
     def ends(self, request: pytest.FixtureRequest) -> Iterator[Ends]:
         yield from three_ends(BusAddress("virtual", request.node.nodeid))
+
+
+class _Flood(SimpleQueue[can.Message]):
+    """A queue that somebody fills faster than it is read."""
+
+    def get_nowait(self) -> can.Message:
+        self.put(can.Message(arbitration_id=0x7F, is_extended_id=False))
+        assert self.qsize() < 1000, "a reader that never ends"
+        self.put(can.Message(arbitration_id=0x7F, is_extended_id=False))
+        return super().get_nowait()
+
+
+def test_a_flood_does_not_keep_a_reader() -> None:
+    with open_bus(BusAddress("virtual", "flooded")) as end:
+        assert isinstance(end, VirtualEnd)
+        end.channel.remove(end.queue)
+        end.queue = cast("Queue[can.Message]", _Flood())
+        end.channel.append(end.queue)
+        for _ in range(3):
+            end.queue.put(can.Message(arbitration_id=0x81, is_extended_id=False))
+        assert [frame.arbitration_id for frame in (end.recv(0.0), end.recv(0.0)) if frame] == [0x81, 0x81]
 
 
 def test_an_end_of_python_cans_own_is_on_the_same_bus() -> None:

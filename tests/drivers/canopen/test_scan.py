@@ -12,11 +12,12 @@ import pytest
 
 from drivers.canopen.link import Link
 from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.scan import SCAN_S
 from drivers.errors import DriveFault, ObjectAccessError, SetupRefused
 from drivers.profiles.profile import ObjectEntry
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync, TimedSync
-from tests.drivers.hostile import HOSTILE, NAME, Answer, Hostile, about, endless
+from tests.drivers.hostile import HOSTILE, NAME, Answer, Hostile, about, endless, silent
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, ScriptedNode, cell, lose_first_answer
 
 
@@ -32,6 +33,17 @@ def test_every_node_is_reported_whatever_one_of_them_does(answer: Answer, proble
     assert [node.problems for node in found[::2]] == [(), ()]
     assert any(re.search(problem, text) for text in found[1].problems)
     assert bus.clock.now_ns - begun_ns < 5_000_000_000
+
+
+def test_a_scan_of_many_nodes_that_do_not_end_ends() -> None:
+    network, bus = cell(40)
+    bus.nodes = tuple(Hostile(node.node_id, bus, silent) for node in bus.nodes)
+    begun_ns = bus.clock.now_ns
+    with network:
+        found = network.scan(wait_s=0.05)
+    assert bus.clock.now_ns - begun_ns < (SCAN_S + 10.0) * 1e9
+    assert [node.node_id for node in found] == list(range(1, 41))
+    assert "the scan was over after 30 s; is the bus flooded?" in found[-1].problems[0]
 
 
 def test_an_object_of_unbounded_length_is_no_reason_to_ask_again() -> None:

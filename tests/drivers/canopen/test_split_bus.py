@@ -293,6 +293,23 @@ def test_a_node_on_the_other_bus_is_reported_once_and_not_believed(pair: Pair) -
     assert pair.bus.recv(0.0) is None
 
 
+def test_a_flood_of_frames_that_are_left_out_does_not_keep_the_reader(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[can.Message] = []
+
+    def flood(_timeout: float | None) -> can.Message:
+        assert len(read) < 1000, "a reader that never ends"
+        read.append(frame(0x181, data=bytes(8)))
+        pair.clock.now_ns += 1_000_000
+        return read[-1]
+
+    monkeypatch.setattr(pair.right, "recv", flood)
+    with pytest.raises(NodeMisplaced):
+        pair.bus.recv(0.0)
+    assert pair.bus.recv(0.01) is None
+
+
 def test_one_node_id_on_two_buses_is_refused_before_anything_is_opened() -> None:
     parts = tuple(BusPart(name, BusAddress("carrier-pigeon", name), frozenset((3, 4))) for name in NAMES)
     with pytest.raises(BusError, match="node 3 is on left and on right; give one of the two another"):

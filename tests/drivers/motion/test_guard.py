@@ -7,7 +7,7 @@ from itertools import pairwise
 import can
 import pytest
 
-from drivers.errors import BusBusy, SetupRefused
+from drivers.errors import BusBusy, MotionTimeout, SetupRefused
 from drivers.motion.execute import execute
 from drivers.motion.move import Move
 from drivers.stream.sample import CellEvent, EventKind
@@ -247,6 +247,47 @@ def test_any_frame_with_our_node_id_and_any_lss_frame_stops_the_axes(frame: can.
             list(execute(network, stream, (MOVE,), permission()))
         assert bus.cycle < 70
     assert [node.statusword & 0x6F for node in bus.nodes] == [0x40, 0x40]
+
+
+@pytest.mark.parametrize("command", [0x23, 0x2B, 0x3F, 0x21, 0x00, 0xC6], ids=hex)
+def test_another_master_that_writes_stops_the_axes(command: int) -> None:
+    network, bus = cell(2)
+    for node in bus.nodes:
+        give_guard(node)
+    reading = can.Message(arbitration_id=0x602, is_extended_id=False, data=bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0)))
+    writing = can.Message(arbitration_id=0x602, is_extended_id=False, data=bytes((command, 0x81, 0x60, 0, 1, 0, 0, 0)))
+    with network:
+        network.prepare()
+        bus.cycle = -1
+        bus.on_cycle = lambda cycle: bus.inject(reading if cycle < 60 else writing) if cycle in (50, 60) else None
+        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock))
+        with pytest.raises(BusBusy, match=r"an SDO download \(it writes\) to J2 \(node 2\) \(602h\)"):
+            list(execute(network, stream, (MOVE,), permission()))
+        assert 60 <= bus.cycle < 70
+    assert [node.statusword & 0x6F for node in bus.nodes] == [0x40, 0x40]
+
+
+@pytest.mark.parametrize(("node_id", "command"), [(2, 0x40), (2, 0x60), (2, 0xA4), (2, 0x80), (9, 0x23)])
+def test_another_master_that_only_reads_is_an_event_and_named_behind_a_late_move(node_id: int, command: int) -> None:
+    network, bus = cell(2)
+    for node in bus.nodes:
+        give_guard(node)
+    frame = can.Message(arbitration_id=0x600 + node_id, is_extended_id=False, data=bytes((command, *bytes(7))))
+    events: list[CellEvent] = []
+    with network:
+        network.prepare()
+        bus.cycle = -1
+        bus.on_cycle = lambda cycle: bus.inject(frame) if cycle == 60 else None
+        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock), events.append)
+        for _ in execute(network, stream, (MOVE,), permission()):
+            pass
+        assert (
+            f"an SDO request to {'J2 (node 2)' if node_id == 2 else 'node 9'} (60{node_id}h)" in network.other_master()
+        )
+    assert [event.code for event in events if event.kind is EventKind.BUS_BUSY] == [0x600 + node_id]
+    late = MotionTimeout(0, (1,), (), 1.0, other_master=network.other_master())
+    assert "another master was on the bus: an SDO request" in str(late)
+    assert "end the other program first; else check brakes" in str(late)
 
 
 def test_axes_without_guard_are_named() -> None:

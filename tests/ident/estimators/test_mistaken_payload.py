@@ -138,6 +138,8 @@ def test_what_is_refused_is_what_the_limits_say(total: float, axis: float, unkno
             require_plausible(estimate, error, ("J1", "J2"))
     else:
         require_plausible(estimate, error, ("J1", "J2"))
+    with pytest.raises(ModelContradicted):  # what is no number is within no limit
+        require_plausible(estimate, RelativeError((float("nan"), 1.0), float("nan")), ("J1", "J2"))
 
 
 def test_few_but_honest_data_pass(truth: Truth) -> None:

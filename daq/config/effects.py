@@ -1,0 +1,53 @@
+"""Place the effects that a cell file declares: names, settings and places as the dictionary of effects has them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from daq.config.yaml_file import Fault
+from ident.effects.dictionary import EFFECTS
+from ident.effects.effect import Effect, PlacedEffect, Side, check_settings, is_placeable
+from ident.errors import EffectRefused
+from ident.model.robot import Robot
+
+
+def place_effect(name: str, place: int, settings: Mapping[str, float], robot: Robot) -> PlacedEffect | Fault:
+    """Return a declared effect, or what is wrong with it; the path of a fault is relative to the effect.
+
+    Args:
+        name: of its family.
+        place: index of its joint among `Robot.places`.
+        settings: those that are given; the others are those of the dictionary's first member.
+        robot: that has it.
+    """
+    families = {family[0].name: family[0] for family in EFFECTS}
+    if name not in families:
+        return Fault(("name",), f"{name!r}, and there is no such effect", f"one of {', '.join(families)}")
+    known = families[name]
+    unknown = sorted(set(settings) - set(known.settings))
+    if unknown:
+        return Fault(("settings",), f"settings {', '.join(unknown)}", ", ".join(known.settings) or "no settings")
+    full = {**known.settings, **settings}
+    for setting, value in full.items():
+        # A file has one kind of number; an order is whole.
+        if isinstance(known.settings[setting], int) and value != int(value):
+            return Fault(("settings", setting), f"{value:g}", "a whole number")
+    try:
+        check_settings(known, full, place, robot.axis_count)
+    except EffectRefused as error:
+        return Fault(("settings",), str(error), "settings in their range")
+    effect = known.with_settings({setting: type(known.settings[setting])(value) for setting, value in full.items()})
+    if not is_placeable(effect, place, robot):
+        return Fault(("axis",), "a place that this effect cannot have", _places(effect, place, robot))
+    return PlacedEffect(effect, place)
+
+
+def _places(effect: Effect, place: int, robot: Robot) -> str:
+    """Describe where an effect that is elsewhere can be."""
+    if effect.with_motor != (place < robot.axis_count):
+        return "an axis: it acts on a motor" if effect.with_motor else "a joint of a closed chain without a motor"
+    if effect.side is Side.ALL_MOTORS:
+        return "the first axis: it acts on all motors alike"
+    if effect.side is Side.TWO_JOINTS:
+        return "the pair the other way: on the axis of the lower number, with `other_axis` the higher"
+    return "an axis that is revolute"
