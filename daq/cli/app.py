@@ -7,6 +7,7 @@ import gc
 import io
 import json
 import os
+import re
 import signal
 import sys
 from collections.abc import Sequence
@@ -182,9 +183,14 @@ def _usage_failed(error: Any, json_wanted: bool) -> int:
     if param is not None:
         shown = param.name.upper() if param.param_type_name == "argument" else max(param.opts, key=len)
         found = found.replace(f"'{param.display_name_raw}'", f"'{shown}'", 1)
-    help_of = f"{error.ctx.command_path} --help"
-    usage = error.ctx.get_usage()
-    failure = Failure("UsageError", error.ctx.command_path, found, usage, f"`{help_of}` explains it", ExitCode.USAGE)
+    remedy, usage = f"`{error.ctx.command_path} --help` explains it", error.ctx.get_usage()
+    # A value of the wrong type: the message of typer's validation does not repeat it.
+    given = [one["input"] for one in getattr(error.__cause__, "errors", list)()]
+    if len(given) == 1 and isinstance(given[0], str):
+        found = f"{given[0]!r}: {found}"
+        if re.fullmatch(r"[+-]?\d*,\d+", given[0]):
+            remedy = f"write a decimal point: {given[0].replace(',', '.')}"
+    failure = Failure("UsageError", error.ctx.command_path, found, usage, remedy, ExitCode.USAGE)
     show_failure(failure, json_wanted=json_wanted)
     return ExitCode.USAGE
 

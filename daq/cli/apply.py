@@ -332,7 +332,7 @@ def _enter_rollback(cell: Cell, written: Written, now: datetime, actor: Applier)
     )
 
 
-ROLLBACK = Verb("rollback", rollback, "drivegain rollback CELL")
+ROLLBACK = Verb("rollback", rollback, "drivegain rollback press-4/cells/press-4.yaml")
 
 
 @dataclass(frozen=True, slots=True)

@@ -287,4 +287,4 @@ def _write_files(chosen: tuple[Series, ...], cell: Cell, picture: Path | None, c
             replace_file(csv, csv_text(chosen).encode())
 
 
-HISTORY = Verb("history", history_verb, "drivegain history CELL --axis J4 --plot history.png")
+HISTORY = Verb("history", history_verb, "drivegain history press-4/cells/press-4.yaml --axis J4 --plot history.png")

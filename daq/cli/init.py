@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from daq.cli.terminal import write_output
-from daq.cli.verb import Verb, judged_output
+from daq.cli.verb import Verb, judged_output, say_next
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
 
@@ -68,6 +68,7 @@ def init(
     """Create a folder for a new cell, with commented templates to fill in."""
     for path in make_folder(folder, simulated=simulated):
         typer.echo(path)
+    say_next("drivegain", "scan", folder / "cells" / f"{folder.resolve().name}.yaml")
 
 
 def _copy(source: str, path: Path, name: str, texts: dict[str, Any]) -> Path:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from daq.cli.verb import JsonOption, Verb, judged_output, print_json
+from daq.errors import DaqError, LogForeign
 
 NewLogOption = Annotated[
     Path, typer.Option("--out", help="Log to write (.mcap); must not exist.", callback=judged_output)
@@ -18,8 +20,15 @@ def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: Json
     """Show what is in a log: role and payload, duration, losses, moves, validity."""
     from daq.cli.terminal import output_console, print_view
     from daq.report.log import describe_log, log_lines
+    from daq.workflow.calibration_file import load_calibration
 
-    description = describe_log(log)
+    try:
+        description = describe_log(log)
+    except LogForeign as error:
+        with suppress(DaqError):
+            load_calibration(log)
+            error.found, error.remedy = "a calibration", f"`drivegain report {log}` reads it"
+        raise
     if json:
         print_json(description)
     else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import chain, count
 from pathlib import Path
 from typing import Annotated
 
@@ -90,7 +91,13 @@ def plan_verb(
         print_json(plan_document(out, declared, experiment, made, judged))
     else:
         typer.echo(plan_text(out, preview, declared, experiment, made, judged))
-        say_next("drivegain", "record", cell, out, "--out", "unloaded.mcap", "--enable-motion")
+        say_next("drivegain", "record", cell, out, "--out", free_name(), "--enable-motion")
+
+
+def free_name() -> str:
+    """Name of a log that is not there yet; the first two are those of the help's examples."""
+    names = chain(("unloaded.mcap", "held-out.mcap"), (f"run-{number}.mcap" for number in count(3)))
+    return next(name for name in names if not Path(name).exists())
 
 
 @contextmanager

@@ -107,7 +107,7 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
         raise typer.Exit(ended.exit_code)
 
 
-RECALIBRATE = Verb("recalibrate", recalibrate_verb, "drivegain recalibrate CELL --dry-run")
+RECALIBRATE = Verb("recalibrate", recalibrate_verb, "drivegain recalibrate press-4/cells/press-4.yaml --dry-run")
 
 
 _SYSTEM, _OF_USER = Path("/etc/systemd/system"), Path(".config/systemd/user")
@@ -221,4 +221,6 @@ def require_own_unit(path: Path, option: str = "") -> None:
         raise UsageError(str(path), found=found, expected=f"no such file, or {expected}", remedy=remedy)
 
 
-INSTALL_UNITS = Verb("install-units", install_units, "drivegain install-units CELL --schedule weekly")
+INSTALL_UNITS = Verb(
+    "install-units", install_units, "drivegain install-units press-4/cells/press-4.yaml --schedule weekly"
+)

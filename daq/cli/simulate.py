@@ -234,16 +234,18 @@ def demo(
 
 
 def demo_view(outcome: Outcome) -> Iterator[RenderableType]:
-    """Nodes on the bus, turns of the loop, errors before and after, and the gains beside the truth."""
+    """Nodes on the bus, turns of the loop, errors before and after, the summary, and the gains beside the truth."""
     from daq.report.bus import scan_rows, scan_table
     from daq.report.gains import gain_table
-    from daq.report.residual import before_after_table, turns_view
+    from daq.report.residual import before_after_table, summary, turns_view
 
     fitted, truth = outcome.fitted, outcome.truth
     yield scan_table(scan_rows(outcome.cell, outcome.nodes, outcome.cell.buses[0].name))
     yield ""
     yield from turns_view(fitted)
     yield before_after_table(outcome.changed, fitted.cell.axis_names)
+    yield ""
+    yield from summary(fitted, outcome.changed, outcome.calibration.effects)
     yield ""
     yield gain_table(outcome.calibration.gains, truth, title="Drive gains beside the truth of the simulated cell")
     if fitted.paper is not None:

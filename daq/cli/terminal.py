@@ -9,8 +9,9 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
+import typer
 from rich.console import Console, RenderableType
 
 from daq.cli.verb import judged_output
@@ -148,26 +149,55 @@ def say_written(console: Console, *paths: Path | None) -> None:
             console.print(terminal_text(f"Written: {name}{seen}"))
 
 
-class Stepper:
-    """Progress bars for steps that follow each other."""
+class Stepper(Protocol):
+    """Progress of steps that follow each other."""
+
+    def step(self, title: str) -> None:
+        """End the current step and begin the next."""
+
+    def progress(self, done: int, total: int, remark: str) -> None:
+        """Report progress within the step; a total of 0 is unknown."""
+
+    def end(self) -> None:
+        """End the current step."""
+
+
+class _Lines:
+    """A line for each step as it ends, whole and at once, for a file or pipe."""
+
+    def __init__(self) -> None:
+        self._title, self._began_s = "", 0.0
+
+    def step(self, title: str) -> None:
+        self.end()
+        self._title, self._began_s = title, time.monotonic()
+
+    def progress(self, done: int, total: int, remark: str) -> None:
+        """Show nothing: a line cannot be taken back."""
+
+    def end(self) -> None:
+        if self._title:
+            typer.echo(f"{terminal_text(self._title)} ({time.monotonic() - self._began_s:.0f} s)", err=True)
+        self._title = ""
+
+
+class _Bars:
+    """Progress bars."""
 
     def __init__(self, bars: Progress) -> None:
         self._bars = bars
         self._task: TaskID | None = None
 
     def step(self, title: str) -> None:
-        """End the current step and begin the next."""
         self.end()
         self._task = self._bars.add_task(title, total=None, remark="")
 
     def progress(self, done: int, total: int, remark: str) -> None:
-        """Report progress within the step; a total of 0 is unknown."""
         if self._task is not None:
             of = f"{done}/{total} " if total else ""
             self._bars.update(self._task, completed=done, total=total or None, remark=of + remark)
 
     def end(self) -> None:
-        """End the current step."""
         if self._task is not None:
             self._bars.update(self._task, completed=1, total=1)
             self._bars.stop_task(self._task)
@@ -175,13 +205,19 @@ class Stepper:
 
 @contextmanager
 def show_steps() -> Iterator[Stepper]:
-    """Show progress bars on stderr; the last one is ended unless an error is raised."""
+    """Show progress on stderr, in a terminal as bars; the last step is ended unless an error is raised."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        lines = _Lines()
+        yield lines
+        lines.end()
+        return
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     remark = TextColumn("{task.fields[remark]}", style="dim")
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=20), TimeElapsedColumn(), remark)
-    with Progress(*columns, console=Console(stderr=True), refresh_per_second=5) as bars:
-        stepper = Stepper(bars)
+    with Progress(*columns, console=console, refresh_per_second=5) as bars:
+        stepper = _Bars(bars)
         yield stepper
         stepper.end()
 

@@ -40,7 +40,7 @@ def weigh_verb(
         print_view(weighed_view(found))
 
 
-WEIGH = Verb("weigh", weigh_verb, "drivegain weigh calibration.yaml loaded.mcap --bare unloaded.mcap")
+WEIGH = Verb("weigh", weigh_verb, "drivegain weigh calibration.yaml held-out.mcap --bare unloaded.mcap")
 
 
 def contact_verb(

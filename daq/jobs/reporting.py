@@ -196,7 +196,7 @@ def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
     """List the next steps for the operator, a line each."""
     session, outcome = conclusion.session, conclusion.outcome
     if outcome is Outcome.PROPOSED and session is not None and session.state.target is not None:
-        calibration, cell = shlex.quote(str(session.folder / CALIBRATION)), shlex.quote(str(cell_file))
+        calibration, cell = shlex.quote(str(session.folder / CALIBRATION)), shlex.quote(str(cell_file.absolute()))
         sign = f"let a second person sign it: drivegain sign calibration {calibration} --key KEY --name NAME"
         return [
             *([sign] if session.state.target.unsigned else []),
@@ -207,7 +207,7 @@ def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
     if outcome is Outcome.APPLIED and session is not None and session.state.target is not None:
         return [
             "let the controller load the file",
-            f"to undo it: drivegain rollback {shlex.quote(str(cell_file))}",
+            f"to undo it: drivegain rollback {shlex.quote(str(cell_file.absolute()))}",
         ]
     return {
         Outcome.REFUSED: ["see which check failed; the next job records anew"],

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import RenderableType
+from rich.table import Table
 from rich.text import Text
 
 from daq.config.cell import Cell, robot_of
@@ -22,7 +23,7 @@ from ident.contact import ExternalTorque
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, pseudo_inertia
 from ident.model.robot import Place
 from ident.model.urdf import read_urdf
-from ident.weighing import KNOWN
+from ident.weighing import KNOWN, WeighedBody
 
 LISTED = 20  #: Contacts shown in a terminal; `--json` has all
 NOISE_ROWS = 4.0
@@ -31,10 +32,52 @@ NOISE_ROWS = 4.0
 
 def weighed_view(found: Weighed) -> Iterator[RenderableType]:
     """Mass, centre and inertia, the ten parameters, and doubts."""
+    body, carrier = found.body, "flange" if found.cell.chain is None else "platform"
+    nothing, turns = _shows_nothing(body), not np.isnan(body.values[:-1]).all()
+    if nothing:
+        yield Text("No body shows: the mass is within two σ of nothing.", style="bold")
+    table = plain_table(("", "value ± σ", "unit"), title=f"Body on the {carrier}", left=(0, 2))
+    table.add_row("mass", with_deviation(body.mass_kg, body.mass_std_kg), "kg")
+    if not nothing and turns:
+        _add_centre_and_inertia(table, found)
+    yield table
+    if not nothing and turns:
+        platform = _platform(found.cell)
+        but = "" if platform is None else f"; `centre … in {platform[0]}` is in the link's own frame"
+        yield f"In the frame of {carrier_text(found.cell)}{but}."
+    elif not turns:
+        yield f"The {carrier} does not turn in these moves: centre and inertia cannot be seen."
+    if found.declared_kg is not None:
+        yield f"The logs declare {found.declared_kg:g} kg: {100.0 * (body.mass_kg / found.declared_kg - 1.0):+.2f} %."
+    within = "moves, gains, robot and effects" if body.complete else "moves and gains"
+    how = "robot and body together, beside runs without load" if found.bare else "on the robot of the calibration"
+    yield f"Found {how}; σ from {body.moves} moves, with the errors of {within}; it leaves {body.error.total:.3g} %."
+    if not nothing and turns:
+        headings = ("parameter", "value ± σ", "unit", "identifiable")
+        ten = plain_table(headings, title="The ten about the joint's frame", left=(0, 2, 3))
+        rows = zip(LINK_PARAMETERS, LINK_UNITS, body.values, body.std, body.identifiable, strict=True)
+        for name, unit, value, std, identifiable in rows:
+            ten.add_row(name, with_deviation(value, std), unit, "yes" if identifiable else "no")
+        yield ""
+        yield ten
+        if any(np.isfinite(body.std) & ~body.identifiable):
+            yield (
+                f"no beside a σ: it is more than {100 * KNOWN:.0f} % of the value, and 2 σ is more than a steel cube "
+                "of this mass has."
+            )
+    if not nothing:
+        # Below the table: beside the rows they would push σ and unit off a terminal of 80 columns.
+        yield from (f"{one.name}: add {one.seconds:.0f} s of {one.words} (σ {one.std:.2g})" for one in found.help)
+    yield from (Text(doubt, style="bold") for doubt in _doubts(found))
+
+
+def _shows_nothing(body: WeighedBody) -> bool:
+    return body.mass_kg < 2.0 * body.mass_std_kg
+
+
+def _add_centre_and_inertia(table: Table, found: Weighed) -> None:
     body = found.body
     (centre, centre_std), (inertia, inertia_std) = body.centre_m, body.inertia_kg_m2
-    table = plain_table(("", "value ± σ", "unit"), title="Body on the flange", left=(0, 2))
-    table.add_row("mass", with_deviation(body.mass_kg, body.mass_std_kg), "kg")
     for name, value, std in zip("xyz", 1000.0 * centre, 1000.0 * centre_std, strict=True):
         table.add_row(f"centre {name}", with_deviation(value, std), "mm")
     platform = _platform(found.cell)
@@ -44,29 +87,6 @@ def weighed_view(found: Weighed) -> Iterator[RenderableType]:
             table.add_row(terminal_text(f"centre {name} in {link}"), with_deviation(value, std), "mm")
     for name, value, std in zip(LINK_PARAMETERS[:6], inertia, inertia_std, strict=True):
         table.add_row(f"{name} about the centre", with_deviation(value, std), "kg m²")
-    yield table
-    but = "" if platform is None else f"; `centre … in {platform[0]}` is in the link's own frame"
-    yield f"In the frame of {carrier_text(found.cell)}{but}."
-    if found.declared_kg is not None:
-        yield f"The logs declare {found.declared_kg:g} kg: {100.0 * (body.mass_kg / found.declared_kg - 1.0):+.2f} %."
-    within = "moves, gains, robot and effects" if body.complete else "moves and gains"
-    how = "robot and body together, beside runs without load" if found.bare else "on the robot of the calibration"
-    yield f"Found {how}; σ from {body.moves} moves, with the errors of {within}; it leaves {body.error.total:.3g} %."
-    headings = ("parameter", "value ± σ", "unit", "identifiable")
-    ten = plain_table(headings, title="The ten about the joint's frame", left=(0, 2, 3))
-    rows = zip(LINK_PARAMETERS, LINK_UNITS, body.values, body.std, body.identifiable, strict=True)
-    for name, unit, value, std, identifiable in rows:
-        ten.add_row(name, with_deviation(value, std), unit, "yes" if identifiable else "no")
-    yield ""
-    yield ten
-    if any(np.isfinite(body.std) & ~body.identifiable):
-        yield (
-            f"no beside a σ: it is more than {100 * KNOWN:.0f} % of the value, and 2 σ is more than a steel cube of "
-            "this mass has."
-        )
-    # Below the table: beside the rows they would push σ and unit off a terminal of 80 columns.
-    yield from (f"{one.name}: add {one.seconds:.0f} s of {one.words} (σ {one.std:.2g})" for one in found.help)
-    yield from (Text(doubt, style="bold") for doubt in _doubts(found))
 
 
 def _doubts(found: Weighed) -> Iterator[str]:
@@ -78,9 +98,8 @@ def _doubts(found: Weighed) -> Iterator[str]:
             f"The logs contradict the calibration: {body.error.total:.3g} % of the torque is left. Is it the same "
             "robot, and one body mounted one way?"
         )
-    if body.mass_kg < 2.0 * body.mass_std_kg:
-        yield "No body shows: the mass is within two σ of nothing."
-    elif not np.isnan(body.values).any() and np.linalg.eigvalsh(pseudo_inertia(body.values))[0] < 0.0:
+    whole = not _shows_nothing(body) and not np.isnan(body.values).any()
+    if whole and np.linalg.eigvalsh(pseudo_inertia(body.values))[0] < 0.0:
         yield "No solid body has exactly this inertia; use it within its σ."
 
 

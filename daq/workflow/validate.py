@@ -175,7 +175,6 @@ def predicted(
     """
     warn_without_temperature(calibration, run.name, run.temperature_c)
     run = replace(run, payload=as_calibrated(calibration, run.payload, run.name))
-    roles = {source.role for source in calibration.sources if source.sha256 == run.digest}
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
     use, _ = row_masks(model, data, conditioning)
@@ -185,7 +184,7 @@ def predicted(
         log=log,
         run=run.name,
         digest=run.digest,
-        data_use=DataUse.FIT if "fit" in roles else DataUse.HOLDOUT if "holdout" in roles else DataUse.NEW,
+        data_use=data_use(calibration, run),
         same_configuration=configuration_sha256 == calibration.configuration_sha256,
         partial=run.partial,
         time_s=data.time_s[filter_.centres(len(data.time_s))] - data.time_s[0],
@@ -193,6 +192,19 @@ def predicted(
         predicted_nm=filter_(predict_torque(calibration, model, data).T),
         use=use,
     )
+
+
+def data_use(calibration: Calibration, run: Run) -> DataUse:
+    """Whether a calibration has met a run."""
+    roles = {source.role for source in calibration.sources if source.sha256 == run.digest}
+    return DataUse.FIT if "fit" in roles else DataUse.HOLDOUT if "holdout" in roles else DataUse.NEW
+
+
+def warn_of_fitted(calibration: Calibration, runs: Sequence[Run], consequence: str) -> None:
+    """Warn of runs that the fit has seen."""
+    seen = [run.name for run in runs if data_use(calibration, run) is DataUse.FIT]
+    if seen:
+        _LOG.warning("%s %s part of the fit: %s", ", ".join(seen), "were" if len(seen) > 1 else "was", consequence)
 
 
 def warn_without_temperature(calibration: Calibration, name: str, temperature_c: FloatArray | None) -> None:

@@ -15,6 +15,7 @@ from daq.workflow.validate import (
     check_cell,
     conditioning_of,
     unpredictable,
+    warn_of_fitted,
     warn_without_temperature,
 )
 from ident.calibration import Calibration
@@ -68,6 +69,7 @@ def weigh_logs(
     for run in (*loaded, *without):
         warn_without_temperature(calibration, run.name, run.temperature_c)
     _require_once((*logs, *bare), (*loaded, *without))
+    warn_of_fitted(calibration, loaded, "the agreement proves nothing; weigh a log that the fit has not seen")
     described: Cell = cells[0]
     body = weigh(calibration, model_of(described), loaded, conditioning_of(calibration), bare=without)
     help_: tuple[Help, ...] = ()
@@ -96,6 +98,7 @@ def contact_in(
     if quiet:
         calm = [_loaded(calibration, one, cell)[0] for one in quiet]
         _require_once((log, *quiet), (run, *calm))
+        warn_of_fitted(calibration, calm, "other motion has larger errors than it, and the threshold is too low")
         known = (_predictable(calibration, one, other) for one, other in zip(quiet, calm, strict=True))
         band = prediction_band(calibration, model, known, conditioning)
     return external_torque(calibration, model, _predictable(calibration, log, run), conditioning, band), described

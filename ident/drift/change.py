@@ -39,6 +39,8 @@ from numpy.typing import ArrayLike
 
 from ident.arrays import FloatArray
 
+LEAST_PROBABILITY = 1e-6  #: That is written with its digits: further out no distribution of errors is known
+
 DISPERSION = 1.05  #: Default without a history: repeated fits of simulated cells scatter 5 % more than their σ
 FALSE_ALARM = 0.01
 """Share of comparisons without any change in which a gain is said to change by more than noise, over all axes."""
@@ -154,7 +156,7 @@ def decide(
     words = "no gain to compare"
     if axes:
         parts = [
-            f"{axis} {change.percent:+.2g} % ({_short(abs(change.sigmas))} σ, p = {p:.2g} among {n})"
+            f"{axis} {change.percent:+.2g} % ({_short(abs(change.sigmas))} σ, {_probability(p)} among {n})"
             for axis, change, p in zip(axes, changes, adjusted, strict=True)
         ]
         largest = parts[int(np.argmax([abs(change.sigmas) for change in changes]))]
@@ -229,6 +231,11 @@ def _ratio(part: float, whole: float) -> float:
     if whole:
         return part / whole
     return math.copysign(math.inf, part) if part else 0.0
+
+
+def _probability(p: float) -> str:
+    """A probability in words; far in the tail of a distribution its digits mean nothing."""
+    return f"p < {LEAST_PROBABILITY:.0e}".replace("e-0", "e-") if p < LEAST_PROBABILITY else f"p = {p:.2g}"
 
 
 def _short(sigmas: float) -> str:

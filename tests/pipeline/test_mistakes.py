@@ -63,16 +63,6 @@ def test_an_earlier_calibration_and_its_certificate_may_be_replaced(
     assert (report / "report.html").read_text() == "mine"
 
 
-def test_gains_without_a_payload_of_known_mass_have_a_remedy(
-    copied_log: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["fit", str(copied_log)]) == ExitCode.DATA_UNFIT
-    said = capsys.readouterr().err
-    assert f"error:    run {copied_log.stem}\n" in said
-    assert "found:    no run with a payload of known mass\n" in said
-    assert "or hold the gains (`--gains fixed`)" in said
-
-
 def test_one_recording_counts_once(copied_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     twin = tmp_path / "twin.mcap"
     twin.write_bytes(copied_log.read_bytes())

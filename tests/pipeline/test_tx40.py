@@ -51,7 +51,10 @@ def test_least_squares_too(tx40: Path, capsys: pytest.CaptureFixture[str]) -> No
 
 def test_without_a_payload_free_gains_are_refused(tx40: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["fit", str(tx40)]) == ExitCode.DATA_UNFIT
-    assert "weighed payload" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"error:    run {tx40.stem}\n" in said
+    assert "found:    no run with a payload of known mass\n" in said
+    assert "or hold the gains (`--gains fixed`)" in said
 
 
 def test_known_lacks_of_this_robot_are_found(tx40: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,14 +19,18 @@ from rich.console import Console
 from daq.cli import main
 from daq.cli.app import BY_JOB, VERBS
 from daq.cli.init import INIT
-from daq.cli.terminal import say_written
+from daq.cli.plan import free_name
+from daq.cli.terminal import say_written, show_steps
 from daq.cli.verb import Job, Listed, cell_here, cells_in, continued
 from daq.config.cell import PacingMode
 from daq.config.cell_file import load_cell
 from daq.config.import_description import load_import
 from daq.errors import ExitCode
+from daq.workflow.calibration_file import save_calibration
 from drivers.stream.sample import CellEvent, EventKind
+from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import DISC, START_NS, demo_content, samples, write
+from tests.pipeline.next_step import next_step
 
 
 @pytest.mark.parametrize("listed", VERBS, ids=[verb.name for verb in VERBS])
@@ -95,12 +99,52 @@ def test_no_verb_waits_for_a_pipe_that_is_named_like_a_cell_file(
     assert main(["scan", "missing.yaml"]) == ExitCode.CONFIGURATION
 
 
+def test_a_plan_names_a_log_that_is_not_there_yet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("unloaded.mcap", "held-out.mcap", "run-3.mcap", "run-4.mcap"):
+        assert free_name() == name
+        Path(name).touch()
+
+
+def test_a_value_of_the_wrong_type_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    record = ["record", "cell.yaml", "plan.yaml", "--out", "a.mcap", "--mass"]
+    assert main([*record, "4,59"]) == ExitCode.USAGE
+    said = capsys.readouterr().err
+    assert "found:    '4,59': Invalid value for '--mass'" in said
+    assert "do:       write a decimal point: 4.59" in said
+    assert main([*record, "heavy"]) == ExitCode.USAGE
+    said = capsys.readouterr().err
+    assert "found:    'heavy': " in said
+    assert "--help` explains it" in said
+
+
+def test_a_calibration_is_no_log_but_known(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "calibration.yaml"
+    save_calibration(demo_calibration(), file)
+    assert main(["info", str(file)]) == ExitCode.DATA_UNFIT
+    said = capsys.readouterr().err
+    assert "found:    a calibration\n" in said
+    assert f"do:       `drivegain report {file}` reads it" in said
+
+
+def test_progress_in_a_pipe_is_a_whole_line_a_step(capsys: pytest.CaptureFixture[str]) -> None:
+    title = "record loaded-1: " + "a long remark on this run " * 4
+    with show_steps() as stepper:
+        stepper.step(title)
+        stepper.progress(3, 10, "moves")
+        assert capsys.readouterr().err == ""
+        stepper.step("identify")
+        assert capsys.readouterr().err == f"{title} (0 s)\n"
+    assert capsys.readouterr().err == "identify (0 s)\n"
+
+
 def test_examples_name_files_that_other_examples_make() -> None:
     examples = [kind.example for listed in VERBS for kind in (listed.load(), *listed.load().kinds)]
     made = {value for one in examples for value in re.findall(r"--(?:out|report) (\S+)", one)}
     used = {word for one in examples for word in one.split() if re.search(r"\.(mcap|yaml)$", word)}
     # Made by `record` with other options, as in the guide, and by `init`.
-    assert used - made == {"unloaded.mcap", "held-out.mcap", "press-4/imports/press-4.yaml"}
+    of_init = {"press-4/imports/press-4.yaml", "press-4/cells/press-4.yaml"}
+    assert used - made == {"unloaded.mcap", "held-out.mcap", *of_init}
 
 
 @pytest.mark.parametrize("width", [40, 78])
@@ -251,7 +295,9 @@ def test_a_reader_that_has_seen_enough_is_no_error_to_report(log: Path, checkout
 def test_init_makes_a_cell_that_can_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "new" / "press-4"
     assert main(["init", str(folder)]) == 0
-    written = {Path(line) for line in capsys.readouterr().out.splitlines()}
+    printed = capsys.readouterr()
+    assert next_step(printed.err) == "scan"
+    written = {Path(line) for line in printed.out.splitlines()}
     assert written == {path for path in folder.rglob("*") if path.is_file()}
     cell = load_cell(folder / "cells/press-4.yaml")
     assert cell.name == "press-4"

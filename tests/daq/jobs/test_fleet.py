@@ -167,7 +167,7 @@ def test_a_cell_that_cannot_be_fitted_is_a_row_and_not_the_end(few: Path, capsys
     document = json.loads(capsys.readouterr().out)
     errors = {cell["cell"]: cell["error"] and cell["error"]["kind"] for cell in document["cells"]}
     assert errors == {
-        "cell-000": "DataUnfit",
+        "cell-000": "PayloadMissing",
         "cell-002": "LogTruncated",
         "cell-003": None,
         "foreign.mcap": "SchemaMismatch",

@@ -18,8 +18,8 @@ from daq.config.cell_file import load_cell
 from daq.errors import ExitCode, JobHeld
 from daq.jobs.context import CLOCK_SLACK, require_clock
 from daq.jobs.recording import calibration_of_session
-from daq.jobs.reporting import file_stem
-from daq.jobs.session import STATE, Basis, Outcome, Session, SessionState, begin, remove_old, save, sessions
+from daq.jobs.reporting import Conclusion, file_stem, to_do
+from daq.jobs.session import STATE, Basis, Outcome, Session, SessionState, Target, begin, remove_old, save, sessions
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import BEGAN, make_rig
 
@@ -163,6 +163,15 @@ def test_two_cells_never_share_a_file_of_metrics(cells: list[str]) -> None:
     assert one != other
     assert one.isascii()
     assert "/" not in one
+
+
+def test_what_to_do_can_be_typed_in_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    target = Target(file="gains.yaml", base_sha256="a" * 64, after_sha256="b" * 64)
+    for outcome in (Outcome.PROPOSED, Outcome.APPLIED):
+        session = begin(tmp_path, BASIS, BEGAN).update(target=target, outcome=outcome)
+        lines = to_do(Conclusion(outcome, 0, session, ""), Path("cells/demo.yaml"))
+        assert f" {tmp_path}/cells/demo.yaml" in lines[-1]
 
 
 def test_a_plain_name_is_its_own() -> None:

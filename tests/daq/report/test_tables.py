@@ -34,6 +34,7 @@ from daq.writeback.request import GainChange
 from ident.calibration import Gain
 from ident.data.conditioning import Conditioning
 from ident.data.torque_channel import TorqueSlope
+from ident.discovery.loop import Step
 from ident.estimators.comparison import ESTIMATORS, Comparison, EstimatorTrial
 from ident.estimators.estimate import RelativeError
 from tests.daq.calibrations import demo_calibration
@@ -86,6 +87,7 @@ def _monitor(cell: Cell, _: Any) -> Iterator[RenderableType]:
         "in_fault": True,
         "fault": None,
         "silent": False,
+        "remark": "answers after 1.2 s",
         "rate_hz": 1000.1,
         "lost": 12345678,
         "prediction": asdict(RecentCurrent(-12.345, -11.234, 0.123, 1.234, 0.99, True)),
@@ -103,7 +105,8 @@ def _comparison(cell: Cell, _: Any) -> Iterable[RenderableType]:
 
 
 def _turns(cell: Cell, _: Any) -> Iterator[RenderableType]:
-    finding = SimpleNamespace(
+    after: Any = None  # the table needs nothing of it
+    finding: Any = SimpleNamespace(
         effect=SimpleNamespace(name="position-dependent-friction"),
         axis=5,
         probability=0.123,
@@ -113,7 +116,7 @@ def _turns(cell: Cell, _: Any) -> Iterator[RenderableType]:
         error_after_percent=112.34,
         passed=True,
     )
-    step = SimpleNamespace(findings=(finding,) * 6, set_aside=(), accepted=None, declared=False)
+    step = Step((finding,) * 6, (), np.ones(6), None, after)
     fitted: Any = SimpleNamespace(steps=(step,), cell=cell)
     return residual.turns_view(fitted)
 

@@ -21,11 +21,14 @@ from daq.report.fit_schemas import WeighReport
 from daq.report.text import json_text
 from daq.report.weighing import contact_document, contact_view, weighed_document, weighed_view
 from daq.workflow.calibration_file import load_calibration, save_calibration
+from daq.workflow.validate import warn_of_fitted
 from daq.workflow.weigh import Weighed
 from ident.contact import Band, ExternalTorque
+from ident.data.run import Run
 from ident.estimators.estimate import RelativeError
 from ident.model.bodies import LINK_PARAMETERS
 from ident.weighing import Help, Scale, WeighedBody
+from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import DISC, demo_content, samples, write
 
 
@@ -50,15 +53,26 @@ def test_a_log_is_not_its_own_quiet_motion(real: tuple[Path, Path], capsys: pyte
     assert "the same log twice" in capsys.readouterr().err
 
 
+def test_quiet_motion_that_the_fit_has_seen_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    calibration, rest = demo_calibration(), np.zeros((4, 6))
+    runs = [Run(name, np.arange(4.0), rest, rest, digest=key * 64) for name, key in (("seen", "a"), ("held", "d"))]
+    warn_of_fitted(calibration, runs[1:], "no matter")
+    assert caplog.messages == []
+    warn_of_fitted(calibration, runs, "no proof")
+    assert caplog.messages == ["seen was part of the fit: no proof"]
+
+
 def test_a_real_flange_without_a_body_weighs_nothing(
-    real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+    real: tuple[Path, Path], capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     file, log = real
     assert main(["weigh", str(log), "--calibration", str(file)]) == 0
     text = capsys.readouterr().out
-    assert "No body shows" in text
-    mass, std = map(float, text.partition("mass ")[2].split("kg")[0].split("±"))
+    assert text.startswith("No body shows: the mass is within two σ of nothing.\n")
+    assert "centre" not in text
+    mass, std = map(float, text.partition("mass  ")[2].split("kg")[0].split("±"))
     assert abs(mass) < 3.0 * std < 0.3
+    assert caplog.messages[0].startswith("tx40 was part of the fit: the agreement proves nothing")
 
 
 def test_a_calibration_comes_first_or_as_an_option(real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
@@ -143,6 +157,17 @@ def test_the_centre_is_shown_in_the_platforms_frame_too(checkout: Path) -> None:
     serial = replace(found, cell=load_cell(checkout / "configs/cells/demo.yaml"))
     assert weighed_document(serial)["centre_in_platform_m"] is None
     assert " in " not in _text(weighed_view(serial)).partition("In the frame")[0]
+
+
+def test_a_platform_that_only_translates_shows_a_mass_alone(checkout: Path) -> None:
+    cell = load_cell(checkout / "configs/cells/five-bar.yaml")
+    ten = np.array([np.nan] * 9 + [5.0])
+    covariance = np.diag(np.where(np.isnan(ten), np.nan, 0.02) ** 2)
+    body = WeighedBody(ten, covariance, covariance, True, 20, RelativeError((2.0,) * 2, 2.0), Scale.__new__(Scale))
+    lines = _text(weighed_view(Weighed(cell, (Path("a.mcap"),), (), body, (), 5.0))).splitlines()
+    assert lines[0].strip() == "Body on the platform"
+    assert "The platform does not turn in these moves: centre and inertia cannot be seen." in lines
+    assert not any(line.startswith(("centre", "Ixx", "parameter")) for line in lines)
 
 
 def test_contacts_are_listed(checkout: Path) -> None:

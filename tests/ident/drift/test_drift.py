@@ -51,6 +51,12 @@ def test_a_history_is_judged_without_importing_scipy() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def test_a_probability_far_in_the_tail_has_no_digits() -> None:
+    certain, likely = (decide(("J1",), [10.0], [0.01], [new], [0.01]).words for new in (12.0, 10.05))
+    assert "p < 1e-6 among 1" in certain
+    assert "p = 0.0" in likely
+
+
 def test_one_change_is_the_two_sided_normal_test() -> None:
     change = change_significance(-10.0, 0.03, -9.4, 0.04, dispersion=1.2)
     assert change.percent == pytest.approx(-6.0)

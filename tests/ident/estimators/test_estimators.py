@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ident.data.run import Run
 from ident.equations.system import require_distinct
-from ident.errors import DataUnfit, RankDeficient
+from ident.errors import DataUnfit, PayloadMissing, RankDeficient
 from ident.estimators.estimate import Estimate
 from ident.estimators.identify import Identification, estimate_with, identify
 from ident.estimators.least_squares import Scaling, tls, wls
@@ -121,11 +121,11 @@ def test_tls_scalings_agree_without_noise(clean_found: Identification, scaling: 
 
 
 def test_without_a_known_payload_there_is_no_scale(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
-    with pytest.raises(DataUnfit, match="weighed payload"):
+    with pytest.raises(PayloadMissing, match="payload of known mass"):
         _fit(truth, clean_runs[:1])
     system = identify(truth.model, clean_runs[:1], CONDITIONING, fixed_gains=GAINS).system
     for method in Method:
-        with pytest.raises(DataUnfit, match="weighed payload"):
+        with pytest.raises(PayloadMissing, match="payload of known mass"):
             estimate_with(method, system)
 
 
