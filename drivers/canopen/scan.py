@@ -95,12 +95,15 @@ def _describe(link: Link, node_id: int, scan_end_ns: int) -> tuple[FoundNode, in
     An object that it reports badly does not keep the others from it.
     """
     access, problems = link.objects(node_id, SCAN_POLICY), list[str]()
-    if link.clock() >= scan_end_ns:
-        problems.append(f"nothing was asked of it: the scan was over after {SCAN_S:g} s; is the bus flooded?")
     end_ns = min(link.clock() + round(NODE_S * 1e9), scan_end_ns)
+    unasked = f"the rest was not asked: its answers took longer than {NODE_S:g} s"
+    if link.clock() >= scan_end_ns:
+        unasked = f"nothing was asked of it: the scan was over after {SCAN_S:g} s; is the bus flooded?"
 
     def reported(read: Callable[[], T]) -> T | None:
         if link.clock() >= end_ns:
+            if unasked not in problems:
+                problems.append(unasked)
             return None
         try:
             return read()

@@ -56,6 +56,18 @@ def test_an_object_of_unbounded_length_is_no_reason_to_ask_again() -> None:
     assert len([frame for frame in bus.sent if frame.data[0] == 0x40 and about(bytes(frame.data)) == NAME]) == 1
 
 
+def test_a_slow_node_is_said_to_be_slow() -> None:
+    def slow(data: bytes, bus: ScriptedBus) -> None:
+        if about(data) != 0x1000:
+            bus.clock.now_ns += 800_000_000
+
+    network, bus = cell(1)
+    bus.nodes = (Hostile(1, bus, slow),)
+    with network:
+        (found,) = network.scan(wait_s=0.05)
+    assert "the rest was not asked: its answers took longer than 3 s" in found.problems
+
+
 TEXT = b"a name that its node has by block transfer alone " * 20
 
 
