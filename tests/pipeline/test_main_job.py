@@ -87,7 +87,7 @@ def test_loaded_logs_alone_are_refused(demonstration: Path, capsys: pytest.Captu
 
 def test_bare_logs_alone_are_refused(demonstration: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["fit", str(demonstration / "bare-1.mcap")]) == ExitCode.DATA_UNFIT
-    assert "weighed payload" in capsys.readouterr().err
+    assert "no run with a payload of known mass" in capsys.readouterr().err
 
 
 def test_the_wrong_drive_train_shows_in_the_residual(
