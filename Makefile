@@ -121,6 +121,7 @@ bench: setup
 bench-stream: setup vcan-tools
 	@mkdir -p out
 	DRIVEGAIN_VCAN_OUT=$(CURDIR)/out $(BIN)/python -m tests.vcan.run $(BIN)/python -m tests.bench.stream
+	DRIVEGAIN_VCAN_OUT=$(CURDIR)/out $(BIN)/python -m tests.bench.stream_cost
 
 ident-study: setup
 	$(BIN)/python -m tests.studies.ident_study

@@ -4,8 +4,10 @@ Writes out/bench-stream.json and asserts nothing but that every frame is account
 The frames come from a process of their own (tests/bench/stream_sender.py) at the rate asked for, and go through the
 real SyncStream into a log and a feed, as `record` does it; the highest rate without a loss is looked for downwards from
 1 kHz, with a busy Python thread beside it. Then drivegain, candump (can-utils) and a plain listener receive the same
-frames, one after the other and alone, and drivegain's capture process is stopped for 30, 100 and 300 ms. The table for
-docs/evidence/stream.md is printed at the end.
+frames, one after the other and alone, and drivegain's capture process is stopped for 30, 100 and 300 ms. What a frame
+costs is measured from outside, by stream_cost.py, which prints the table for docs/evidence/stream.md.
+
+    python -m tests.bench.stream --hear candump --cycles 5000     one listener at the compared rate, and nothing else
 """
 
 from __future__ import annotations
@@ -25,7 +27,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,6 @@ from tests.vcan.run import INTERFACE, OUT
 RATES_HZ = (1000, 900, 800, 700, 600, 500, 400, 300, 200, 100)
 COMPARED_HZ = 250
 STOPS_S = (0.03, 0.1, 0.3)
-ASKED_RATIO, ASKED_HZ = 3, 250
 CHECKOUT = Path(__file__).parents[2]
 DEMO = CHECKOUT / "configs" / "cells" / "demo.yaml"
 LISTENER = """
@@ -64,17 +64,6 @@ while True:
     end.recv_into(frame)
     sys.stdout.write("x\\n")
     sys.stdout.flush()
-"""
-SPARE = """
-import os, signal, sys, time
-os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-count, begun = 0, time.monotonic()
-def end(*_):
-    print(count, time.monotonic() - begun)
-    sys.exit()
-signal.signal(signal.SIGTERM, end)
-while True:
-    count += 1
 """
 LISTENERS = {
     "nothing": ("sleep", "1000000"),
@@ -97,10 +86,15 @@ def main() -> int:
     """Downwards to the first rate without a loss, then more frames than can be taken."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0, help="of each run")
+    parser.add_argument("--hear", choices=("drivegain", *LISTENERS), help=f"this one alone, at {COMPARED_HZ} Hz")
+    parser.add_argument("--cycles", type=int, default=COMPARED_HZ, help="with --hear")
     arguments = parser.parse_args()
     # The wire is a queue of the kernel here (vcan), and a thousand frames in it are a seventh of a second.
     with suppress(OSError):
         WIRE_QUEUE.write_text("10000\n")
+    if arguments.hear:
+        heard = hear(arguments.hear, 1_000_000 // COMPARED_HZ, arguments.cycles)
+        return 0 if arguments.hear == "nothing" or heard["lost"] == 0 else 1
     runs = []
     for rate_hz in RATES_HZ:
         runs.append(one_run(1_000_000 // rate_hz, round(rate_hz * arguments.seconds), busy))
@@ -119,79 +113,34 @@ def main() -> int:
         "without_busy_thread": quiet,
         "flood": flood,
         "capture_stopped_for_30_100_300_ms": stopped,
-        "compared": compared,
+        "compared_hz_without_loss": compared,
     }
     path = Path(os.environ.get(OUT, "out")) / "bench-stream.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(result, indent=2) + "\n")
     _print_line(f"written: {path}")
-    for line in table(compared, stopped):
-        _print_line(line)
     return 0 if all(run["identity_holds"] for run in (*runs, quiet, flood, stopped)) else 1
 
 
-def compare(seconds: float) -> list[dict[str, Any]]:
-    """Processor time of a frame at one rate, and the highest rate without a loss, of each listener alone.
-
-    The time is the difference of a long and a short run, less that of the sender alone: starting costs the same.
-    """
-    rows, cost_us = [], dict[str, float]()
-    lengths = round(COMPARED_HZ * seconds / 4), round(COMPARED_HZ * seconds)
-    alone = 1.0 / spare(lambda: time.sleep(seconds / 4))[1]
-    for name in ("nothing", "drivegain", "candump", "plain listener"):
-        if name == "candump" and shutil.which(name) is None:
+def compare(seconds: float) -> dict[str, int | None]:
+    """Highest rate without a loss of each listener alone [Hz]; None for one that loses at every rate."""
+    rates = dict[str, int | None]()
+    for name in ("drivegain", *LISTENERS):
+        if name == "nothing" or (name == "candump" and shutil.which(name) is None):
             continue
-        used = [spare(partial(hear, name, 1_000_000 // COMPARED_HZ, cycles)) for cycles in lengths]
-        busy_s = [counted[0] - counted[0] * counted[1] * alone for counted in used]
-        frames = FRAMES_A_CYCLE * (lengths[1] - lengths[0])
-        cost_us[name] = 1e6 * (busy_s[1] - busy_s[0]) / frames
-        if name == "nothing":
-            continue
+        rates[name] = None
         for rate_hz in RATES_HZ:
             run = hear(name, 1_000_000 // rate_hz, round(rate_hz * seconds))
             if run["lost"] == 0 and run["rate_held"]:
+                rates[name] = rate_hz
                 break
-        held = run["lost"] == 0 and run["rate_held"]
-        rate, cost = rate_hz if held else None, round(cost_us[name] - cost_us["nothing"], 1)
-        rows.append({"listener": name, "processor_us_a_frame": cost, "highest_rate_hz_without_loss": rate})
-        _print_line(json.dumps(rows[-1]))
-    return rows
-
-
-def table(compared: Sequence[dict[str, Any]], stopped: dict[str, Any]) -> list[str]:
-    """Return the comparison in Markdown, with what is asked of drivegain."""
-    candump = next((row["processor_us_a_frame"] for row in compared if row["listener"] == "candump"), None)
-    lines = [
-        f"| listener | processor time a frame | of candump's (asked: ≤ {ASKED_RATIO}) "
-        f"| highest rate × {NODES} axes without loss (asked: ≥ {ASKED_HZ} Hz) |",
-        "|---|---|---|---|",
-    ]
-    for row in compared:
-        cost, rate = row["processor_us_a_frame"], row["highest_rate_hz_without_loss"]
-        ratio = f"{cost / candump:.1f}" if candump else "–"
-        lines.append(f"| {row['listener']} | {cost} µs | {ratio} | {'none' if rate is None else f'{rate} Hz'} |")
-    lost, missing, sent = stopped["lost"], stopped["missing_answers"], stopped["sent"]
-    stops = ", ".join(f"{1000 * stop_s:g}" for stop_s in STOPS_S)
-    return [*lines, "", f"Capture stopped for {stops} ms: {lost} of {sent} frames lost, {missing} answers missing"]
+        _print_line(f"{name}: {rates[name]} Hz without a loss")
+    return rates
 
 
 def hear(name: str, period_us: int, cycles: int) -> dict[str, Any]:
     """So many cycles to one of the listeners, or to none."""
     return one_run(period_us, cycles, nothing) if name == "drivegain" else listen(LISTENERS[name], period_us, cycles)
-
-
-def spare(action: Callable[[], object]) -> tuple[float, float]:
-    """Count in a program of the lowest priority while something is done; returns seconds, and counts a second.
-
-    A guest charges processor time to the process that runs at a tick, and what wakes up with the ticks escapes it. What
-    is left to others does not.
-    """
-    with subprocess.Popen((sys.executable, "-S", "-c", SPARE), stdout=subprocess.PIPE, text=True) as process:
-        time.sleep(0.5)
-        action()
-        process.terminate()
-        count, seconds = map(float, process.communicate()[0].split())
-    return seconds, count / seconds
 
 
 def listen(command: tuple[str, ...], period_us: int, cycles: int) -> dict[str, Any]:
