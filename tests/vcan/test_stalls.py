@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import select
 import signal
 import socket
@@ -277,7 +278,8 @@ def test_a_deaf_node_on_a_flooded_bus_is_named_within_the_time_limit(
             said, _ = run.end()
             answered_ns = max(at_ns for at_ns, number, _ in run.heard.frames if number == TPDO1 + 3)
             stop_s, closing_s = run.heard.stop_s(answered_ns), (time.time_ns() - answered_ns) * 1e-9
-        if "no axis answered" not in said:  # a flooded guest on a busy host may starve all amplifiers before J3 is deaf
+        # A flooded guest on a busy host may starve the other amplifiers, too, before J3 is deaf.
+        if not re.search("no (axis answered|answer from J1)", said):
             break
     stop_ms = 1e3 * stop_s
     figure(f"flood, J3 deaf: stop {stop_ms:.0f} ms after its last answer, end {closing_s:.1f} s, attempt {attempt}")
