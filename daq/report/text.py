@@ -20,18 +20,24 @@ SHOWN_SIGMAS = 2.0  #: Half width of the intervals and bands of reports and pict
 
 def printable(text: str) -> str:
     """Spell out control characters, which could command a terminal; line ends stay."""
-    return "".join(c if c.isprintable() or c == "\n" else f"\\x{ord(c):02x}" for c in text)
+    return "".join(c if c.isprintable() or c == "\n" else _spelled(c) for c in text)
+
+
+def _spelled(character: str) -> str:
+    """A character as Python writes it: \\x1b, \\u202e."""
+    number = ord(character)
+    return f"\\x{number:02x}" if number < 0x100 else f"\\u{number:04x}" if number < 0x10000 else f"\\U{number:08x}"
 
 
 def terminal_text(text: str) -> Text:
     """One line of text that rich does not read as markup; control characters and line ends are spelled out."""
-    return Text("".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text))
+    return Text("".join(c if c.isprintable() else _spelled(c) for c in text))
 
 
 def terminal_lines(text: str) -> str:
     """Lines of a diff: control characters except tabs spelled out, line ends as \\n."""
     lines = text.splitlines()
-    return "\n".join("".join(c if c.isprintable() or c == "\t" else f"\\x{ord(c):02x}" for c in line) for line in lines)
+    return "\n".join("".join(c if c.isprintable() or c == "\t" else _spelled(c) for c in line) for line in lines)
 
 
 class WholeTable(Table):

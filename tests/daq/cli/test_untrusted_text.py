@@ -21,7 +21,7 @@ from daq.ledger.watch import Series, watch
 from daq.report.fleet import FIRST_COLUMNS, fleet_csv, fleet_document
 from daq.report.history import csv_text, plot_history
 from daq.report.proposal import show
-from daq.report.text import inert, terminal_lines, terminal_text
+from daq.report.text import inert, printable, terminal_lines, terminal_text
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.request import Request
 from daq.writeback.target import Proposal, propose
@@ -125,6 +125,10 @@ def test_a_unit_neither_commands_the_terminal_nor_is_markup(unit: str, tmp_path:
 def test_terminal_text_has_no_control_characters(text: str) -> None:
     assert terminal_text(text).plain.isprintable()
     assert terminal_lines(text).replace("\n", "").replace("\t", "").isprintable()
+
+
+def test_characters_are_spelled_as_python_writes_them() -> None:
+    assert printable("\x1b\u202e\U000e0001") == r"\x1b\u202e\U000e0001"
 
 
 def test_lines_keep_their_tabs_and_lose_their_carriage_returns() -> None:
