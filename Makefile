@@ -73,7 +73,7 @@ test: check
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not processes"
 
 test-processes: setup
-	$(BIN)/python -m pytest -q -m processes tests/pipeline tests/daq/jobs
+	$(BIN)/python -m pytest -q -m processes tests/pipeline tests/daq/jobs tests/faults
 
 test-vcan: setup vcan-tools
 	@if command -v npm >/dev/null; then npm ci --prefix tests/vcan/foreign --no-audit --no-fund; \

@@ -201,6 +201,7 @@ def test_no_foreign_device_takes_the_place_of_a_killed_recorder(node_id: int) ->
         assert "two have it" in end.refused
 
 
+@pytest.mark.processes
 def test_a_process_that_is_killed_leaves_no_axis_with_power() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "tests.faults.test_killed", "3", "100"], capture_output=True, text=True, check=False
