@@ -149,7 +149,6 @@ def scan_table(rows: list[dict[str, Any]]) -> Table:
 def monitor_document(cell: Cell, watched: WatchedCell) -> dict[str, Any]:
     """JSON document of one reading of the bus."""
     from drivers.canopen.link import nmt_name  # noqa: PLC0415 - as above
-    from drivers.stream.monitor import ANSWER_S  # noqa: PLC0415 - as above
 
     reading, faults, prediction = watched.reading, watched.faults, watched.prediction
     # While another master prepares, it sends no SYNC, and no axis has to answer.
@@ -178,7 +177,7 @@ def monitor_document(cell: Cell, watched: WatchedCell) -> dict[str, Any]:
                 "silent": addressed and not axis.heard,
                 "delay_s": axis.delay_s,
                 "refused": [{"object": str(one.entry), "abort_code": one.abort_code} for one in axis.refused],
-                "remark": "; ".join(_answer_remarks(axis, ANSWER_S)),
+                "remark": "; ".join(_answer_remarks(axis)),
                 "fault": asdict(faults[declared.name]) if state in FAULTY and declared.name in faults else None,
                 "prediction": prediction["axes"][len(axes)] if prediction is not None and prediction["axes"] else None,
             }
@@ -204,14 +203,14 @@ def monitor_document(cell: Cell, watched: WatchedCell) -> dict[str, Any]:
     }
 
 
-def _answer_remarks(axis: AxisReading, allowed_s: float) -> Iterator[str]:
+def _answer_remarks(axis: AxisReading) -> Iterator[str]:
     """Describe the answers of an axis that are late or without a value."""
     for one in axis.refused:
         if one.abort_code is None:
             yield f"answers without a value of {one.entry.bits} bits for {one.entry}"
         else:
             yield f"answers with abort 0x{one.abort_code:08X} for {one.entry}"
-    if axis.delay_s is not None and axis.delay_s > allowed_s:
+    if axis.delay_s is not None and axis.is_late:
         yield f"answers after {1e3 * axis.delay_s:.0f} ms"
 
 

@@ -60,6 +60,11 @@ class AxisReading:
     delay_s: float | None = None  #: longest time until an answer to a request since the last reading, None without one
     refused: tuple[Refusal, ...] = ()  #: objects that its last answers did not give
 
+    @property
+    def is_late(self) -> bool:
+        """Whether an answer took longer than `ANSWER_S`."""
+        return self.delay_s is not None and self.delay_s > ANSWER_S
+
 
 @dataclass(frozen=True, slots=True)
 class CellReading:

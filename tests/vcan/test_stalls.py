@@ -218,7 +218,7 @@ def flooded(identifier: str = "7F0", rate_hz: int = FLOOD_HZ) -> Iterator[None]:
     ("identifier", "rate_hz"),
     # Recorder and listener count surplus PDOs one by one: more of them starve the one processor of a guest.
     [("7F0", FLOOD_HZ), ("481", 1000)],
-    ids=["nobody's", "surplus PDOs"],
+    ids=["unused identifier", "surplus PDOs"],
 )
 def test_ctrl_c_stops_the_axes_on_a_flooded_bus(
     tmp_path: Path, identifier: str, rate_hz: int, figure: Callable[[str], None]

@@ -39,7 +39,7 @@ class TestVirtual(BusContract):
 
 
 class _Flood(SimpleQueue[can.Message]):
-    """A queue that somebody fills faster than it is read."""
+    """A queue that fills faster than it is read."""
 
     def get_nowait(self) -> can.Message:
         self.put(can.Message(arbitration_id=0x7F, is_extended_id=False))

@@ -196,7 +196,7 @@ def test_one_late_heartbeat_is_no_second_device() -> None:
 def test_heartbeats_of_two_states_in_turn_are_two_devices() -> None:
     network, bus = cell(2)
     with network:
-        assert listen(network, bus, [5, 127, 5], 100_000_000).shared_id(2, 0) == ""  # it was told to
+        assert listen(network, bus, [5, 127, 5], 100_000_000).shared_id(2, 0) == ""  # one change may be commanded
         assert listen(network, bus, [127, 5], 100_000_000).shared_id(2, 0) == (
             "heartbeats OPERATIONAL and PRE-OPERATIONAL in turn"
         )
