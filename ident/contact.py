@@ -140,7 +140,7 @@ def external_torque(
     itself, left_out = band is None, 0
     if band is None:
         quiet, left_out = _quiet(rows)
-        band = _band([quiet])
+        band = _band([quiet], ALARMS_PER_HOUR)
     scale = np.einsum("jd,jdr->jr", band.scale, rows.drivers)
     return ExternalTorque(rows.time_s, rows.torque_nm, scale, rows.use, band, itself, left_out)
 
@@ -150,17 +150,20 @@ def prediction_band(
     model: Model,
     quiet: Iterable[Run],
     conditioning: Conditioning,
+    *,
+    alarms_per_hour: float = ALARMS_PER_HOUR,
 ) -> Band:
     """Learn band and thresholds from runs without contact, best held out of the calibration's fit.
 
     Args:
         calibration, model, conditioning: as for `external_torque`.
         quiet: the runs; a minute or more, with the motion that is to be watched.
+        alarms_per_hour: false alarms of all joints together, in an hour of motion.
 
     Raises:
         DataUnfit, ModelError, EffectRefused: as from `external_torque`.
     """
-    return _band([_residual(calibration, model, run, conditioning) for run in quiet])
+    return _band([_residual(calibration, model, run, conditioning) for run in quiet], alarms_per_hour)
 
 
 def _residual(calibration: Calibration, model: Model, run: Run, conditioning: Conditioning) -> _Residual:
@@ -213,7 +216,7 @@ def _scales(parts: Sequence[_Residual], *, robust: bool = False) -> FloatArray:
     return out
 
 
-def _band(parts: Sequence[_Residual]) -> Band:
+def _band(parts: Sequence[_Residual], alarms_per_hour: float) -> Band:
     if not parts:
         raise DataUnfit("", "no quiet run was given; expected at least one without contact")
     scale = _scales(parts)
@@ -234,9 +237,9 @@ def _band(parts: Sequence[_Residual]) -> Band:
         correlation_s[joint] = row_s * _correlation(runs)
         factor[joint] = np.nanquantile(np.abs(signed), PREDICTED_SHARE)
         times = np.concatenate([part.time_s + 1e6 * index for index, part in enumerate(parts)])
-        level = alarm_level(np.abs(signed), times, 2.0 * correlation_s[joint], ALARMS_PER_HOUR / count, quiet_s[joint])
+        level = alarm_level(np.abs(signed), times, 2.0 * correlation_s[joint], alarms_per_hour / count, quiet_s[joint])
         threshold[joint] = np.nan if level is None else level
-    return Band(scale, factor, threshold, correlation_s, quiet_s, ALARMS_PER_HOUR)
+    return Band(scale, factor, threshold, correlation_s, quiet_s, alarms_per_hour)
 
 
 def alarm_level(

@@ -34,14 +34,15 @@ def weighed_view(found: Weighed) -> Iterator[RenderableType]:
     """Mass, centre and inertia, the ten parameters, and doubts."""
     body, carrier = found.body, "flange" if found.cell.chain is None else "platform"
     nothing, turns = _shows_nothing(body), not np.isnan(body.values[:-1]).all()
+    shown = turns and not nothing
     if nothing:
         yield Text("No body shows: the mass is within two σ of nothing.", style="bold")
     table = plain_table(("", "value ± σ", "unit"), title=f"Body on the {carrier}", left=(0, 2))
     table.add_row("mass", with_deviation(body.mass_kg, body.mass_std_kg), "kg")
-    if not nothing and turns:
+    if shown:
         _add_centre_and_inertia(table, found)
     yield table
-    if not nothing and turns:
+    if shown:
         platform = _platform(found.cell)
         but = "" if platform is None else f"; `centre … in {platform[0]}` is in the link's own frame"
         yield f"In the frame of {carrier_text(found.cell)}{but}."
@@ -52,7 +53,7 @@ def weighed_view(found: Weighed) -> Iterator[RenderableType]:
     within = "moves, gains, robot and effects" if body.complete else "moves and gains"
     how = "robot and body together, beside runs without load" if found.bare else "on the robot of the calibration"
     yield f"Found {how}; σ from {body.moves} moves, with the errors of {within}; it leaves {body.error.total:.3g} %."
-    if not nothing and turns:
+    if shown:
         headings = ("parameter", "value ± σ", "unit", "identifiable")
         ten = plain_table(headings, title="The ten about the joint's frame", left=(0, 2, 3))
         rows = zip(LINK_PARAMETERS, LINK_UNITS, body.values, body.std, body.identifiable, strict=True)

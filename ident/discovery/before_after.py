@@ -219,10 +219,10 @@ class Errors:
 class Moves:
     """The linearised problem by move: what leaving moves out needs."""
 
-    grams: FloatArray  #: G_c of each move, shape (c, f, f)
-    scores: FloatArray  #: s_c of each move, shape (c, f)
+    grams: FloatArray  #: G_c of each move, shape (C, f, f)
+    scores: FloatArray  #: s_c of each move, shape (C, f)
     scale: FloatArray  #: unit of each unknown, shape (f,); the gains are the first
-    runs: IntArray  #: run of each move, shape (c,)
+    runs: IntArray  #: run of each move, shape (C,)
 
     def blocks(self) -> IntArray:
         """First move of each block of moves that is independent of the others."""

@@ -220,11 +220,11 @@ def motor_jacobian(
 
 
 def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
-    """Shift of the unknowns when each cluster is left out, d_c = −(H − G_c)⁻¹ s_c with H = Σ G_c, shape (c, f).
+    """Shift of the unknowns when each cluster is left out, d_c = −(H − G_c)⁻¹ s_c with H = Σ G_c, shape (C, f).
 
     Args:
-        grams: G_c = J_cᵀJ_c of each cluster, shape (c, f, f).
-        scores: s_c = J_cᵀe_c around the estimate, where they sum to zero, shape (c, f).
+        grams: G_c = J_cᵀJ_c of each cluster, shape (C, f, f).
+        scores: s_c = J_cᵀe_c around the estimate, where they sum to zero, shape (C, f).
     """
     hessian = grams.sum(axis=0)
     # In units in which every unknown is seen equally well: kilograms are beside kg m².
@@ -259,9 +259,9 @@ def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) ->
     Fishman 1978).
 
     Args:
-        grams: G_c of each cluster, shape (c, f, f), in the order of time.
-        scores: s_c, shape (c, f).
-        runs: run of each cluster, shape (c,).
+        grams: G_c of each cluster, shape (C, f, f), in the order of time.
+        scores: s_c, shape (C, f).
+        runs: run of each cluster, shape (C,).
 
     Returns:
         first cluster of each block, ascending; at least MIN_MOVES_TO_LEAVE_OUT where there are as many clusters.
