@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
 from math import hypot
 from xml.etree import ElementTree
 
@@ -202,8 +201,9 @@ def _effect_faults(model: CellModel, robot: Robot | None, *, logged: bool) -> It
     """
     if not model.effects:
         return
-    # The dictionary of effects loads scipy, which most verbs do without: for the few cells that declare effects alone.
-    place: Callable[[str, int, Mapping[str, float], Robot], object] = import_module("daq.config.effects").place_effect
+    # The dictionary of effects loads scipy, which cells without effects, and so most verbs, do without.
+    from daq.config.effects import place_effect  # noqa: PLC0415 - see above
+
     passive = () if robot is None else robot.passive_names
     names = [*(axis.name for axis in model.axes), *passive]
     placed = [(effect.name, effect.axis) for effect in model.effects]
@@ -213,7 +213,7 @@ def _effect_faults(model: CellModel, robot: Robot | None, *, logged: bool) -> It
         elif placed.index((effect.name, effect.axis)) < index:
             yield Fault(("effects", index), f"{effect.name} on {effect.axis} twice", "each effect once on an axis")
         elif not logged and robot is not None and len(names) == len(robot.places):
-            found = place(effect.name, names.index(effect.axis), effect.settings, robot)
+            found = place_effect(effect.name, names.index(effect.axis), effect.settings, robot)
             if isinstance(found, Fault):
                 yield replace(found, path=("effects", index, *found.path))
 
