@@ -31,7 +31,7 @@ from drivers.canopen.network import CanopenNetwork
 from drivers.errors import DriverError
 from drivers.profiles.cia402 import FAULTY, decode
 from drivers.profiles.scale import read_scale
-from drivers.stream.monitor import ANSWER_S, READING_S, AxisReading, CellMonitor, CellReading, ReadingSource
+from drivers.stream.monitor import READING_S, AxisReading, CellMonitor, CellReading, ReadingSource
 from drivers.stream.sample import CellEvent, EventKind, Sample
 from ident.calibration import Calibration
 from ident.errors import IdentificationError
@@ -153,7 +153,7 @@ class CellWatch:
         """On a quiet bus, read the current's scale of each axis once, and the error code of an axis in fault."""
         asked = reading.source is ReadingSource.ASKED
         for number, (axis, found) in enumerate(zip(self._network.axes, reading.axes, strict=True)):
-            if not asked or found.delay_s is None or found.delay_s > ANSWER_S:
+            if not asked or found.delay_s is None or found.is_late:
                 continue
             if number in self._unscaled:
                 self._unscaled.remove(number)
