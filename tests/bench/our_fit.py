@@ -14,10 +14,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 from ident.model.robot import Motion
 from ident.model.urdf import robot_from_urdf
-from tests.bench.torque_fit import PIECE_SAMPLES, fill_rows, fit_torques, standard_rows
+from tests.bench.torque_fit import PIECE_SAMPLES, fill_rows, fit_torques, joint_columns, standard_rows
 
 FloatArray = NDArray[np.float64]
 
@@ -26,6 +27,18 @@ def _pieces(data: dict[str, FloatArray]) -> Iterator[tuple[Motion, FloatArray]]:
     for first in range(0, data["q"].shape[1], PIECE_SAMPLES):
         part = slice(first, first + PIECE_SAMPLES)
         yield Motion(data["q"][:, part].T, data["v"][:, part].T, data["a"][:, part].T), data["torque"][:, part]
+
+
+def _bare_qr_s(columns: tuple[FloatArray, ...]) -> float:
+    """Processor time of LAPACK's own QR of the columns of each joint, already in its layout; copies do not count."""
+    spent_s = 0.0
+    for own in columns:
+        rows = own.T.copy(order="F")
+        work, _ = lapack.dgeqrf_lwork(*rows.shape)
+        begin = time.process_time()
+        lapack.dgeqrf(rows, lwork=int(work), overwrite_a=1)
+        spent_s += time.process_time() - begin
+    return spent_s
 
 
 def main(data_path: str, urdf: str, predicted_path: str, repeats: str) -> None:
@@ -37,6 +50,9 @@ def main(data_path: str, urdf: str, predicted_path: str, repeats: str) -> None:
         begin = time.process_time()
         fit = fit_torques(robot, _pieces(data))
         seconds.append({"total": time.process_time() - begin})
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    columns = joint_columns(robot, _pieces(data))
+    bare_qr = [_bare_qr_s(columns) for _ in range(int(repeats))]
     predicted = []
     for motion, torque in _pieces(data):
         room = standard_rows(robot, torque.shape[1])
@@ -47,7 +63,8 @@ def main(data_path: str, urdf: str, predicted_path: str, repeats: str) -> None:
         "seconds": seconds,
         "base_parameters": len(fit.values),
         "residual_norm_nm": fit.residual_norm,
-        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+        "peak_mb": peak_mb,
+        "bare_qr_seconds": bare_qr,
     }
     sys.stdout.write(json.dumps(found) + "\n")
 

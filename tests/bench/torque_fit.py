@@ -18,6 +18,7 @@ from ident.model.robot import Motion, Robot
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
 
 PIECE_SAMPLES = 8192
 DRIVE_PARAMETERS = ("Ia", "fv", "fs", "off")
@@ -89,22 +90,16 @@ def structure(robot: Robot) -> BaseParameters:
 def fit_torques(robot: Robot, pieces: Iterable[tuple[Motion, FloatArray]]) -> TorqueFit:
     """Identify from motions and the joint torques [Nm] measured in them, shape (n, k)."""
     count, general = robot.joint_count, structure(robot)
-    needed = np.zeros((count, WIDTH), dtype=np.bool_)
-    needed.flat[list(general.independent)] = True
+    needed = _needed(robot, general)
     place = np.cumsum(needed).reshape(needed.shape) - 1  # of each column among the needed ones
-    drive = np.arange(WIDTH) >= len(LINK_PARAMETERS)
-    # A joint's torque depends on the links behind it and on its own drive.
-    held = [
-        np.flatnonzero(needed & (np.isin(np.arange(count), links)[:, None] & ~drive | own[:, None] & drive))
-        for own, links in zip(np.eye(count, dtype=np.bool_), moved_links(robot), strict=True)
-    ]
+    held = _held(robot, needed)
     triangles: list[FloatArray | None] = [None] * count
     room, own = standard_rows(robot, 0), np.zeros((WIDTH * count + 1, 0))
     for motion, torque in pieces:
         samples = torque.shape[1]
         if room.shape[2] != samples:
             room, own = standard_rows(robot, samples), np.zeros((WIDTH * count + 1, samples))
-        fill_rows(robot, motion, room, needed[:, ~drive])
+        fill_rows(robot, motion, room, needed[:, : len(LINK_PARAMETERS)])
         for joint, columns in enumerate(held):
             rows = own[: len(columns) + 1]
             np.take(room[joint], columns, axis=0, out=rows[:-1], mode="clip")  # "raise" would go through a copy
@@ -124,6 +119,33 @@ def fit_torques(robot: Robot, pieces: Iterable[tuple[Motion, FloatArray]]) -> To
     small = qr_update(None, whole[:, [*place.flat[list(base.independent)], last]].T)
     values = solve_triangular(small[:-1, :-1], small[:-1, -1])
     return TorqueFit(base, np.asarray(values), float(abs(small[-1, -1])))
+
+
+def joint_columns(robot: Robot, pieces: Iterable[tuple[Motion, FloatArray]]) -> tuple[FloatArray, ...]:
+    """What `fit_torques` reduces, held whole: for each joint its columns and its torque, shape (c_j + 1, k)."""
+    needed = _needed(robot, structure(robot))
+    held, parts = _held(robot, needed), []
+    for motion, torque in pieces:
+        room = standard_rows(robot, torque.shape[1])
+        fill_rows(robot, motion, room, needed[:, : len(LINK_PARAMETERS)])
+        parts.append([np.vstack((room[joint, columns], torque[joint])) for joint, columns in enumerate(held)])
+    return tuple(np.concatenate(own, axis=1) for own in zip(*parts, strict=True))
+
+
+def _needed(robot: Robot, general: BaseParameters) -> BoolArray:
+    """Columns that depend on no others whatever the motion, shape (n, 14)."""
+    needed = np.zeros((robot.joint_count, WIDTH), dtype=np.bool_)
+    needed.flat[list(general.independent)] = True
+    return needed
+
+
+def _held(robot: Robot, needed: BoolArray) -> tuple[IntArray, ...]:
+    """The needed columns that a joint's torque depends on: of the links behind it, and of its own drive."""
+    drive, links = np.arange(WIDTH) >= len(LINK_PARAMETERS), np.arange(robot.joint_count)
+    return tuple(
+        np.flatnonzero(needed & (np.isin(links, moved)[:, None] & ~drive | (links == joint)[:, None] & drive))
+        for joint, moved in enumerate(moved_links(robot))
+    )
 
 
 def qr_merge(parts: Iterable[tuple[FloatArray, Sequence[int]]], width: int) -> FloatArray:
