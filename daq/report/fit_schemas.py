@@ -374,6 +374,7 @@ class WeighReport(StrictModel):
     cell: str
     logs: list[str]
     bare: list[str]
+    part_of_the_fit: list[str]
     declared_kg: Figure
     mass_kg: WeighedValue
     centre_m: WeighedValues

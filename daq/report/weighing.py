@@ -133,6 +133,7 @@ def weighed_document(found: Weighed) -> dict[str, Any]:
         "cell": found.cell.name,
         "logs": [str(log) for log in found.logs],
         "bare": [str(log) for log in found.bare],
+        "part_of_the_fit": list(found.fitted),
         "declared_kg": found.declared_kg,
         "mass_kg": {"value": body.mass_kg, "std": body.mass_std_kg},
         "centre_m": _pair(*body.centre_m),

@@ -200,11 +200,12 @@ def data_use(calibration: Calibration, run: Run) -> DataUse:
     return DataUse.FIT if "fit" in roles else DataUse.HOLDOUT if "holdout" in roles else DataUse.NEW
 
 
-def warn_of_fitted(calibration: Calibration, runs: Sequence[Run], consequence: str) -> None:
-    """Warn of runs that the fit has seen."""
-    seen = [run.name for run in runs if data_use(calibration, run) is DataUse.FIT]
+def warn_of_fitted(calibration: Calibration, runs: Sequence[Run], consequence: str) -> tuple[str, ...]:
+    """Warn of runs that the fit has seen, and name them."""
+    seen = tuple(run.name for run in runs if data_use(calibration, run) is DataUse.FIT)
     if seen:
         _LOG.warning("%s %s part of the fit: %s", ", ".join(seen), "were" if len(seen) > 1 else "was", consequence)
+    return seen
 
 
 def warn_without_temperature(calibration: Calibration, name: str, temperature_c: FloatArray | None) -> None:

@@ -35,6 +35,7 @@ class Weighed:
     body: WeighedBody  #: mass, centre and inertia
     help: tuple[Help, ...]  #: moves for what the logs do not show
     declared_kg: float | None  #: mass of the payload that the logs declare; None where they do not, or differ
+    fitted: tuple[str, ...] = ()  #: runs that the calibration's fit has seen: their agreement proves nothing
 
 
 def weigh_logs(
@@ -69,7 +70,7 @@ def weigh_logs(
     for run in (*loaded, *without):
         warn_without_temperature(calibration, run.name, run.temperature_c)
     _require_once((*logs, *bare), (*loaded, *without))
-    warn_of_fitted(calibration, loaded, "the agreement proves nothing; weigh a log that the fit has not seen")
+    fitted = warn_of_fitted(calibration, loaded, "the agreement proves nothing; weigh a log that the fit has not seen")
     described: Cell = cells[0]
     body = weigh(calibration, model_of(described), loaded, conditioning_of(calibration), bare=without)
     help_: tuple[Help, ...] = ()
@@ -77,7 +78,8 @@ def weigh_logs(
         with suppress(ConfigurationError):  # the cell does not say enough to plan moves in it
             help_ = moves_that_help(body, extra_moves(experiment_of(described)))
     masses = {None if run.payload is None else run.payload.known.get("m") for run in loaded}
-    return Weighed(described, tuple(logs), tuple(bare), body, help_, masses.pop() if len(masses) == 1 else None)
+    declared_kg = masses.pop() if len(masses) == 1 else None
+    return Weighed(described, tuple(logs), tuple(bare), body, help_, declared_kg, fitted)
 
 
 def contact_in(

@@ -56,9 +56,9 @@ def test_a_log_is_not_its_own_quiet_motion(real: tuple[Path, Path], capsys: pyte
 def test_quiet_motion_that_the_fit_has_seen_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
     calibration, rest = demo_calibration(), np.zeros((4, 6))
     runs = [Run(name, np.arange(4.0), rest, rest, digest=key * 64) for name, key in (("seen", "a"), ("held", "d"))]
-    warn_of_fitted(calibration, runs[1:], "no matter")
+    assert warn_of_fitted(calibration, runs[1:], "no matter") == ()
     assert caplog.messages == []
-    warn_of_fitted(calibration, runs, "no proof")
+    assert warn_of_fitted(calibration, runs, "no proof") == ("seen",)
     assert caplog.messages == ["seen was part of the fit: no proof"]
 
 
@@ -73,6 +73,8 @@ def test_a_real_flange_without_a_body_weighs_nothing(
     mass, std = map(float, text.partition("mass  ")[2].split("kg")[0].split("±"))
     assert abs(mass) < 3.0 * std < 0.3
     assert caplog.messages[0].startswith("tx40 was part of the fit: the agreement proves nothing")
+    assert main(["weigh", str(log), "--calibration", str(file), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["part_of_the_fit"] == ["tx40"]
 
 
 def test_a_calibration_comes_first_or_as_an_option(real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
