@@ -12,21 +12,27 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.discovery.balancer import propose_balancers
-from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, prepare_search, score_candidates
+from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, score_candidates
 from ident.discovery.choice import choice_covariance, is_small
-from ident.discovery.evidence import Evidence, by_instruments, with_effects
+from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import (
     Gates,
     RunsLeftOut,
-    gain_shifts,
     impossible,
-    in_noise,
-    moved_gains,
     own_unknowns,
     whitened_columns,
     without_effects_of,
 )
-from ident.discovery.refinement import refine_together
+from ident.discovery.joining import (
+    JointFit,
+    SetAside,
+    as_joined,
+    join,
+    keys_of,
+    linearised,
+    refuted_by_structure,
+    resettled,
+)
 from ident.discovery.resonance import propose_resonances
 from ident.discovery.ripple import propose_orders
 from ident.discovery.search import (
@@ -44,30 +50,10 @@ from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.position import Counterbalance
 from ident.effects.transmission import Ripple
 from ident.effects.unnamed import is_unnamed
-from ident.errors import EffectRefused, NotConverged, RankDeficient
+from ident.errors import EffectRefused
 
-UNFITTED = (NotConverged, RankDeficient, np.linalg.LinAlgError)
 MAX_EFFECTS = 12  #: More effects than this on one robot mean that the declared model is wrong
-SHOWN = 0.999  #: Confidence of what instruments show: a dozen effects may ask them in one search
-REFINEMENTS = 4  #: Refits of an effect whose settings are fitted; each moves them by a fraction of the one before
 PIECES_PER_EFFECT = 3  #: Fewer pieces of moves than this for each effect cannot show that all of them are there
-
-
-@dataclass(frozen=True, slots=True)
-class SetAside:
-    """A finding that passed the search, but did not join the model."""
-
-    finding: Finding
-    words: str = ""  #: why it did not, `{rival}` in the place of the rival's name
-    rival: PlacedEffect | None = None  #: an effect that is kept instead
-    moved: tuple[tuple[int, float], ...] = ()  #: gains that it would move: index, and by how many σ
-
-    def reason(self, axes: Sequence[str]) -> str:
-        """Why it did not join, in words, with the names of the axes."""
-        if self.moved:
-            gains = ", ".join(f"the gain of {axes[motor]} by {size:.1f} σ" for motor, size in self.moved)
-            return f"it has no name, and would move {gains}"
-        return self.words if self.rival is None else self.words.replace("{rival}", self.rival.name_among(axes))
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +102,7 @@ def find_effects(
        on runs left out (`RunsLeftOut`);
     4. tests terms without a name, splines and motor harmonics, on the same axis, or on all axes if no named effect
        passed; one that explains much more replaces the named effect (`find_structure`, `is_inadequate`), but not if it
-       moves a gain by more than its σ;
+       moves a gain by more than its σ; then the named effect may move none either;
     5. refines its setting (`refine_setting`), adds it, and refits gains, parameters and effects together;
     6. asks instruments from the demanded motion whether the effect is a disturbance in the position loop;
     7. linearises the problem around the joint fit and deals whole moves to folds (`prepare_search`); every effect in
@@ -142,10 +128,10 @@ def find_effects(
         the turns taken; the last one has accepted nothing, unless MAX_EFFECTS was reached.
     """
     gates, cache = gates or Gates(), ColumnCache()
-    model = _linearised(start, cache)
+    model = linearised(start, cache)
     names = axes or [joint.name for joint in start.model.robot.places]
     steps: list[Step] = []
-    seen = {_keys(start)}
+    seen = {keys_of(start)}
     for _ in range(MAX_EFFECTS):
         step, joined = _turn(model, rng, gates, families, seen, progress, names)
         if steps:
@@ -154,7 +140,7 @@ def find_effects(
         if joined is None:
             break
         model = joined
-        seen.add(_keys(model.evidence))
+        seen.add(keys_of(model.evidence))
     else:
         steps[-1] = _settled(steps[-1], model.search_problem, (), rng, gates)
     return (*steps[:-1], _with_choice(steps, model, gates))
@@ -189,7 +175,7 @@ def with_declared(
         name = placed.name_among(names)
         progress(f"fitting the declared {name}")
         joined = with_effects(evidence, (*evidence.effects, placed))
-        model = _resettled(_linearised(replace(joined, declared=len(joined.effects)), cache))
+        model = resettled(linearised(replace(joined, declared=len(joined.effects)), cache))
         evidence, estimate, last = model.evidence, model.evidence.estimate, model.evidence.effects[-1]
         reduced = without_effects_of(model.search_problem, estimate, (last,))
         problem, columns = reduced.search_problem, reduced.columns
@@ -204,7 +190,7 @@ def with_declared(
     return tuple(steps)
 
 
-def _with_choice(steps: Sequence[Step], model: _JointFit, gates: Gates) -> Step:
+def _with_choice(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
     """Return the last step, what the choice of its effects adds to the covariance of its estimate included."""
     estimate, accepted = model.evidence.estimate, dict[PlacedEffect, tuple[Finding, tuple[Finding, ...]]]()
     for step in steps:  # an effect that left and joined again counts by its last turn
@@ -213,7 +199,8 @@ def _with_choice(steps: Sequence[Step], model: _JointFit, gates: Gates) -> Step:
             accepted[placed] = found, (*step.findings, *step.structures)
     last, left = steps[-1], list[Finding]()
     if last.accepted is None:  # its findings are of the last model
-        left += [aside.finding for aside in last.set_aside if aside.moved]
+        # A name that a term without one refutes is no model that could be true.
+        left += [aside.finding for aside in last.set_aside if aside.moved and aside.rival is None]
         left += [found for found in (*last.findings, *last.structures) if is_small(found, gates)]
     choice = choice_covariance(model.search_problem, estimate, tuple(accepted.values()), left)
     last = replace(last, choice_std=np.sqrt(np.diag(choice)[: len(estimate.gains)]))
@@ -223,32 +210,15 @@ def _with_choice(steps: Sequence[Step], model: _JointFit, gates: Gates) -> Step:
     return replace(last, after=replace(model.evidence, estimate=chosen))
 
 
-@dataclass(frozen=True, slots=True)
-class _JointFit:
-    """A joint fit, and the problem linearised around it."""
-
-    evidence: Evidence
-    search_problem: SearchProblem
-
-
-def _linearised(evidence: Evidence, cache: ColumnCache) -> _JointFit:
-    problem = prepare_search(evidence.model, evidence.fit_runs, evidence.training, evidence.estimate, cache)
-    return _JointFit(evidence, problem)
-
-
-def _keys(evidence: Evidence) -> frozenset[EffectKey]:
-    return frozenset(effect_key(placed.effect, placed.axis) for placed in evidence.effects)
-
-
 def _turn(
-    model: _JointFit,
+    model: JointFit,
     rng: np.random.Generator,
     gates: Gates,
     families: tuple[tuple[Effect, ...], ...],
     seen: set[frozenset[EffectKey]],
     progress: Callable[[str], None],
     names: Sequence[str],
-) -> tuple[Step, _JointFit | None]:
+) -> tuple[Step, JointFit | None]:
     """Take one turn: the step, and the model with what was accepted; None where nothing was."""
     evidence, problem = model.evidence, model.search_problem
     known, moves = len(evidence.effects), problem.folds.moves
@@ -258,7 +228,7 @@ def _turn(
     present = {placed.effect.name for placed in evidence.effects if not is_unnamed(placed.effect)}
     findings, structures = rank_effects(problem, rng, gates, families, proposed, present), tuple[Finding, ...]()
     limits_nm, runs = detection_limits_nm(problem, gates), RunsLeftOut.of(problem)
-    taken, searched, aside, ended = set(_keys(evidence)), range(0), list[SetAside](), ""
+    taken, searched, aside, ended = set(keys_of(evidence)), range(0), list[SetAside](), ""
     while True:
         named = choose_effect(findings, taken)
         if named is not None and (why := runs.refusal(whitened_columns(problem, named.effect, named.axis))):
@@ -280,13 +250,14 @@ def _turn(
             accepted = named
         if accepted is None or known >= most:
             break
+        refuted = refuted_by_structure(model, accepted, aside)
         near = (*proposed.get(accepted.axis, ()), *families)
         effect = refine_setting(problem, accepted.effect, accepted.axis, near)
         accepted = replace(accepted, effect=effect)
         progress(f"adding {effect.name} on {names[accepted.axis]}")
-        joined = _join(model, accepted, rng, gates, seen)
-        if isinstance(joined, _JointFit):
-            accepted = _as_joined(accepted, joined.evidence)
+        joined = refuted or join(model, accepted, rng, gates, seen)
+        if isinstance(joined, JointFit):
+            accepted = as_joined(accepted, joined.evidence)
             if named is not None and is_unnamed(effect):
                 rival = PlacedEffect(effect, accepted.axis)
                 aside.append(SetAside(named, "{rival} explains clearly more of the same residual", rival))
@@ -297,8 +268,7 @@ def _turn(
         others = structures if is_unnamed(effect) else ()
         taken |= {effect_key(one.effect, one.axis) for one in (accepted, *others) if one.axis == accepted.axis}
     if accepted is not None:
-        pieces = problem.folds.linearisation.cluster_count
-        ended = f"{pieces} pieces of {moves} moves allow no more than {most} effects"
+        ended = f"{problem.folds.linearisation.cluster_count} pieces of {moves} moves allow no more than {most} effects"
     elif moves < MIN_MOVES_FOR_STRUCTURE:
         ended = f"structure without a name needs {MIN_MOVES_FOR_STRUCTURE} moves, found {moves}"
     return Step(findings, structures, limits_nm, None, evidence, tuple(aside), ended), None
@@ -330,143 +300,6 @@ def _first_of_axis(aside: Sequence[SetAside], new: SetAside) -> tuple[SetAside, 
 def _refused(findings: Sequence[Finding], refused: Finding, why: str) -> tuple[Finding, ...]:
     new = replace(refused, passed=False, refusals=(*refused.refusals, why))
     return tuple(new if finding is refused else finding for finding in findings)
-
-
-def _join(
-    model: _JointFit, accepted: Finding, rng: np.random.Generator, gates: Gates, seen: set[frozenset[EffectKey]]
-) -> _JointFit | SetAside:
-    """Refit with a finding in the model and drop what no longer passes; or say why it may not join."""
-    joined = _refit(model, accepted)
-    if isinstance(joined, _JointFit):
-        accepted = _as_joined(accepted, joined.evidence)
-    pruned = joined if isinstance(joined, SetAside) else _pruned(joined, accepted, rng, gates)
-    if isinstance(pruned, SetAside):
-        return pruned
-    if _keys(pruned.evidence) in seen:
-        return SetAside(accepted, "it would only exchange places with an effect that it replaces")
-    last = PlacedEffect(accepted.effect, accepted.axis)
-    why = "" if pruned is joined else _refuted_by_instruments(pruned.evidence, last)
-    return SetAside(accepted, why) if why else pruned
-
-
-def _refit(model: _JointFit, accepted: Finding) -> _JointFit | SetAside:
-    """Refit with a finding in the model; or say why it may not join, whatever else is in the model."""
-    evidence, problem = model.evidence, model.search_problem
-    last, gains_std = PlacedEffect(accepted.effect, accepted.axis), evidence.estimate.gains_std
-    if is_unnamed(last.effect):  # before the refit, which takes longer
-        torque = whitened_columns(problem, last.effect, last.axis) @ accepted.coefficients
-        if moved := moved_gains(gain_shifts(problem.folds, torque), gains_std):
-            return SetAside(accepted, moved=moved)
-    try:
-        refitted = with_effects(evidence, (*evidence.effects, last), problem.runs)
-        # Asked here: after it, the linearised problem would take memory beside the instruments.
-        if why := _refuted_by_instruments(refitted, last):
-            return SetAside(accepted, why)
-        joined = _resettled(_linearised(refitted, problem.cache))
-    except UNFITTED as error:
-        # The linearised problem distinguished the effect from the model, the whole one does not.
-        return SetAside(accepted, f"it cannot be fitted: {error}")
-    terms = [placed for placed in refitted.effects if is_unnamed(placed.effect)]
-    if last in terms:  # no setting of theirs is refined
-        together = without_effects_of(joined.search_problem, refitted.estimate, terms)
-        if moved := moved_gains(together.gain_shifts, gains_std):
-            return SetAside(accepted, moved=moved)
-    return joined
-
-
-def _resettled(model: _JointFit) -> _JointFit:
-    """Refine the settings of the last effect around the joint fit and refit, until they stay as they are.
-
-    The model without an effect may be far off, and the settings that fit its residual best with it.
-    """
-    for _ in range(REFINEMENTS):
-        evidence, last = model.evidence, model.evidence.effects[-1]
-        if not last.effect.refined:
-            break
-        reduced = without_effects_of(model.search_problem, evidence.estimate, (last,))
-        effect = refine_together(reduced.search_problem, last.effect, last.axis)
-        if effect == last.effect:
-            break
-        others = evidence.effects[:-1]
-        refitted = with_effects(evidence, (*others, PlacedEffect(effect, last.axis)), model.search_problem.runs)
-        model = _linearised(refitted, model.search_problem.cache)
-    return model
-
-
-def _as_joined(accepted: Finding, evidence: Evidence) -> Finding:
-    """A finding with the settings that its effect has in a joint fit."""
-    key = effect_key(accepted.effect, accepted.axis)
-    found = (placed.effect for placed in evidence.effects if effect_key(placed.effect, placed.axis) == key)
-    return replace(accepted, effect=next(found, accepted.effect))
-
-
-def _refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
-    """Why an effect of a joint fit may be a disturbance in the position loop alone; empty where it may not.
-
-    A torque that disturbs the arm moves it, and comes back in the current: columns of the recorded motion then explain
-    a part of it, which those of the demanded motion do not. Their coefficients may be zero, and are nearer to zero than
-    to those of the fit. Instruments that would not show an effect of that size refute no named one; nor do those by
-    which nothing can be fitted.
-    """
-    try:
-        estimate = by_instruments(evidence)
-    except UNFITTED:
-        return ""
-    if estimate is None:
-        return ""
-    own = own_unknowns(estimate, (placed,))
-    place, values, fitted = len(estimate.gains) + own, estimate.parameters[own], evidence.estimate.parameters[own]
-    covariance = estimate.covariance[np.ix_(place, place)]
-    if not (why := in_noise(values, covariance, SHOWN)):
-        return ""
-    precision = np.linalg.pinv(covariance, hermitian=True)
-    nearer = float(fitted @ precision @ (fitted - 2.0 * values)) > 0.0  # |values − fitted|² > |values|²
-    if not is_unnamed(placed.effect) and (not nearer or in_noise(fitted, covariance)):
-        return ""
-    return f"with instruments from the demanded motion, {why}"
-
-
-def _pruned(model: _JointFit, accepted: Finding, rng: np.random.Generator, gates: Gates) -> _JointFit | SetAside:
-    """Drop effects that no longer pass beside the last one; or say why the last one may not stay."""
-    last = model.evidence.effects[-1]
-    needed: set[PlacedEffect] = set()
-    while True:
-        evidence = model.evidence
-        judged = [
-            (placed, *_beside_others(model, placed, rng, gates)) for placed in evidence.effects[evidence.declared :]
-        ]
-        failing = [one for one in judged if one[2] and one[0] not in needed]
-        if not failing:
-            return model
-        named = next((placed for placed, _, _ in failing if not is_unnamed(placed.effect)), None)
-        if is_unnamed(last.effect) and named is not None:
-            return SetAside(accepted, "{rival} would no longer pass beside it", named)
-        worst, _, why = min(failing, key=lambda one: one[1])
-        if worst == last:
-            return SetAside(accepted, f"in the joint fit it no longer passes: {why}")
-        try:
-            kept = tuple(placed for placed in evidence.effects if placed != worst)
-            rest = with_effects(evidence, kept, model.search_problem.runs)
-            model = _linearised(rest, model.search_problem.cache)
-        except UNFITTED:
-            needed.add(worst)  # the data cannot be fitted without it
-
-
-def _beside_others(model: _JointFit, placed: PlacedEffect, rng: np.random.Generator, gates: Gates) -> tuple[float, str]:
-    """Judge an effect of a joint fit beside all others: fall of ‖e‖² on held-out moves, and why it does not pass."""
-    estimate = model.evidence.estimate
-    reduced = without_effects_of(model.search_problem, estimate, (placed,))
-    problem, columns = reduced.search_problem, reduced.columns
-    (trial,) = score_candidates(problem.folds, columns, (slice(0, columns.shape[1]),))
-    if trial is None:
-        return 0.0, "the model contains it already"
-    (finding,) = rank_families(problem, (FamilyTrials(placed.axis, ((placed.effect, trial),)),), rng, gates)
-    own = own_unknowns(estimate, (placed,))
-    values, place = estimate.parameters[own], len(estimate.gains) + own
-    joint = in_noise(values, estimate.covariance[np.ix_(place, place)])
-    physics = impossible(placed.effect.coefficients, values, estimate.parameters_std[own])
-    reasons = (*finding.refusals, joint, physics, RunsLeftOut.of(problem).refusal(columns))
-    return finding.held_out_fall, "; ".join(dict.fromkeys(reason for reason in reasons if reason))
 
 
 def _settled(

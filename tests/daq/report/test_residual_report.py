@@ -37,7 +37,8 @@ from ident.discovery.before_after import Account, account
 from ident.discovery.evidence import with_effects
 from ident.discovery.gates import PairedChange
 from ident.discovery.gear_loss import GearLoss
-from ident.discovery.loop import SetAside, Step
+from ident.discovery.joining import SetAside
+from ident.discovery.loop import Step
 from ident.discovery.noise_floor import FloorSource, NoiseFloor
 from ident.discovery.search import Finding
 from ident.effects.dictionary import EFFECTS

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
 from ident.data.run import Run
-from ident.discovery import loop
+from ident.discovery import joining, loop
 from ident.discovery.candidates import SearchProblem, score_candidates
 from ident.discovery.evidence import Evidence, gather, with_effects
 from ident.discovery.gates import (
@@ -28,7 +28,8 @@ from ident.discovery.gates import (
     whitened_columns,
     without_effects_of,
 )
-from ident.discovery.loop import SetAside, find_effects
+from ident.discovery.joining import SetAside
+from ident.discovery.loop import find_effects
 from ident.discovery.search import (
     FEWEST_MOVES,
     Finding,
@@ -283,11 +284,11 @@ def test_coefficients_in_their_noise_are_no_effect() -> None:
     assert not in_noise(np.array([3.0, 0.0]), covariance)
 
 
-def _term_after(sticking: Evidence, order: tuple[Effect, ...]) -> loop._JointFit | SetAside:
+def _term_after(sticking: Evidence, order: tuple[Effect, ...]) -> joining.JointFit | SetAside:
     """Joint fit of a named effect and a term that can replace it, judged as if the last one had just joined."""
     joined = with_effects(sticking, tuple(PlacedEffect(effect, 1) for effect in order))
     finding = Finding(order[-1], 1, np.ones(1), np.ones(1), 0.0, 1.0, 0.1, 5.0, 4.0, 0.2, 9.0, True, np.ones(8))
-    return loop._pruned(loop._linearised(joined, {}), finding, np.random.default_rng(0), GATES)
+    return joining._pruned(joining.linearised(joined, {}), finding, np.random.default_rng(0), GATES)
 
 
 def test_a_term_without_a_name_makes_no_named_effect_leave(sticking: Evidence) -> None:
@@ -297,7 +298,7 @@ def test_a_term_without_a_name_makes_no_named_effect_leave(sticking: Evidence) -
     assert refused.rival == PlacedEffect(STICKING[0], 1)
     assert refused.reason(("J1", "J2", "J3")) == "stribeck on J2 would no longer pass beside it"
     kept = _term_after(sticking, (term, STICKING[0]))
-    assert isinstance(kept, loop._JointFit)
+    assert isinstance(kept, joining.JointFit)
     assert kept.evidence.effects == (PlacedEffect(STICKING[0], 1),)
 
 
@@ -350,7 +351,7 @@ def test_a_disturbance_in_the_loop_is_no_effect(
 ) -> None:
     """Without instruments the search takes it for a skew of the time stamps."""
     if not has_gate:
-        monkeypatch.setattr(loop, "by_instruments", lambda _: None)
+        monkeypatch.setattr(joining, "by_instruments", lambda _: None)
     families = tuple(family for family in EFFECTS if family[0].name == "time-skew")
     first, *_ = find_effects(disturbed, np.random.default_rng(0), GATES, families)
     assert (first.accepted is None) == has_gate

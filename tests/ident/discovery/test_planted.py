@@ -385,6 +385,23 @@ def test_the_loop_ends_where_nothing_is_left(small_arm: Arm) -> None:
     assert [step.accepted is not None for step in steps] == [True, False]
 
 
+def test_a_name_that_structure_refutes_bends_no_gain(arm: Arm) -> None:
+    """Of what grows with the load, a dictionary without it can name only saturation, which would bend the gain."""
+    grown = Planted("load-friction", 1, lambda t: 0.3 * np.abs(t.load) * np.sign(t.velocity), (0.3,))
+    start = _with(arm, grown)
+    families = tuple(family for family in EFFECTS if family[0].name not in ("load-friction", "efficiency"))
+    (step,) = find_effects(start, np.random.default_rng(0), GATES, families)
+    assert step.accepted is None
+    aside = {one.finding.effect.name: one for one in step.set_aside}
+    assert set(aside) == {"smooth-load", "saturation"}
+    assert "the gain of J2 by" in aside["saturation"].reason(("J1", "J2", "J3", "J4", "J5", "J6"))
+    assert aside["saturation"].rival == PlacedEffect(aside["smooth-load"].finding.effect, 1)
+    # With it the gain would be off by more than three times as much.
+    bent_by_name = with_effects(start, (PlacedEffect(aside["saturation"].finding.effect, 1),)).estimate
+    before, after = (np.abs(one.gains / arm.truth.gains - 1.0)[1] for one in (start.estimate, bent_by_name))
+    assert after > 3.0 * before
+
+
 def test_friction_against_temperature_is_named_first_and_the_worst_gain_gets_better(small_arm: Arm) -> None:
     start = _with(small_arm, next(case for case in SMALL_CASES if case.family == "temperature-friction"))
     steps = find_effects(start, np.random.default_rng(1))

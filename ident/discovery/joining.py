@@ -1,0 +1,231 @@
+"""Whether a finding may join the model: refit everything with it, and judge every effect beside all the others.
+
+`join` is the entry. It refits gains, parameters and effects together, asks instruments from the demanded motion whether
+the effect is a disturbance in the position loop, linearises the problem around the joint fit, and lets each effect pass
+all gates again beside the others; what fails leaves. A finding that may not join is returned as `SetAside`, with why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, prepare_search, score_candidates
+from ident.discovery.evidence import Evidence, by_instruments, with_effects
+from ident.discovery.gates import (
+    Gates,
+    RunsLeftOut,
+    gain_shifts,
+    impossible,
+    in_noise,
+    moved_gains,
+    own_unknowns,
+    whitened_columns,
+    without_effects_of,
+)
+from ident.discovery.refinement import refine_together
+from ident.discovery.search import EffectKey, Finding, effect_key, rank_families
+from ident.discovery.structure import is_inadequate
+from ident.effects.effect import PlacedEffect
+from ident.effects.unnamed import is_unnamed
+from ident.errors import NotConverged, RankDeficient
+
+UNFITTED = (NotConverged, RankDeficient, np.linalg.LinAlgError)
+SHOWN = 0.999  #: Confidence of what instruments show: a dozen effects may ask them in one search
+REFINEMENTS = 4  #: Refits of an effect whose settings are fitted; each moves them by a fraction of the one before
+
+
+@dataclass(frozen=True, slots=True)
+class SetAside:
+    """A finding that passed the search, but did not join the model."""
+
+    finding: Finding
+    words: str = ""  #: why it did not, `{rival}` in the place of the rival's name
+    rival: PlacedEffect | None = None  #: an effect that is kept instead, or that explains more
+    moved: tuple[tuple[int, float], ...] = ()  #: gains that it would move: index, and by how many σ
+
+    def reason(self, axes: Sequence[str]) -> str:
+        """Why it did not join, in words, with the names of the axes."""
+        words = self.words if self.rival is None else self.words.replace("{rival}", self.rival.name_among(axes))
+        if self.moved:
+            gains = ", ".join(f"the gain of {axes[motor]} by {size:.1f} σ" for motor, size in self.moved)
+            return f"it would move {gains}, and {words}" if words else f"it has no name, and would move {gains}"
+        return words
+
+
+@dataclass(frozen=True, slots=True)
+class JointFit:
+    """A joint fit, and the problem linearised around it."""
+
+    evidence: Evidence
+    search_problem: SearchProblem
+
+
+def linearised(evidence: Evidence, cache: ColumnCache) -> JointFit:
+    """Linearise the problem around a joint fit."""
+    problem = prepare_search(evidence.model, evidence.fit_runs, evidence.training, evidence.estimate, cache)
+    return JointFit(evidence, problem)
+
+
+def keys_of(evidence: Evidence) -> frozenset[EffectKey]:
+    """Keys of the effects of a model."""
+    return frozenset(effect_key(placed.effect, placed.axis) for placed in evidence.effects)
+
+
+def join(
+    model: JointFit, accepted: Finding, rng: np.random.Generator, gates: Gates, seen: set[frozenset[EffectKey]]
+) -> JointFit | SetAside:
+    """Refit with a finding in the model and drop what no longer passes; or say why it may not join."""
+    joined = _refit(model, accepted)
+    if isinstance(joined, JointFit):
+        accepted = as_joined(accepted, joined.evidence)
+    pruned = joined if isinstance(joined, SetAside) else _pruned(joined, accepted, rng, gates)
+    if isinstance(pruned, SetAside):
+        return pruned
+    if keys_of(pruned.evidence) in seen:
+        return SetAside(accepted, "it would only exchange places with an effect that it replaces")
+    last = PlacedEffect(accepted.effect, accepted.axis)
+    why = "" if pruned is joined else _refuted_by_instruments(pruned.evidence, last)
+    return SetAside(accepted, why) if why else pruned
+
+
+def refuted_by_structure(model: JointFit, found: Finding, aside: Sequence[SetAside]) -> SetAside | None:
+    """Why a named effect may not join beside a term of its axis that explains clearly more, but would bend a gain.
+
+    The name is then only similar to the truth. It does no harm unless it bends a gain, too.
+    """
+    if is_unnamed(found.effect):
+        return None
+    terms = [one.finding for one in aside if one.moved and one.rival is None and one.finding.axis == found.axis]
+    better = next((term for term in terms if is_inadequate(found, term)), None)
+    if better is None or not (moved := _moved_by(model, found)):
+        return None
+    return SetAside(found, "{rival} explains clearly more", PlacedEffect(better.effect, better.axis), moved)
+
+
+def _refit(model: JointFit, accepted: Finding) -> JointFit | SetAside:
+    """Refit with a finding in the model; or say why it may not join, whatever else is in the model."""
+    evidence, problem = model.evidence, model.search_problem
+    last, gains_std = PlacedEffect(accepted.effect, accepted.axis), evidence.estimate.gains_std
+    # Asked before the refit, which takes longer.
+    if is_unnamed(last.effect) and (moved := _moved_by(model, accepted)):
+        return SetAside(accepted, moved=moved)
+    try:
+        refitted = with_effects(evidence, (*evidence.effects, last), problem.runs)
+        # Asked here: after it, the linearised problem would take memory beside the instruments.
+        if why := _refuted_by_instruments(refitted, last):
+            return SetAside(accepted, why)
+        joined = resettled(linearised(refitted, problem.cache))
+    except UNFITTED as error:
+        # The linearised problem distinguished the effect from the model, the whole one does not.
+        return SetAside(accepted, f"it cannot be fitted: {error}")
+    terms = [placed for placed in refitted.effects if is_unnamed(placed.effect)]
+    if last in terms:  # no setting of theirs is refined
+        together = without_effects_of(joined.search_problem, refitted.estimate, terms)
+        if moved := moved_gains(together.gain_shifts, gains_std):
+            return SetAside(accepted, moved=moved)
+    return joined
+
+
+def _moved_by(model: JointFit, found: Finding) -> tuple[tuple[int, float], ...]:
+    """Index of each gain that a finding would move by more than its σ, to first order, and by how many."""
+    problem = model.search_problem
+    torque = whitened_columns(problem, found.effect, found.axis) @ found.coefficients
+    return moved_gains(gain_shifts(problem.folds, torque), model.evidence.estimate.gains_std)
+
+
+def resettled(model: JointFit) -> JointFit:
+    """Refine the settings of the last effect around the joint fit and refit, until they stay as they are.
+
+    The model without an effect may be far off, and the settings that fit its residual best with it.
+    """
+    for _ in range(REFINEMENTS):
+        evidence, last = model.evidence, model.evidence.effects[-1]
+        if not last.effect.refined:
+            break
+        reduced = without_effects_of(model.search_problem, evidence.estimate, (last,))
+        effect = refine_together(reduced.search_problem, last.effect, last.axis)
+        if effect == last.effect:
+            break
+        others = evidence.effects[:-1]
+        refitted = with_effects(evidence, (*others, PlacedEffect(effect, last.axis)), model.search_problem.runs)
+        model = linearised(refitted, model.search_problem.cache)
+    return model
+
+
+def as_joined(accepted: Finding, evidence: Evidence) -> Finding:
+    """A finding with the settings that its effect has in a joint fit."""
+    key = effect_key(accepted.effect, accepted.axis)
+    found = (placed.effect for placed in evidence.effects if effect_key(placed.effect, placed.axis) == key)
+    return replace(accepted, effect=next(found, accepted.effect))
+
+
+def _refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
+    """Why an effect of a joint fit may be a disturbance in the position loop alone; empty where it may not.
+
+    A torque that disturbs the arm moves it, and comes back in the current: columns of the recorded motion then explain
+    a part of it, which those of the demanded motion do not. Their coefficients may be zero, and are nearer to zero than
+    to those of the fit. Instruments that would not show an effect of that size refute no named one; nor do those by
+    which nothing can be fitted.
+    """
+    try:
+        estimate = by_instruments(evidence)
+    except UNFITTED:
+        return ""
+    if estimate is None:
+        return ""
+    own = own_unknowns(estimate, (placed,))
+    place, values, fitted = len(estimate.gains) + own, estimate.parameters[own], evidence.estimate.parameters[own]
+    covariance = estimate.covariance[np.ix_(place, place)]
+    if not (why := in_noise(values, covariance, SHOWN)):
+        return ""
+    precision = np.linalg.pinv(covariance, hermitian=True)
+    nearer = float(fitted @ precision @ (fitted - 2.0 * values)) > 0.0  # |values − fitted|² > |values|²
+    if not is_unnamed(placed.effect) and (not nearer or in_noise(fitted, covariance)):
+        return ""
+    return f"with instruments from the demanded motion, {why}"
+
+
+def _pruned(model: JointFit, accepted: Finding, rng: np.random.Generator, gates: Gates) -> JointFit | SetAside:
+    """Drop effects that no longer pass beside the last one; or say why the last one may not stay."""
+    last = model.evidence.effects[-1]
+    needed: set[PlacedEffect] = set()
+    while True:
+        evidence = model.evidence
+        judged = [
+            (placed, *_beside_others(model, placed, rng, gates)) for placed in evidence.effects[evidence.declared :]
+        ]
+        failing = [one for one in judged if one[2] and one[0] not in needed]
+        if not failing:
+            return model
+        named = next((placed for placed, _, _ in failing if not is_unnamed(placed.effect)), None)
+        if is_unnamed(last.effect) and named is not None:
+            return SetAside(accepted, "{rival} would no longer pass beside it", named)
+        worst, _, why = min(failing, key=lambda one: one[1])
+        if worst == last:
+            return SetAside(accepted, f"in the joint fit it no longer passes: {why}")
+        try:
+            kept = tuple(placed for placed in evidence.effects if placed != worst)
+            rest = with_effects(evidence, kept, model.search_problem.runs)
+            model = linearised(rest, model.search_problem.cache)
+        except UNFITTED:
+            needed.add(worst)  # the data cannot be fitted without it
+
+
+def _beside_others(model: JointFit, placed: PlacedEffect, rng: np.random.Generator, gates: Gates) -> tuple[float, str]:
+    """Judge an effect of a joint fit beside all others: fall of ‖e‖² on held-out moves, and why it does not pass."""
+    estimate = model.evidence.estimate
+    reduced = without_effects_of(model.search_problem, estimate, (placed,))
+    problem, columns = reduced.search_problem, reduced.columns
+    (trial,) = score_candidates(problem.folds, columns, (slice(0, columns.shape[1]),))
+    if trial is None:
+        return 0.0, "the model contains it already"
+    (finding,) = rank_families(problem, (FamilyTrials(placed.axis, ((placed.effect, trial),)),), rng, gates)
+    own = own_unknowns(estimate, (placed,))
+    values, place = estimate.parameters[own], len(estimate.gains) + own
+    joint = in_noise(values, estimate.covariance[np.ix_(place, place)])
+    physics = impossible(placed.effect.coefficients, values, estimate.parameters_std[own])
+    reasons = (*finding.refusals, joint, physics, RunsLeftOut.of(problem).refusal(columns))
+    return finding.held_out_fall, "; ".join(dict.fromkeys(reason for reason in reasons if reason))
