@@ -246,7 +246,7 @@ def time_skew(fitted: Fit) -> tuple[float, float] | None:
 
     It is taken from the last turn, where no accepted effect accounts for it.
     """
-    skews = [finding for finding in fitted.steps[-1].findings if finding.effect == TimeSkew()]
+    skews = [finding for finding in fitted.steps[-1].findings if isinstance(finding.effect, TimeSkew)]
     return None if not skews else (float(skews[0].coefficients[0]), float(skews[0].deviations[0]))
 
 

@@ -36,9 +36,9 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
     (friction.PositionFriction(),),
     tuple(electrical.Cogging(order) for order in ORDERS),
     (transmission.Ripple(0.5),),  # and what the periodogram proposes (ident.discovery.ripple)
-    (electrical.Saturation(),),
-    (electrical.Lag(),),
-    (electrical.TimeSkew(),),
+    (electrical.Saturation(two_terms=1),),
+    tuple(electrical.Lag(filter_s) for filter_s in (0.002, 0.004, 0.008, 0.016, 0.032)),
+    tuple(electrical.TimeSkew(filter_s) for filter_s in (0.001, 0.002, 0.004, 0.008, 0.016)),
     tuple(
         friction.WarmUp(constant_s, whole) for constant_s in (20.0, 40.0, 80.0, 160.0, 320.0, 900.0) for whole in (0, 1)
     ),

@@ -50,7 +50,7 @@ class Property(Enum):
     PERIODIC_IN_MOTOR_ANGLE = "repeats after one motor revolution"
     ODD_IN_CURRENT = "turns its sign with the current"
     ODD_IN_LOAD = "turns its sign with the load"
-    RATE_OF_TORQUE = "is zero where the torque does not change"
+    RATE_OF_TORQUE = "is zero where the torque has not changed for a while"
     SMOOTH = "changes little where its variable does"
     RATE_OF_LOAD = "is zero where the load does not change"
 
@@ -186,7 +186,7 @@ def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axe
         )
 
 
-ADDED = frozenset({"half_gap_rad", "resonant_rad_nm", "damping_ratio"})
+ADDED = frozenset({"half_gap_rad", "resonant_rad_nm", "damping_ratio", "two_terms", "filter_s"})
 """Settings that calibrations of an earlier version do not have; they mean 0, and names of columns leave a 0 out."""
 
 ALL_AXES = "all axes"  #: Where an effect is that acts on every motor alike

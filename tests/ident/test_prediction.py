@@ -16,8 +16,8 @@ from ident.data.dataset import Dataset, differentiate, planned
 from ident.data.run import Run
 from ident.discovery.evidence import Evidence, gather, with_effects
 from ident.effects.dictionary import EFFECTS, UNNAMED
-from ident.effects.effect import PlacedEffect, check_settings
-from ident.effects.electrical import Cogging
+from ident.effects.effect import ALL_AXES, Effect, PlacedEffect, Side, check_settings
+from ident.effects.electrical import Cogging, Lag, Saturation, TimeSkew
 from ident.effects.friction import LoadFriction, Stribeck, WarmUp
 from ident.effects.position import Spring
 from ident.effects.signals import Abscissa
@@ -215,11 +215,23 @@ def test_settings_that_no_effect_has_are_refused(
         placed_effect(AcceptedEffect(name, "J3", settings, (), 1.0, 1.0), calibrated(identified))
 
 
-def test_an_elasticity_of_an_earlier_version_is_that_of_first_order(identified: Evidence) -> None:
-    compliance = Parameter("elasticity compliance 3", 2e-4, 1e-5, "rad/Nm")
-    earlier = AcceptedEffect("elasticity", "J3", {}, (compliance,), 1.0, 1.0)
+@pytest.mark.parametrize(
+    ("effect", "coefficient"),
+    [
+        (Elasticity(), "elasticity compliance 3"),
+        (Saturation(), "saturation coefficient 3"),
+        (Lag(), "lag time 3"),
+        (TimeSkew(), "time-skew time 1"),
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_an_effect_of_an_earlier_version_is_that_of_first_order(
+    identified: Evidence, effect: Effect, coefficient: str
+) -> None:
+    axis = ALL_AXES if effect.side is Side.ALL_MOTORS else "J3"
+    earlier = AcceptedEffect(effect.name, axis, {}, (Parameter(coefficient, 2e-4, 1e-5, ""),), 1.0, 1.0)
     placed, values = placed_effect(earlier, calibrated(identified))
-    assert (placed, values.tolist()) == (PlacedEffect(Elasticity(), 2), [2e-4])
+    assert (placed.effect, values.tolist()) == (effect, [2e-4])
 
 
 def test_every_effect_of_the_dictionary_has_settings_that_an_effect_can_have() -> None:

@@ -18,6 +18,7 @@ from ident.discovery.loop import find_effects
 from ident.discovery.search import rank_effects
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect, Side
+from ident.effects.electrical import Saturation
 from ident.errors import RankDeficient, TooFewMoves
 from ident.estimators.identify import identify
 from ident.estimators.maximum_likelihood import ml
@@ -170,14 +171,34 @@ def _heated(t: TrueSignals) -> FloatArray:
     return np.asarray(above_k * (0.15 * np.sign(t.velocity) - 0.1 * t.velocity))
 
 
+def _saturated(torque: FloatArray, gain: float, half_a: float) -> FloatArray:
+    """Gain times the current that a torque needs where half the torque constant is left at half_a: i / (1 + (i/h)²)."""
+    least_a = torque / gain
+    return np.asarray(gain * 2.0 * least_a / (1.0 + np.sqrt(1.0 - 4.0 * (least_a / half_a) ** 2)))
+
+
+def _followed(torque: FloatArray, constant_s: float, rate_hz: float) -> FloatArray:
+    """What a first-order lag makes of it, in ten Euler steps a sample."""
+    out, state, steps = np.empty_like(torque), float(torque[0]), 10
+    for sample, value in enumerate(torque):
+        for _ in range(steps):
+            state += (float(value) - state) / (constant_s * rate_hz * steps)
+        out[sample] = state
+    return out
+
+
+def _late(torques: FloatArray, delay_s: float, rate_hz: float) -> FloatArray:
+    time_s = np.arange(torques.shape[1]) / rate_hz
+    return np.stack([np.interp(time_s - delay_s, time_s, torque) for torque in torques])
+
+
 CASES = (
     Planted("spring", 1, lambda t: 9.0 * t.position, (9.0,)),
     Planted("cogging", 0, lambda t: 4.0 * np.cos(t.motor_angle) + 3.0 * np.sin(t.motor_angle), (4.0, 3.0)),
     Planted("ripple", 0, lambda t: 4.0 * np.cos(0.5 * t.motor_angle) + 3.0 * np.sin(0.5 * t.motor_angle), (4.0, 3.0)),
-    # g v (1 − c v²) = τ with v = τ/g to first order: the current must be larger by c v³.
-    Planted("saturation", 1, lambda t: 0.02 * t.motor_torque * (t.motor_torque / GAINS[1]) ** 2, (0.02,)),
-    Planted("lag", 0, lambda t: -0.01 * np.gradient(t.motor_torque) * t.rate_hz, (0.01,)),
-    Planted("time-skew", 0, lambda t: -0.004 * np.gradient(t.motor_torques, axis=1) * t.rate_hz, (0.004,)),
+    Planted("saturation", 1, lambda t: _saturated(t.motor_torque, GAINS[1], 10.0) - t.motor_torque, (0.01, 2e-4)),
+    Planted("lag", 0, lambda t: _followed(t.motor_torque, 0.01, t.rate_hz) - t.motor_torque, (0.01,)),
+    Planted("time-skew", 0, lambda t: _late(t.motor_torques, 0.008, t.rate_hz) - t.motor_torques, (0.008,)),
 )  # fmt: skip
 SMALL_CASES = (
     Planted("stribeck", 1, lambda t: 6.0 * np.sign(t.velocity) / np.exp(np.abs(t.velocity) / 0.2), (6.0,)),
@@ -386,10 +407,11 @@ def test_the_loop_ends_where_nothing_is_left(small_arm: Arm) -> None:
 
 
 def test_a_name_that_structure_refutes_bends_no_gain(arm: Arm) -> None:
-    """Of what grows with the load, a dictionary without it can name only saturation, which would bend the gain."""
+    """Of what grows with the load, a dictionary without it can name only a saturation, which would bend the gain."""
     grown = Planted("load-friction", 1, lambda t: 0.3 * np.abs(t.load) * np.sign(t.velocity), (0.3,))
     start = _with(arm, grown)
-    families = tuple(family for family in EFFECTS if family[0].name not in ("load-friction", "efficiency"))
+    lacking = "load-friction", "efficiency", "saturation"
+    families = (*(family for family in EFFECTS if family[0].name not in lacking), (Saturation(),))
     (step,) = find_effects(start, np.random.default_rng(0), GATES, families)
     assert step.accepted is None
     aside = {one.finding.effect.name: one for one in step.set_aside}
