@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-import scipy  # loads scipy.signal when it is first used
+from scipy.linalg import lapack
 
 from ident.arrays import FloatArray
 from ident.effects.effect import Effect, Property, Range, Side, Switch
@@ -114,7 +114,10 @@ def filtered_rate(torque_nm: FloatArray, rate_hz: float, filter_s: float) -> Flo
     sample.
     """
     if filter_s > 0.0:
+        # y_k + (s − 1) y_k−1 = s τ_k is a triangular system with two bands.
         share = -np.expm1(-1.0 / (filter_s * rate_hz))
-        start = (1.0 - share) * torque_nm[..., :1]
-        torque_nm = scipy.signal.lfilter((share,), (1.0, share - 1.0), torque_nm, zi=start)[0]
+        band = np.full((2, torque_nm.shape[-1]), share - 1.0, order="F")
+        driven = share * torque_nm
+        driven[..., 0] = torque_nm[..., 0]
+        torque_nm = lapack.dtbtrs(band, np.atleast_2d(driven).T, uplo="L", diag="U")[0].T.reshape(torque_nm.shape)
     return np.asarray(np.gradient(torque_nm, axis=-1) * rate_hz)
