@@ -169,6 +169,8 @@ def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[P
     if not everywhere and accepted.axis not in places:
         raise EffectRefused(f"effect {accepted.name!r} acts on axis {accepted.axis!r}; there are {', '.join(places)}")
     axis = 0 if everywhere else places.index(accepted.axis)
+    if known.side is Side.ALL_MOTORS and axis:
+        raise EffectRefused(f"effect {accepted.name!r} acts on axis {accepted.axis!r}; it acts on {ALL_AXES}")
     added = {name: 0.0 for name in known.settings if name in ADDED and name not in accepted.settings}
     accepted = replace(accepted, settings={**accepted.settings, **added})
     if set(accepted.settings) != set(known.settings):

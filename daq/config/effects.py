@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from daq.config.yaml_file import Fault
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import Effect, PlacedEffect, Side, check_settings, is_placeable
+from ident.effects.effect import ADDED, Effect, PlacedEffect, Side, check_settings, is_placeable
 from ident.errors import EffectRefused
 from ident.model.robot import Robot
 
@@ -17,7 +17,8 @@ def place_effect(name: str, place: int, settings: Mapping[str, float], robot: Ro
     Args:
         name: of its family.
         place: index of its joint among `Robot.places`.
-        settings: those that are given; the others are those of the dictionary's first member.
+        settings: those that are given; the others are those of the dictionary's first member, or 0 if a later version
+            added them.
         robot: that has it.
     """
     families = {family[0].name: family[0] for family in EFFECTS}
@@ -27,7 +28,8 @@ def place_effect(name: str, place: int, settings: Mapping[str, float], robot: Ro
     unknown = sorted(set(settings) - set(known.settings))
     if unknown:
         return Fault(("settings",), f"settings {', '.join(unknown)}", ", ".join(known.settings) or "no settings")
-    full = {**known.settings, **settings}
+    added = {name: 0 for name in known.settings if name in ADDED}  # a file of an earlier version does not have them
+    full = {**known.settings, **added, **settings}
     for setting, value in full.items():
         # A file has one kind of number; an order is whole.
         if isinstance(known.settings[setting], int) and value != int(value):

@@ -13,7 +13,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from daq.report.effect_names import effect_text, size_text
+from daq.report.effect_names import effect_text, size_text, variable_text
 from daq.report.fit import coefficients, error_document, error_table, identifiability_notes
 from daq.report.gains import diagnosis_texts, gain_table, partial_note
 from daq.report.text import picked, plain_table
@@ -205,7 +205,13 @@ def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
         finding = aside.finding
         axis = PlacedEffect(finding.effect, finding.axis).axis_name(axes)
         replaced = aside.rival is not None and aside.rival in last.after.effects
-        if step is last or (replaced and not is_unnamed(finding.effect)):
+        if aside.rival is not None and aside.moved and step is last:
+            yield (
+                f"{axis}: what looks like {effect_text(finding.effect, axes)} depends clearly more on "
+                f"{variable_text(aside.rival.effect, axes)}, and was not added: it would move "
+                f"{aside.moved_text(axes)}."
+            )
+        elif step is last or (replaced and not is_unnamed(finding.effect)):
             yield (
                 f"{axis} may have {effect_text(finding.effect, axes)}: it would change the error of moves left out "
                 f"from {finding.error_before_percent:.1f} to {finding.error_after_percent:.1f} %, and was not "
@@ -246,7 +252,10 @@ def time_skew(fitted: Fit) -> tuple[float, float] | None:
 
     It is taken from the last turn, where no accepted effect accounts for it.
     """
-    skews = [finding for finding in fitted.steps[-1].findings if isinstance(finding.effect, TimeSkew)]
+    last = fitted.steps[-1]
+    if any(isinstance(placed.effect, TimeSkew) for placed in last.after.effects):
+        return None
+    skews = [finding for finding in last.findings if isinstance(finding.effect, TimeSkew)]
     return None if not skews else (float(skews[0].coefficients[0]), float(skews[0].deviations[0]))
 
 

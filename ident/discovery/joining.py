@@ -3,6 +3,7 @@
 `join` is the entry. It refits gains, parameters and effects together, asks instruments from the demanded motion whether
 the effect is a disturbance in the position loop, linearises the problem around the joint fit, and lets each effect pass
 all gates again beside the others; what fails leaves. A finding that may not join is returned as `SetAside`, with why.
+`refuted_by_structure` asks before the refit whether a name is only similar to what would bend a gain.
 """
 
 from __future__ import annotations
@@ -22,13 +23,15 @@ from ident.discovery.gates import (
     in_noise,
     moved_gains,
     own_unknowns,
+    runs_to_leave_out,
     whitened_columns,
     without_effects_of,
 )
 from ident.discovery.refinement import refine_together
-from ident.discovery.search import EffectKey, Finding, effect_key, rank_families
+from ident.discovery.search import EffectKey, Finding, effect_key, is_better, rank_families
 from ident.discovery.structure import is_inadequate
 from ident.effects.effect import PlacedEffect
+from ident.effects.signals import Abscissa
 from ident.effects.unnamed import is_unnamed
 from ident.errors import NotConverged, RankDeficient
 
@@ -49,10 +52,14 @@ class SetAside:
     def reason(self, axes: Sequence[str]) -> str:
         """Why it did not join, in words, with the names of the axes."""
         words = self.words if self.rival is None else self.words.replace("{rival}", self.rival.name_among(axes))
-        if self.moved:
-            gains = ", ".join(f"the gain of {axes[motor]} by {size:.1f} σ" for motor, size in self.moved)
-            return f"it would move {gains}, and {words}" if words else f"it has no name, and would move {gains}"
-        return words
+        if not self.moved:
+            return words
+        gains = self.moved_text(axes)
+        return f"it would move {gains}, and {words}" if words else f"it has no name, and would move {gains}"
+
+    def moved_text(self, axes: Sequence[str]) -> str:
+        """Which gains it would move, and by how many σ, with the names of the axes."""
+        return ", ".join(f"the gain of {axes[motor]} by {size:.1f} σ" for motor, size in self.moved)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,23 +99,40 @@ def join(
 
 
 def refuted_by_structure(model: JointFit, found: Finding, aside: Sequence[SetAside]) -> SetAside | None:
-    """Why a named effect may not join beside a term of its axis that explains clearly more, but would bend a gain.
+    """Why a name may not join: structure on its axis explains clearly more, was set aside as it bends a gain, and the
+    name bends one, too.
 
-    The name is then only similar to the truth. It does no harm unless it bends a gain, too.
+    The name is then only similar to the truth. It does no harm where it bends no gain, and is no mistake where it still
+    lowers the error beside the structure: then it explains something else. A term against the time, or the session,
+    refutes nothing where no run can be left out: it can tell the loaded runs from the others.
     """
     if is_unnamed(found.effect):
         return None
-    terms = [one.finding for one in aside if one.moved and one.rival is None and one.finding.axis == found.axis]
-    better = next((term for term in terms if is_inadequate(found, term)), None)
-    if better is None or not (moved := _moved_by(model, found)):
-        return None
-    return SetAside(found, "{rival} explains clearly more", PlacedEffect(better.effect, better.axis), moved)
+    problem, folds = model.search_problem, model.search_problem.folds
+    unsure = () if runs_to_leave_out(problem.observation) else (Abscissa.TIME, Abscissa.SESSION)
+    before = float(folds.square_sum(folds.residual).sum())
+    for term in (one.finding for one in aside if one.moved and is_unnamed(one.finding.effect)):
+        if term.axis != found.axis or term.effect.abscissa in unsure:
+            continue
+        own, free = (whitened_columns(problem, one.effect, one.axis) for one in (found, term))
+        parts = slice(0, own.shape[1]), slice(own.shape[1], None), slice(None)
+        by_name, by_term, by_both = score_candidates(folds, np.hstack((own, free)), parts)
+        if by_name is None or by_term is None or by_both is None:
+            continue
+        left, beside = by_name.held_out.sum(axis=1), by_both.held_out.sum(axis=1)
+        again = replace(
+            found, coefficients=by_name.coefficients, fold_errors=left, held_out_fall=before - float(left.sum())
+        )
+        explains_more = is_better(beside, by_term.held_out.sum(axis=1))
+        if not explains_more and is_inadequate(again, term) and (moved := _moved_by(model, again)):
+            return SetAside(found, "{rival} explains clearly more", PlacedEffect(term.effect, term.axis), moved)
+    return None
 
 
 def _refit(model: JointFit, accepted: Finding) -> JointFit | SetAside:
     """Refit with a finding in the model; or say why it may not join, whatever else is in the model."""
     evidence, problem = model.evidence, model.search_problem
-    last, gains_std = PlacedEffect(accepted.effect, accepted.axis), evidence.estimate.gains_std
+    last = PlacedEffect(accepted.effect, accepted.axis)
     # Asked before the refit, which takes longer.
     if is_unnamed(last.effect) and (moved := _moved_by(model, accepted)):
         return SetAside(accepted, moved=moved)
@@ -124,13 +148,13 @@ def _refit(model: JointFit, accepted: Finding) -> JointFit | SetAside:
     terms = [placed for placed in refitted.effects if is_unnamed(placed.effect)]
     if last in terms:  # no setting of theirs is refined
         together = without_effects_of(joined.search_problem, refitted.estimate, terms)
-        if moved := moved_gains(together.gain_shifts, gains_std):
+        if moved := moved_gains(together.gain_shifts, evidence.estimate.gains_std):
             return SetAside(accepted, moved=moved)
     return joined
 
 
 def _moved_by(model: JointFit, found: Finding) -> tuple[tuple[int, float], ...]:
-    """Index of each gain that a finding would move by more than its σ, to first order, and by how many."""
+    """Index of each gain that a finding would move by more than its σ, to first order, and by how many σ."""
     problem = model.search_problem
     torque = whitened_columns(problem, found.effect, found.axis) @ found.coefficients
     return moved_gains(gain_shifts(problem.folds, torque), model.evidence.estimate.gains_std)

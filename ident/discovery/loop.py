@@ -101,8 +101,9 @@ def find_effects(
     3. chooses the best on held-out moves, the simplest among equals (`choose_effect`), if it does not raise the error
        on runs left out (`RunsLeftOut`);
     4. tests terms without a name, splines and motor harmonics, on the same axis, or on all axes if no named effect
-       passed; one that explains much more replaces the named effect (`find_structure`, `is_inadequate`), but not if it
-       moves a gain by more than its σ; then the named effect may move none either;
+       passed; one that explains much more replaces the named effect (`find_structure`, `is_inadequate`). A term that
+       moves a gain by more than its σ does not join; the name that it refutes then joins only if it moves none either
+       (`refuted_by_structure`);
     5. refines its setting (`refine_setting`), adds it, and refits gains, parameters and effects together;
     6. asks instruments from the demanded motion whether the effect is a disturbance in the position loop;
     7. linearises the problem around the joint fit and deals whole moves to folds (`prepare_search`); every effect in
@@ -199,8 +200,8 @@ def _with_choice(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
             accepted[placed] = found, (*step.findings, *step.structures)
     last, left = steps[-1], list[Finding]()
     if last.accepted is None:  # its findings are of the last model
-        # A name that a term without one refutes is no model that could be true.
-        left += [aside.finding for aside in last.set_aside if aside.moved and aside.rival is None]
+        # A name that structure refutes is no model that could be true.
+        left += [one.finding for one in last.set_aside if one.moved and is_unnamed(one.finding.effect)]
         left += [found for found in (*last.findings, *last.structures) if is_small(found, gates)]
     choice = choice_covariance(model.search_problem, estimate, tuple(accepted.values()), left)
     last = replace(last, choice_std=np.sqrt(np.diag(choice)[: len(estimate.gains)]))
@@ -250,10 +251,10 @@ def _turn(
             accepted = named
         if accepted is None or known >= most:
             break
-        refuted = refuted_by_structure(model, accepted, aside)
         near = (*proposed.get(accepted.axis, ()), *families)
         effect = refine_setting(problem, accepted.effect, accepted.axis, near)
-        accepted = replace(accepted, effect=effect)
+        chosen, accepted = accepted, replace(accepted, effect=effect)
+        refuted = refuted_by_structure(model, accepted, aside)
         progress(f"adding {effect.name} on {names[accepted.axis]}")
         joined = refuted or join(model, accepted, rng, gates, seen)
         if isinstance(joined, JointFit):
@@ -266,7 +267,7 @@ def _turn(
         aside.append(joined)
         # The variables of an axis go together: if its best term may not join, no other term replaces it.
         others = structures if is_unnamed(effect) else ()
-        taken |= {effect_key(one.effect, one.axis) for one in (accepted, *others) if one.axis == accepted.axis}
+        taken |= {effect_key(one.effect, one.axis) for one in (chosen, *others) if one.axis == chosen.axis}
     if accepted is not None:
         ended = f"{problem.folds.linearisation.cluster_count} pieces of {moves} moves allow no more than {most} effects"
     elif moves < MIN_MOVES_FOR_STRUCTURE:

@@ -33,7 +33,7 @@ from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial
 from ident.discovery.gates import Gates, impossible
 from ident.discovery.refinement import refine_together
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import Effect, PlacedEffect, is_placeable
+from ident.effects.effect import ADDED, Effect, PlacedEffect, is_placeable
 
 EffectKey = tuple[str, int, tuple[float, ...]]
 
@@ -157,13 +157,18 @@ def choose_effect(findings: Sequence[Finding], taken: Collection[EffectKey] = ()
         and finding.held_out_fall >= AS_GOOD * best.held_out_fall
         and not (best.effect.refined and is_better(best.fold_errors, finding.fold_errors))
     ]
-    return min(alike, key=lambda finding: len(finding.effect.coefficients) + len(finding.effect.settings))
+    return min(alike, key=lambda finding: len(finding.effect.coefficients) + len(_own_settings(finding.effect)))
 
 
 def effect_key(effect: Effect, axis: int) -> EffectKey:
     """Identify an effect on an axis by its family, integer settings and order: two orders of a ripple are two."""
-    whole = (value for name, value in effect.settings.items() if isinstance(value, int) or name == "order")
-    return effect.name, axis, tuple(whole)
+    own = _own_settings(effect)
+    return effect.name, axis, tuple(value for name, value in own.items() if isinstance(value, int) or name == "order")
+
+
+def _own_settings(effect: Effect) -> dict[str, float]:
+    """Settings without the switches that choose a form of the same effect."""
+    return {name: value for name, value in effect.settings.items() if not (name in ADDED and isinstance(value, int))}
 
 
 def is_better(one: FloatArray, other: FloatArray) -> BoolArray:
@@ -213,7 +218,8 @@ def _judge(
     problem = search_problem.folds.linearisation
     probability = [next(probabilities) for _ in family.members]
     # A setting that needs impossible coefficients is chosen only where every setting of the family does.
-    ruled_out = [impossible(effect.coefficients, trial.coefficients, _sigma(trial)) for effect, trial in family.members]
+    fewest = min(len(effect.coefficients) for effect, _ in family.members)
+    ruled_out = [_ruled_out(effect, trial, fewest) for effect, trial in family.members]
     possible = [index for index, why in enumerate(ruled_out) if not why] or range(len(family.members))
     best = max(possible, key=lambda index: float(family.members[index][1].fallen.sum()))
     effect, trial = family.members[best]
@@ -255,6 +261,17 @@ def _judge(
         share_of_excess=min(float(trial.fallen[motor]) / excess, 1.0) if excess > 0.0 else None,
         fold_errors=after.sum(axis=1),
         refusals=refusals,
+    )
+
+
+def _ruled_out(effect: Effect, trial: Trial, fewest: int) -> str:
+    """Which coefficients are impossible; of a form with more of them than the fewest of its family, without tolerance.
+
+    Two that are nearly collinear each hide in their σ, however certain both together are.
+    """
+    exact = len(effect.coefficients) > fewest
+    return impossible(
+        effect.coefficients, trial.coefficients, np.zeros(len(trial.coefficients)) if exact else _sigma(trial)
     )
 
 

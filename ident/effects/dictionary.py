@@ -26,6 +26,12 @@ ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
 PAIRED = range(2, 13)
 """The higher number of a pair of joints; pairs that a robot does not have are left out of its search."""
 
+FILTERS = (
+    *((filter_s, 0) for filter_s in (0.001, 0.004, 0.012, 0.05)),
+    *((filter_s, 1) for filter_s in (0.001, 0.003, 0.01)),
+)
+"""Time constants of a late current, and of an early one; those between are found by refinement."""
+
 EFFECTS: tuple[tuple[Effect, ...], ...] = (
     tuple(friction.Stribeck(speed_rad_s) for speed_rad_s in (0.05, 0.08, 0.12, 0.2, 0.3, 0.5)),
     tuple(friction.NonlinearViscous(exponent) for exponent in (1 / 3, 0.5, 2.0, 3.0)),
@@ -36,9 +42,9 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
     (friction.PositionFriction(),),
     tuple(electrical.Cogging(order) for order in ORDERS),
     (transmission.Ripple(0.5),),  # and what the periodogram proposes (ident.discovery.ripple)
-    (electrical.Saturation(two_terms=1),),
-    tuple(electrical.Lag(filter_s) for filter_s in (0.002, 0.004, 0.008, 0.016, 0.032)),
-    tuple(electrical.TimeSkew(filter_s) for filter_s in (0.001, 0.002, 0.004, 0.008, 0.016)),
+    tuple(electrical.Saturation(two_terms) for two_terms in (0, 1)),
+    tuple(electrical.Lag(filter_s, backwards) for filter_s, backwards in FILTERS),
+    tuple(electrical.TimeSkew(filter_s, backwards) for filter_s, backwards in FILTERS),
     tuple(
         friction.WarmUp(constant_s, whole) for constant_s in (20.0, 40.0, 80.0, 160.0, 320.0, 900.0) for whole in (0, 1)
     ),

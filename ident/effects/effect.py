@@ -186,7 +186,7 @@ def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axe
         )
 
 
-ADDED = frozenset({"half_gap_rad", "resonant_rad_nm", "damping_ratio", "two_terms", "filter_s"})
+ADDED = frozenset({"half_gap_rad", "resonant_rad_nm", "damping_ratio", "two_terms", "filter_s", "backwards"})
 """Settings that calibrations of an earlier version do not have; they mean 0, and names of columns leave a 0 out."""
 
 ALL_AXES = "all axes"  #: Where an effect is that acts on every motor alike

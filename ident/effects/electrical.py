@@ -17,11 +17,12 @@ from ident.model.regressor import cos_sin
 
 @dataclass(frozen=True, slots=True)
 class Saturation(Effect):
-    """τ = c · g v³ + d · g v⁵;  c, d > 0: the motor needs more current at large torque than without.
+    """τ = c · g v³ + d · g v⁵: at large torque the motor needs more current v than its gain g says.
 
-    v is the current that the model predicts. Source: saturation of the stator iron, the first two even terms of the
-    current per torque; Hendershot & Miller, Design of Brushless Permanent-Magnet Motors. With the first alone, a motor
-    that loses a tenth of its torque constant bends its gain by two per cent. Signature: large current, odd in it.
+    v is the current that the model predicts. Where half the torque constant is left at a current h, i/(1 + (i/h)²) = v,
+    c is about 1/h² and d about 2/h⁴ (the series converges below v = h/2). With the first term alone the gain takes up
+    what is left of the others. Source: saturation of the stator iron, the first even terms of the current per torque;
+    Hendershot & Miller, Design of Brushless Permanent-Magnet Motors. Signature: large current, odd in it.
     """
 
     name = "saturation"
@@ -66,11 +67,12 @@ class Cogging(Effect):
 
 @dataclass(frozen=True, slots=True)
 class Lag(Effect):
-    """τ = −c · ẏ,  T ẏ + y = g v;  c > 0: the current is late by c.
+    """τ = −c · ẏ,  T ẏ + y = g v;  c > 0: the current is late by c; c < 0: it is early.
 
-    v is the current that the model predicts. A first-order lag of time constant c is this with T = c, exactly; a delay
-    is v(t − c) ≈ v − c v̇ + c²/2 · v̈, this with T = c/2 to second order. With T = 0 it is the first order alone, which
-    bends the gain where the torque jumps. Signature: rate of torque.
+    v is the current that the model predicts, other effects left out. A first-order lag of time constant c is this with
+    T = c; a delay is v(t − c) ≈ v − c v̇ + c²/2 · v̈, this with T = c/2 to second order. For an early current the filter
+    runs backwards in time. With T = 0 it is the first order alone, which is wrong where the torque jumps, and bends the
+    gain. Source: Taylor and Padé expansions of a delay. Signature: rate of torque.
     """
 
     name = "lag"
@@ -79,19 +81,20 @@ class Lag(Effect):
     abscissa = Abscissa.TORQUE_RATE
     coefficients = (Column("time", "s"),)
 
-    filter_s: Annotated[float, Range(0.0, 1.0)] = 0.0  #: T
+    filter_s: Annotated[float, Range(0.0, 0.1)] = 0.0  #: T
+    backwards: Switch = 0  #: 1 where the filter runs backwards in time, else 0
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
-        return -filtered_rate(signals.motor_torque_nm[axis], signals.rate_hz, self.filter_s)[None]
+        return -_rate(signals.motor_torque_nm[axis], signals.rate_hz, self)[None]
 
 
 @dataclass(frozen=True, slots=True)
 class TimeSkew(Effect):
     """τ_i = −c · ẏ_i,  T ẏ_i + y_i = g_i v_i, of every motor i;  c > 0: all currents are late by c.
 
-    On one axis a delay is a `Lag`, where T is explained; the same delay on all axes is a fault of the recording.
-    Signature: rate of torque, the same time everywhere.
+    On one axis a delay is a `Lag` (see there for T); the same delay on all axes is a fault of the recording. Source:
+    Padé expansion of a delay. Signature: rate of torque, the same time everywhere.
     """
 
     name = "time-skew"
@@ -100,24 +103,39 @@ class TimeSkew(Effect):
     abscissa = Abscissa.TORQUE_RATE
     coefficients = (Column("time", "s"),)
 
-    filter_s: Annotated[float, Range(0.0, 1.0)] = 0.0  #: T
+    filter_s: Annotated[float, Range(0.0, 0.1)] = 0.0  #: T
+    backwards: Switch = 0  #: 1 where the filter runs backwards in time, else 0
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (n, 1, k); the axis does not matter."""
-        return -filtered_rate(signals.motor_torque_nm, signals.rate_hz, self.filter_s)[:, None]
+        return -_rate(signals.motor_torque_nm, signals.rate_hz, self)[:, None]
+
+
+def _rate(torque_nm: FloatArray, rate_hz: float, effect: Lag | TimeSkew) -> FloatArray:
+    if effect.backwards:
+        return -filtered_rate(torque_nm[..., ::-1], rate_hz, effect.filter_s)[..., ::-1]
+    return filtered_rate(torque_nm, rate_hz, effect.filter_s)
 
 
 def filtered_rate(torque_nm: FloatArray, rate_hz: float, filter_s: float) -> FloatArray:
-    """Rate of what a first-order low pass leaves of torques [Nm/s], time last, of the shape of ``torque_nm``.
+    """ẏ of T ẏ + y = τ [Nm/s], exact for torques that are linear between samples; of the shape of ``torque_nm``.
 
-    It starts as if the first torque had been there for ever, and is exact for torques that are held from sample to
-    sample.
+    It starts as if the first torque had been there for ever. With T = 0, ẏ is the central difference of τ.
+
+    Args:
+        torque_nm: τ, shape (k,) or (n, k).
+        rate_hz: sampling rate.
+        filter_s: T.
     """
-    if filter_s > 0.0:
-        # y_k + (s − 1) y_k−1 = s τ_k is a triangular system with two bands.
-        share = -np.expm1(-1.0 / (filter_s * rate_hz))
-        band = np.full((2, torque_nm.shape[-1]), share - 1.0, order="F")
-        driven = share * torque_nm
-        driven[..., 0] = torque_nm[..., 0]
-        torque_nm = lapack.dtbtrs(band, np.atleast_2d(driven).T, uplo="L", diag="U")[0].T.reshape(torque_nm.shape)
-    return np.asarray(np.gradient(torque_nm, axis=-1) * rate_hz)
+    if not filter_s > 0.0:
+        return np.asarray(np.gradient(torque_nm, axis=-1) * rate_hz)
+    steps = filter_s * rate_hz
+    kept = np.exp(-1.0 / steps)
+    new, old = 1.0 - (1.0 - kept) * steps, (1.0 - kept) * steps - kept
+    # y_k − kept · y_k−1 = new · τ_k + old · τ_k−1 is a triangular system with two bands.
+    band = np.full((2, torque_nm.shape[-1]), -kept, order="F")
+    driven = new * torque_nm
+    driven[..., 1:] += old * torque_nm[..., :-1]
+    driven[..., 0] = torque_nm[..., 0]
+    passed = lapack.dtbtrs(band, np.atleast_2d(driven).T, uplo="L", diag="U")[0].T.reshape(torque_nm.shape)
+    return np.asarray((torque_nm - passed) / filter_s)

@@ -178,6 +178,7 @@ STIFFNESS = Parameter("spring stiffness 3", 1.0, 0.0, "Nm/rad")
         (AcceptedEffect("cogging", "J3", {"order": 2.5}, (), 1.0, 1.0), "whole"),
         (AcceptedEffect("spring", "J3", {}, (), 1.0, 1.0), "coefficients none; it needs spring stiffness 3"),
         (AcceptedEffect("spring", "J4", {}, (STIFFNESS,), 1.0, 1.0), "it needs spring stiffness 4"),
+        (AcceptedEffect("time-skew", "J3", {}, (STIFFNESS,), 1.0, 1.0), "'J3'; it acts on all axes"),
     ],
 )
 def test_an_effect_that_does_not_exist_is_refused(identified: Evidence, effect: AcceptedEffect, words: str) -> None:

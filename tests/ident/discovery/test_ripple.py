@@ -9,10 +9,13 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
+from ident.discovery import loop
 from ident.discovery.evidence import Evidence
 from ident.discovery.gates import Gates
+from ident.discovery.joining import SetAside
 from ident.discovery.loop import find_effects
 from ident.discovery.ripple import Periodogram, _fast_length, periodogram, propose_orders
+from ident.discovery.search import Finding
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.electrical import Cogging
@@ -48,6 +51,23 @@ def test_an_order_between_the_whole_ones_is_named(small: Evidence, small_truth: 
     assert abs(effect.order - order) * 40.0 * range_rev < 0.1
     found = last.estimate.parameters[len(last.rows_without_effects.columns) :][:2]
     assert np.hypot(*found) == pytest.approx(4.0, rel=0.1)
+
+
+def test_an_order_that_may_not_join_is_tried_once(
+    small: Evidence, small_truth: Truth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is refined before it is refused, and must not be chosen again with the order that it had before."""
+    refused: list[Finding] = []
+
+    def refuse(model: object, found: Finding, *_: object) -> SetAside:
+        refused.append(found)
+        assert len(refused) < 5
+        return SetAside(found, "refused")
+
+    monkeypatch.setattr(loop, "join", refuse)
+    (step,) = find_effects(_rippling(small, small_truth, 0, 0.37, 4.0), np.random.default_rng(0), GATES, RIPPLES)
+    assert step.accepted is None
+    assert len(refused) == len(step.set_aside)
 
 
 def test_noise_proposes_no_order(small: Evidence) -> None:
