@@ -87,7 +87,7 @@ def fit_verb(
     from dataclasses import replace
     from datetime import UTC, datetime
 
-    from daq.cli.terminal import at_most_one, check_folder, check_output, print_view, status
+    from daq.cli.terminal import at_most_one, check_folder, check_output, print_view, require_different, status
     from daq.config.cell_file import load_cell
     from daq.log.reader import LossyLogs
     from daq.report.fit import fit_document, fit_view
@@ -102,6 +102,8 @@ def fit_verb(
         return
     check_folder(out)
     check_output(out, (*logs, *(holdout or ()), cell), CALIBRATION)
+    require_different(out=out, report=report)
+    require_different(out=out, pictures=pictures)
     check_report(report)
     with status("identifying"):
         described = None if cell is None else load_cell(cell)
@@ -205,7 +207,7 @@ def residual_verb(
     from dataclasses import replace
     from datetime import UTC, datetime
 
-    from daq.cli.terminal import check_folder, check_output, print_view, status
+    from daq.cli.terminal import check_folder, check_output, print_view, require_different, status
     from daq.config.cell_file import load_cell
     from daq.log.reader import LossyLogs
     from daq.report.fit import start_of
@@ -217,6 +219,8 @@ def residual_verb(
 
     check_folder(out)
     check_output(out, (*logs, *(holdout or ()), cell), CALIBRATION)
+    require_different(out=out, report=report)
+    require_different(out=out, pictures=pictures)
     check_report(report)
     with status("identifying") as report_step:
         fitted = fit(

@@ -74,6 +74,22 @@ def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) 
     check_replaceable(out, f"format: {format_}", format_)
 
 
+def require_different(**outputs: Path | None) -> None:
+    """Refuse two options that name the same file or folder."""
+    named: dict[Path, str] = {}
+    for option, path in outputs.items():
+        if path is None:
+            continue
+        other = named.setdefault(path.resolve(), option)
+        if other != option:
+            raise UsageError(
+                str(path),
+                found=f"the same name for --{other} and --{option}",
+                expected="a name for each",
+                remedy=f"choose another name for --{option}",
+            )
+
+
 def check_folder(out: Path | None) -> None:
     """Refuse, before the work is done, an output file in a folder that does not exist."""
     if out is not None and not out.parent.is_dir():

@@ -139,10 +139,10 @@ def check_current(current: FloatArray, wanted: ImportDescription, file: Table) -
     usual = np.percentile(size, 99.0, axis=0)
     for index, column in enumerate(wanted.current.columns):
         row = int(np.argmax(size[:, index]))
-        if size[row, index] == 0.0:
+        if len(current) > 1 and not np.ptp(current[:, index]):
             raise TableUnfit(
                 f"{file.path}, column {column}",
-                found="zero in every row",
+                found=f"{current[0, index]:g} in every row" if current[0, index] else "zero in every row",
                 expected="the current reference of a motor that moves",
                 remedy="is the channel connected, and the column the right one?",
             )

@@ -186,9 +186,11 @@ def _effects(calibration: Calibration, consequence: str) -> str:
 def _effect(effect: AcceptedEffect, calibration: Calibration) -> str:
     words, size = accepted_text(effect, calibration), size_text(effect, calibration)
     before, after = percent_text(effect.error_before_percent), percent_text(effect.error_after_percent)
+    kept_out = any(source.role == "holdout" for source in calibration.sources)
+    data = "On data that the fit has not used" if kept_out else "On moves left out in turn, which its choice has seen"
     text = paragraph(
-        f"{effect.axis} has {words}: {size}. On data that the fit has not used, the model without it leaves {before} % "
-        f"of the torque of {effect.axis}, with it {after} %."
+        f"{effect.axis} has {words}: {size}. {data}, the model without it leaves {before} % of the torque of "
+        f"{effect.axis}, with it {after} %."
     )
     shown = curve_of(effect, calibration)
     if shown is None:

@@ -38,7 +38,7 @@ WORDS = {
     "efficiency": "a gear that loses a part of the power in both directions",
     "coupling": "friction shared with another joint",
     "inertial-coupling": "inertia shared with another joint",
-    "hinge": "a cable or hose that pulls from some position on",
+    "hinge": "a cable or hose that pulls beyond some position",
     "gravity-compensator": "a gravity compensator, or another torque that repeats with the joint",
     "counterbalance": "a balancer between two links",
     "passive-friction": "friction in a joint without a motor",

@@ -35,6 +35,7 @@ from ident.estimators.estimate import RelativeError
 
 _SHOWN = 6  #: Findings listed for each turn; the JSON has them all
 _SHOWN_RIVALS = 3
+MUCH = 0.2  #: Share of the squared residual; a candidate that would explain it, and failed a check, is named
 SLIGHT = 0.1  #: Share of an error; an effect that lowers it by less is said to be small
 
 _OF_A_GEAR = (
@@ -127,11 +128,13 @@ def summary(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) ->
     noise = f" (noise floor {floor:.1f} %)" if math.isfinite(floor) else ""
     ending = [*_choice_sentence(fitted, account), _silence(fitted)]
     if (skew := time_skew(fitted)) is not None and abs(skew[0]) > CERTAIN * skew[1]:
-        beside = " beside the effects found" if kept else ""
+        beside = " (beside the effects above; it was not added)" if kept else ""
         ending.append(
             f"Currents were sampled {1e3 * abs(skew[0]):.2f} ± {1e3 * skew[1]:.2f} ms "
-            f"{'after' if skew[0] > 0 else 'before'} the positions on all axes alike{beside}."
+            f"{'after' if skew[0] > 0 else 'before'} the positions on all axes alike{beside}. Tenths of a "
+            "millisecond are a filter of the drive, several milliseconds a fault of the recording: check its time stamps."
         )
+    ending += _refused(fitted)
     ending += gear_sentences(fitted)
     ending += floor_sentences(account, fitted.cell.axis_names)
     ending += _holdout_verdict(fitted, account)
@@ -217,6 +220,20 @@ def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
                 f"from {finding.error_before_percent:.1f} to {finding.error_after_percent:.1f} %, and was not "
                 f"added: {aside.reason(axes)}."
             )
+
+
+def _refused(fitted: Fit) -> Iterator[str]:
+    """Sentences on the strongest candidate of each axis that failed a check, but would explain much of the rest."""
+    axes, told = fitted.cell.place_names, set[int]()
+    for finding in sorted(fitted.steps[-1].findings, key=lambda one: -one.explained):
+        if finding.explained < MUCH or finding.axis in told or not finding.refusals:
+            continue
+        told.add(finding.axis)
+        axis = PlacedEffect(finding.effect, finding.axis).axis_name(axes)
+        yield (
+            f"{axis}: {effect_text(finding.effect, axes)} would explain {100.0 * finding.explained:.0f} % of what is "
+            f"left, squared, but failed a check: {'; '.join(finding.refusals)}. The cause may be another one."
+        )
 
 
 def floor_sentences(account: Account, axes: Sequence[str]) -> list[str]:

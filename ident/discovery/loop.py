@@ -76,7 +76,7 @@ class Step:
     def ranked(self, count: int) -> tuple[Finding, ...]:
         """The best findings on named effects, and the accepted one wherever it ranks."""
         best, added = self.findings[:count], self.accepted
-        if added is None or any((one.effect, one.axis) == (added.effect, added.axis) for one in best):
+        if added is None or effect_key(added.effect, added.axis) in {effect_key(one.effect, one.axis) for one in best}:
             return best
         return (*best, added)
 

@@ -168,6 +168,17 @@ def test_an_unwritable_standard_output_is_no_traceback(
 
 
 @pytest.mark.parametrize("verb", ["fit", "residual"])
+@pytest.mark.parametrize("other", ["--report", "--pictures"])
+def test_one_name_for_two_outputs_is_refused_before_any_log_is_read(
+    verb: str, other: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    same = str(tmp_path / "same")
+    assert main([verb, str(tmp_path / "no.mcap"), "--out", same, other, same]) == ExitCode.USAGE
+    assert f"the same name for --out and {other}" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("verb", ["fit", "residual"])
 def test_a_missing_folder_is_named_before_any_log_is_read(
     verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

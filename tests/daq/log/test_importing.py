@@ -413,10 +413,11 @@ def test_a_number_that_is_no_current(bench: Bench, capsys: pytest.CaptureFixture
     _refused(bench, capsys, 4, "run.csv:122, column i4", "1e+300")
 
 
-def test_a_dead_channel(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
-    bench.current_a[:, 2] = 0.0
+@pytest.mark.parametrize(("value", "words"), [(0.0, "zero in every row"), (3.0, "3 in every row")])
+def test_a_dead_channel(bench: Bench, capsys: pytest.CaptureFixture[str], value: float, words: str) -> None:
+    bench.current_a[:, 2] = value
     bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
-    _refused(bench, capsys, 4, "column i3", "zero in every row")
+    _refused(bench, capsys, 4, "column i3", words)
 
 
 def test_a_last_number_that_may_lack_digits(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
