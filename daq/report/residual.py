@@ -132,7 +132,7 @@ def summary(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) ->
         ending.append(
             f"Currents were sampled {1e3 * abs(skew[0]):.2f} ± {1e3 * skew[1]:.2f} ms "
             f"{'after' if skew[0] > 0 else 'before'} the positions on all axes alike{beside}. Tenths of a "
-            "millisecond are a filter of the drive, several milliseconds a fault of the recording: check its time stamps."
+            "millisecond are a filter of the drive, several milliseconds a fault of the recording: check its stamps."
         )
     ending += _refused(fitted)
     ending += gear_sentences(fitted)

@@ -56,14 +56,14 @@ class Gates:
         return max(self.explained, 1.0 - (1.0 - self.error_fall) ** 2)
 
 
-def impossible(columns: Sequence[Column], values: FloatArray, deviations: FloatArray) -> str:
-    """Name the coefficients that are outside their possible values by more than SIGMAS σ; empty without any."""
+def impossible(columns: Sequence[Column], values: FloatArray, deviations: FloatArray, tolerance: float = SIGMAS) -> str:
+    """Name the coefficients that are outside their possible values by more than a number of σ; empty without any."""
     found = []
     for column, value, std in zip(columns, values, deviations, strict=True):
         size = f"{column.name} is {value:.3g} ± {std:.2g} {column.unit}; physics allows"
-        if value < column.least - SIGMAS * std:
+        if value < column.least - tolerance * std:
             found.append(f"{size} no less than {column.least:g}")
-        elif value > column.largest + SIGMAS * std:
+        elif value > column.largest + tolerance * std:
             found.append(f"{size} no more than {column.largest:g}")
     return ", ".join(found)
 

@@ -30,7 +30,7 @@ import scipy  # loads scipy.special when it is first used: a fit needs none of i
 
 from ident.arrays import BoolArray, FloatArray
 from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial
-from ident.discovery.gates import Gates, impossible
+from ident.discovery.gates import SIGMAS, Gates, impossible
 from ident.discovery.refinement import refine_together
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import ADDED, Effect, PlacedEffect, is_placeable
@@ -269,10 +269,8 @@ def _ruled_out(effect: Effect, trial: Trial, fewest: int) -> str:
 
     Two that are nearly collinear each hide in their σ, however certain both together are.
     """
-    exact = len(effect.coefficients) > fewest
-    return impossible(
-        effect.coefficients, trial.coefficients, np.zeros(len(trial.coefficients)) if exact else _sigma(trial)
-    )
+    tolerance = 0.0 if len(effect.coefficients) > fewest else SIGMAS
+    return impossible(effect.coefficients, trial.coefficients, _sigma(trial), tolerance)
 
 
 def _sigma(trial: Trial) -> FloatArray:
