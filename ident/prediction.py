@@ -172,9 +172,9 @@ def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[P
     if known.side is Side.ALL_MOTORS and axis:
         raise EffectRefused(f"effect {accepted.name!r} acts on axis {accepted.axis!r}; it acts on {ALL_AXES}")
     added = {name: 0.0 for name in known.settings if name in ADDED and name not in accepted.settings}
-    accepted = replace(accepted, settings={**accepted.settings, **added})
+    own, accepted = accepted.settings, replace(accepted, settings={**accepted.settings, **added})
     if set(accepted.settings) != set(known.settings):
-        found, exist = (", ".join(sorted(settings)) or "none" for settings in (accepted.settings, known.settings))
+        found, exist = (", ".join(sorted(settings)) or "none" for settings in (own, known.settings))
         raise EffectRefused(f"effect {accepted.name!r} is given the settings {found}; it has {exist}")
     check_settings(known, accepted.settings, axis, len(calibration.gains))
     # A file knows one kind of number; an order must be whole.

@@ -77,7 +77,10 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
     driver.MotionTimeout: ("every move within its time", "check brakes and limits, or record with --speed 0.5"),
     driver.DriverError: ("an undisturbed bus", "read the message above; `drivegain monitor CELL` shows the bus"),
     identification.DataUnfit: ("runs that can be used", "leave the run out, or record it again"),
-    identification.TooFewMoves: ("enough moves to judge the scatter", "record a longer plan (`plan --duration 60`)"),
+    identification.TooFewMoves: (
+        "enough moves to judge the scatter",
+        "record a longer plan (`plan --duration 60`), or give more logs",
+    ),
     identification.RankDeficient: (
         "moves that identify every unknown",
         "record runs without load and with the payload, with a plan of `drivegain plan`",
@@ -87,6 +90,10 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
         "use a heavier payload or a plan of `drivegain plan`",
     ),
     identification.NotConverged: ("a fit that settles", "check the cell file, or try `fit --method wls`"),
+    identification.EffectRefused: (
+        "effects as `drivegain residual` and the cell file's reference have them",
+        "correct `effects` of the calibration or of the cell file, or fit the logs again",
+    ),
     identification.IdentificationError: (
         "a model and runs that belong together",
         "check the cell file and the logs (`drivegain info LOG`)",

@@ -79,7 +79,7 @@ def turns_view(fitted: Fit) -> Iterator[RenderableType]:
             yield f"Declared in the cell file: {placed.name_among(fitted.cell.place_names)}.\n"
     for number, step in enumerate((step for step in fitted.steps if not step.declared), start=1):
         headings = ("effect", "axis", "p", "folds", "explains", "left-out error", "gates")
-        table = plain_table(headings, title=f"Turn {number}: best candidates on left-out moves")
+        table = plain_table(headings, title=f"Turn {number}: best candidates on left-out moves, before the refit")
         for finding in step.ranked(_SHOWN):
             table.add_row(
                 finding.effect.name,
