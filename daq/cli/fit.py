@@ -209,6 +209,7 @@ def residual_verb(
 
     from daq.cli.terminal import check_folder, check_output, print_view, require_different, status
     from daq.config.cell_file import load_cell
+    from daq.errors import OutputFailed
     from daq.log.reader import LossyLogs
     from daq.report.fit import start_of
     from daq.report.residual import residual_document, residual_view
@@ -236,18 +237,26 @@ def residual_verb(
         calibration = calibration_of(closed, datetime.now(UTC))
         report_step("computing the errors before and after")
         changed = account(start_of(closed), closed.steps, leave_out_runs=leave_out_runs, progress=report_step)
-    if report is not None:
-        with status("drawing the report"):
-            save_report(closed, changed, calibration, report)
-    check_holdout(closed)
-    _save(closed, calibration, out, pictures)
-    if json:
-        print_json(residual_document(closed, changed, calibration))
-    else:
-        print_view(residual_view(closed, changed, calibration), out, report, pictures)
-        if out is not None:
-            same = [] if cell is None else ["--cell", cell]
-            say_next("drivegain", "validate", out, *(holdout or logs), *same)
+
+    def show(*written: Path | None) -> None:
+        if json:
+            print_json(residual_document(closed, changed, calibration))
+        else:
+            print_view(residual_view(closed, changed, calibration), *written)
+
+    try:
+        if report is not None:
+            with status("drawing the report"):
+                save_report(closed, changed, calibration, report)
+        check_holdout(closed)
+        _save(closed, calibration, out, pictures)
+    except OutputFailed:
+        show()  # what took minutes to find is not lost with the disk
+        raise
+    show(out, report, pictures)
+    if out is not None and not json:
+        same = [] if cell is None else ["--cell", cell]
+        say_next("drivegain", "validate", out, *(holdout or logs), *same)
 
 
 def check_report(folder: Path | None) -> None:

@@ -1,5 +1,5 @@
 """The job that is timed: rows of the standard parameters, base parameters, ordinary least squares; from measured
-joint torques, sample by sample, as the classical tools do it. Nothing larger than a piece of rows is ever held."""
+joint torques, sample by sample, as the classical tools do it. `fit_torques` never holds more than a piece of rows."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -460,6 +461,32 @@ def test_effects_that_held_out_runs_refute_are_not_written(
     assert json.loads((folder / DOCUMENT).read_text(encoding="utf-8"))["worse_holdout"] is True
     with pytest.raises(EffectsRefuted, match="20 moves"):
         fit_module.check_holdout(closed.fitted)
+
+
+@pytest.mark.parametrize("options", [(), ("--json",)])
+def test_what_was_found_is_printed_although_the_disk_is_full(
+    closed: Closed,
+    shelved: Shelf,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    options: tuple[str, ...],
+) -> None:
+    del shelved
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    for name in ("fit", "close_loop"):
+        monkeypatch.setattr(fit_module, name, lambda *_, **__: closed.fitted)
+    monkeypatch.setattr(os, "fsync", full)
+    out = tmp_path / "calibration.yaml"
+    assert main(["residual", *NAMES[:3], "--holdout", NAMES[3], "--out", str(out), *options]) == ExitCode.UNEXPECTED
+    text, message = capsys.readouterr()
+    assert "J3 has a spring" in text
+    assert "Written" not in text
+    assert "no space left" in message.lower()
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_rise_within_noise_is_said_with_what_apply_will_refuse(closed: Closed) -> None:
