@@ -74,6 +74,7 @@ FRICTION = frozenset(
 )
 LARGEST_RISE_PERCENT = 0.2
 """By which an accepted set of effects may raise the worst gain error [points], or by the σ of that gain."""
+GAIN_PERCENT = 1.5  #: Largest gain error of a cell with one effect that counts as small
 WITHIN_95 = 1.96  #: Half-width of a 95 % interval in σ
 PARTS: tuple[tuple[str, tuple[EffectCase, ...]], ...] = (
     ("single", SINGLES),
@@ -321,13 +322,13 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
         known = [row for row in single if row.true[0] in (*row.named[:1], *row.ambiguity) and row.named]
         friction = [row for row in single if row.true[0].split()[0] in FRICTION and row.floor_percent is not None]
         near = [row for row in friction if row.error_after_percent <= (row.floor_percent or 0.0) + 0.3]
-        small = [row for row in single if row.max_gain_error_percent <= (4.0 if "saturation" in row.case else 1.5)]
+        small = [row for row in single if row.max_gain_error_percent <= GAIN_PERCENT]
         lines += [
             f"one effect: {len(first)} of {len(single)} named first, {len(known)} named or in the ambiguity set",
             f"friction: {len(near)} of {len(friction)} within 0.3 points of their clean floor",
             f"processor time with one effect: median {np.median([row.processor_s for row in single]):.0f} s, "
             f"most {max(row.processor_s for row in single):.0f} s",
-            f"gains: {len(small)} of {len(single)} within 1.5 % (saturation 4 %)",
+            f"gains: {len(small)} of {len(single)} within {GAIN_PERCENT} %",
         ]
     clean = [row for row in rows if row.part == "clean"]
     if clean:
