@@ -243,10 +243,12 @@ def _beside_others(model: JointFit, placed: PlacedEffect, rng: np.random.Generat
     estimate = model.evidence.estimate
     reduced = without_effects_of(model.search_problem, estimate, (placed,))
     problem, columns = reduced.search_problem, reduced.columns
-    (trial,) = score_candidates(problem.folds, columns, (slice(0, columns.shape[1]),))
-    if trial is None:
+    forms = placed.effect.forms
+    trials = score_candidates(problem.folds, columns, [slice(len(form.coefficients)) for form in forms])
+    members = tuple((form, trial) for form, trial in zip(forms, trials, strict=True) if trial is not None)
+    if not members:
         return 0.0, "the model contains it already"
-    (finding,) = rank_families(problem, (FamilyTrials(placed.axis, ((placed.effect, trial),)),), rng, gates)
+    (finding,) = rank_families(problem, (FamilyTrials(placed.axis, members),), rng, gates)
     own = own_unknowns(estimate, (placed,))
     values, place = estimate.parameters[own], len(estimate.gains) + own
     joint = in_noise(values, estimate.covariance[np.ix_(place, place)])

@@ -223,6 +223,10 @@ def _judge(
     possible = [index for index, why in enumerate(ruled_out) if not why] or range(len(family.members))
     best = max(possible, key=lambda index: float(family.members[index][1].fallen.sum()))
     effect, trial = family.members[best]
+    if len(effect.coefficients) > fewest:
+        # High powers rest on few moves, whose random signs test nothing: the simplest form is surprising for both.
+        plain = (index for index in possible if len(family.members[index][0].coefficients) == fewest)
+        probability[best] = min(probability[best], *(probability[index] for index in plain))
     after = replace(family, members=tuple(family.members[index] for index in possible)).nested()
     fall = before.sum(axis=1) - after.sum(axis=1)
     # Another motor may supply a joint's torque (R): the drive in question is the one whose residual falls most.

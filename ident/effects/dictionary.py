@@ -42,7 +42,7 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
     (friction.PositionFriction(),),
     tuple(electrical.Cogging(order) for order in ORDERS),
     (transmission.Ripple(0.5),),  # and what the periodogram proposes (ident.discovery.ripple)
-    tuple(electrical.Saturation(two_terms) for two_terms in (0, 1)),
+    electrical.Saturation(two_terms=1).forms,
     tuple(electrical.Lag(filter_s, backwards) for filter_s, backwards in FILTERS),
     tuple(electrical.TimeSkew(filter_s, backwards) for filter_s, backwards in FILTERS),
     tuple(

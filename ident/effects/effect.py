@@ -116,6 +116,11 @@ class Effect(ABC):
         """Settings that are fitted together with the whole model; those of the dictionary are only where to begin."""
         return ()
 
+    @property
+    def forms(self) -> tuple[Self, ...]:
+        """The effect after its simpler forms, whose columns are the first ones of its own."""
+        return (self,)
+
     @abstractmethod
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Torque per unit coefficient [Nm], (p, k); (2, p, k) of two joints, (m, p, k) of all joints or motors."""

@@ -38,6 +38,11 @@ class Saturation(Effect):
         terms = Column("coefficient", "1/A²", least=0.0), Column("second coefficient", "1/A⁴", least=0.0)
         return terms[: 1 + self.two_terms]
 
+    @property
+    def forms(self) -> tuple[Saturation, ...]:
+        """That of one term, then that of two if it has them."""
+        return tuple(Saturation(two_terms) for two_terms in range(1 + self.two_terms))
+
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1 or 2, k)."""
         square = signals.current_a[axis] ** 2

@@ -15,7 +15,7 @@ from ident.discovery.candidates import ColumnCache
 from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import Gates
 from ident.discovery.loop import find_effects
-from ident.discovery.search import rank_effects
+from ident.discovery.search import FEWEST_MOVES, moves_behind, rank_effects
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect, Side
 from ident.effects.electrical import Lag, Saturation
@@ -352,6 +352,19 @@ def test_more_than_the_first_order_keeps_the_gain(arm: Arm, family: str) -> None
     )
     assert whole < 0.5 * first
     assert whole < 0.01
+
+
+def test_a_form_whose_powers_rest_on_few_moves_is_judged_by_its_simplest(arm: Arm) -> None:
+    planted = Planted("saturation", 2, lambda t: _saturated(t.motor_torque, GAINS[2], 12.0) - t.motor_torque, ())
+    start = _with(arm, planted)
+    (family,) = search_problem_of(start).test((_family("saturation"),), 2)
+    plain, whole = (moves_behind(trial) for _, trial in family.members)
+    assert whole < FEWEST_MOVES < plain
+    steps = find_effects(start, np.random.default_rng(0), GATES, (_family("saturation"),))
+    assert [step.accepted and (step.accepted.effect, step.accepted.axis) for step in steps] == [
+        (Saturation(two_terms=1), 2),
+        None,
+    ]
 
 
 def test_motors_in_another_order_change_no_verdict(arm: Arm) -> None:
