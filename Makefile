@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE :=
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
 	@echo "make test    set up, then lint, types, import contracts and tests"
-	@echo "make test-processes  whole jobs in several processes: the tutorial followed to the letter, jobs that are killed"
+	@echo "make test-processes  whole jobs: the tutorial followed to the letter, jobs that are killed, two buses, real recordings"
 	@echo "make test-vcan  the main job over real SocketCAN (vcan), under User-Mode Linux where this kernel has none"
 	@echo "make chaos    random faults at random moments on SocketCAN for 10 minutes; SEED=1 MINUTES=10 or ROUND=7 (docs/evidence/socketcan.md)"
 	@echo "make test-console  the live console in headless Chromium beside whole recordings; screenshots in out/console"

@@ -40,7 +40,9 @@ LONG = ("test_main_job.py", "test_any_robot.py", "test_tx40.py")
 
 def pytest_configure(config: pytest.Config) -> None:
     """Register what `make test` leaves to a target of its own."""
-    config.addinivalue_line("markers", "processes: a whole job in several processes (make test-processes)")
+    config.addinivalue_line(
+        "markers", "processes: a whole job: on several processes or buses, or a real recording (make test-processes)"
+    )
 
 
 def pytest_sessionstart() -> None:

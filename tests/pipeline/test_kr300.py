@@ -24,6 +24,7 @@ def _run(folder: Path, name: str) -> Run:
     return Run(name, table[:, 0], np.deg2rad(table[:, 1:7]), table[:, 7:13])
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("out", "ABC")
 def test_no_impossible_effect_joins_and_no_effect_raises_the_held_out_error(shared_data: Path, out: str) -> None:
     """The search once gave this arm a warm-up of 900 s in recordings of 20 s, and 3.17 % instead of 2.95 %."""

@@ -31,6 +31,8 @@ from drivers.stream.sync import LockstepSync
 from tests.conftest import CHECKOUT
 from tests.two_buses import LEFT, RIGHT, on_two_buses
 
+pytestmark = pytest.mark.processes
+
 PERIOD_NS = 1_000_000
 ROOM = (AxisLimits(-20_000_000, 20_000_000, 900_000.0, 6_000_000.0),) * 6
 PERMISSION = MotionPermission("the test", ROOM)

@@ -57,6 +57,7 @@ def test_without_a_payload_free_gains_are_refused(tx40: Path, capsys: pytest.Cap
     assert "or hold the gains (`--gains fixed`)" in said
 
 
+@pytest.mark.processes
 def test_known_lacks_of_this_robot_are_found(tx40: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
     assert main(["residual", str(tx40), "--gains", "fixed", "--json"]) == ExitCode.OK
