@@ -102,8 +102,7 @@ def fit_verb(
         return
     check_folder(out)
     check_output(out, (*logs, *(holdout or ()), cell), CALIBRATION)
-    require_different(out=out, report=report)
-    require_different(out=out, pictures=pictures)
+    require_different(out, report=report, pictures=pictures)
     check_report(report)
     with status("identifying"):
         described = None if cell is None else load_cell(cell)
@@ -220,8 +219,7 @@ def residual_verb(
 
     check_folder(out)
     check_output(out, (*logs, *(holdout or ()), cell), CALIBRATION)
-    require_different(out=out, report=report)
-    require_different(out=out, pictures=pictures)
+    require_different(out, report=report, pictures=pictures)
     check_report(report)
     with status("identifying") as report_step:
         fitted = fit(

@@ -74,17 +74,13 @@ def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) 
     check_replaceable(out, f"format: {format_}", format_)
 
 
-def require_different(**outputs: Path | None) -> None:
-    """Refuse two options that name the same file or folder."""
-    named: dict[Path, str] = {}
-    for option, path in outputs.items():
-        if path is None:
-            continue
-        other = named.setdefault(path.resolve(), option)
-        if other != option:
+def require_different(out: Path | None, **folders: Path | None) -> None:
+    """Refuse --out and an option of a folder that have the same name."""
+    for option, folder in folders.items():
+        if out is not None and folder is not None and out.resolve() == folder.resolve():
             raise UsageError(
-                str(path),
-                found=f"the same name for --{other} and --{option}",
+                str(out),
+                found=f"the same name for --out and --{option}",
                 expected="a name for each",
                 remedy=f"choose another name for --{option}",
             )

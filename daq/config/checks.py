@@ -201,8 +201,7 @@ def _effect_faults(model: CellModel, robot: Robot | None, *, logged: bool) -> It
     """
     if not model.effects:
         return
-    # The dictionary of effects loads scipy, which cells without effects, and so most verbs, do without.
-    from daq.config.effects import place_effect  # noqa: PLC0415 - see above
+    from daq.config.effects import place_effect  # noqa: PLC0415 - loads scipy, which cells without effects do not need
 
     passive = () if robot is None else robot.passive_names
     names = [*(axis.name for axis in model.axes), *passive]

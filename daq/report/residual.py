@@ -223,16 +223,20 @@ def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
 
 
 def _refused(fitted: Fit) -> Iterator[str]:
-    """Sentences on the strongest candidate of each axis that failed a check, but would explain much of the rest."""
-    axes, told = fitted.cell.place_names, set[int]()
-    for finding in sorted(fitted.steps[-1].findings, key=lambda one: -one.explained):
-        if finding.explained < MUCH or finding.axis in told or not finding.refusals:
-            continue
-        told.add(finding.axis)
+    """Sentences on the strongest candidate of each axis that failed a check, but would explain much of the residual."""
+    axes, last = fitted.cell.place_names, fitted.steps[-1]
+    # Those are reported with the reason already.
+    reported = {(aside.finding.effect, aside.finding.axis) for aside in last.set_aside}
+    strongest: dict[int, Finding] = {}
+    for finding in last.findings:
+        failed = finding.explained >= MUCH and finding.refusals and (finding.effect, finding.axis) not in reported
+        if failed and (finding.axis not in strongest or finding.explained > strongest[finding.axis].explained):
+            strongest[finding.axis] = finding
+    for finding in strongest.values():
         axis = PlacedEffect(finding.effect, finding.axis).axis_name(axes)
         yield (
-            f"{axis}: {effect_text(finding.effect, axes)} would explain {100.0 * finding.explained:.0f} % of what is "
-            f"left, squared, but failed a check: {'; '.join(finding.refusals)}. The cause may be another one."
+            f"{axis}: {effect_text(finding.effect, axes)} would explain {100.0 * finding.explained:.0f} % of the "
+            f"squared residual, but failed a check: {'; '.join(finding.refusals)}. The cause may be another one."
         )
 
 

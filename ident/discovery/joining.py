@@ -104,7 +104,7 @@ def refuted_by_structure(model: JointFit, found: Finding, aside: Sequence[SetAsi
 
     The name is then only similar to the truth. It does no harm where it bends no gain, and is no mistake where it still
     lowers the error beside the structure: then it explains something else. A term against the time, or the session,
-    refutes nothing where no run can be left out: it can tell the loaded runs from the others.
+    refutes nothing where no run can be left out: it can separate the loaded runs from the others.
     """
     if is_unnamed(found.effect):
         return None
@@ -123,8 +123,8 @@ def refuted_by_structure(model: JointFit, found: Finding, aside: Sequence[SetAsi
         again = replace(
             found, coefficients=by_name.coefficients, fold_errors=left, held_out_fall=before - float(left.sum())
         )
-        explains_more = is_better(beside, by_term.held_out.sum(axis=1))
-        if not explains_more and is_inadequate(again, term) and (moved := _moved_by(model, again)):
+        adds_to_term = is_better(beside, by_term.held_out.sum(axis=1))
+        if not adds_to_term and is_inadequate(again, term) and (moved := _moved_by(model, again)):
             return SetAside(found, "{rival} explains clearly more", PlacedEffect(term.effect, term.axis), moved)
     return None
 

@@ -33,7 +33,7 @@ from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial
 from ident.discovery.gates import SIGMAS, Gates, impossible
 from ident.discovery.refinement import refine_together
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import ADDED, Effect, PlacedEffect, is_placeable
+from ident.effects.effect import FORMS, Effect, PlacedEffect, is_placeable
 
 EffectKey = tuple[str, int, tuple[float, ...]]
 
@@ -167,8 +167,8 @@ def effect_key(effect: Effect, axis: int) -> EffectKey:
 
 
 def _own_settings(effect: Effect) -> dict[str, float]:
-    """Settings without the switches that choose a form of the same effect."""
-    return {name: value for name, value in effect.settings.items() if not (name in ADDED and isinstance(value, int))}
+    """Settings without those that choose a form of the same effect."""
+    return {name: value for name, value in effect.settings.items() if name not in FORMS}
 
 
 def is_better(one: FloatArray, other: FloatArray) -> BoolArray:
@@ -226,7 +226,7 @@ def _judge(
     if len(effect.coefficients) > fewest:
         # High powers rest on few moves, whose random signs test nothing: the simplest form is surprising for both.
         plain = (index for index in possible if len(family.members[index][0].coefficients) == fewest)
-        probability[best] = min(probability[best], *(probability[index] for index in plain))
+        probability[best] = min((probability[best], *(probability[index] for index in plain)))
     after = replace(family, members=tuple(family.members[index] for index in possible)).nested()
     fall = before.sum(axis=1) - after.sum(axis=1)
     # Another motor may supply a joint's torque (R): the drive in question is the one whose residual falls most.

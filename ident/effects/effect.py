@@ -118,7 +118,7 @@ class Effect(ABC):
 
     @property
     def forms(self) -> tuple[Self, ...]:
-        """The effect after its simpler forms, whose columns are the first ones of its own."""
+        """Simpler forms of the effect, then the effect itself; each form's columns are the first ones of the next."""
         return (self,)
 
     @abstractmethod
@@ -193,6 +193,9 @@ def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axe
 
 ADDED = frozenset({"half_gap_rad", "resonant_rad_nm", "damping_ratio", "two_terms", "filter_s", "backwards"})
 """Settings that calibrations of an earlier version do not have; they mean 0, and names of columns leave a 0 out."""
+
+FORMS = frozenset({"two_terms", "backwards"})
+"""Settings that choose a form of one effect: a search counts an effect in two forms as one."""
 
 ALL_AXES = "all axes"  #: Where an effect is that acts on every motor alike
 

@@ -91,7 +91,10 @@ class Lag(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
-        return -_rate(signals.motor_torque_nm[axis], signals.rate_hz, self)[None]
+        rate = filtered_rate(
+            signals.motor_torque_nm[axis], signals.rate_hz, self.filter_s, backwards=bool(self.backwards)
+        )
+        return -rate[None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,16 +116,11 @@ class TimeSkew(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (n, 1, k); the axis does not matter."""
-        return -_rate(signals.motor_torque_nm, signals.rate_hz, self)[:, None]
+        rate = filtered_rate(signals.motor_torque_nm, signals.rate_hz, self.filter_s, backwards=bool(self.backwards))
+        return -rate[:, None]
 
 
-def _rate(torque_nm: FloatArray, rate_hz: float, effect: Lag | TimeSkew) -> FloatArray:
-    if effect.backwards:
-        return -filtered_rate(torque_nm[..., ::-1], rate_hz, effect.filter_s)[..., ::-1]
-    return filtered_rate(torque_nm, rate_hz, effect.filter_s)
-
-
-def filtered_rate(torque_nm: FloatArray, rate_hz: float, filter_s: float) -> FloatArray:
+def filtered_rate(torque_nm: FloatArray, rate_hz: float, filter_s: float, *, backwards: bool) -> FloatArray:
     """ẏ of T ẏ + y = τ [Nm/s], exact for torques that are linear between samples; of the shape of ``torque_nm``.
 
     It starts as if the first torque had been there for ever. With T = 0, ẏ is the central difference of τ.
@@ -131,7 +129,10 @@ def filtered_rate(torque_nm: FloatArray, rate_hz: float, filter_s: float) -> Flo
         torque_nm: τ, shape (k,) or (n, k).
         rate_hz: sampling rate.
         filter_s: T.
+        backwards: the filter runs from the last sample to the first.
     """
+    if backwards:
+        return -filtered_rate(torque_nm[..., ::-1], rate_hz, filter_s, backwards=False)[..., ::-1]
     if not filter_s > 0.0:
         return np.asarray(np.gradient(torque_nm, axis=-1) * rate_hz)
     steps = filter_s * rate_hz

@@ -399,9 +399,9 @@ def test_a_strong_candidate_that_failed_a_check_is_named_with_it(closed: Closed)
     )
     weak = replace(strong, axis=2, explained=0.1)
     asked = replace(closed.fitted, steps=(first, replace(last, findings=(weak, strong))))
-    told = [one for one in summary(asked, closed.account, ()) if "failed a check" in one]
-    assert told == [
-        "J2: friction that grows with the load would explain 40 % of what is left, squared, but failed a check: "
+    sentences = [one for one in summary(asked, closed.account, ()) if "failed a check" in one]
+    assert sentences == [
+        "J2: friction that grows with the load would explain 40 % of the squared residual, but failed a check: "
         "coefficient is -1 ± 0.1. The cause may be another one."
     ]
 
@@ -413,11 +413,11 @@ def test_a_name_that_structure_refutes_is_reported_with_what_it_depends_on(close
     assert refuted.reason([f"J{axis}" for axis in range(1, 7)]) == (
         "it would move the gain of J4 by 2.9 σ, and smooth-position on J2 explains clearly more"
     )
-    told = summary(replace(closed.fitted, steps=(first, replace(last, set_aside=(refuted,)))), closed.account, ())
+    sentences = summary(replace(closed.fitted, steps=(first, replace(last, set_aside=(refuted,)))), closed.account, ())
     assert (
         "J2: what looks like friction that grows with the load depends clearly more on the joint position, and was not "
         "added: it would move the gain of J4 by 2.9 σ."
-    ) in told
+    ) in sentences
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -15,7 +15,7 @@ from ident.discovery.candidates import ColumnCache
 from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import Gates
 from ident.discovery.loop import find_effects
-from ident.discovery.search import FEWEST_MOVES, moves_behind, rank_effects
+from ident.discovery.search import FEWEST_MOVES, moves_behind, rank_effects, rank_families
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect, Side
 from ident.effects.electrical import Lag, Saturation
@@ -367,6 +367,16 @@ def test_a_second_term_keeps_the_gain_of_a_saturated_motor(arm: Arm) -> None:
     found, plain, whole = _gain_errors(arm, planted, Saturation())
     assert found == Saturation(two_terms=1)
     assert whole < min(0.5 * plain, 0.01)
+
+
+def test_a_richer_form_needs_no_possible_simpler_one(small_arm: Arm) -> None:
+    problem = search_problem_of(small_arm.clean)
+    (family,) = problem.test((_family("saturation"),), 1)
+    (plain, one), (whole, both) = family.members
+    trials = replace(one, coefficients=np.array([-1e9])), replace(both, coefficients=np.array([1.0, 1.0]))
+    members = tuple(zip((plain, whole), trials, strict=True))
+    (finding,) = rank_families(problem, (replace(family, members=members),), np.random.default_rng(0), GATES)
+    assert finding.effect == whole
 
 
 def test_motors_in_another_order_change_no_verdict(arm: Arm) -> None:
