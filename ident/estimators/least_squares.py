@@ -11,6 +11,10 @@ from ident.equations.system import System, require_known_payload
 from ident.equations.triangles import Triangles, singular_values, solve
 from ident.estimators.estimate import Estimate
 from ident.estimators.method import Method
+from ident.model.base import independent_columns
+
+NO_COLUMN = 1e-8
+"""Norm of a column, relative to the largest of the same joint, below which the joint does not have this column."""
 
 
 def ls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
@@ -27,12 +31,50 @@ def ls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
 
 
 def wls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
-    """Weighted least squares: rows of a joint are divided by the residual's standard deviation from ``ls`` (§2.3).
+    """Weighted least squares: rows of a joint are divided by the standard deviation of their error.
+
+    With fixed gains it is that of §2.2, `joint_error_std`. With free gains §2.2 has none to offer: where a known mass
+    exerts no torque on a joint, as on every wrist, the right-hand side of this joint's own equations (eq. 15) is zero.
+    So are their solution and its error. The error of the global ``ls`` is taken there.
 
     Arguments and errors as for ``ls``.
     """
-    first = _solve(system, np.ones(system.axis_count), Method.LS, fixed_gains)
-    return _solve(system, 1.0 / first.axis_noise, Method.WLS, fixed_gains)
+    if fixed_gains is not None and not system.model.is_redundant:
+        row_std = joint_error_std(system.joints, fixed_gains)
+    else:
+        row_std = ls(system, fixed_gains).axis_noise
+    return _solve(system, 1.0 / row_std, Method.WLS, fixed_gains)
+
+
+def joint_error_std(triangles: Triangles, gains: FloatArray) -> FloatArray:
+    """Standard deviation of the error of each joint's own equations, solved by least squares (§2.2), shape (n,) [Nm].
+
+    Args:
+        triangles: of each joint's rows of W_tot.
+        gains: known gains [Nm/A], shape (m,).
+    """
+    count = len(gains)
+    deviations = []
+    for factor, rows in zip(triangles.factors, triangles.rows.tolist(), strict=True):
+        own = _own_columns(factor[:, count:-1])
+        torque = factor[:, :count] @ gains + factor[:, -1]
+        basis, _ = np.linalg.qr(own)
+        error = float(np.linalg.norm(torque - basis @ (basis.T @ torque)))
+        deviations.append(_deviation(error, factor, rows - own.shape[1]))
+    return np.array(deviations)
+
+
+def _own_columns(columns: FloatArray) -> FloatArray:
+    """Columns that the equations of one joint distinguish, shape (r, c) → (r, ≤c)."""
+    return columns[:, independent_columns(columns, smallest=NO_COLUMN)]
+
+
+def _deviation(size: float, factor: FloatArray, freedom: int) -> float:
+    """Standard deviation of an error of this size; without noise it is rounding error, without rows infinite."""
+    if not factor.any():
+        return np.inf
+    rounding = np.finfo(np.float64).eps * float(np.linalg.norm(factor))
+    return max(size, rounding) / float(np.sqrt(max(freedom, 1)))
 
 
 def _solve(system: System, weight: FloatArray, method: Method, fixed: FloatArray | None) -> Estimate:
@@ -70,9 +112,15 @@ class Scaling(Enum):
     """Scaling before TLS, which is not invariant to it."""
 
     NONE = "none"
-    ROWS = "rows weighted per joint"  # the paper, §3.3
+    ROWS = "rows of joint j divided by σ_W^j of eq. (22)"  # the paper, §3.3
+    RESIDUALS = "rows of joint j divided by the deviation of its residual"
     COLUMNS = "unit-norm columns"
-    BOTH = "rows weighted per joint, unit-norm columns"
+    BOTH = "rows divided by the deviation of their residual, unit-norm columns"
+
+    @property
+    def has_unit_columns(self) -> bool:
+        """Whether the columns are divided by their norms."""
+        return self in (Scaling.COLUMNS, Scaling.BOTH)
 
 
 def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
@@ -80,20 +128,16 @@ def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
 
     Args:
         system: of at least one loaded and one unloaded run.
-        scaling: of rows and columns before the decomposition; the paper weights rows per joint.
+        scaling: of rows and columns before the decomposition; the paper divides rows by `joint_data_std`. A joint of a
+            redundant robot has no equations of its own: ROWS is RESIDUALS there.
 
     Raises:
         DataUnfit: no run carries a known payload.
     """
     require_known_payload(system)
     triangles = system.joints
-    weight = np.ones(system.axis_count)
-    columns = scaling in (Scaling.COLUMNS, Scaling.BOTH)
-    if scaling in (Scaling.ROWS, Scaling.BOTH):
-        first, _, _ = _smallest(triangles, weight, columns)
-        # σ_W^j, the standard deviation of joint j's equations (§3.3, last paragraph).
-        weight = 1.0 / triangles.residual_std(first, len(first) - 1)
-    vector, covariance, singular = _smallest(triangles, weight, columns)
+    row_std = _row_std(system, scaling)
+    vector, covariance, singular = _smallest(triangles, 1.0 / row_std, scaling.has_unit_columns)
     count = system.axis_count
     weighted = system.weighted_singular_values(vector, len(vector) - 1, gains=True)
     return Estimate(
@@ -110,19 +154,55 @@ def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
     )
 
 
+def joint_data_std(triangles: Triangles) -> FloatArray:
+    """Standard deviation σ_W^j of the data in the equations of each joint (eq. 22 and §3.3), shape (n,).
+
+    It is the smallest singular value of these equations over √(r − c). Eq. (22) expects full rank c, which W_tot has
+    and a single joint has not: most parameters are absent from its torque, and some of those that are present cannot be
+    told apart in it. Columns below NO_COLUMN of the largest norm, and columns that depend on those before them, are
+    left out. c is the number of the others. A joint without any column has an infinite deviation, so no weight.
+
+    Args:
+        triangles: of each joint's rows of W_tot.
+    """
+    deviations = []
+    for factor, rows in zip(triangles.factors, triangles.rows.tolist(), strict=True):
+        own = _own_columns(factor)
+        smallest = float(singular_values(own).min(initial=np.inf))
+        deviations.append(_deviation(smallest, factor, rows - own.shape[1]))
+    return np.array(deviations)
+
+
+def _row_std(system: System, scaling: Scaling) -> FloatArray:
+    """Divisor of the rows of each joint, shape (n,)."""
+    triangles = system.joints
+    even = np.ones(len(triangles.factors))
+    if scaling in (Scaling.NONE, Scaling.COLUMNS):
+        return even
+    if scaling is Scaling.ROWS and not system.model.is_redundant:
+        return joint_data_std(triangles)
+    first, _, _ = _smallest(triangles, even, scaling.has_unit_columns)
+    return triangles.residual_std(first, len(first) - 1)
+
+
 def _smallest(
     triangles: Triangles, weight: FloatArray, unit_columns: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Solution with last entry one, its covariance (eq. 23), and the singular values of the scaled W_tot."""
     stacked = triangles.stacked(weight)
-    norms = np.linalg.norm(stacked, axis=0) if unit_columns else np.ones(stacked.shape[1])
+    norms = np.ones(stacked.shape[1])
+    if unit_columns:
+        norms = np.linalg.norm(stacked, axis=0)
     scaled = stacked / norms
     u, s, vt = np.linalg.svd(scaled, full_matrices=False)
     vector = vt[-1] / vt[-1, -1]
-    rows, unknowns = int(triangles.rows.sum()), len(vector)
-    noise = s[-1] / np.sqrt(max(rows - unknowns, 1))  # eq. (22)
+    rows = int(triangles.rows.sum())
+    unknowns = len(vector)
+    data_std = s[-1] / np.sqrt(max(rows - unknowns, 1))  # eq. (22)
     compatible = scaled - s[-1] * np.outer(u[:, -1], vt[-1])  # eq. (20)
     first = compatible[:, :-1]
     size = 1.0 + float(np.sum(vector[:-1] ** 2))
-    scaled_covariance = noise**2 * size * solve(first, scaled[:, -1])[1]  # eq. (23)
+    _, inverse = solve(first, scaled[:, -1])
+    scaled_covariance = data_std**2 * size * inverse  # eq. (23)
     back = norms[-1] / norms[:-1]
     return vector * norms[-1] / norms, scaled_covariance * np.outer(back, back), s

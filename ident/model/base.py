@@ -21,30 +21,46 @@ class BaseParameters:
     names: tuple[str, ...]  #: leading name and what is regrouped with it
 
 
-def base_parameters(triangle: FloatArray, names: tuple[str, ...], tolerance: float = 1e-8) -> BaseParameters:
-    """Find them in the triangular factor of an observation matrix.
+def independent_columns(matrix: FloatArray, tolerance: float = 1e-8, smallest: float = SMALLEST_COLUMN) -> list[int]:
+    """Indices of the columns that do not depend on the columns before them, ascending.
 
     A column is independent if, after projection off the chosen columns before it, more than ``tolerance`` of its norm
-    remains. Taking columns in the given order keeps the paper's regrouping (``Izz1 + Ia1 + …``).
+    remains.
 
     Args:
-        triangle: any matrix with the same Gram matrix as the observation matrix, shape (r, c).
-        names: of the c standard parameters.
-        tolerance: relative to each column's norm. Before that, columns below SMALLEST_COLUMN of the largest count as
-            zero: normalised, one of them could be chosen, and the condition number would become 1e16.
+        matrix: shape (r, c).
+        tolerance: relative to each column's norm.
+        smallest: columns with a norm below this share of the largest count as zero: normalised, one of them could be
+            chosen, and the condition number would become 1e16.
     """
-    norms = np.linalg.norm(triangle, axis=0)
-    present = norms > SMALLEST_COLUMN * float(norms.max(initial=0.0))
+    norms = np.linalg.norm(matrix, axis=0)
+    present = norms > smallest * float(norms.max(initial=0.0))
     independent: list[int] = []
-    basis = np.zeros((triangle.shape[0], 0))
-    for column in np.flatnonzero(present):
-        unit = triangle[:, column] / norms[column]
+    basis = np.zeros((matrix.shape[0], 0))
+    for column in np.flatnonzero(present).tolist():
+        unit = matrix[:, column] / norms[column]
         rest = unit - basis @ (basis.T @ unit)
         rest -= basis @ (basis.T @ rest)  # twice is enough (Kahan): the first projection loses digits by cancellation
         size = float(np.linalg.norm(rest))
         if size > tolerance:
-            independent.append(int(column))
+            independent.append(column)
             basis = np.column_stack((basis, rest / size))
+    return independent
+
+
+def base_parameters(triangle: FloatArray, names: tuple[str, ...], tolerance: float = 1e-8) -> BaseParameters:
+    """Find them in the triangular factor of an observation matrix.
+
+    Taking columns in the given order keeps the paper's regrouping (``Izz1 + Ia1 + …``).
+
+    Args:
+        triangle: any matrix with the same Gram matrix as the observation matrix, shape (r, c).
+        names: of the c standard parameters.
+        tolerance: of `independent_columns`.
+    """
+    norms = np.linalg.norm(triangle, axis=0)
+    present = norms > SMALLEST_COLUMN * float(norms.max(initial=0.0))
+    independent = independent_columns(triangle, tolerance)
     chosen = triangle[:, independent]
     scale = norms[independent]
     weights = linalg.lstsq(chosen / scale, triangle)[0] / scale[:, None]

@@ -39,7 +39,7 @@ from tests.studies.side_by_side import side_by_side
 from tests.studies.study_cells import Truth, declared_payload, spec_of, study_cell, truth_from, truth_of
 
 OUT = Path("out/ident-study")
-SEEDS = tuple(range(1, 9))
+SEEDS = tuple(range(1, 13))
 FLOORS = {"3.5": 1.59, "10": 4.55}
 """Relative error of the fit [%] and the factor of the clean cell's current noise that gives it on the study's plans.
 

