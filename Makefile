@@ -11,7 +11,7 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study coverage-study paper planning-study robot-study crash-study kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study weigh-study words wheel lock clean
+.PHONY: help setup demo test test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study crash-study kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study weigh-study words wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -27,6 +27,7 @@ help:
 	@echo "make bench   speed and memory: against figaroh 1.0.2, growth to 4 million samples, a whole fit; minutes"
 	@echo "make bench-stream  six axes at 1 kHz through the stream on SocketCAN, with a busy thread beside (docs/evidence/stream.md); minutes"
 	@echo "make ident-study  errors by estimator and noise floor (docs/evidence/estimators.md); half an hour"
+	@echo "make tls-study  total least squares beside maximum likelihood, without and with an undeclared effect (docs/evidence/estimators.md); minutes"
 	@echo "make loop-noise-study  gain errors and whether error bars are true, also with a disturbance in the position loop (docs/evidence/estimators.md); 10 min"
 	@echo "make coverage-study  whether the error bars of the gains are true: clean, disturbed, after the search, without rests (docs/evidence/estimators.md); resumable, an hour"
 	@echo "make gain-study  the demonstration on several clean cells; minutes"
@@ -125,6 +126,9 @@ bench-stream: setup vcan-tools
 
 ident-study: setup
 	$(BIN)/python -m tests.studies.ident_study
+
+tls-study: setup
+	$(BIN)/python -m tests.studies.tls_study
 
 gain-study: setup
 	$(BIN)/python -m tests.studies.clean_cells

@@ -30,6 +30,7 @@ ESTIMATORS: dict[str, Callable[[System], Estimate]] = {
     "wls": wls,
     "tls, unscaled": lambda system: tls(system, Scaling.NONE),
     "tls, rows (paper)": lambda system: tls(system, Scaling.ROWS),
+    "tls, residuals": lambda system: tls(system, Scaling.RESIDUALS),
     "tls, columns": lambda system: tls(system, Scaling.COLUMNS),
     "tls, both": lambda system: tls(system, Scaling.BOTH),
     "ml": ml,

@@ -120,9 +120,8 @@ def simulate(task: CaseTask, cell: Cell) -> tuple[RawRun, ...]:
     return tuple(runs)
 
 
-def make(task: CaseTask) -> str:
-    """Simulate and score a cell as far as that was not done; return what was done."""
-    cell, begun_s = load_cell(CELL), time.process_time()
+def make_runs(task: CaseTask, cell: Cell) -> None:
+    """Simulate the runs of a cell unless the same ones are there."""
     spec = world_cell(task.seed, CASES[task.case].world).bare
     source = digest_of_source("tests.studies.followed_cell", (*MOVING, "tests.studies.followed_cell"))
     fingerprint = digest(source, cell.digest, DURATION_S, spec.urdf, spec.axes, task.effects)
@@ -130,6 +129,12 @@ def make(task: CaseTask) -> str:
         task.path.parent.mkdir(parents=True, exist_ok=True)
         write_runs(task.path, simulate(task, cell))
         finish(task.path, fingerprint)
+
+
+def make(task: CaseTask) -> str:
+    """Simulate and score a cell as far as that was not done; return what was done."""
+    cell, begun_s = load_cell(CELL), time.process_time()
+    make_runs(task, cell)
     simulated_s = time.process_time() - begun_s
     ways = ("ident.discovery.loop" if CASES[task.case].searched else "ident.estimators.identify",)
     fingerprint = digest(*map(digest_of_source, ways), mark_of(task.path).read_text())

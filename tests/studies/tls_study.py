@@ -1,0 +1,128 @@
+"""Where total least squares is as good as maximum likelihood, and where it is not.
+
+    python -m tests.studies.tls_study
+
+Twelve clean cells, then a cell for each undeclared effect of the effects study, which the model of the fit lacks. All
+estimators see the same rows. Run by `make tls-study`; the runs are those of `make coverage-study` and are kept in
+out/coverage-cases. Writes docs/evidence/data/tls-model-errors.csv.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from daq.config.cell import model_of
+from daq.config.cell_file import load_cell
+from ident.arrays import FloatArray
+from ident.equations.reduction import reduce_runs
+from ident.equations.system import System
+from ident.estimators.estimate import Estimate
+from ident.estimators.least_squares import Scaling, tls, wls
+from ident.estimators.maximum_likelihood import ml
+from tests.studies.coverage_cases import EFFECTS, OUT, CaseTask, make_runs
+from tests.studies.direct_cell import run_of
+from tests.studies.output import as_csv, print_line
+from tests.studies.raw_runs import read_runs
+from tests.studies.side_by_side import side_by_side
+from tests.studies.study_cells import world_cell
+from tests.studies.study_plans import CELL
+
+TABLE = Path("docs/evidence/data/tls-model-errors.csv")
+CLEAN_CELLS = 12
+WORLD = "measurement"
+ESTIMATORS: dict[str, Callable[[System], Estimate]] = {
+    "ml": ml,
+    "tls": tls,
+    "tls, residual weights": lambda system: tls(system, Scaling.RESIDUALS),
+    "wls": wls,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class CellErrors:
+    """Errors of the gains of one cell.
+
+    Attributes:
+        title: undeclared effect and its axis, or "none".
+        relative_error_percent: of the fit by ml.
+        gain_errors_percent: of each gain, by estimator.
+        tls_shift_sigmas: |tls − ml| of each gain, in σ of ml.
+        tls_shift_percent: the same, in per cent of ml.
+    """
+
+    title: str
+    relative_error_percent: float
+    gain_errors_percent: dict[str, FloatArray]
+    tls_shift_sigmas: FloatArray
+    tls_shift_percent: FloatArray
+
+
+def errors_of(task: CaseTask) -> CellErrors:
+    """Errors of every estimator on one cell, whose runs are made if they are missing."""
+    cell = load_cell(CELL)
+    make_runs(task, cell)
+    runs = [run_of(raw, cell) for raw in read_runs(task.path)]
+    reduction = reduce_runs(model_of(cell), runs, cell.conditioning)
+    system = reduction.system(reduction.base(), reduction.payload_columns())
+    true_gains = np.array([axis.gain_nm_per_a for axis in world_cell(task.seed, WORLD).bare.axes])
+    estimates = {name: estimator(system) for name, estimator in ESTIMATORS.items()}
+    title = "none"
+    if task.effects:
+        (effect,) = task.effects
+        title = f"{effect.name} on {cell.axis_names[effect.axis]}"
+    shift = np.abs(estimates["tls"].gains - estimates["ml"].gains)
+    return CellErrors(
+        title=title,
+        relative_error_percent=estimates["ml"].relative_error(system).total,
+        gain_errors_percent={
+            name: 100.0 * np.abs(estimate.gains / true_gains - 1.0) for name, estimate in estimates.items()
+        },
+        tls_shift_sigmas=shift / estimates["ml"].gains_std,
+        tls_shift_percent=100.0 * shift / np.abs(estimates["ml"].gains),
+    )
+
+
+def table(clean: Sequence[CellErrors], bent: Sequence[CellErrors]) -> str:
+    """Mean and largest gain errors as a Markdown table: all clean cells in one row, then a row for each effect."""
+    headings = ("undeclared effect", "fit %", *(f"{name}, mean / max %" for name in ESTIMATORS), "tls − ml, max σ / %")
+    lines = ["| " + " | ".join(headings) + " |", "|---" * len(headings) + "|"]
+    groups = [(f"none, {len(clean)} cells", list(clean)), *((cell.title, [cell]) for cell in bent)]
+    for title, cells in groups:
+        fit_percent = float(np.mean([cell.relative_error_percent for cell in cells]))
+        sizes = []
+        for name in ESTIMATORS:
+            errors = np.concatenate([cell.gain_errors_percent[name] for cell in cells])
+            sizes.append(f"{errors.mean():.2f} / {errors.max():.2f}")
+        sigmas = max(float(cell.tls_shift_sigmas.max()) for cell in cells)
+        percents = max(float(cell.tls_shift_percent.max()) for cell in cells)
+        sizes.append(f"{sigmas:.1f} / {percents:.2f}")
+        lines.append(f"| {title} | {fit_percent:.1f} | " + " | ".join(sizes) + " |")
+    return "\n".join(lines)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Make what is missing, print the table and write it for the page."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.tls_study", description=__doc__)
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--table", type=Path, default=TABLE)
+    options = parser.parse_args(arguments)
+    clean_tasks = [CaseTask(options.out, "clean", number) for number in range(CLEAN_CELLS)]
+    bent_tasks = [CaseTask(options.out, "after-loop", number) for number in range(len(EFFECTS))]
+    found = list(side_by_side(errors_of, [*clean_tasks, *bent_tasks], options.processes))
+    clean = found[:CLEAN_CELLS]
+    text = table(clean, found[CLEAN_CELLS:])
+    print_line(text)
+    means = {name: float(np.mean([cell.gain_errors_percent[name] for cell in clean])) for name in ESTIMATORS}
+    print_line(f"clean cells: tls / ml = {means['tls'] / means['ml']:.2f}")
+    options.table.write_text(as_csv(text), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
