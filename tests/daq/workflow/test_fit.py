@@ -16,7 +16,7 @@ from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import LogRepeated, LogsDiffer
 from daq.log.reader import LossyLogs
-from daq.report.fit import fit_document, fit_view, paper_note
+from daq.report.fit import fit_document, fit_view
 from daq.workflow import fit as fit_module
 from daq.workflow import verdicts as verdicts_module
 from daq.workflow.cases import CaseFit
@@ -166,9 +166,3 @@ def test_the_drives_own_torque_is_shown_beside_the_gains_and_changes_none(
     out = io.StringIO()
     Console(file=out, width=80).print(*fit_view(case, calibration, None), sep="\n")
     assert "own torque against the current, not used in the fit" in out.getvalue()
-
-
-def test_the_papers_gains_are_shown_beside_those_of_the_fit() -> None:
-    said = paper_note(("crank-1", "crank-2"), np.array([7.352, -6.838]), np.array([7.314, -8.113]))
-    assert "not used" in said
-    assert "crank-1 7.314 (-0.5 %), crank-2 -8.113 (+18.6 %)" in said
