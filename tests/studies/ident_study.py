@@ -1,7 +1,7 @@
 """How far the gains are off, by estimator and noise floor.
 
-Run by `make ident-study`; records what is missing (record_study.py, over the real driver path), writes
-out/ident-study.json and prints the first table of docs/evidence/estimators.md.
+Run by `make ident-study`; records what is missing (record_study.py, over the real driver path), and writes
+out/ident-study.json and the first table of docs/evidence/estimators.md.
 """
 
 from __future__ import annotations
@@ -27,11 +27,13 @@ from ident.equations.system import System
 from ident.estimators.comparison import ESTIMATORS
 from ident.estimators.least_squares import wls
 from ident.model.model import Model
+from tests.studies.output import as_csv
 from tests.studies.record_study import CELL, FLOORS, SEEDS, StudyLogs, record_study, study_logs
 
 FloatArray = NDArray[np.float64]
 
 OUT = Path("out/ident-study.json")
+TABLE = Path("docs/evidence/data/estimators.csv")
 PLATE = "plate"
 
 
@@ -67,7 +69,7 @@ def score(logs: StudyLogs, model: Model, conditioning: Conditioning) -> dict[str
     The second payload is weighed as in the paper's Table 8: gains fixed, classical IDIM-WLS on the runs without load
     and one trajectory with the payload, of which nothing is known.
     """
-    system = _system(model, [load_run(path)[0] for path in logs.fit], conditioning)
+    system = _system(model, [load_run(path)[0] for path in logs.fit], conditioning, instruments=True)
     bare = [run for run in (load_run(path)[0] for path in logs.fit) if run.payload is None]
     weighing = [_system(model, [*bare, load_run(path)[0]], conditioning) for path in logs.second_payload]
     true = np.array(logs.truth.gains_nm_per_a)
@@ -83,8 +85,9 @@ def score(logs: StudyLogs, model: Model, conditioning: Conditioning) -> dict[str
     return scores
 
 
-def _system(model: Model, runs: Sequence[Run], conditioning: Conditioning) -> System:
-    reduction = reduce_runs(model, runs, conditioning)
+def _system(model: Model, runs: Sequence[Run], conditioning: Conditioning, *, instruments: bool = False) -> System:
+    """Equations of some runs; `iv` needs the instruments."""
+    reduction = reduce_runs(model, runs, conditioning, instruments=instruments)
     return reduction.system(reduction.base(), reduction.payload_columns())
 
 
@@ -123,6 +126,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
     parser.add_argument("--floors", nargs="+", choices=tuple(FLOORS), default=list(FLOORS))
     parser.add_argument("--kept", action="store_true", help="score what was recorded, whatever software recorded it")
+    parser.add_argument("--table", type=Path, default=TABLE)
     options = parser.parse_args(arguments)
     cell = load_cell(CELL)
     model = model_of(cell)
@@ -146,9 +150,15 @@ def main(arguments: list[str] | None = None) -> int:
                 f"{reported.second_payload_max_percent:.2f} |"
             )
     result["cells"] = cells
+    for floor in options.floors:
+        ratio = result["tls"][floor]["mean_percent"] / result["ml"][floor]["mean_percent"]
+        result.setdefault("tls_over_ml", {})[floor] = ratio
+        lines.append(f"\nfloor {floor} %: mean gain error of tls / ml = {ratio:.2f}")
     OUT.parent.mkdir(parents=True, exist_ok=True)
     OUT.write_text(json.dumps(result, indent=2) + "\n")
-    sys.stdout.write("\n".join(lines) + "\n")
+    text = "\n".join(lines) + "\n"
+    options.table.write_text(as_csv(text), encoding="utf-8")
+    sys.stdout.write(text)
     return 0
 
 

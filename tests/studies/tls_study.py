@@ -2,9 +2,10 @@
 
     python -m tests.studies.tls_study
 
-Twelve clean cells, then a cell for each undeclared effect of the effects study, which the model of the fit lacks. All
-estimators see the same rows. Run by `make tls-study`; the runs are those of `make coverage-study` and are kept in
-out/coverage-cases. Writes docs/evidence/data/tls-model-errors.csv.
+Twelve clean cells, then a cell for each undeclared effect of the effects study, which the model of the fit lacks, then
+cells with an undeclared effect on every axis. All estimators see the same rows. Run by `make tls-study`; the runs of
+the first two are those of `make coverage-study`, and all are kept in out/coverage-cases. Writes
+docs/evidence/data/tls-model-errors.csv.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 
 from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
+from drivers.simulation.spec import UndeclaredEffect
 from ident.arrays import FloatArray
 from ident.equations.reduction import reduce_runs
 from ident.equations.system import System
@@ -34,6 +36,9 @@ from tests.studies.study_plans import CELL
 
 TABLE = Path("docs/evidence/data/tls-model-errors.csv")
 CLEAN_CELLS = 12
+CROWDED_CELLS = 6
+EFFECT_NUMBERS = (2, 0, 6, 26, 19, 21)
+"""Of EFFECTS, one on each of J1 to J6: drag, Stribeck, load friction, coupling, friction by position, cogging."""
 WORLD = "measurement"
 ESTIMATORS: dict[str, Callable[[System], Estimate]] = {
     "ml": ml,
@@ -43,16 +48,31 @@ ESTIMATORS: dict[str, Callable[[System], Estimate]] = {
 }
 
 
+class CrowdedTask(CaseTask):
+    """A cell with an undeclared effect on every axis."""
+
+    @property
+    def effects(self) -> tuple[UndeclaredEffect, ...]:
+        """One effect for each axis."""
+        return tuple(EFFECTS[number] for number in EFFECT_NUMBERS)
+
+    @property
+    def path(self) -> Path:
+        """File of the runs."""
+        return self.out / "crowded" / f"{self.seed}.npz"
+
+
 @dataclass(frozen=True, slots=True)
 class CellErrors:
     """Errors of the gains of one cell.
 
     Attributes:
-        title: undeclared effect and its axis, or "none".
+        title: undeclared effects and their axes, empty for a clean cell.
         relative_error_percent: of the fit by ml.
         gain_errors_percent: of each gain, by estimator.
         tls_shift_sigmas: |tls − ml| of each gain, in σ of ml.
         tls_shift_percent: the same, in per cent of ml.
+        scores: error of each gain over its σ, by estimator; eqs. (10) and (23) for wls and tls.
     """
 
     title: str
@@ -60,6 +80,7 @@ class CellErrors:
     gain_errors_percent: dict[str, FloatArray]
     tls_shift_sigmas: FloatArray
     tls_shift_percent: FloatArray
+    scores: dict[str, FloatArray]
 
 
 def errors_of(task: CaseTask) -> CellErrors:
@@ -71,10 +92,7 @@ def errors_of(task: CaseTask) -> CellErrors:
     system = reduction.system(reduction.base(), reduction.payload_columns())
     true_gains = np.array([axis.gain_nm_per_a for axis in world_cell(task.seed, WORLD).bare.axes])
     estimates = {name: estimator(system) for name, estimator in ESTIMATORS.items()}
-    title = "none"
-    if task.effects:
-        (effect,) = task.effects
-        title = f"{effect.name} on {cell.axis_names[effect.axis]}"
+    title = ", ".join(f"{effect.name} on {cell.axis_names[effect.axis]}" for effect in task.effects)
     shift = np.abs(estimates["tls"].gains - estimates["ml"].gains)
     return CellErrors(
         title=title,
@@ -84,14 +102,18 @@ def errors_of(task: CaseTask) -> CellErrors:
         },
         tls_shift_sigmas=shift / estimates["ml"].gains_std,
         tls_shift_percent=100.0 * shift / np.abs(estimates["ml"].gains),
+        scores={name: (estimate.gains - true_gains) / estimate.gains_std for name, estimate in estimates.items()},
     )
 
 
-def table(clean: Sequence[CellErrors], bent: Sequence[CellErrors]) -> str:
-    """Mean and largest gain errors as a Markdown table: all clean cells in one row, then a row for each effect."""
+def table(clean: Sequence[CellErrors], bent: Sequence[CellErrors], crowded: Sequence[CellErrors]) -> str:
+    """Mean and largest gain errors as a Markdown table: a row for the clean cells, for each effect, for all effects."""
     headings = ("undeclared effect", "fit %", *(f"{name}, mean / max %" for name in ESTIMATORS), "tls − ml, max σ / %")
     lines = ["| " + " | ".join(headings) + " |", "|---" * len(headings) + "|"]
-    groups = [(f"none, {len(clean)} cells", list(clean)), *((cell.title, [cell]) for cell in bent)]
+    groups = [(f"none, {len(clean)} cells", list(clean))]
+    groups += [(cell.title, [cell]) for cell in bent]
+    groups += [(f"any one of these, {len(bent)} cells", list(bent))]
+    groups += [(f"one on every axis, {len(crowded)} cells", list(crowded))]
     for title, cells in groups:
         fit_percent = float(np.mean([cell.relative_error_percent for cell in cells]))
         sizes = []
@@ -114,12 +136,17 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     clean_tasks = [CaseTask(options.out, "clean", number) for number in range(CLEAN_CELLS)]
     bent_tasks = [CaseTask(options.out, "after-loop", number) for number in range(len(EFFECTS))]
-    found = list(side_by_side(errors_of, [*clean_tasks, *bent_tasks], options.processes))
+    crowded_tasks = [CrowdedTask(options.out, "clean", number) for number in range(CROWDED_CELLS)]
+    found = list(side_by_side(errors_of, [*clean_tasks, *bent_tasks, *crowded_tasks], options.processes))
     clean = found[:CLEAN_CELLS]
-    text = table(clean, found[CLEAN_CELLS:])
+    bent = found[CLEAN_CELLS:-CROWDED_CELLS]
+    text = table(clean, bent, found[-CROWDED_CELLS:])
     print_line(text)
     means = {name: float(np.mean([cell.gain_errors_percent[name] for cell in clean])) for name in ESTIMATORS}
     print_line(f"clean cells: tls / ml = {means['tls'] / means['ml']:.2f}")
+    for name in ("ml", "tls"):
+        scores = np.concatenate([cell.scores[name] for cell in clean])
+        print_line(f"clean cells: error / σ of {name}, root mean square {np.sqrt(np.mean(scores**2)):.2f}")
     options.table.write_text(as_csv(text), encoding="utf-8")
     return 0
 
