@@ -19,7 +19,7 @@ import typer
 from typer.core import TyperGroup
 
 from daq.cli.failure import Failure, show_failure
-from daq.cli.terminal import STARTED, WRITTEN, interruptible, remove_empty_folders
+from daq.cli.terminal import STARTED, WRITTEN, interruptible, remove_empty_folders, say_last
 from daq.cli.verb import HELP_NAMES, Job, Listed
 from daq.environment import software
 from daq.errors import DaqError, ExitCode, OutputFailed
@@ -95,7 +95,7 @@ class _Verbs(TyperGroup):
         except KeyboardInterrupt as interrupt:
             writes = ctx.invoked_subcommand in {"apply", "rollback"}
             nothing = "nothing was changed" if writes else "no file was written"
-            typer.echo(printable(f"interrupted: {_kept() or nothing}"), err=True)
+            say_last(printable(f"interrupted: {_kept() or nothing}"))
             raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
 
 
@@ -166,7 +166,7 @@ def _run(words: list[str], json_wanted: bool) -> int:
             return _output_failed(stop.__context__, json_wanted)
         ended = stop.code
     except typer.Abort:
-        typer.echo("interrupted: no file was written", err=True)  # Ctrl-C or Ctrl-D at a prompt
+        say_last("interrupted: no file was written")  # Ctrl-C or Ctrl-D at a prompt
         ended = ExitCode.INTERRUPTED
     except CLICK_ERROR as error:
         ended = _usage_failed(error, json_wanted)

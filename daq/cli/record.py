@@ -12,7 +12,7 @@ import typer
 
 from daq.cli.verb import CellArgument, JsonOption, Verb, judged_output, print_json, say_next
 from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError
-from drivers.errors import POWERED, DriverError, SampleLost
+from drivers.errors import POWERED, DriverError, SampleLost, all_notes, error_chain
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
@@ -41,7 +41,7 @@ def record_verb(
 
     A run with losses is kept, marked invalid, and ends with exit code 4; `fit` refuses it.
     """
-    from daq.cli.terminal import interruptible, progress_bar
+    from daq.cli.terminal import interruptible, progress_bar, say_last
     from daq.config.bus import bus_loads
     from daq.config.cell_file import load_cell
     from daq.environment import login
@@ -89,7 +89,7 @@ def record_verb(
             )
     except KeyboardInterrupt as interrupt:
         made = next((path for path in (out, part) if path.exists()), None)
-        typer.echo(_interrupted(interrupt, made, out), err=True)
+        say_last(_interrupted(interrupt, made, out))
         raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
     except DriverError as error:
         _add_what_is_kept(error, declared, part)
@@ -195,11 +195,11 @@ def _interrupted(interrupt: KeyboardInterrupt, made: Path | None, out: Path) -> 
     """Describe in one line what became of the axes and of the recording."""
     # A stop that could not be confirmed is noted on the interrupt; an interrupt during a stop for another reason cut
     # that stop short.
-    first = interrupt.__context__
-    while first is not None and not isinstance(first, DriverError | OutputFailed | DiskSpaceShort | KeyboardInterrupt):
-        first = first.__context__
+    behind = error_chain(interrupt)[1:]
+    causes = (DriverError, OutputFailed, DiskSpaceShort, KeyboardInterrupt)
+    first = next((error for error in behind if isinstance(error, causes)), None)
     notes = [] if first is None else [f"it came while they were stopped after {type(first).__name__}: {first}"]
-    notes += [note for error in (first, interrupt) for note in getattr(error, "__notes__", ())]
+    notes += all_notes(interrupt)
     problems = "; ".join(note for note in notes if not note.startswith(POWERED))
     powered = ", ".join(note.removeprefix(POWERED) for note in notes if note.startswith(POWERED))
     axes = f"{powered} NOT CONFIRMED WITHOUT POWER, use the emergency stop" if powered else "axes stopped"
