@@ -72,7 +72,7 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
         "check the power of the cell and the load of bus and computer: `drivegain monitor CELL`",
     ),
     driver.MotionRefused: (
-        "a person or the cell's policy that permits motion, and moves within the limits",
+        "a person who permits motion, and moves within the limits",
         "pass --enable-motion when the cell is clear; plan again where a limit is named",
     ),
     driver.MotionTimeout: ("every move within its time", "check brakes and limits, or record with --speed 0.5"),

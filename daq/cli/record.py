@@ -25,7 +25,7 @@ def record_verb(
     out: Annotated[Path, typer.Option("--out", help="Log to write (.mcap); must not exist.", callback=judged_output)],
     enable_motion: Annotated[
         bool,
-        typer.Option("--enable-motion", help="Allow motion, where the cell's `policy: {motion: allowed}` does not."),
+        typer.Option("--enable-motion", help="Allow motion. Without it nothing moves, whatever the cell file says."),
     ] = False,
     payload: Annotated[str | None, typer.Option(help="Mounted payload, by its name in the cell file.")] = None,
     mass: Annotated[float | None, typer.Option(help="Mass of the payload read off the scale [kg].", min=0.0)] = None,
@@ -39,6 +39,7 @@ def record_verb(
 ) -> None:
     """Execute the moves of a plan and log every sample; Ctrl-C and SIGTERM stop the axes.
 
+    Where the cell file has an interlock (`recalibration`), it must release the robot: exit code 11 where it does not.
     A run with losses is kept, marked invalid, and ends with exit code 4; `fit` refuses it.
     """
     from daq.cli.terminal import interruptible, progress_bar, say_last
@@ -58,9 +59,8 @@ def record_verb(
     carried = mounted(declared, payload)
     check_entered_mass(declared, carried, mass)
     part = _free(out)
-    allowed_by = granted(declared, who, enable_motion)
     not_weighed = carried is not None and mass is None
-    for line in _before_motion(declared, plan, not_weighed, None if enable_motion else allowed_by):
+    for line in _before_motion(declared, plan, not_weighed):
         typer.echo(line, err=True)
     try:
         with (
@@ -78,7 +78,7 @@ def record_verb(
                 out,
                 payload=carried,
                 operator=who,
-                granted_by=allowed_by,
+                granted_by=who if enable_motion else None,
                 run_id=str(uuid.uuid4()),
                 speed=speed,
                 entered_kg=mass,
@@ -154,8 +154,8 @@ def _is_unloaded(log: Path, declared: Cell) -> bool:
     return (found["cell"], found["payload"], found["valid"]) == (declared.name, None, True)
 
 
-def _before_motion(cell: Cell, plan: Path, not_weighed: bool, allowed_by: str | None) -> Iterator[str]:
-    """Remarks for a person before the axes move; ``allowed_by`` is what in the cell file allows the motion."""
+def _before_motion(cell: Cell, plan: Path, not_weighed: bool) -> Iterator[str]:
+    """Remarks for a person before the axes move."""
     from daq.report.bus import load_lines
     from daq.report.plan_preview import find_preview
 
@@ -164,8 +164,6 @@ def _before_motion(cell: Cell, plan: Path, not_weighed: bool, allowed_by: str | 
     if (page := find_preview(plan)) is not None:
         yield f"preview of these moves: {page}"
     yield from load_lines(cell)
-    if allowed_by is not None:
-        yield f"motion is enabled by {allowed_by} in the cell file; the axes move now"
 
 
 def _free(out: Path) -> Path:
@@ -210,15 +208,6 @@ def _interrupted(interrupt: KeyboardInterrupt, made: Path | None, out: Path) -> 
         return f"interrupted: {axes}; all moves were finished, and {out} is complete"
     kept = f"the samples recorded so far are in {made}, which `fit` does not read"
     return f"interrupted: {axes}; {kept}; {_next_command(made)}"
-
-
-def granted(cell: Cell, who: str, enable_motion: bool) -> str | None:
-    """Return who enables the motion: the operator or the cell's policy; None where motion is disabled."""
-    from daq.config.cell import MotionPolicy
-
-    if enable_motion:
-        return who
-    return f"the policy of cell {cell.name}, for {who}" if cell.motion is MotionPolicy.ALLOWED else None
 
 
 def mounted(cell: Cell, name: str | None) -> Payload | None:

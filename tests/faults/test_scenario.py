@@ -12,7 +12,6 @@ import can
 import pytest
 
 from daq.cli.app import main
-from daq.cli.record import granted
 from daq.config.bus import bus_address
 from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent, ConfigurationMissing, ExitCode, SchemaMismatch
@@ -114,19 +113,6 @@ def test_without_leave_nothing_is_sent_to_the_cell(tmp_path: Path) -> None:
     plan.write_text(PLAN, encoding="utf-8")
     arguments = ["record", str(CONFIGS / "cells" / "demo.yaml"), str(plan), "--out", str(tmp_path / "a.mcap")]
     assert main(arguments) == ExitCode.USAGE
-
-
-def test_the_policy_of_a_cell_may_allow_motion_and_is_named(tmp_path: Path) -> None:
-    text = (CONFIGS / "cells" / "demo.yaml").read_text(encoding="utf-8")
-    path = tmp_path / "cell.yaml"
-    for policy, expected in (
-        ("", None),
-        ("policy: {motion: ask}\n", None),
-        ("policy: {motion: allowed}\n", "the policy of cell demo, for Ada"),
-    ):
-        path.write_text(text.replace("../robots", str(CONFIGS / "robots")) + policy, encoding="utf-8")
-        assert granted(load_cell(path), "Ada", enable_motion=False) == expected
-        assert granted(load_cell(path), "Ada", enable_motion=True) == "Ada"
 
 
 def test_times_of_a_scenario_become_syncs(tmp_path: Path) -> None:
