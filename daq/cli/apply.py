@@ -426,7 +426,7 @@ def saving_of(ram_only: bool, save_unknown: bool, *, drives: bool = True) -> Sav
 def drives_on_the_bus(declared: Cell, saving: Saving) -> Iterator[DriveTarget]:
     """Open the drives of a cell, its buses locked; Ctrl-C and SIGTERM restore the values written until then."""
     from daq.config.bus import cell_address, drive_axes
-    from daq.workflow.safeguards import bus_lock
+    from daq.workflow.bus_lock import bus_lock
     from daq.writeback.drive_target import DriveTarget
     from drivers.canopen.network import CanopenNetwork
 

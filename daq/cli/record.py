@@ -47,11 +47,12 @@ def record_verb(
     from daq.config.cell_file import load_cell
     from daq.environment import login
     from daq.report.text import picked
+    from daq.workflow.bus_lock import bus_lock
     from daq.workflow.feed import Feed
     from daq.workflow.plan import slowed
     from daq.workflow.plan_file import load_plan
     from daq.workflow.record import record
-    from daq.workflow.safeguards import bus_lock, check_entered_mass
+    from daq.workflow.safeguards import check_entered_mass
 
     declared = load_cell(cell)
     moves = slowed(declared, load_plan(plan, declared), speed)

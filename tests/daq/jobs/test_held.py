@@ -36,9 +36,9 @@ from daq.jobs.journal import Form, Journal
 from daq.jobs.session import Outcome
 from daq.jobs.time_bound import time_bound
 from daq.ledger.audit import AuditAction
+from daq.workflow.bus_lock import bus_lock, lock_name
 from daq.workflow.interlock import MAX_OUTPUT_CHARACTERS, Finished, require_release, run_command
 from daq.workflow.record import Recorded
-from daq.workflow.safeguards import bus_lock, lock_name
 from drivers.errors import MotionRefused
 from drivers.simulation.drive import PowerState
 from tests.daq.jobs.made import Made, made_rig
