@@ -106,8 +106,8 @@ def build_app() -> typer.Typer:
         name="drivegain",
         help="Record a robot over CANopen, identify its joint drive gains and dynamics, write the calibration back.",
         epilog="Exit codes: 0 ok, 1 unexpected, or the output could not be written, 2 usage, 3 calibration refused, "
-        "4 data unfit, 5 device fault, 6 configuration, 10 to 14 see recalibrate (11: the interlock refuses, "
-        "12: the bus is taken), "
+        "4 data unfit, 5 device fault, 6 configuration, 10 to 14 see recalibrate "
+        "(11: the interlock refuses, 12: the bus is taken), "
         "130 interrupted.",
         no_args_is_help=True,
         context_settings={"help_option_names": HELP_NAMES},

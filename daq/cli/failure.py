@@ -224,7 +224,7 @@ def _number(error: BaseException | None) -> int | None:
 
 
 def show_failure(failure: Failure, *, json_wanted: bool) -> None:
-    """Print an error on stderr; where that takes nothing, the exit code alone tells what happened."""
+    """Print an error on stderr; where that takes nothing, the exit code alone says it."""
     console = Console(stderr=True, soft_wrap=True)
     with suppress(OSError, ValueError):  # a full disk, a reader that has gone, a closed stream
         if json_wanted:

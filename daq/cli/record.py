@@ -25,7 +25,10 @@ def record_verb(
     out: Annotated[Path, typer.Option("--out", help="Log to write (.mcap); must not exist.", callback=judged_output)],
     enable_motion: Annotated[
         bool,
-        typer.Option("--enable-motion", help="Allow motion. Without it nothing moves, whatever the cell file says."),
+        typer.Option(
+            "--enable-motion",
+            help="Allow motion. Without it nothing moves, whatever the cell file says.",
+        ),
     ] = False,
     payload: Annotated[str | None, typer.Option(help="Mounted payload, by its name in the cell file.")] = None,
     mass: Annotated[float | None, typer.Option(help="Mass of the payload read off the scale [kg].", min=0.0)] = None,
@@ -39,7 +42,8 @@ def record_verb(
 ) -> None:
     """Execute the moves of a plan and log every sample; Ctrl-C and SIGTERM stop the axes.
 
-    Where the cell file has an interlock (`recalibration`), it must release the robot: exit code 11 where it does not.
+    Where the cell file has an interlock (`recalibration`), it must release the robot: exit code
+    11 where it does not.
     A run with losses is kept, marked invalid, and ends with exit code 4; `fit` refuses it.
     """
     from daq.cli.terminal import interruptible, progress_bar, say_last

@@ -34,8 +34,8 @@ def scan_verb(
 
     Every node id is tried on every bus, so that an amplifier on the wrong bus is found. Nameplate gains are compared
     with the motors' data in the drives and with the controller's file. Nothing is changed without
-    --reset-faults; find out why an axis is in fault before you reset it. While a recording or another master uses the
-    bus, nothing is sent: exit code 12 or 5.
+    --reset-faults; find out why an axis is in fault before you reset it. While a recording or
+    another master uses the bus, nothing is sent: exit code 12 or 5.
     """
     from daq.cli.terminal import print_view
     from daq.config.bus import bus_parts, cell_address, drive_axes
@@ -92,7 +92,12 @@ class ScannedBus:
     causes: dict[str, str]  #: error code of each axis that was in fault and was reset
 
 
-def _scan_bus(address: BusAddress, axes: tuple[Axis, ...], wait_s: float, reset_faults: bool) -> ScannedBus:
+def _scan_bus(
+    address: BusAddress,
+    axes: tuple[Axis, ...],
+    wait_s: float,
+    reset_faults: bool,
+) -> ScannedBus:
     """Find the nodes of a bus whose lock is taken, and reset the axes in fault if that is wanted.
 
     Raises:

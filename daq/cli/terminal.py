@@ -162,7 +162,7 @@ def say_written(console: Console, *paths: Path | None) -> None:
 
 
 def say_last(text: str) -> None:
-    """Print the last line of a command on stderr; where that takes nothing, the exit code alone says how it ended."""
+    """Print the last line of a command on stderr; the exit code says it where that takes nothing."""
     with suppress(OSError, ValueError):  # a full disk, a reader that has gone, a closed stream
         typer.echo(text, err=True)
 

@@ -149,10 +149,11 @@ class DeclaredEffect:
 
 
 class MotionPolicy(Enum):
-    """Permission of a scheduled job to move the axes; a person gives theirs to each recording, by --enable-motion."""
+    """Permission of a scheduled job to move the axes; `record` needs --enable-motion each time."""
 
     ASK = "ask"  #: No job may; only a person
-    ALLOWED = "allowed"  #: A job may, where the interlock releases the robot: a fenced cell with its own safety chain
+    #: A job may, where the interlock releases the robot: a fenced cell with its own safety chain.
+    ALLOWED = "allowed"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,7 +178,8 @@ class Cell:
     #: a calibration (`policy`, `history`, `recalibration`).
     recording_digest: str
     motion: MotionPolicy = MotionPolicy.ASK  #: permission of a scheduled job to move the axes
-    unguarded: Permission = Permission.REFUSED  #: of a job, to move axes that go on moving when it is killed
+    #: Permission of a job to move axes that go on moving when it is killed.
+    unguarded: Permission = Permission.REFUSED
     recovery_motion: Permission = Permission.REFUSED  #: to move axes slowly back within their limits before a recording
     apply: ApplyPolicy = DEFAULT_APPLY_POLICY  #: bounds and permissions of the write-back
     history: HistoryPlace | None = None  #: files of the history; None for a cell from a log

@@ -148,7 +148,7 @@ def record(
         block_signals: blocks signals while the axes are stopped.
         progress: receives the number of finished moves and of all moves.
         require_released: check that the robot may move, before the drives are used and again before they get power; if
-            it raises, no file is made. By default the interlock of the cell file is asked, where it declares one.
+            it raises, no file is made. By default the interlock of the cell file decides, where it declares one.
         feed: gets what the log gets, for consoles.
         unguarded: whether axes may move that go on moving when this program is killed.
 
