@@ -215,7 +215,7 @@ class NotReleased(JobHeld):
 
 
 class BusTaken(JobHeld):
-    """Another recording or job of drivegain uses the bus."""
+    """Another program of drivegain uses the bus, such as a recording or a job."""
 
 
 class TimeBoundReached(JobHeld):

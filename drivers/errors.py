@@ -22,10 +22,51 @@ Where an error ends a motion, each part of the stop that could not be confirmed 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Protocol
 
 WHILE = "while "  #: Prefix of the notes that report what a stop, or the closing of a network, could not confirm
 POWERED = "not confirmed without power: "  #: Prefix of the note that names the axes which had power and may still have
+
+
+def error_chain(error: BaseException | None) -> tuple[BaseException, ...]:
+    """Return an error and all errors behind it, nearest first: causes, and errors that were being handled.
+
+    Each is there once, whatever cycles they form. They are compared by identity: the `__eq__` of a foreign error may
+    raise, as that of canopen's SdoAbortedError does with any error that has no abort code.
+    """
+    found: dict[int, BaseException] = {}
+    waiting = [error]
+    while waiting:
+        nearest = waiting.pop(0)
+        if nearest is not None and id(nearest) not in found:
+            found[id(nearest)] = nearest
+            waiting += [nearest.__cause__, nearest.__context__]
+    return tuple(found.values())
+
+
+def text_of(error: BaseException) -> str:
+    """Return the text of an error; empty where it has none, or where a foreign error fails to write it."""
+    with suppress(Exception):
+        return str(error)
+    return ""
+
+
+def all_notes(error: BaseException | None) -> tuple[str, ...]:
+    """Return the notes of an error, and of all errors behind it, each once.
+
+    An error that comes later, such as that of a full disk, does not carry the notes of the one that it hides.
+    """
+    notes: dict[str, None] = {}
+    for one in error_chain(error):
+        for note in getattr(one, "__notes__", ()):
+            notes[note] = None
+    return tuple(notes)
+
+
+def stop_notes(error: BaseException | None) -> tuple[str, ...]:
+    """Return those of `all_notes` that say what a stop, or the closing of a network, could not confirm."""
+    return tuple(note for note in all_notes(error) if note.startswith((WHILE, POWERED)))
 
 
 class NamedNode(Protocol):

@@ -19,7 +19,7 @@ import typer
 from typer.core import TyperGroup
 
 from daq.cli.failure import Failure, show_failure
-from daq.cli.terminal import STARTED, WRITTEN, interruptible, remove_empty_folders
+from daq.cli.terminal import STARTED, WRITTEN, interruptible, remove_empty_folders, say_last
 from daq.cli.verb import HELP_NAMES, Job, Listed
 from daq.environment import software
 from daq.errors import DaqError, ExitCode, OutputFailed
@@ -95,7 +95,7 @@ class _Verbs(TyperGroup):
         except KeyboardInterrupt as interrupt:
             writes = ctx.invoked_subcommand in {"apply", "rollback"}
             nothing = "nothing was changed" if writes else "no file was written"
-            typer.echo(printable(f"interrupted: {_kept() or nothing}"), err=True)
+            say_last(printable(f"interrupted: {_kept() or nothing}"))
             raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
 
 
@@ -106,7 +106,8 @@ def build_app() -> typer.Typer:
         name="drivegain",
         help="Record a robot over CANopen, identify its joint drive gains and dynamics, write the calibration back.",
         epilog="Exit codes: 0 ok, 1 unexpected, or the output could not be written, 2 usage, 3 calibration refused, "
-        "4 data unfit, 5 device fault, 6 configuration, 10 to 14 see recalibrate (12: the bus is taken), "
+        "4 data unfit, 5 device fault, 6 configuration, 10 to 14 see recalibrate "
+        "(11: the interlock refuses, 12: the bus is taken), "
         "130 interrupted.",
         no_args_is_help=True,
         context_settings={"help_option_names": HELP_NAMES},
@@ -166,7 +167,7 @@ def _run(words: list[str], json_wanted: bool) -> int:
             return _output_failed(stop.__context__, json_wanted)
         ended = stop.code
     except typer.Abort:
-        typer.echo("interrupted: no file was written", err=True)  # Ctrl-C or Ctrl-D at a prompt
+        say_last("interrupted: no file was written")  # Ctrl-C or Ctrl-D at a prompt
         ended = ExitCode.INTERRUPTED
     except CLICK_ERROR as error:
         ended = _usage_failed(error, json_wanted)

@@ -18,11 +18,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from daq.cli.terminal import WRITTEN, at_most_one, delay_signals, interruptible, output_console, write_output
+from daq.cli.terminal import (
+    WRITTEN,
+    at_most_one,
+    delay_signals,
+    interruptible,
+    output_console,
+    say_last,
+    write_output,
+)
 from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
 from daq.environment import login
 from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, ExitCode, UsageError, evidence
 from daq.report.text import terminal_text
+from drivers.errors import all_notes
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
@@ -417,7 +426,7 @@ def saving_of(ram_only: bool, save_unknown: bool, *, drives: bool = True) -> Sav
 def drives_on_the_bus(declared: Cell, saving: Saving) -> Iterator[DriveTarget]:
     """Open the drives of a cell, its buses locked; Ctrl-C and SIGTERM restore the values written until then."""
     from daq.config.bus import cell_address, drive_axes
-    from daq.workflow.safeguards import bus_lock
+    from daq.workflow.bus_lock import bus_lock
     from daq.writeback.drive_target import DriveTarget
     from drivers.canopen.network import CanopenNetwork
 
@@ -431,8 +440,8 @@ def drives_on_the_bus(declared: Cell, saving: Saving) -> Iterator[DriveTarget]:
             yield DriveTarget(declared, network, saving)
     except KeyboardInterrupt as interrupt:
         written = "the drives were written" if WRITTEN else "nothing was written to the drives"
-        said = "; ".join(getattr(interrupt, "__notes__", ())) or written
-        typer.echo(f"interrupted: {said}", err=True)
+        said = "; ".join(all_notes(interrupt)) or written
+        say_last(f"interrupted: {said}")
         raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
 
 

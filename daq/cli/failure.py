@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import json
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -71,7 +72,7 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
         "check the power of the cell and the load of bus and computer: `drivegain monitor CELL`",
     ),
     driver.MotionRefused: (
-        "a person or the cell's policy that permits motion, and moves within the limits",
+        "a person who permits motion, and moves within the limits",
         "pass --enable-motion when the cell is clear; plan again where a limit is named",
     ),
     driver.MotionTimeout: ("every move within its time", "check brakes and limits, or record with --speed 0.5"),
@@ -167,7 +168,7 @@ class Failure:
             *_parts(error),
             int(exit_code(type(error)) or ExitCode.UNEXPECTED),
             labelled,
-            tuple(note for note in notes if note.startswith((f"{driver.WHILE}stopping", f"{driver.WHILE}closing"))),
+            tuple(note for note in driver.stop_notes(error) if note.startswith(driver.WHILE)),
             may_have_power(error),
         )
 
@@ -193,7 +194,7 @@ class Failure:
 
 def may_have_power(error: BaseException | None) -> str:
     """Name the axes that had power and are not confirmed without it; empty where there are none."""
-    notes = getattr(error, "__notes__", ())
+    notes = driver.stop_notes(error)
     return ", ".join(note.removeprefix(driver.POWERED) for note in notes if note.startswith(driver.POWERED))
 
 
@@ -213,7 +214,9 @@ def _parts(error: Exception) -> tuple[str, str, str, str]:
 
 def _number(error: BaseException | None) -> int | None:
     """Return the number of the operating system's error that an error came from."""
-    while error is not None:
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
         if isinstance(error, OSError) and error.errno is not None:
             return error.errno
         error = error.__cause__
@@ -221,12 +224,14 @@ def _number(error: BaseException | None) -> int | None:
 
 
 def show_failure(failure: Failure, *, json_wanted: bool) -> None:
-    """Print an error on stderr."""
+    """Print an error on stderr; where that takes nothing, the exit code alone says it."""
     console = Console(stderr=True, soft_wrap=True)
-    if json_wanted:
-        line = json.dumps(failure.document(), ensure_ascii=False)
-        console.file.write(spelled_bytes(line) + "\n")
-        return
-    for label, text, style in failure.lines():
-        # Indented, a line end in the name of a file cannot make another line of an error.
-        console.print(Text(f"{label + ':':<10}", style=style) + Text(printable(text).replace("\n", "\n" + 10 * " ")))
+    with suppress(OSError, ValueError):  # a full disk, a reader that has gone, a closed stream
+        if json_wanted:
+            line = json.dumps(failure.document(), ensure_ascii=False)
+            console.file.write(spelled_bytes(line) + "\n")
+            return
+        for label, text, style in failure.lines():
+            # Indented, a line end in the name of a file cannot make another line of an error.
+            indented = printable(text).replace("\n", "\n" + 10 * " ")
+            console.print(Text(f"{label + ':':<10}", style=style) + Text(indented))

@@ -11,7 +11,7 @@ import typer
 
 from daq.cli.verb import JsonOption, Verb, judged_output, print_json
 from daq.errors import DaqError, ExitCode, UsageError, exit_code
-from drivers.errors import WHILE, DriverError
+from drivers.errors import DriverError, all_notes, stop_notes
 from ident.errors import IdentificationError
 
 if TYPE_CHECKING:
@@ -43,8 +43,7 @@ def recalibrate_verb(
     try:
         _run(cell, dry_run, now, json, journal)
     except KeyboardInterrupt as interrupt:
-        notes = [note for note in getattr(interrupt, "__notes__", ()) if note.startswith(WHILE)]
-        journal.say(Level.ERROR, "interrupted", axes="; ".join(notes) or "stopped")
+        journal.say(Level.ERROR, "interrupted", axes="; ".join(stop_notes(interrupt)) or "stopped")
         raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
     except (DaqError, DriverError, IdentificationError) as error:
         journal.say(
@@ -52,7 +51,7 @@ def recalibrate_verb(
             "failed",
             error=type(error).__name__,
             text=str(error),
-            notes=list(getattr(error, "__notes__", ())),
+            notes=list(all_notes(error)),
         )
         if journal.form is Form.TEXT:
             raise

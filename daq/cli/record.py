@@ -12,7 +12,7 @@ import typer
 
 from daq.cli.verb import CellArgument, JsonOption, Verb, judged_output, print_json, say_next
 from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError
-from drivers.errors import POWERED, DriverError, SampleLost
+from drivers.errors import POWERED, DriverError, SampleLost, all_notes, error_chain
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
@@ -25,7 +25,10 @@ def record_verb(
     out: Annotated[Path, typer.Option("--out", help="Log to write (.mcap); must not exist.", callback=judged_output)],
     enable_motion: Annotated[
         bool,
-        typer.Option("--enable-motion", help="Allow motion, where the cell's `policy: {motion: allowed}` does not."),
+        typer.Option(
+            "--enable-motion",
+            help="Allow motion. Without it nothing moves, whatever the cell file says.",
+        ),
     ] = False,
     payload: Annotated[str | None, typer.Option(help="Mounted payload, by its name in the cell file.")] = None,
     mass: Annotated[float | None, typer.Option(help="Mass of the payload read off the scale [kg].", min=0.0)] = None,
@@ -39,18 +42,21 @@ def record_verb(
 ) -> None:
     """Execute the moves of a plan and log every sample; Ctrl-C and SIGTERM stop the axes.
 
+    Where the cell file has an interlock (`recalibration`), it must release the robot: exit code
+    11 where it does not.
     A run with losses is kept, marked invalid, and ends with exit code 4; `fit` refuses it.
     """
-    from daq.cli.terminal import interruptible, progress_bar
+    from daq.cli.terminal import interruptible, progress_bar, say_last
     from daq.config.bus import bus_loads
     from daq.config.cell_file import load_cell
     from daq.environment import login
     from daq.report.text import picked
+    from daq.workflow.bus_lock import bus_lock
     from daq.workflow.feed import Feed
     from daq.workflow.plan import slowed
     from daq.workflow.plan_file import load_plan
     from daq.workflow.record import record
-    from daq.workflow.safeguards import bus_lock, check_entered_mass
+    from daq.workflow.safeguards import check_entered_mass
 
     declared = load_cell(cell)
     moves = slowed(declared, load_plan(plan, declared), speed)
@@ -58,9 +64,8 @@ def record_verb(
     carried = mounted(declared, payload)
     check_entered_mass(declared, carried, mass)
     part = _free(out)
-    allowed_by = granted(declared, who, enable_motion)
     not_weighed = carried is not None and mass is None
-    for line in _before_motion(declared, plan, not_weighed, None if enable_motion else allowed_by):
+    for line in _before_motion(declared, plan, not_weighed):
         typer.echo(line, err=True)
     try:
         with (
@@ -78,7 +83,7 @@ def record_verb(
                 out,
                 payload=carried,
                 operator=who,
-                granted_by=allowed_by,
+                granted_by=who if enable_motion else None,
                 run_id=str(uuid.uuid4()),
                 speed=speed,
                 entered_kg=mass,
@@ -89,7 +94,7 @@ def record_verb(
             )
     except KeyboardInterrupt as interrupt:
         made = next((path for path in (out, part) if path.exists()), None)
-        typer.echo(_interrupted(interrupt, made, out), err=True)
+        say_last(_interrupted(interrupt, made, out))
         raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
     except DriverError as error:
         _add_what_is_kept(error, declared, part)
@@ -154,8 +159,8 @@ def _is_unloaded(log: Path, declared: Cell) -> bool:
     return (found["cell"], found["payload"], found["valid"]) == (declared.name, None, True)
 
 
-def _before_motion(cell: Cell, plan: Path, not_weighed: bool, allowed_by: str | None) -> Iterator[str]:
-    """Remarks for a person before the axes move; ``allowed_by`` is what in the cell file allows the motion."""
+def _before_motion(cell: Cell, plan: Path, not_weighed: bool) -> Iterator[str]:
+    """Remarks for a person before the axes move."""
     from daq.report.bus import load_lines
     from daq.report.plan_preview import find_preview
 
@@ -164,8 +169,6 @@ def _before_motion(cell: Cell, plan: Path, not_weighed: bool, allowed_by: str | 
     if (page := find_preview(plan)) is not None:
         yield f"preview of these moves: {page}"
     yield from load_lines(cell)
-    if allowed_by is not None:
-        yield f"motion is enabled by {allowed_by} in the cell file; the axes move now"
 
 
 def _free(out: Path) -> Path:
@@ -195,11 +198,11 @@ def _interrupted(interrupt: KeyboardInterrupt, made: Path | None, out: Path) -> 
     """Describe in one line what became of the axes and of the recording."""
     # A stop that could not be confirmed is noted on the interrupt; an interrupt during a stop for another reason cut
     # that stop short.
-    first = interrupt.__context__
-    while first is not None and not isinstance(first, DriverError | OutputFailed | DiskSpaceShort | KeyboardInterrupt):
-        first = first.__context__
+    behind = error_chain(interrupt)[1:]
+    causes = (DriverError, OutputFailed, DiskSpaceShort, KeyboardInterrupt)
+    first = next((error for error in behind if isinstance(error, causes)), None)
     notes = [] if first is None else [f"it came while they were stopped after {type(first).__name__}: {first}"]
-    notes += [note for error in (first, interrupt) for note in getattr(error, "__notes__", ())]
+    notes += all_notes(interrupt)
     problems = "; ".join(note for note in notes if not note.startswith(POWERED))
     powered = ", ".join(note.removeprefix(POWERED) for note in notes if note.startswith(POWERED))
     axes = f"{powered} NOT CONFIRMED WITHOUT POWER, use the emergency stop" if powered else "axes stopped"
@@ -210,15 +213,6 @@ def _interrupted(interrupt: KeyboardInterrupt, made: Path | None, out: Path) -> 
         return f"interrupted: {axes}; all moves were finished, and {out} is complete"
     kept = f"the samples recorded so far are in {made}, which `fit` does not read"
     return f"interrupted: {axes}; {kept}; {_next_command(made)}"
-
-
-def granted(cell: Cell, who: str, enable_motion: bool) -> str | None:
-    """Return who enables the motion: the operator or the cell's policy; None where motion is disabled."""
-    from daq.config.cell import MotionPolicy
-
-    if enable_motion:
-        return who
-    return f"the policy of cell {cell.name}, for {who}" if cell.motion is MotionPolicy.ALLOWED else None
 
 
 def mounted(cell: Cell, name: str | None) -> Payload | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -14,7 +14,9 @@ from daq.errors import UsageError
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
+    from drivers.canopen.bus import BusAddress
     from drivers.canopen.network import CanopenNetwork
+    from drivers.canopen.scan import FoundNode
     from drivers.profiles.profile import Axis
     from drivers.profiles.scale import ScaleReading
 
@@ -32,38 +34,32 @@ def scan_verb(
 
     Every node id is tried on every bus, so that an amplifier on the wrong bus is found. Nameplate gains are compared
     with the motors' data in the drives and with the controller's file. Nothing is changed without
-    --reset-faults; find out why an axis is in fault before you reset it.
+    --reset-faults; find out why an axis is in fault before you reset it. While a recording or
+    another master uses the bus, nothing is sent: exit code 12 or 5.
     """
     from daq.cli.terminal import print_view
     from daq.config.bus import bus_parts, cell_address, drive_axes
     from daq.config.cell_file import load_cell
     from daq.errors import ConfigurationInconsistent
     from daq.report.bus import current_signals, scan_rows, scan_view
+    from daq.workflow.bus_lock import bus_lock
     from daq.workflow.nameplates import check_nameplates, nameplate_warnings
-    from drivers.canopen.network import CanopenNetwork
-    from drivers.profiles.cia402 import State
 
     declared = load_cell(cell)
-    found, reset, misfits = {}, list[str](), dict[str, str]()
+    found: dict[str, tuple[FoundNode, ...]] = {}
+    reset: list[str] = []
+    misfits: dict[str, str] = {}
     scales: dict[str, ScaleReading | None] = {}
     causes: dict[str, str] = {}
-    for part in bus_parts(declared):
-        axes = tuple(axis for axis in drive_axes(declared) if axis.node_id in part.node_ids)
-        with CanopenNetwork(part.address, axes) as network:
-            found[part.name] = network.scan(wait_s=wait)
-            sound = {node.node_id for node in found[part.name] if node.identity and not node.problems}
-            here = [axis for axis in axes if axis.node_id in sound]
-            scales |= {axis.name: _scale_of(network, axis) for axis in here}
-            misfits |= {axis.name: text for axis in here if (text := _misfit_of(network, axis))}
-        in_fault = {node.node_id for node in found[part.name] if node.state is State.FAULT}
-        faulty = tuple(axis for axis in axes if axis.node_id in in_fault)
-        if reset_faults and faulty:
-            with CanopenNetwork(part.address, faulty) as network:
-                causes |= {axis.name: _fault_of(network, axis) for axis in faulty}
-                network.reset_faults()
-            with CanopenNetwork(part.address, axes) as network:
-                found[part.name] = network.scan(wait_s=wait)
-            reset += [axis.name for axis in faulty]
+    with bus_lock(declared):
+        for part in bus_parts(declared):
+            axes = tuple(axis for axis in drive_axes(declared) if axis.node_id in part.node_ids)
+            scanned = _scan_bus(part.address, axes, wait, reset_faults)
+            found[part.name] = scanned.nodes
+            scales |= scanned.scales
+            misfits |= scanned.misfits
+            causes |= scanned.causes
+            reset += scanned.causes
     readings = [scales.get(name) for name in declared.axis_names]
     mistyped, warnings = list[str](), nameplate_warnings(declared, readings)
     try:
@@ -84,6 +80,50 @@ def scan_verb(
         raise no_answer(declared, missing, tuple(node.node_id for nodes in found.values() for node in nodes), wait)
     if not json and not mistyped and all(row["verdict"] == "ok" for row in rows):
         say_next("drivegain", "plan", cell, "--out", "plan.yaml")
+
+
+@dataclass(frozen=True, slots=True)
+class ScannedBus:
+    """What was found on one bus."""
+
+    nodes: tuple[FoundNode, ...]  #: by node id
+    scales: dict[str, ScaleReading | None]  #: of the current, by axis; None where it cannot be read
+    misfits: dict[str, str]  #: objects of its profile that a drive lacks, by axis
+    causes: dict[str, str]  #: error code of each axis that was in fault and was reset
+
+
+def _scan_bus(
+    address: BusAddress,
+    axes: tuple[Axis, ...],
+    wait_s: float,
+    reset_faults: bool,
+) -> ScannedBus:
+    """Find the nodes of a bus whose lock is taken, and reset the axes in fault if that is wanted.
+
+    Raises:
+        BusBusy: another master commands the bus; nothing was sent.
+        DriverError: the bus is lost, or an axis stays in fault.
+    """
+    from drivers.canopen.network import CanopenNetwork
+    from drivers.profiles.cia402 import State
+
+    with CanopenNetwork(address, axes) as network:
+        nodes = network.scan(wait_s=wait_s)
+        sound = {node.node_id for node in nodes if node.identity and not node.problems}
+        here = [axis for axis in axes if axis.node_id in sound]
+        scales = {axis.name: _scale_of(network, axis) for axis in here}
+        misfits = {axis.name: text for axis in here if (text := _misfit_of(network, axis))}
+    in_fault = {node.node_id for node in nodes if node.state is State.FAULT}
+    faulty = tuple(axis for axis in axes if axis.node_id in in_fault)
+    if not reset_faults or not faulty:
+        return ScannedBus(nodes, scales, misfits, {})
+    with CanopenNetwork(address, faulty) as network:
+        network.require_quiet()
+        causes = {axis.name: _fault_of(network, axis) for axis in faulty}
+        network.reset_faults()
+    with CanopenNetwork(address, axes) as network:
+        nodes = network.scan(wait_s=wait_s)
+    return ScannedBus(nodes, scales, misfits, causes)
 
 
 def no_answer(cell: Cell, missing: Sequence[Axis], answered: tuple[int, ...], wait_s: float) -> Exception:

@@ -56,6 +56,7 @@ def simulate(
 
     from daq.cli.terminal import at_most_one, interruptible
     from daq.simulation.simulation_file import load_scenario, load_simulation, require_simulator, shipped_simulation
+    from daq.workflow.bus_lock import require_untaken
     from drivers.canopen.bus import BusAddress, bus_errors, open_bus
     from drivers.canopen.hub import Hub
     from drivers.canopen.split_bus import BusPart, SplitAddress, open_cell_bus
@@ -88,6 +89,8 @@ def simulate(
             BusPart(name, BusAddress(interface, name) if hub is None else hub.address(name), nodes)
             for name, nodes in there.items()
         )
+        if hub is None:  # a hub is a bus of this program, on which nobody is yet
+            require_untaken(part.address for part in parts)
         address = SplitAddress(parts) if bus else parts[0].address
         end = open_cell_bus(address) if isinstance(address, SplitAddress) else open_bus(address, answering=True)
         stack.callback(end.shutdown)

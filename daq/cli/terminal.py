@@ -161,6 +161,12 @@ def say_written(console: Console, *paths: Path | None) -> None:
             console.print(terminal_text(f"Written: {name}{seen}"))
 
 
+def say_last(text: str) -> None:
+    """Print the last line of a command on stderr; the exit code says it where that takes nothing."""
+    with suppress(OSError, ValueError):  # a full disk, a reader that has gone, a closed stream
+        typer.echo(text, err=True)
+
+
 class Stepper(Protocol):
     """Progress of steps that follow each other."""
 

@@ -149,11 +149,11 @@ class DeclaredEffect:
 
 
 class MotionPolicy(Enum):
-    """Permission that a recording needs to move the axes."""
+    """Permission of a scheduled job to move the axes; `record` needs --enable-motion each time."""
 
-    ASK = "ask"  #: The operator's, every time: --enable-motion
+    ASK = "ask"  #: No job may; only a person
+    #: A job may, where the interlock releases the robot: a fenced cell with its own safety chain.
     ALLOWED = "allowed"
-    """None: a fenced cell whose safety chain does not depend on this program, for scheduled recordings."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,8 +177,9 @@ class Cell:
     #: sha256 of the content that a recording or its fit depends on, hex: without comments, and without the later use of
     #: a calibration (`policy`, `history`, `recalibration`).
     recording_digest: str
-    motion: MotionPolicy = MotionPolicy.ASK  #: permission that a recording needs
-    unguarded: Permission = Permission.REFUSED  #: to move axes that go on moving when the recorder is killed
+    motion: MotionPolicy = MotionPolicy.ASK  #: permission of a scheduled job to move the axes
+    #: Permission of a job to move axes that go on moving when it is killed.
+    unguarded: Permission = Permission.REFUSED
     recovery_motion: Permission = Permission.REFUSED  #: to move axes slowly back within their limits before a recording
     apply: ApplyPolicy = DEFAULT_APPLY_POLICY  #: bounds and permissions of the write-back
     history: HistoryPlace | None = None  #: files of the history; None for a cell from a log

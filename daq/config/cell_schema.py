@@ -206,9 +206,19 @@ class ConditioningModel(StrictModel):
 class PolicyModel(StrictModel):
     """Actions that are permitted in this cell."""
 
-    motion: MotionPolicy = MotionPolicy.ASK
+    motion: Annotated[
+        MotionPolicy,
+        Field(
+            description="allowed: the scheduled job `recalibrate` may move the axes where the interlock releases them. "
+            "`record` needs --enable-motion all the same."
+        ),
+    ] = MotionPolicy.ASK
     unguarded: Annotated[
-        Permission, Field(description="Move axes that do not stop by themselves when the recorder is killed.")
+        Permission,
+        Field(
+            description="allowed: the scheduled job may move axes that do not stop by themselves when it is killed. "
+            "`record` needs --unguarded all the same."
+        ),
     ] = Permission.REFUSED
     recovery_motion: Annotated[
         Permission, Field(description="Before a recording, move axes slowly back that are a little beyond a limit.")

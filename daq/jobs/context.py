@@ -15,11 +15,11 @@ from daq.config.policy import HistoryPlace
 from daq.config.recalibration import Recalibration
 from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, writing
 from daq.jobs.drives import check_drives
-from daq.jobs.interlock import Runner, require_release, run_command
 from daq.jobs.journal import Journal, Level
 from daq.jobs.session import Session
 from daq.ledger.store import HistoryStore
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
+from daq.workflow.interlock import Runner, release_check, run_command
 from daq.workflow.plan import Plan, plan
 from daq.workflow.record import Recorded, record
 from daq.workflow.safeguards import FreeBytes, agree, free_bytes
@@ -137,8 +137,10 @@ def section_of(cell: Cell) -> Recalibration:
             )
     if cell.motion is not MotionPolicy.ALLOWED:
         raise MotionRefused(
-            "a scheduled job moves the robot without an operator: nothing moves unless the cell file says "
-            "`policy: {motion: allowed}`"
+            f"`policy: {{motion: {cell.motion.value}}}` for a job that moves the robot without an operator",
+            expected="`policy: {motion: allowed}` in the cell file",
+            remedy="nothing has moved; whoever answers for the cell writes it there, or a person records with "
+            "`drivegain record`",
         )
     return cell.recalibration
 
@@ -183,7 +185,7 @@ def before_motion(context: JobContext, *, take_over: bool = True) -> None:
         )
     with HistoryStore(context.target.history.store) as store:
         store.entries()  # the gains are compared with them: unreadable now is better than after the recordings
-    require_release(section.interlock, tools.run, tools.now, section.working_folder)
+    release_check(context.cell, tools.now, tools.run)()
     context.journal.say(Level.INFO, "the interlock lets the robot move", free_mb=round(free_mb))
     tools.drives(context.cell, context.block_signals, take_over)
     context.journal.say(Level.INFO, "drives are as declared, without fault and without power")

@@ -44,10 +44,11 @@ def check_drives(cell: Cell, block_signals: SignalBlocker, take_over: bool) -> N
     Raises:
         DriveFault: one has a fault; to reset it is a person's decision.
         StateRefused: one has power already: another controller drives this robot, or it moves.
-        BusBusy: one has power, and another master commands the bus.
+        BusBusy: another master commands the bus; nothing was sent.
         DriverError: a drive does not answer, is another one than declared, or the bus has gone.
     """
     with network_of(cell, block_signals) as network:
+        network.require_quiet()  # a recorder on another computer is not excluded by the lock of the bus
         network.check_identities()
         left = _with_power(network)
         if not left:

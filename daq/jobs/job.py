@@ -23,7 +23,7 @@ from daq.jobs.time_bound import time_bound
 from daq.ledger.audit import AuditAction
 from daq.ledger.ledger import Ledger
 from daq.ledger.watch import alarm_text, watch
-from daq.workflow.safeguards import bus_lock
+from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.network import SignalBlocker
 
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from daq.config.cell import Cell
+from daq.config.policy import Permission
 from daq.config.recalibration import PlannedRun, Recalibration
 from daq.errors import (
     CalibrationMissing,
@@ -18,13 +19,13 @@ from daq.errors import (
     CalibrationUnreadable,
     ConfigurationError,
     DataError,
+    JobHeld,
     LogUnreadable,
     RunInvalid,
     writing,
 )
 from daq.files import sha256_of
 from daq.jobs.context import JobContext
-from daq.jobs.interlock import mount, require_release
 from daq.jobs.journal import Journal, Level
 from daq.jobs.session import CALIBRATION, REPORT, Basis, Fitted, Outcome, RecordedRun, Session
 from daq.log.container import UNFINISHED
@@ -33,6 +34,7 @@ from daq.report.fit import start_of
 from daq.report.residual import summary
 from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.fit import check_holdout
+from daq.workflow.interlock import Runner, release_check
 from daq.workflow.plan import Plan
 from daq.workflow.plan_file import load_plan, save_plan
 from daq.workflow.record import Recorded
@@ -40,6 +42,7 @@ from ident.calibration import Calibration
 from ident.errors import IdentificationError
 
 WARM_UP = "warm-up"
+NOTHING = "none"  #: Argument of the mount command for a run without load
 
 
 def log_of(session: Session, name: str) -> Path:
@@ -93,6 +96,23 @@ def record_runs(context: JobContext, session: Session) -> Session:
     return session
 
 
+def mount(section: Recalibration, planned: PlannedRun, run: Runner) -> None:
+    """Run the mount command for the payload of a run; before every run, also where nothing changes.
+
+    Raises:
+        JobHeld: the command did not end with 0, in its time.
+    """
+    wanted = planned.payload or NOTHING
+    ended = run(section.mount, (wanted,), section.working_folder)
+    if ended.code != 0:
+        raise JobHeld(
+            f"mount command {section.mount.command[0]} {wanted}",
+            found=str(ended),
+            expected="exit code 0: it is mounted as the run needs it",
+            remedy=f"mount {wanted} by hand or see to the changer; the next job goes on with run {planned.name}",
+        )
+
+
 def _plan(context: JobContext, session: Session, planned: PlannedRun) -> Plan:
     """Load the approved plan, or make the plan of the seed once a session."""
     if planned.plan_file is not None:
@@ -141,14 +161,12 @@ def _record_valid(context: JobContext, session: Session, planned: PlannedRun, pl
 
 
 def _record(context: JobContext, planned: PlannedRun, plan: Plan, out: Path) -> Recorded:
-    """Make one recording; the interlock is checked before the drives are used, and again before they get power."""
+    """Make one recording; the interlock is checked before the drives are used, and again before they get power.
 
-    def released() -> None:
-        require_release(context.section.interlock, context.tools.run, context.tools.now, context.section.working_folder)
-
+    Waiting for the drives and mapping their PDOs takes seconds, in which the cell may be opened.
+    """
     # `section_of` has checked that the cell has it.
     payload = next((one.payload for one in context.cell.payloads if one.name == planned.payload), None)
-    released()
     return context.tools.record(
         context.file,
         context.cell,
@@ -161,8 +179,8 @@ def _record(context: JobContext, planned: PlannedRun, plan: Plan, out: Path) -> 
         run_id=str(uuid.uuid4()),
         free=context.tools.free,
         block_signals=context.block_signals,
-        # Waiting for the drives and mapping their PDOs takes seconds, in which the cell may be opened.
-        before_motion=released,
+        require_released=release_check(context.cell, context.tools.now, context.tools.run),
+        unguarded=context.cell.unguarded is Permission.ALLOWED,
     )
 
 

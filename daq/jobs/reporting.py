@@ -23,7 +23,7 @@ from daq.jobs.session import CALIBRATION, REPORT, Outcome, Session, SessionState
 from daq.ledger.audit import AuditAction, AuditEntry, append
 from daq.ledger.store import HistoryStore
 from daq.report.text import json_text, picked
-from drivers.errors import WHILE
+from drivers.errors import stop_notes
 from ident.calibration import Calibration
 
 SUMMARY_TEXT, SUMMARY_JSON = "summary.txt", "summary.json"
@@ -59,9 +59,8 @@ def report_failure(context: JobContext, folder: Path, error: BaseException) -> N
         outcome = session.state.outcome or (Outcome.INTERRUPTED if interrupted else Outcome.STOPPED)
         code = ExitCode.INTERRUPTED if interrupted else exit_code(type(error)) or ExitCode.UNEXPECTED
         problem = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-        notes = [note for note in getattr(error, "__notes__", ()) if note.startswith(WHILE)]
-        _report(context, session, outcome, code, "; ".join((problem, *notes)), problem)
-    except (DaqError, OSError, StopIteration) as second:
+        _report(context, session, outcome, code, "; ".join((problem, *stop_notes(error))), problem)
+    except Exception as second:  # noqa: BLE001 - whatever it is, it must not hide the error that ended the job
         error.add_note(f"kept: the end of the session could not be recorded: {second}")
 
 

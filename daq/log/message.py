@@ -200,7 +200,8 @@ def reading_from_bytes(data: bytes, quantity: Quantity) -> SlowReading:
 
 
 def _string(text: str) -> bytes:
-    data = text.replace("\0", " ").encode() + b"\0"
+    # Bytes of a file name that are no UTF-8 are in its text as lone surrogates; an error may name such a file.
+    data = text.replace("\0", " ").encode("utf-8", "backslashreplace") + b"\0"
     return struct.pack("<I", len(data)) + data
 
 

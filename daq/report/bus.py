@@ -217,7 +217,7 @@ def _answer_remarks(axis: AxisReading) -> Iterator[str]:
 _ALARMING = {str(state) for state in (*FAULTY, State.QUICK_STOP_ACTIVE)}
 _SOURCE_TEXT = {
     "overheard": "another master leads this bus; its traffic is read and nothing is sent",
-    "recorder": "drivegain's recorder leads this bus; its traffic is read and nothing is sent",
+    "recorder": "drivegain's recorder, or another of its verbs, uses this bus; its traffic is read and nothing is sent",
     "asked": "no other master: the axes are queried, nothing is written",
 }
 _FAULT_UNKNOWN = "the drive names no error code; find the cause, then `drivegain scan CELL --reset-faults`"

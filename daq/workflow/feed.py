@@ -32,7 +32,7 @@ from pydantic import TypeAdapter
 
 from daq.log.conversion import SiScaling
 from daq.log.metadata import RunStatistics
-from drivers.errors import POWERED, WHILE
+from drivers.errors import POWERED, WHILE, stop_notes, text_of
 from drivers.stream.sample import CellEvent, Sample
 
 BATCH_S = 0.02  #: Time of the samples in one packet
@@ -281,8 +281,9 @@ class Feed:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        self._flush()
         ended = end_of(error)
+        with suppress(Exception):  # samples that cannot be sent must not hide the error that ended the run
+            self._flush()
         self._send({"end": ended})
         self._ended.set()
         if self._waiter is not None:
@@ -440,16 +441,20 @@ SHOWN = (f"{WHILE}stopping", POWERED)  #: Notes of an error that a console shows
 
 
 def end_of(error: BaseException | None) -> dict[str, Any]:
-    """Describe how a program ended: whether all axes are known to be stopped, and the error in words."""
-    chain: list[BaseException] = []
-    while error is not None and error not in chain:
-        chain.append(error)
-        error = error.__context__
-    notes = [note for one in chain for note in getattr(one, "__notes__", ()) if note.startswith(SHOWN)]
-    reason = "" if not chain else str(chain[0]) or ("stopped" if isinstance(chain[0], KeyboardInterrupt) else "")
-    text = reason or ("" if not chain else type(chain[0]).__name__)
+    """Describe how a program ended: whether all axes are known to be stopped, and the error in words.
+
+    It never raises: it describes the error that a stop was made for, and must not take its place.
+    """
+    notes = [note for note in stop_notes(error) if note.startswith(SHOWN)]
+    parts = notes if error is None else [_in_words(error), *notes]
     return {
-        "ok": not chain,
+        "ok": error is None,
         "axes_stopped": not any(note.startswith(POWERED) for note in notes),
-        "text": "; ".join((text, *notes) if text else notes),
+        "text": "; ".join(parts),
     }
+
+
+def _in_words(error: BaseException) -> str:
+    """Return the text of an error, or what it is where it has none."""
+    usual = "stopped" if isinstance(error, KeyboardInterrupt) else type(error).__name__
+    return text_of(error) or usual

@@ -22,10 +22,10 @@ from daq.config.cell import Cell, PacingMode
 from daq.errors import LogIncomplete
 from daq.log.conversion import SiScaling, scaling
 from daq.log.metadata import AxisReadback, Readback, RunStatistics
+from daq.workflow.bus_lock import bus_taken
 from daq.workflow.events import ALARMING
 from daq.workflow.feed import Feed, RunFacts, facts_of_recorder
 from daq.workflow.prediction import Predictor, Recent, predictor_of
-from daq.workflow.safeguards import bus_taken
 from drivers.canopen.emcy import ErrorCode, explain, read_error_code
 from drivers.canopen.network import CanopenNetwork
 from drivers.errors import DriverError
@@ -110,9 +110,8 @@ class CellWatch:
         """Read the bus for a time."""
         reading = self._monitor.watch(interval_s)
         self._take_events(reading.events, reading)
+        self._query(reading)
         recorder = bus_taken(self._cell)
-        if not recorder:
-            self._query(reading)
         self._follow(reading, recorder)
         loads = zip(self._cell.buses, bus_loads_percent(self._cell, reading), strict=True)
         self._feed.measured({bus.name: load / 100.0 for bus, load in loads})
@@ -155,6 +154,8 @@ class CellWatch:
         for number, (axis, found) in enumerate(zip(self._network.axes, reading.axes, strict=True)):
             if not asked or found.delay_s is None or found.is_late:
                 continue
+            if bus_taken(self._cell):
+                return  # a recorder has come meanwhile, and would refuse a bus on which it hears requests
             if number in self._unscaled:
                 self._unscaled.remove(number)
                 self._monitor.pause()

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
@@ -16,7 +17,6 @@ from daq.config.bus import bus_loads, cell_address, drive_axes, load_warnings, p
 from daq.config.cell import Cell, joint_names
 from daq.config.cell_file import bundle
 from daq.config.drive import shipped_profiles
-from daq.config.policy import Permission
 from daq.environment import software
 from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
 from daq.files import sha256
@@ -25,6 +25,7 @@ from daq.log.metadata import Loss, RunInfo, RunStatistics, loss_reason, readback
 from daq.log.writer import LogContent, LogWriter
 from daq.workflow.experiment import path_of
 from daq.workflow.feed import Feed, RunFacts
+from daq.workflow.interlock import release_check
 from daq.workflow.nameplates import check_nameplates, nameplate_warnings
 from daq.workflow.plan import Plan
 from daq.workflow.plan_file import check_approach
@@ -128,7 +129,7 @@ def record(
     free: FreeBytes = free_bytes,
     block_signals: SignalBlocker = nullcontext,
     progress: Callable[[int, int], None] = lambda _move, _moves: None,
-    before_motion: Callable[[], None] = lambda: None,
+    require_released: Callable[[], None] | None = None,
     feed: Feed | None = None,
     unguarded: bool = False,
 ) -> Recorded:
@@ -146,14 +147,18 @@ def record(
         entered_kg: mass of the payload that was weighed for this recording [kg]; None if it was not.
         block_signals: blocks signals while the axes are stopped.
         progress: receives the number of finished moves and of all moves.
-        before_motion: last check before the log is opened; if it raises, the axes have no power and no file is made.
+        require_released: check that the robot may move, before the drives are used and again before they get power; if
+            it raises, no file is made. By default the interlock of the cell file decides, where it declares one.
         feed: gets what the log gets, for consoles.
-        unguarded: whether axes may move that go on moving when this program is killed, whatever the cell's policy says.
+        unguarded: whether axes may move that go on moving when this program is killed.
+
+    The cell's `policy` permits nothing here: it is for jobs, which pass its permissions as arguments.
 
     Raises:
         UsageError: the weighed mass is not the payload's, or a file of that name exists; no file was made.
         MotionRefused: motion is disabled, an axis is unguarded or outside its limits, or the moves leave them; no file
             was made, and nothing has moved, except where an axis was brought back (`daq.workflow.recovery`).
+        NotReleased: the interlock does not release the robot; nothing has moved.
         DiskSpaceShort: before the run, nothing has moved; during it, the axes were stopped, and the log is complete but
             marked invalid.
         ConfigurationInconsistent, OutputFailed: see daq/errors.py.
@@ -161,16 +166,13 @@ def record(
             No fit reads it; `daq.log.salvage` converts it to a partial log.
     """
     clocks = clocks or Clocks()
-    if granted_by is None:
-        raise MotionRefused(
-            "a recording without permission to move",
-            expected="an operator who permits motion",
-            remedy="pass --enable-motion",
-        )
+    granted_by = _permission(granted_by)
     check_entered_mass(cell, payload, entered_kg)
+    require_released = require_released or release_check(cell, partial(_wall_time, clocks))
+    require_released()
     with defer_full_gc(), network_of(cell, block_signals) as network, _sync_producer(cell, network) as wanted:
         network.prepare()
-        _require_guarded(cell, network, unguarded)
+        _require_guarded(network, unguarded)
         polling = Polling.found(network, beside_stream=polling_fits(cell))
         scales = network.scales()
         check_nameplates(cell_file, cell, scales)
@@ -186,15 +188,14 @@ def record(
         producer, remarks = _started(cell, wanted)
         permission = MotionPermission(granted_by, motor_limits(cell, scale))
         pacing = partial(_pacing, cell, clocks.wall_ns(), clocks, producer)
-        start_counts, recovered = _start(cell, network, scale, permission, pacing, before_motion)
+        start_counts, recovered = _start(cell, network, scale, permission, pacing, require_released)
         moves = _checked_moves(cell, plan, scale, start_counts, permission)
         room = DiskRoom(out, free)
-        longest_s = duration_of(moves, start_counts, rate_hz) + ALLOWANCE_S
-        room.require(largest_log_bytes(joint_names(cell), rate_hz, longest_s, files))
+        room.require(_log_bytes(cell, moves, start_counts, files))
         short: DiskSpaceShort | None = None
         temperatures = polling.temperatures(clocks.wall_ns())
         # Before the first SYNC of the recording's stream, whose schedule does not wait either.
-        before_motion()
+        require_released()
         started_ns = clocks.monotonic_ns()
         run = RunInfo(
             run_id=run_id,
@@ -315,6 +316,13 @@ def duration_of(moves: Sequence[Move], start_counts: Sequence[int], rate_hz: flo
     return total_s
 
 
+def _log_bytes(cell: Cell, moves: Sequence[Move], start_counts: Sequence[int], files: Mapping[str, bytes]) -> int:
+    """Return the size of the log of these moves at most [bytes]."""
+    rate_hz = 1e6 / _sync(cell).period_us
+    longest_s = duration_of(moves, start_counts, rate_hz) + ALLOWANCE_S
+    return largest_log_bytes(joint_names(cell), rate_hz, longest_s, files)
+
+
 def until_complete(stream: SyncStream) -> tuple[Sample, ...]:
     """Return the samples up to the first that has the position of every axis; no move can be planned without it.
 
@@ -376,14 +384,33 @@ def motor_moves(cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence
     return tuple(moves)
 
 
-def _require_guarded(cell: Cell, network: CanopenNetwork, unguarded: bool) -> None:
-    """Refuse axes that go on moving when this program is killed, unless operator or policy accept it.
+def _permission(granted_by: str | None) -> str:
+    """Return who permits the motion.
+
+    Raises:
+        MotionRefused: no one does.
+    """
+    if granted_by is None:
+        raise MotionRefused(
+            "a recording without permission to move",
+            expected="an operator who permits motion",
+            remedy="pass --enable-motion",
+        )
+    return granted_by
+
+
+def _wall_time(clocks: Clocks) -> datetime:
+    return datetime.fromtimestamp(clocks.wall_ns() * 1e-9, UTC)
+
+
+def _require_guarded(network: CanopenNetwork, unguarded: bool) -> None:
+    """Refuse axes that go on moving when this program is killed, unless that was accepted.
 
     Raises:
         MotionRefused: names them.
     """
     without = network.without_guard()
-    if without and not unguarded and cell.unguarded is not Permission.ALLOWED:
+    if without and not unguarded:
         raise MotionRefused(
             f"axes that are UNGUARDED: {'; '.join(network.unguarded())}",
             expected="that every axis watches the recorder's heartbeat (1016h)",
@@ -398,7 +425,7 @@ def _start(
     scale: SiScaling,
     permission: MotionPermission,
     pacing: Callable[[], Pacing],
-    before_motion: Callable[[], None],
+    require_released: Callable[[], None],
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Return the positions of the axes [counts], brought back within their limits if need be, and remarks about that.
 
@@ -410,7 +437,7 @@ def _start(
     way = recovery_move(cell, scale, start_counts, permission.limits)
     if way is None:
         return start_counts, ()
-    before_motion()
+    require_released()
     move, slow, remark = way
     bring_back(network, pacing(), move, slow, permission.granted_by)
     return _positions(network, pacing()), (remark,)

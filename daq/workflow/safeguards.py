@@ -1,112 +1,19 @@
-"""Safeguards of a recording: bus lock, disk space, the payload's mass, deferred garbage collection.
-
-Every recording and every job takes the lock of its bus before it sends anything to the drives. It is the lock of
-flock(2) on a file in a folder of the system, and ends with its process. It excludes other programs of drivegain on this
-computer; a foreign master is detected on the bus itself (BusBusy).
-"""
+"""Safeguards of a recording: disk space, the payload's mass, deferred garbage collection."""
 
 from __future__ import annotations
 
 import gc
-import os
-import re
 import shutil
-import socket
-import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
-from ipaddress import IPv4Address, IPv6Address, ip_address
+from contextlib import contextmanager
 from pathlib import Path
 
-from daq.config.cell import Bus, Cell, WeighedPayload
+from daq.config.cell import Cell, WeighedPayload
 from daq.config.cell_file import URDF
-from daq.errors import BusTaken, DiskSpaceShort, OutputFailed, UsageError, writing
-from daq.files import hold_lock
+from daq.errors import DiskSpaceShort, UsageError, writing
 from daq.log.message import currents_bytes, joint_state_bytes, joint_state_prefix, sample_dtype
 from daq.log.writer import JOINT_STATE_NS
 from ident.model.bodies import Payload
-
-SHARED_FOLDERS = (Path("/run/lock"), Path("/var/lock"), Path("/tmp"))
-"""Tried in this order; all users of a computer must come to the same one, so TMPDIR is not asked."""
-VIRTUAL = "virtual"  #: python-can's bus within one process: a bus of that name in another process is another bus
-
-
-@contextmanager
-def bus_lock(cell: Cell, folder: Path | None = None) -> Iterator[None]:
-    """Keep all buses of a cell for oneself.
-
-    Args:
-        cell: its file; one without a bus needs no lock.
-        folder: of the lock files; the first folder of SHARED_FOLDERS that everybody may write into, when None.
-
-    Raises:
-        BusTaken: another recording or job has one of them.
-        OutputFailed: the lock file cannot be made, or something else is there.
-    """
-    where = folder or _shared_folder()
-    with ExitStack() as held:
-        # In one order for all: two cells that share two buses must not wait for, or refuse, each other crosswise.
-        for name, bus in sorted({lock_name(bus): bus for bus in cell.buses}.items()):
-            lock = where / name
-            try:
-                held.enter_context(hold_lock(lock))
-            except BlockingIOError as error:
-                raise BusTaken(
-                    f"bus {bus.interface}:{bus.channel}",
-                    found=f"another recording or job of drivegain on it (it holds {lock})",
-                    expected="one at a time: two of them would move one robot",
-                    remedy=f"wait for its end; `fuser {lock}` shows its process",
-                ) from error
-            except OSError as error:
-                raise OutputFailed.of(lock, error) from error
-        yield
-
-
-def bus_taken(cell: Cell, folder: Path | None = None, locks: Path = Path("/proc/locks")) -> bool:
-    """Whether a recording or job of this computer has a bus of the cell; the lock itself is not touched."""
-    try:
-        lines = [line for line in locks.read_text().splitlines() if " FLOCK " in line]
-        held = {int(line.split()[-3].rpartition(":")[2]) for line in lines}
-        files = [(folder or _shared_folder()) / lock_name(bus) for bus in cell.buses]
-        return any(file.exists() and file.stat().st_ino in held for file in files)
-    except (OSError, ValueError, IndexError):
-        return False  # a kernel that does not list locks
-
-
-def lock_name(bus: Bus) -> str:
-    """Name of a bus's lock file: by interface and channel, for a hub by its host's address and port."""
-    parts = [bus.interface, bus.channel]
-    if bus.interface == "socketcand":
-        parts += [_address(bus), str(bus.port)]
-    elif bus.interface == VIRTUAL:
-        parts.append(str(os.getpid()))
-    return "drivegain-" + "-".join(re.sub(r"[^A-Za-z0-9.]", "_", part) for part in parts) + ".lock"
-
-
-def _address(bus: Bus) -> str:
-    """One for all names of a host; its name where it has no address, since it is unreachable then."""
-    try:
-        found = socket.getaddrinfo(bus.host, bus.port, type=socket.SOCK_STREAM)
-    except (OSError, UnicodeError):
-        return bus.host.lower()
-    # Servers of names answer in changing order; and whether a hub is reached by IPv4 or IPv6, it is one.
-    addresses: list[IPv4Address | IPv6Address] = []
-    for *_, where in found:
-        address = ip_address(str(where[0]))
-        # One of IPv4 within IPv6 (::ffff:10.0.0.7) is that of IPv4.
-        addresses.append((address.ipv4_mapped or address) if isinstance(address, IPv6Address) else address)
-    address = min(addresses, key=lambda one: (one.version, str(one)))
-    # Who connects to the unspecified address comes to this machine, as by a loopback address.
-    return "localhost" if address.is_loopback or address.is_unspecified else str(address)
-
-
-def _shared_folder() -> Path:
-    for folder in SHARED_FOLDERS:
-        with suppress(OSError):
-            if folder.stat().st_mode & stat.S_IWOTH:
-                return folder
-    return SHARED_FOLDERS[-1]
-
 
 FreeBytes = Callable[[Path], int]  #: Room left for this user on the disk of a folder [bytes]
 

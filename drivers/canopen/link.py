@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol
 
@@ -19,7 +20,7 @@ from drivers.canopen.emcy import describe
 from drivers.canopen.sdo import SDO_ANSWER, SDO_REQUEST, Clock, ObjectAccess, SdoPolicy, SynchronousSdoClient
 from drivers.canopen.socketcan import CapturedMessage, receive_only
 from drivers.canopen.split_bus import BUS_OFF, BUS_OFF_REASON, CellAddress, open_cell_bus
-from drivers.errors import BusError, StateRefused, node_label
+from drivers.errors import BusBusy, BusError, StateRefused, node_label
 from drivers.stream.sample import CellEvent, EventKind
 
 SYNC_COB_ID = 0x080
@@ -36,6 +37,7 @@ BEATS_JUDGED, JUDGED_PERIODS = 4, 2.2
 """So many heartbeats of one device last three periods; those of two that have one node id, two at most."""
 BEATS_S = 3.0  #: Longest time to listen for the heartbeats of a second device
 PERIODS_HEARD = 3.0  #: Periods in which two devices send `BEATS_JUDGED` heartbeats, and then at least one more
+LISTEN_S = 0.2  #: Usual time to listen for other masters before the first frame is sent
 PUMP_S = 0.1  #: Longest time spent on frames that have already arrived, however fast more arrive
 # linux/can/error.h: classes of an error frame, and the controller's state in its second byte.
 _CONTROLLER, _RESTARTED = 0x004, 0x100
@@ -60,6 +62,15 @@ class NmtCommand(IntEnum):
     START = 1
     STOP = 2
     ENTER_PRE_OPERATIONAL = 128
+
+
+@dataclass(frozen=True, slots=True)
+class Beat:
+    """A heartbeat of a node."""
+
+    at_ns: int  #: when it was sent
+    state: int  #: NMT state in it
+    syncs: int  #: SYNCs of another producer until then
 
 
 class SdoListener(Protocol):
@@ -95,6 +106,16 @@ def command_name(identifier: int, names: Mapping[int, str]) -> str:
     return f"{name} {shown}"
 
 
+def _too_fast(beats: Sequence[Beat], period_ms: int) -> bool:
+    """Whether heartbeats come so fast, more than once, that they are those of two devices with this period."""
+    fast = 0
+    for first, last in zip(beats, beats[BEATS_JUDGED - 1 :], strict=False):
+        timed_by_clock = first.syncs == last.syncs
+        lasting_ns = last.at_ns - first.at_ns
+        fast += timed_by_clock and lasting_ns < JUDGED_PERIODS * 1e6 * period_ms
+    return fast > 1
+
+
 def _sent_ns(message: can.Message, now_ns: int) -> int:
     """Return the time of a frame by its own stamp where it has one, however late it is read; one clock for one bus."""
     return message.monotonic_ns if isinstance(message, CapturedMessage) else round(message.timestamp * 1e9) or now_ns
@@ -119,7 +140,8 @@ class Link:
         self.boots: Counter[int] = Counter()  #: Boot-up messages of each node id right after another
         self.twice: dict[int, str] = {}  #: Node ids whose request was answered twice, and by what
         self.asked_by: dict[int, object] = {}  #: Client of the last SDO request to each node; none where it had none
-        self._beats: dict[int, deque[tuple[int, int]]] = {}  # times [ns] and states of the last heartbeats
+        self._beats: dict[int, deque[Beat]] = {}  # the last ones of each node
+        self._foreign_syncs = 0  # since the bus was opened
         self.silent: set[int] = set()  #: Nodes that did not answer their last request, and sent nothing since
         self.heard: set[int] = set()  #: Node ids of which any frame arrived since the bus was opened
         #: Number of frames by identifier that only we should send (NMT, SYNC, LSS, SDO request, set-point of one of our
@@ -204,6 +226,27 @@ class Link:
             self.pump(left_ns * 1e-9)
         return done
 
+    def require_quiet(self, listen_s: float) -> None:
+        """Listen for a while before the first frame is sent.
+
+        Raises:
+            BusBusy: another master commands this bus.
+        """
+        self.foreign.clear()
+        self.written.clear()
+        self.wait(listen_s)
+        self.require_alone()
+
+    def require_alone(self) -> None:
+        """Check the frames that arrived since `require_quiet`.
+
+        Raises:
+            BusBusy: a command of another master was among them.
+        """
+        if self.foreign:
+            seen = ", ".join(command_name(identifier, self.names) for identifier in sorted(self.foreign))
+            raise BusBusy.by_master(self.address, seen)
+
     def start_heartbeat(self, node_id: int, period_ms: int) -> None:
         """Send a heartbeat with this node id from now on, whenever the bus is read."""
         state = bytes((NmtState.OPERATIONAL,))
@@ -284,6 +327,7 @@ class Link:
     def note_foreign(self, identifier: int) -> None:
         """Count a command, or a heartbeat with our node id, that neither we nor our SYNC producer sent."""
         self.foreign[identifier] = self.foreign.get(identifier, 0) + 1
+        self._foreign_syncs += identifier == SYNC_COB_ID
         if self.foreign[identifier] == 1:  # once: a master would fill the log
             seen = command_name(identifier, self.names)
             self._events.append((0, EventKind.BUS_BUSY, identifier, f"{seen} that we did not send"))
@@ -301,7 +345,8 @@ class Link:
         if state == NmtState.BOOT_UP:
             self.count_beats(node_id)
         else:
-            self._beats.setdefault(node_id, deque(maxlen=BEATS_KEPT)).append((_sent_ns(message, now_ns), state))
+            beat = Beat(_sent_ns(message, now_ns), state, self._foreign_syncs)
+            self._beats.setdefault(node_id, deque(maxlen=BEATS_KEPT)).append(beat)
         self.nmt[node_id], self.heard_ns[node_id] = state, now_ns
         if previous != state:
             self._events.append((node_id, EventKind.NMT, state, f"NMT {nmt_name(previous)} -> {nmt_name(state)}"))
@@ -329,6 +374,9 @@ class Link:
     def shared_id(self, node_id: int, period_ms: int) -> str:
         """Describe the evidence that two devices have a node id; empty without any.
 
+        Heartbeats count by their rate where no SYNC of another producer came between them: a cell in lockstep lives as
+        fast as its SYNC comes, and its heartbeats with it.
+
         Args:
             node_id: of the node.
             period_ms: of its heartbeat since `count_beats`, or since its first one; 0 where that is unknown. One late
@@ -339,11 +387,10 @@ class Link:
         if self.boots[node_id]:
             return f"{self.boots[node_id] + 1} boot-up messages within {BOOTS_S:g} s"
         beats = tuple(self._beats.get(node_id, ()))
-        times_ns, states = [at_ns for at_ns, _ in beats], [state for _, state in beats]
-        lasting = [end - begin for begin, end in zip(times_ns, times_ns[BEATS_JUDGED - 1 :], strict=False)]
-        if sum(each_ns < JUDGED_PERIODS * 1e6 * period_ms for each_ns in lasting) > 1:
-            elapsed_ms = (times_ns[-1] - times_ns[0]) * 1e-6
+        if _too_fast(beats, period_ms):
+            elapsed_ms = (beats[-1].at_ns - beats[0].at_ns) * 1e-6
             return f"{len(beats)} heartbeats in {elapsed_ms:.0f} ms, its period is {period_ms} ms"
+        states = [beat.state for beat in beats]
         between = [
             (before, state)
             for before, state, after in zip(states, states[1:], states[2:], strict=False)

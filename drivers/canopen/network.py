@@ -13,7 +13,7 @@ from typing import Self
 import can
 
 from drivers.canopen.bus import BusAddress
-from drivers.canopen.link import HEARTBEAT, LSS, Link, NmtCommand, NmtState, command_name, never
+from drivers.canopen.link import HEARTBEAT, LISTEN_S, LSS, Link, NmtCommand, NmtState, command_name, never
 from drivers.canopen.needs import Profiles
 from drivers.canopen.pdo import CONTROLWORD, HEARTBEAT_MS, STATUSWORD, AxisPdos, wanted_pdos
 from drivers.canopen.scan import FoundNode, answering, free_ids, read_identity, scan_link
@@ -50,7 +50,8 @@ class Bounds:
     answer_s: float = 1.0  #: until every node answered the search
     #: Until nodes that do not answer while the network closes are given up, all of them together.
     silence_s: float = 0.5
-    listen_s: float = 0.2  #: for other masters before the first frame is sent; each SYNC period of theirs must fit
+    #: For other masters before the first frame is sent; each SYNC period of theirs must fit.
+    listen_s: float = LISTEN_S
     nmt_s: float = 2.0  #: until a heartbeat confirms an NMT state
     mode_s: float = 1.0  #: until 6061h shows the requested mode
     disable_s: float = 2.0  #: until an axis is without power when the network closes
@@ -198,7 +199,12 @@ class CanopenNetwork:
         self.link.deadline_ns = None
 
     def scan(self, node_ids: Sequence[int] = range(1, 128), wait_s: float = 0.5) -> tuple[FoundNode, ...]:
-        """Find the nodes on the bus; changes nothing."""
+        """Find the nodes on the bus; changes nothing.
+
+        Raises:
+            BusBusy: another master commands this bus, and may be moving its axes; nothing was sent.
+        """
+        self.require_quiet()
         return scan_link(self.link, node_ids, wait_s)
 
     def check_identities(self) -> tuple[Identity, ...]:
@@ -321,10 +327,7 @@ class CanopenNetwork:
         Raises:
             BusBusy: another master commands this bus.
         """
-        self.link.foreign.clear()
-        self.link.written.clear()
-        self.link.wait(self.bounds.listen_s)
-        self.require_alone()
+        self.link.require_quiet(self.bounds.listen_s)
 
     def require_alone(self) -> None:
         """Check the frames that arrived since `require_quiet`.
@@ -332,9 +335,7 @@ class CanopenNetwork:
         Raises:
             BusBusy: a command of another master was among them.
         """
-        if self.link.foreign:
-            seen = ", ".join(command_name(identifier, self.link.names) for identifier in sorted(self.link.foreign))
-            raise BusBusy.by_master(self.link.address, seen)
+        self.link.require_alone()
 
     def other_master(self) -> str:
         """Describe SDO requests of another master since `require_quiet`; empty without any."""

@@ -9,7 +9,7 @@ from functools import partial
 from typing import TypeVar
 
 from drivers.canopen.bus import BusAddress
-from drivers.canopen.link import Link
+from drivers.canopen.link import LISTEN_S, Link
 from drivers.canopen.needs import HEARTBEAT_TIME
 from drivers.canopen.pdo import STATUSWORD
 from drivers.canopen.sdo import SDO_REQUEST, ObjectAccess, SdoPolicy, upload_request
@@ -54,18 +54,22 @@ def scan(
 ) -> tuple[FoundNode, ...]:
     """Open a bus and find its nodes; changes nothing.
 
+    Nothing is sent while another master commands the bus: it may be moving the axes.
+
     Args:
         address: of the bus, such as ``"socketcan:can0"``.
         node_ids: to search.
         wait_s: for answers and heartbeats.
 
     Raises:
+        BusBusy: another master commands this bus.
         BusError: the bus cannot be opened, or is lost.
     """
     place = BusAddress.parse(address) if isinstance(address, str) else address
     link = Link(place, SdoPolicy(), time.monotonic_ns)
     link.open()
     try:
+        link.require_quiet(LISTEN_S)
         return scan_link(link, node_ids, wait_s)
     finally:
         link.close()

@@ -19,7 +19,16 @@ from drivers.canopen.pdo import (
     PROFILE_VELOCITY,
     TARGET_POSITION,
 )
-from drivers.errors import WHILE, DriveFault, DriverError, MotionRefused, MotionTimeout, StateRefused, node_label
+from drivers.errors import (
+    WHILE,
+    DriveFault,
+    DriverError,
+    MotionRefused,
+    MotionTimeout,
+    StateRefused,
+    node_label,
+    text_of,
+)
 from drivers.motion.move import MotionPermission, Move, check_moves
 from drivers.motion.watch import FrozenData
 from drivers.profiles.cia402 import (
@@ -107,8 +116,9 @@ def execute(
     except BaseException as error:
         # Also a closed generator and an interrupt, during the stop above as well: it then runs without yielding.
         with network.block_signals():
-            execution.emit(None, EventKind.ENDED, 0, f"{type(error).__name__}: {error}".removesuffix(": "))
             try:
+                ended_by = f"{type(error).__name__}: {text_of(error)}".removesuffix(": ")
+                execution.report(None, EventKind.ENDED, 0, ended_by)
                 for _ in execution.stop():
                     pass
             except BaseException as cut:
@@ -116,13 +126,9 @@ def execute(
                 raise
             if not execution.problems:
                 network.unguard()
-        for problem in execution.problems:
-            error.add_note(f"{WHILE}stopping: {problem}")
+        execution.note_failures(error)
         raise
-    for problem in execution.problems[1:]:
-        execution.problems[0].add_note(f"{WHILE}stopping: {problem}")
-    if execution.problems:
-        raise execution.problems[0]
+    execution.raise_failures()
     stream.check()  # faults during the stop
 
 
@@ -131,6 +137,7 @@ class _Execution:
 
     def __init__(self, network: CanopenNetwork, stream: SyncStream, bounds: MotionBounds, first: Sample) -> None:
         self.problems: list[DriverError] = []  #: Failures to confirm the last stop
+        self.unreported: Exception | None = None  #: First failure to report an event of a stop
         self._network, self._stream = network, stream
         self._bounds, self._sample, self._pdos = bounds, first, network.pdos
         self._nodes, self._axes = network.axes, range(len(network.axes))
@@ -159,6 +166,29 @@ class _Execution:
 
     def emit(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
         self._stream.emit(CellEvent(self._stream.time_ns, axis, kind, code, text))
+
+    def report(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
+        """Emit an event of a stop, which goes on where the event cannot be logged or shown."""
+        try:
+            self.emit(axis, kind, code, text)
+        except Exception as failure:  # noqa: BLE001 - whatever the receiver raises, the axes are stopped first
+            self.unreported = self.unreported or failure
+
+    def note_failures(self, error: BaseException) -> None:
+        """Note on the error that a stop was made for what the stop could not confirm or report."""
+        for problem in self.problems:
+            error.add_note(f"{WHILE}stopping: {problem}")
+        if self.unreported is not None:
+            error.add_note(f"{WHILE}stopping: its events are not all reported: {self.unreported!r}")
+
+    def raise_failures(self) -> None:
+        """Raise what the stop at the end of all moves could not confirm or report."""
+        for problem in self.problems[1:]:
+            self.problems[0].add_note(f"{WHILE}stopping: {problem}")
+        if self.problems:
+            raise self.problems[0]
+        if self.unreported is not None:
+            raise self.unreported
 
     def enable(self, granted_by: str) -> Iterator[Sample]:
         """Bring all axes to OPERATION ENABLED, each holding where it is."""
@@ -269,7 +299,7 @@ class _Execution:
         """Quick stop all axes, then remove their power; failures to confirm it are in `problems`."""
         self._stream.outgoing.clear()  # a set-point that was not sent yet must not start a move now
         self._stream.spare = nothing_to_send
-        self.emit(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
+        self.report(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
         self.problems = []
         self._network.begin_closing()
         unconfirmed = tuple(self._axes)
@@ -280,12 +310,12 @@ class _Execution:
             self._stream.read_on(periods * self._stream.pacing.period_ns * 1e-9, lag_s)
         except DriverError as error:
             # One of several buses may have failed, or a node is misplaced: the others are stopped by SDO.
-            self.emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop by PDO: {error}")
+            self.report(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop by PDO: {error}")
             self.problems.append(error)
         try:
             silent = self._network.find_silent([self._nodes[axis] for axis in unconfirmed])
         except DriverError as error:
-            self.emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
+            self.report(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
             self.problems = self.problems or [error]
             return
         if silent is not None:
@@ -296,12 +326,12 @@ class _Execution:
         for axis in unconfirmed:
             if axis not in heard:
                 text = f"{node_label(self._nodes[axis])} does not answer: its standstill is not confirmed"
-                self.emit(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
+                self.report(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
                 continue
             try:
                 self._network.disable(self._nodes[axis])
             except DriverError as error:
-                self.emit(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], str(error))
+                self.report(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], str(error))
                 self.problems.append(error)
 
     def _stop_by_pdo(self) -> Generator[Sample, None, tuple[int, ...]]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+import socket
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,12 +12,12 @@ import can
 import pytest
 
 from daq.cli.app import main
-from daq.cli.record import granted
 from daq.config.bus import bus_address
 from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent, ConfigurationMissing, ExitCode, SchemaMismatch
 from daq.log.reader import read_log
 from daq.simulation.simulation_file import load_scenario, load_simulation, shipped_simulation
+from daq.workflow.feed import LARGEST_PACKET, Feed, ProgramEnd, connected, read_packet
 from drivers.canopen.bus import open_bus
 from drivers.canopen.hub import Hub
 from drivers.simulation.cell import SimulatedCell
@@ -23,6 +25,7 @@ from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultKind, FaultSpec
 from drivers.simulation.spec import CellSpec, SpecInvalid
 from drivers.stream.sample import EventKind
+from tests.daq.console.feeds import arrivals
 from tests.faults.cells import CONFIGS
 
 PLAN = """format: drivegain-plan
@@ -60,24 +63,56 @@ def test_a_fault_of_a_scenario_ends_a_recording_with_exit_code_5_and_is_in_its_l
     assert EventKind.STOP in {event.kind for event in statistics}
 
 
+class WatchedFeed(Feed):
+    """A feed with a console from its first moment on."""
+
+    console: socket.socket
+
+    def __enter__(self) -> WatchedFeed:
+        came = arrivals(self)
+        super().__enter__()
+        console = connected(self._names.feed, socket.SOCK_SEQPACKET, 10.0)
+        assert console is not None
+        assert came.wait(10)
+        WatchedFeed.console = console
+        return self
+
+
+def end_at_the_console() -> ProgramEnd:
+    """The end that the console of the last `WatchedFeed` received."""
+    with WatchedFeed.console as console:
+        while True:
+            message = read_packet(console.recv(LARGEST_PACKET), None).message
+            if message is not None and message.end is not None:
+                return message.end
+
+
+def test_a_drive_that_refuses_its_mapping_ends_a_recording_with_its_error_and_consoles_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An SDO abort of the library is behind that error, and cannot be compared with other errors."""
+    monkeypatch.setattr("daq.workflow.feed.Feed", WatchedFeed)
+    spec = load_simulation(scenario(tmp_path, "  - {fault: refuses-mapping, axis: J2}\n"))
+    cell_file, plan, out = CONFIGS / "cells" / "demo.yaml", tmp_path / "plan.yaml", tmp_path / "a.mcap"
+    plan.write_text(PLAN, encoding="utf-8")
+    with open_bus(bus_address(load_cell(cell_file))) as bus, SimulatedCell(spec, bus) as cell:
+        command = ["record", str(cell_file), str(plan), "--out", str(out), "--enable-motion", "--json"]
+        assert main(command) == ExitCode.DEVICE_FAULT
+        assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
+    failure = json.loads(capsys.readouterr().err.splitlines()[-1])
+    assert failure["kind"] == "SetupRefused"
+    assert failure["found"].startswith("J2 (node 2): TPDO1: writing 0x0 to 1A00h:00: aborted, Code 0x06010002")
+    assert failure["expected"]
+    assert failure["do"]
+    assert end_at_the_console() == ProgramEnd(ok=False, axes_stopped=True, text=failure["found"])
+    assert not list(tmp_path.glob("*.mcap*"))
+
+
 def test_without_leave_nothing_is_sent_to_the_cell(tmp_path: Path) -> None:
     plan = tmp_path / "plan.yaml"
     plan.write_text(PLAN, encoding="utf-8")
     arguments = ["record", str(CONFIGS / "cells" / "demo.yaml"), str(plan), "--out", str(tmp_path / "a.mcap")]
     assert main(arguments) == ExitCode.USAGE
-
-
-def test_the_policy_of_a_cell_may_allow_motion_and_is_named(tmp_path: Path) -> None:
-    text = (CONFIGS / "cells" / "demo.yaml").read_text(encoding="utf-8")
-    path = tmp_path / "cell.yaml"
-    for policy, expected in (
-        ("", None),
-        ("policy: {motion: ask}\n", None),
-        ("policy: {motion: allowed}\n", "the policy of cell demo, for Ada"),
-    ):
-        path.write_text(text.replace("../robots", str(CONFIGS / "robots")) + policy, encoding="utf-8")
-        assert granted(load_cell(path), "Ada", enable_motion=False) == expected
-        assert granted(load_cell(path), "Ada", enable_motion=True) == "Ada"
 
 
 def test_times_of_a_scenario_become_syncs(tmp_path: Path) -> None:

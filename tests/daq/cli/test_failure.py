@@ -8,7 +8,9 @@ import os
 import re
 import signal
 import socket
+import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ import pytest
 
 from daq.cli.app import main
 from daq.cli.failure import ADVICE, Failure, show_failure
-from daq.errors import DataError, ExitCode
+from daq.errors import DataError, ExitCode, OutputFailed
 from drivers.canopen.bus import bus_errors
 from drivers.errors import BusError, DriveFault, DriverError
 from ident.errors import IdentificationError
@@ -100,6 +102,35 @@ def test_a_program_gets_one_object_a_line(capsys: pytest.CaptureFixture[str]) ->
     assert "axes" not in Failure.of(stop).document()
     stop.add_note("not confirmed without power: J3 (node 3)")
     assert Failure.of(stop).document()["axes"] == "J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop"
+
+
+def test_what_a_stop_could_not_confirm_is_shown_though_a_later_error_hides_its_cause() -> None:
+    """The disk is full while the log of a stopped motion is closed."""
+    later = OutputFailed("a.mcap", found="no space left", expected="room", remedy="free some")
+    later.__context__ = stop = DriveFault(3, "fault")
+    stop.add_note("while stopping: J3 (node 3) does not answer")
+    stop.add_note("not confirmed without power: J3 (node 3)")
+    document = Failure.of(later).document()
+    assert document["axes"] == "J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop"
+    assert document["unconfirmed"] == ["while stopping: J3 (node 3) does not answer"]
+
+
+def test_an_error_that_is_its_own_cause_is_explained() -> None:
+    error = BusError("socketcan:can0", "gone")
+    error.__cause__ = error
+    assert Failure.of(error).exit_code == ExitCode.DEVICE_FAULT
+
+
+@pytest.mark.parametrize("json_option", [[], ["--json"]])
+def test_an_error_that_cannot_be_printed_keeps_its_exit_code(
+    json_option: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Path("/dev/full").open("w", buffering=1, encoding="utf-8") as full:
+        monkeypatch.setattr(sys, "stderr", full)
+        assert main(["scan", "missing.yaml", *json_option]) == ExitCode.CONFIGURATION
+        monkeypatch.undo()
+        with suppress(OSError):  # what could not be written is tried again
+            full.close()
 
 
 def test_an_error_of_a_verb_is_an_object_under_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

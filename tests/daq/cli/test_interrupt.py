@@ -111,6 +111,10 @@ def test_what_is_not_known_to_rest_is_not_said_to() -> None:
     harmless = KeyboardInterrupt()
     harmless.__context__ = BlockingIOError()
     assert "axes stopped" in _interrupted(harmless, None, out)
+    circle = KeyboardInterrupt()
+    circle.__context__ = ValueError("in between")
+    circle.__context__.__context__ = circle
+    assert "axes stopped" in _interrupted(circle, None, out)
 
 
 @pytest.mark.parametrize("module", ["daq.cli.app", "typer.core"])

@@ -27,10 +27,10 @@ from daq.errors import ExitCode
 from daq.report.bus import monitor_document, monitor_view, prediction_view
 from daq.report.bus_schemas import MonitorReport
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from daq.workflow.bus_lock import bus_lock, bus_taken
 from daq.workflow.events import event_document
 from daq.workflow.feed import Feed, RunFacts
 from daq.workflow.monitor import CellWatch, WatchedCell, joint_positions
-from daq.workflow.safeguards import bus_lock, bus_taken
 from drivers.canopen.bus import BusAddress, open_bus
 from drivers.canopen.emcy import explain, remedy_of
 from drivers.canopen.link import Link
@@ -474,6 +474,27 @@ def test_our_own_recorder_is_no_other_master(tmp_path: Path) -> None:
     assert "drivegain's recorder" in said[1]
     assert "another master" not in said[1]
     assert "--reset-faults" in said[0]
+
+
+RATED_CURRENT = bytes((0x75, 0x60))  #: Index of 6075h, as a request has it
+
+
+def test_a_recorder_that_comes_while_the_axes_are_queried_hears_no_further_request(
+    bus: QuietBus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A recorder takes the lock, listens for 0.2 s, and refuses a bus on which it hears a request."""
+    scaled: list[bytes] = []
+
+    def note(data: bytes) -> None:
+        if data[1:3] == RATED_CURRENT:
+            scaled.append(data)
+
+    _answering(bus, monkeypatch, note)
+    monkeypatch.setattr("daq.workflow.monitor.bus_taken", lambda _cell: bool(scaled))
+    watch = _watch(bus, tmp_path / "cell.yaml")
+    watch.listen(2.0)
+    watch.read(0.5)
+    assert len(scaled) == 1  # of the first axis; the five others are not asked
 
 
 PREDICTED_HZ = 250.0

@@ -5,9 +5,13 @@ from __future__ import annotations
 import io
 import json
 import shutil
+import threading
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 from rich.cells import cell_len
@@ -19,15 +23,21 @@ from daq.config.bus import bus_address, drive_axes
 from daq.config.cell import Cell
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.errors import ExitCode
+from daq.log.reader import read_log
 from daq.report.bus import scan_rows, scan_table, scan_view
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.bus import open_bus
+from drivers.canopen.link import BEATS_KEPT, Link
 from drivers.canopen.scan import FoundNode
+from drivers.canopen.sdo import SdoPolicy
 from drivers.profiles.profile import Identity
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import ErrorCode, PowerState
 from drivers.simulation.spec import SdoAbort
+from drivers.stream.sample import EventKind
 from ident.model.model import DriveTrain
+from tests.faults.test_scenario import PLAN
 from tests.two_buses import on_two_buses
 
 
@@ -208,6 +218,107 @@ def test_a_mistyped_nameplate_is_reported_with_its_line(
     (warning,) = (text for text in document["warnings"] if text.startswith("J1: "))
     assert "near √2" in warning
     assert warning.split()[-1] in shown.out
+
+
+# -- while another program uses the bus --------------------------------------------------------------------------------
+
+
+def sent_requests(witness: can.BusABC) -> list[int]:
+    """Nodes to which a request was sent since the last look."""
+    nodes = []
+    while (frame := witness.recv(0.0)) is not None:
+        if 0x600 < frame.arbitration_id < 0x680:
+            nodes.append(frame.arbitration_id - 0x600)
+    return nodes
+
+
+@pytest.mark.parametrize("options", [[], ["--reset-faults"]])
+def test_a_scan_while_a_recorder_has_the_bus_is_refused_like_a_second_recording(
+    checkout: Path, cell: Cell, options: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = str(checkout / "configs/cells/demo.yaml")
+    spec = load_simulation(shipped_simulation("clean"))
+    with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus), open_bus(bus_address(cell)) as witness:
+        with bus_lock(cell):
+            assert main(["scan", file, "--json", *options]) == ExitCode.BUS_TAKEN
+        failure = json.loads(capsys.readouterr().err)
+        assert (failure["kind"], failure["exit_code"]) == ("BusTaken", ExitCode.BUS_TAKEN)
+        assert "such as a recording" in failure["found"]
+        assert sent_requests(witness) == []
+        assert main(["scan", file, *options]) == ExitCode.OK
+
+
+def test_a_scan_beside_a_master_whose_lock_is_not_seen_sends_nothing(
+    checkout: Path, cell: Cell, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A recorder in a container, on another computer, or of another maker."""
+    over = threading.Event()
+    spec = load_simulation(shipped_simulation("clean"))
+    with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus), open_bus(bus_address(cell)) as master:
+
+        def lead() -> None:
+            while not over.wait(0.01):
+                master.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+
+        leading = threading.Thread(target=lead)
+        leading.start()
+        try:
+            command = ["scan", str(checkout / "configs/cells/demo.yaml"), "--json"]
+            assert main(command) == ExitCode.DEVICE_FAULT
+        finally:
+            over.set()
+            leading.join()
+        assert sent_requests(master) == []
+    failure = json.loads(capsys.readouterr().err)
+    assert failure["kind"] == "BusBusy"
+    assert "a SYNC (080h) that we did not send" in failure["found"]
+
+
+def hear_recorder(cell: Cell, until: Callable[[Link], bool]) -> Link:
+    """Listen on the bus of a cell, without a frame of our own, until something was heard."""
+    link = Link(bus_address(cell), SdoPolicy(), time.monotonic_ns)
+    link.open()
+    try:
+        assert link.wait(60.0, lambda: until(link))
+        return link
+    finally:
+        link.close()
+
+
+def test_a_scan_in_the_middle_of_a_motion_leaves_it_alone_and_accuses_no_drive(
+    checkout: Path, cell: Cell, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The heartbeats of a cell in lockstep come as fast as its SYNC."""
+    file, plan, log = checkout / "configs/cells/demo.yaml", tmp_path / "plan.yaml", tmp_path / "a.mcap"
+    plan.write_text(PLAN, encoding="utf-8")
+    command = ["record", str(file), str(plan), "--out", str(log), "--enable-motion", "--speed", "0.05"]
+    ended: list[int] = []
+    recorder = threading.Thread(target=lambda: ended.append(main(command)))
+    spec = load_simulation(shipped_simulation("clean"))
+
+    with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus) as simulated:
+
+        def in_motion(link: Link) -> bool:
+            """Whether all axes have power, and all heartbeats that the link knows came since then."""
+            if not all(node.drive.state is PowerState.OPERATION_ENABLED for node in simulated.nodes):
+                for node in simulated.nodes:
+                    link.count_beats(node.node_id)
+                return False
+            known = [len(link._beats.get(node.node_id, ())) for node in simulated.nodes]
+            return min(known) == BEATS_KEPT
+
+        recorder.start()
+        link = hear_recorder(cell, in_motion)
+        code = main(["scan", str(file)])
+        recorder.join()
+    assert code == ExitCode.BUS_TAKEN
+    assert [link.shared_id(node_id, 100) for node_id in range(1, 7)] == [""] * 6
+    # All moves were made; on a busy machine an answer of the simulated cell may be late, which is counted.
+    assert ended[0] in (ExitCode.OK, ExitCode.DATA_UNFIT)
+    kinds = [event.kind for event in read_log(log).events]
+    assert kinds.count(EventKind.MOVE_END) == 2
+    assert EventKind.BUS_BUSY not in kinds
+    capsys.readouterr()
 
 
 @pytest.fixture(scope="module")

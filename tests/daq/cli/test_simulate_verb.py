@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import can
@@ -14,7 +15,9 @@ import yaml
 import daq.simulation.simulation_file
 from daq.cli.app import main
 from daq.cli.simulate import MountedFile, how_to_reach, nodes_on_buses
+from daq.config.cell_file import load_cell
 from daq.errors import ExitCode, UsageError
+from daq.workflow.bus_lock import bus_lock, require_untaken
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.split_bus import BusPart
 from drivers.simulation.spec import CellSpec
@@ -142,3 +145,20 @@ def test_every_verb_can_be_imported_without_the_simulated_cell() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) > 20
+
+
+def test_no_amplifiers_join_a_bus_on_which_a_recorder_moves_others(
+    checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("daq.workflow.bus_lock.SHARED_FOLDERS", (tmp_path,))
+    tmp_path.chmod(0o1777)
+    monkeypatch.setattr("drivers.canopen.bus.open_bus", lambda *_, **__: pytest.fail("the bus was opened"))
+    cell = load_cell(checkout / "configs/cells/demo.yaml")
+    there = replace(cell, buses=(replace(cell.buses[0], interface="socketcan", channel="vcan9"),))
+    with bus_lock(there):
+        command = ["simulate", "clean", "--interface", "socketcan", "--channel", "vcan9"]
+        assert main(command) == ExitCode.BUS_TAKEN
+    said = capsys.readouterr().err
+    assert "bus socketcan:vcan9" in said
+    assert "they would answer in the middle of its motion" in said
+    require_untaken(there.buses, tmp_path)

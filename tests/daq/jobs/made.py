@@ -47,7 +47,8 @@ class Made:
         """
 
         def copied(_file: Path, _cell: Cell, _plan: Plan, out: Path, **further: Any) -> Recorded:
-            further["before_motion"]()
+            further["require_released"]()  # before the drives are used
+            further["require_released"]()  # before they get power
             # Logs of another day are other logs; the fit that would read them knows its result already.
             out.write_bytes(self.logs[out.stem].read_bytes() + str(rig.clock.at).encode())
             return replace(self.recorded[out.stem], path=out)

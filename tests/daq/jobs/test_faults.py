@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 import yaml
 
 import daq.workflow.record
+from daq.cli.app import main
 from daq.environment import shipped_configurations
 from daq.errors import ExitCode, JobHeld, RunInvalid, exit_code
 from daq.jobs.session import Outcome
@@ -107,6 +109,20 @@ def test_a_fault_from_the_start_ends_the_job_before_anything_moves(
         fails(rig, cell, REFUSALS[kind][0])
         assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
         assert cell.plant.time_s < 1.0
+
+
+def test_a_drive_that_refuses_its_mapping_ends_the_command_with_its_error(
+    tmp_path: Path, short_plan: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As a timer calls it: an SDO abort of the library is behind the error that its feed describes."""
+    rig = make_rig(tmp_path / "cell", short_plan)
+    with serving(rig, FaultSpec(FaultKind.REFUSES_MAPPING, 1)) as cell:
+        assert main(["recalibrate", str(rig.cell_file)]) == ExitCode.DEVICE_FAULT
+        assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
+    last = json.loads(capsys.readouterr().err.splitlines()[-1])
+    assert (last["event"], last["error"]) == ("failed", "SetupRefused")
+    assert last["text"].startswith("J2 (node 2): TPDO1: writing 0x0 to 1A00h:00: aborted")
+    assert (rig.session.state.outcome, rig.session.state.exit_code) == (Outcome.STOPPED, ExitCode.DEVICE_FAULT)
 
 
 def test_a_run_with_a_single_bad_frame_is_recorded_again(tmp_path: Path, one_move: Path) -> None:

@@ -31,14 +31,14 @@ from daq.errors import (
     exit_code,
 )
 from daq.jobs.context import section_of
-from daq.jobs.interlock import MAX_OUTPUT_CHARACTERS, Finished, require_release, run_command
 from daq.jobs.job import preview
 from daq.jobs.journal import Form, Journal
 from daq.jobs.session import Outcome
 from daq.jobs.time_bound import time_bound
 from daq.ledger.audit import AuditAction
+from daq.workflow.bus_lock import bus_lock, lock_name
+from daq.workflow.interlock import MAX_OUTPUT_CHARACTERS, Finished, require_release, run_command
 from daq.workflow.record import Recorded
-from daq.workflow.safeguards import bus_lock, lock_name
 from drivers.errors import MotionRefused
 from drivers.simulation.drive import PowerState
 from tests.daq.jobs.made import Made, made_rig
@@ -469,7 +469,8 @@ def test_a_warm_up_is_made_of_the_plans_moves_and_asks_the_interlock_too(tmp_pat
     def noting(*given: Any, **further: Any) -> Recorded:
         made_of.append(given[3].stem)
         if given[3].stem == "warm-up":
-            further["before_motion"]()
+            further["require_released"]()  # before the drives are used
+            further["require_released"]()  # before they get power
             given[3].touch()
             return made.recorded["bare-1"]
         found: Recorded = copied(*given, **further)

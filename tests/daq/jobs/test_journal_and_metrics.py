@@ -8,6 +8,7 @@ import math
 import os
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NoReturn, cast
 
 import pytest
 from hypothesis import given
@@ -15,9 +16,11 @@ from hypothesis import strategies as st
 from prometheus_client.parser import text_string_to_metric_families
 
 from daq.errors import OutputFailed
+from daq.jobs.context import JobContext
 from daq.jobs.journal import Form, Journal, Level, form_of
-from daq.jobs.reporting import Conclusion, write_metrics
+from daq.jobs.reporting import Conclusion, report_failure, write_metrics
 from daq.jobs.session import Outcome
+from drivers.errors import DriveFault
 
 AT = datetime(2026, 1, 5, 3, 0, tzinfo=UTC)
 
@@ -40,6 +43,19 @@ def test_an_event_is_one_line_whatever_is_in_it(text: str, values: dict[str, obj
         assert (found["event"], found["text"], found["step"]) == ("event", text, "fit")
         assert found["level"] == level.name.lower()
         assert datetime.fromisoformat(found["time"]) == AT
+
+
+def test_a_report_that_fails_does_not_hide_the_error_that_ended_the_job(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unreadable(*_: object) -> NoReturn:
+        raise TypeError("no session")
+
+    monkeypatch.setattr("daq.jobs.session.sessions", unreadable)
+    error = DriveFault(3, "fault")
+    context = cast("JobContext", None)  # the report fails before it is used
+    report_failure(context, tmp_path, error)
+    assert error.__notes__ == ["kept: the end of the session could not be recorded: no session"]
 
 
 def test_a_person_reads_words_and_no_control_characters() -> None:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import struct
+import threading
 from contextlib import nullcontext
 from pathlib import Path
 
+import can
 import pytest
 
 import daq.jobs.drives
 import daq.workflow.record
+from daq.config.bus import bus_address
 from daq.config.cell import PacingMode
 from daq.jobs.drives import check_drives
-from drivers.errors import StateRefused
+from drivers.canopen.bus import open_bus
+from drivers.errors import BusBusy, StateRefused
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
 from tests.daq.jobs.rig import make_rig, serving
@@ -78,3 +82,25 @@ def test_a_drive_that_moves_in_its_quick_stop_is_left_alone(
         with pytest.raises(StateRefused, match=r"17 counts in 0\.2 s: press the emergency stop"):
             check_drives(rig.cell, nullcontext, True)
         assert cell.nodes[AXIS].drive.state is STAYS
+
+
+def test_a_job_beside_a_master_whose_lock_is_not_seen_sends_nothing(tmp_path: Path, one_move: Path) -> None:
+    """A recorder on another computer: the axes may be in the middle of its motion."""
+    rig = make_rig(tmp_path / "cell", one_move)
+    over = threading.Event()
+    with serving(rig), open_bus(bus_address(rig.cell)) as master:
+
+        def lead() -> None:
+            while not over.wait(0.01):
+                master.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+
+        leading = threading.Thread(target=lead)
+        leading.start()
+        try:
+            with pytest.raises(BusBusy, match="a SYNC"):
+                check_drives(rig.cell, nullcontext, True)
+        finally:
+            over.set()
+            leading.join()
+        heard = [frame.arbitration_id for frame in iter(lambda: master.recv(0.0), None)]
+    assert [number for number in heard if 0x600 < number < 0x680] == []

@@ -103,6 +103,13 @@ def test_a_reading_of_an_axis_that_the_log_lacks_is_refused(tmp_path: Path) -> N
         read_log(tmp_path / "a.mcap")
 
 
+def test_an_event_that_names_a_file_whose_name_is_no_utf_8_is_logged(tmp_path: Path) -> None:
+    """The error of a full disk names the log: were it not logged, it would hide why the axes were stopped."""
+    event = CellEvent(START_NS, None, EventKind.ENDED, 0, "OutputFailed: \udcff.mcap: no space left")
+    log = read_log(write(tmp_path / "a.mcap", content(2), samples([[0, 0]]), [event]))
+    assert [found.text for found in log.events] == [r"OutputFailed: \udcff.mcap: no space left"]
+
+
 @settings(deadline=None, max_examples=60)
 @given(_recordings(), EVENTS)
 def test_round_trip(recording: tuple[int, list[Sample]], events: list[CellEvent]) -> None:

@@ -11,10 +11,12 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
+from canopen.sdo.exceptions import SdoAbortedError
 
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
@@ -31,8 +33,10 @@ from daq.workflow.feed import (
     end_of,
     facts_of_recorder,
     packet_dtype,
+    read_packet,
     socket_names,
 )
+from drivers.errors import SetupRefused
 from drivers.stream.sample import CellEvent, EventKind
 from tests.daq.console.feeds import Recording, arrivals, facts
 
@@ -228,3 +232,51 @@ def test_what_a_stop_could_not_confirm_is_in_its_end() -> None:
         "text": "node 3; while stopping: node 2 does not answer; not confirmed without power: node 2",
     }
     assert end_of(None) == {"ok": True, "axes_stopped": True, "text": ""}
+
+
+def _behind(error: BaseException) -> SetupRefused:
+    """An error with another behind it."""
+    refused = SetupRefused(2, "TPDO1: writing 0x0 to 1A00h:00: aborted")
+    refused.__cause__ = error
+    refused.__context__ = error
+    return refused
+
+
+def test_an_sdo_abort_behind_an_error_does_not_keep_its_end_from_a_console() -> None:
+    """The `__eq__` of canopen's abort raises where the other error has no abort code."""
+    abort = SdoAbortedError(0x0601_0002)
+    abort.add_note("not confirmed without power: J3")
+    assert end_of(_behind(abort)) == {
+        "ok": False,
+        "axes_stopped": False,
+        "text": "node 2: TPDO1: writing 0x0 to 1A00h:00: aborted; not confirmed without power: J3",
+    }
+
+
+def test_an_error_that_cannot_be_written_is_named() -> None:
+    class Unwritable(Exception):
+        def __str__(self) -> str:
+            raise ValueError("no text")
+
+    assert end_of(Unwritable())["text"] == "Unwritable"
+    assert end_of(_behind(Unwritable()))["text"].startswith("node 2: ")
+
+
+def _end_at(console: socket.socket) -> dict[str, object]:
+    """The end that a console receives, after whatever else it was sent."""
+    while True:
+        packet = read_packet(console.recv(LARGEST_PACKET), None)
+        if packet.message is not None and packet.message.end is not None:
+            return asdict(packet.message.end)
+
+
+def test_samples_that_cannot_be_sent_do_not_keep_the_end_from_a_console(cell_file: Path, cell: Cell) -> None:
+    feed = Feed(cell_file)
+    with ExitStack() as closing:
+        with pytest.raises(SetupRefused), feed:
+            console = closing.enter_context(_console(cell_file, feed))
+            Recording(feed, cell, cell_file)
+            feed._packed = ["no bytes"]  # type: ignore[list-item]
+            raise _behind(SdoAbortedError(0x0601_0002))
+        end = _end_at(console)
+    assert end == {"ok": False, "axes_stopped": True, "text": "node 2: TPDO1: writing 0x0 to 1A00h:00: aborted"}

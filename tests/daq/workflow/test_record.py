@@ -64,7 +64,8 @@ class Rig:
         clocks: Clocks | None = None,
         *,
         unguarded: bool = True,
-        before_motion: Callable[[], None] = lambda: None,
+        granted_by: str | None = "the test",
+        require_released: Callable[[], None] | None = None,
     ) -> Recorded:
         """Record the plan."""
         declared = load_cell(self.cell_file)
@@ -77,10 +78,10 @@ class Rig:
             self.out,
             payload=None,
             operator="Ada",
-            granted_by="the test",
+            granted_by=granted_by,
             run_id="1",
             clocks=clocks,
-            before_motion=before_motion,
+            require_released=require_released,
             unguarded=unguarded,  # the scripted drives have no 1016h
         )
 

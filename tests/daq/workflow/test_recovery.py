@@ -94,22 +94,27 @@ def test_an_open_door_holds_the_recovery_too(outside: Rig, monkeypatch: pytest.M
     permit(outside, recovery_motion="allowed")
     monkeypatch.setattr("daq.workflow.record.bring_back", lambda *_: pytest.fail("it moved"))
 
+    asked: list[int] = []
+
     def opened() -> None:
-        raise MotionRefused("the door is open")
+        asked.append(len(asked))
+        if len(asked) == 2:  # closed before the drives were used
+            raise MotionRefused("the door is open")
 
     with pytest.raises(MotionRefused, match="the door is open"):
-        outside.run(before_motion=opened)
+        outside.run(require_released=opened)
 
 
-def test_axes_that_no_one_would_stop_move_where_the_cell_says_so(
+def test_the_policy_for_jobs_moves_no_axis_of_a_person_that_no_one_would_stop(
     checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig = Rig(checkout, tmp_path, monkeypatch, "lockstep")
+    permit(rig, motion="allowed", unguarded="allowed")
     failure = refused(rig, unguarded=False)
     assert "UNGUARDED: J1: no 1016h" in failure.found
+    assert "pass --unguarded" in failure.do
     assert "`policy: {unguarded: allowed}`" in failure.do
-    permit(rig, unguarded="allowed")
-    assert rig.run(unguarded=False).log.valid
+    assert rig.run(unguarded=True).log.valid
 
 
 def test_neither_is_part_of_what_a_recording_depends_on(outside: Rig) -> None:

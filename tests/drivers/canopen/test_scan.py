@@ -12,8 +12,8 @@ import pytest
 
 from drivers.canopen.link import Link
 from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.scan import SCAN_S
-from drivers.errors import DriveFault, ObjectAccessError, SetupRefused
+from drivers.canopen.scan import SCAN_S, scan, scan_link
+from drivers.errors import BusBusy, DriveFault, ObjectAccessError, SetupRefused
 from drivers.profiles.profile import ObjectEntry
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync, TimedSync
@@ -200,6 +200,77 @@ def test_heartbeats_of_two_states_in_turn_are_two_devices() -> None:
         assert listen(network, bus, [127, 5], 100_000_000).shared_id(2, 0) == (
             "heartbeats OPERATIONAL and PRE-OPERATIONAL in turn"
         )
+
+
+def sync() -> can.Message:
+    return can.Message(arbitration_id=0x80, is_extended_id=False)
+
+
+def listen_beside_sync(network: CanopenNetwork, bus: ScriptedBus, beats: int, every_ms: int) -> Link:
+    """Hear heartbeats, each behind a SYNC of another producer."""
+    for _ in range(beats):
+        bus.inject(sync())
+        listen(network, bus, [5], every_ms * 1_000_000)
+    return network.link
+
+
+def test_heartbeats_of_a_cell_in_lockstep_are_no_second_device() -> None:
+    """Its time goes as fast as SYNC comes: heartbeats of 100 ms may come every 20 ms."""
+    network, bus = cell(2)
+    with network:
+        assert listen_beside_sync(network, bus, 30, 20).shared_id(2, 100) == ""
+
+
+def test_two_devices_are_found_by_their_heartbeats_once_no_sync_is_between_them() -> None:
+    network, bus = cell(2)
+    with network:
+        assert listen_beside_sync(network, bus, 30, 20).shared_id(2, 100) == ""
+        link = listen(network, bus, [5] * 8, 50_000_000)
+        assert link.shared_id(2, 100) == "8 heartbeats in 350 ms, its period is 100 ms"
+
+
+@pytest.mark.parametrize("serial", [7, 8], ids=["equal answers", "other serial"])
+def test_two_devices_are_found_by_their_answers_beside_sync(serial: int) -> None:
+    network, bus = twins(serial)
+    bus.tamper = lambda message: (message, sync())
+    with network:
+        found = scan_link(network.link, range(1, 5), 0.05)
+    assert [(node.node_id, bool(node.shared)) for node in found] == [(1, False), (2, True)]
+    assert "two answers to one request for 10" in found[1].shared
+
+
+MASTERS = {
+    "SYNC": (sync(), r"a SYNC \(080h\)"),
+    "NMT": (can.Message(arbitration_id=0, is_extended_id=False, data=bytes((1, 0))), "an NMT command"),
+    "SDO": (
+        can.Message(arbitration_id=0x602, is_extended_id=False, data=bytes.fromhex("4041600000000000")),
+        r"an SDO request to J2 \(node 2\)",
+    ),
+    "set-point": (can.Message(arbitration_id=0x201, is_extended_id=False, data=bytes(6)), r"a set-point of J1"),
+}
+"""A frame of another master, and its description."""
+
+
+@pytest.mark.parametrize("name", MASTERS)
+def test_a_scan_beside_another_master_sends_nothing(name: str) -> None:
+    """It may be a recorder on another computer, in the middle of a motion."""
+    frame, text = MASTERS[name]
+    network, bus = cell(2)
+    with network:
+        bus.inject(frame)
+        with pytest.raises(BusBusy, match=f"{text}.* that we did not send"):
+            network.scan(wait_s=0.05)
+        assert bus.sent == []
+        assert len(network.scan(wait_s=0.05)) == 2  # the other master has ended
+
+
+def test_the_scan_of_the_library_beside_another_master_sends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, bus = cell(2)
+    monkeypatch.setattr("drivers.canopen.scan.Link", lambda *_: network.link)
+    bus.inject(sync())
+    with pytest.raises(BusBusy, match="a SYNC"):
+        scan("virtual:scripted")
+    assert bus.sent == []
 
 
 class Beating(ScriptedNode):

@@ -375,6 +375,47 @@ def test_a_stop_that_cannot_be_said_is_noted_on_the_error(moving: Moving) -> Non
     bus.on_cycle = lambda cycle: None
 
 
+class FullSink:
+    """A receiver of events that takes none from a moment on, as a log on a full disk."""
+
+    def __init__(self) -> None:
+        self.full = False
+
+    def __call__(self, _event: CellEvent) -> None:
+        if self.full:
+            raise ValueError("the log takes no event")
+
+
+def test_events_that_cannot_be_logged_delay_no_stop_and_do_not_hide_its_cause(moving: Moving) -> None:
+    network, stream, bus, _ = moving
+    stream.emit = sink = FullSink()
+
+    def act(cycle: int) -> None:
+        if cycle == 60:
+            bus.nodes[1].fault()
+            sink.full = True
+
+    bus.on_cycle = act
+    with pytest.raises(DriveFault) as error:
+        list(execute(network, stream, (FAR,), permission(), BOUNDS))
+    assert powerless(bus)
+    assert not network.powered
+    assert error.value.__notes__ == [
+        "while stopping: its events are not all reported: ValueError('the log takes no event')"
+    ]
+
+
+def test_events_of_the_last_stop_that_cannot_be_logged_are_an_error_after_it(moving: Moving) -> None:
+    network, stream, bus, _ = moving
+    stream.emit = sink = FullSink()
+    near = Move((2_000, 2_000), (100_000, 80_000), (1_000_000, 800_000))
+    samples = execute(network, stream, (near,), permission(), BOUNDS)
+    with pytest.raises(ValueError, match="the log takes no event"):
+        for sample in samples:
+            sink.full = sample.position_counts == near.target_counts
+    assert powerless(bus)
+
+
 def test_why_the_moves_end_is_in_the_log(moving: Moving) -> None:
     _, _, bus, events = moving
     bus.nodes[1].ignores_setpoint = True

@@ -1,4 +1,4 @@
-"""Interlock and mount command of a job, which may hold a motion back as the drives may."""
+"""The interlock of a cell, which may hold back a motion as the drives may, and the commands that a cell file names."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
-from daq.config.recalibration import Command, Interlock, PlannedRun, Recalibration
-from daq.errors import JobHeld, NotReleased
+from daq.config.cell import Cell
+from daq.config.recalibration import Command, Interlock
+from daq.errors import NotReleased
 from daq.files import open_regular
 
 MAX_OUTPUT_CHARACTERS = 400  #: Characters of what a program said that are shown
@@ -85,8 +87,21 @@ def _said(process: subprocess.Popen[bytes], timeout_s: float) -> bytes:
     raise subprocess.TimeoutExpired(process.args, timeout_s)
 
 
-NOTHING = "none"  #: Argument of the mount command for a run without load
 _LOOK_BYTES = 4096
+
+
+def release_check(cell: Cell, now: Callable[[], datetime], run: Runner = run_command) -> Callable[[], None]:
+    """Return the check that the interlock of a cell releases the robot; it does nothing where the cell declares none.
+
+    Args:
+        cell: from its file; the interlock is in its `recalibration`.
+        now: wall clock with time zone.
+        run: runs a command of the cell.
+    """
+    section = cell.recalibration
+    if section is None:
+        return lambda: None
+    return partial(require_release, section.interlock, run, now, section.working_folder)
 
 
 def require_release(interlock: Interlock, run: Runner, now: Callable[[], datetime], folder: Path) -> None:
@@ -104,23 +119,6 @@ def require_release(interlock: Interlock, run: Runner, now: Callable[[], datetim
             raise _held(f"interlock command {interlock.command[0]}", str(ended), "exit code 0")
     if interlock.file is not None:
         _require_file(interlock.file, interlock, now)
-
-
-def mount(section: Recalibration, planned: PlannedRun, run: Runner) -> None:
-    """Run the mount command for the payload of a run; before every run, also where nothing changes.
-
-    Raises:
-        JobHeld: the command did not end with 0, in its time.
-    """
-    wanted = planned.payload or NOTHING
-    ended = run(section.mount, (wanted,), section.working_folder)
-    if ended.code != 0:
-        raise JobHeld(
-            f"mount command {section.mount.command[0]} {wanted}",
-            found=str(ended),
-            expected="exit code 0: it is mounted as the run needs it",
-            remedy=f"mount {wanted} by hand or see to the changer; the next job goes on with run {planned.name}",
-        )
 
 
 def _require_file(file: Path, interlock: Interlock, now: Callable[[], datetime]) -> None:
@@ -147,5 +145,6 @@ def _held(subject: str, found: str, expected: str) -> NotReleased:
         subject,
         found=found,
         expected=expected,
-        remedy="nothing moves: close the cell, let everyone leave it, set automatic mode; the next job takes it up",
+        remedy="nothing moves: close the cell, let everyone leave it and set automatic mode, then record again; the "
+        "next job resumes one that ended here",
     )
