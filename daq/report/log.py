@@ -31,10 +31,13 @@ def describe_log(path: Path) -> dict[str, Any]:
         ConfigurationError: the cell in it is inconsistent.
     """
     reader = LogReader(path)
-    first_ns = last_ns = 0
+    first_ns: int | None = None
+    last_ns = 0
     for block in reader:
-        first_ns = first_ns or int(block.time_ns[0])
+        if first_ns is None:
+            first_ns = int(block.time_ns[0])
         last_ns = int(block.time_ns[-1])
+    assert first_ns is not None  # the reader refuses a log without samples
     head, statistics = reader.head, reader.statistics
     cell = cell_from_bundle(head.files, names={"cell.yaml": f"{path}, cell.yaml"})
     scaling(cell, head.readback)
