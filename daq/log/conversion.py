@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from daq.config.cell import DEGREE, Cell
 from daq.config.cell_file import cell_from_bundle
+from daq.config.same_cell import Correction, correction_of
 from daq.errors import CurrentSaturated, LogIncomplete, PositionImplausible, RunInvalid
 from daq.log.metadata import Readback, reports_only_losses
 from daq.log.reader import Log, LossyLogs, SampleChecks, read_log
@@ -87,10 +88,12 @@ def scaling(cell: Cell, readback: Readback) -> SiScaling:
 def load_run(path: Path | str, cell: Cell | None = None, lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
     """Read a log as a run, with the cell in the log or another description of it.
 
-    A given description also replaces the mass of the payload that the log records. Warns of a partial log, of accepted
-    losses, and of a run slower than planned.
+    A given description has to be of the same cell (`daq.config.same_cell`), and also replaces the mass of the payload
+    that the log records; `Run.recording` says what it corrects. Warns of a partial log, of accepted losses, and of a
+    run slower than planned.
 
     Raises:
+        LogsDiffer: the given description is of another cell.
         DataError: the log cannot be read, or its samples cannot be used.
         ConfigurationError: the cell in the log is inconsistent.
     """
@@ -106,13 +109,29 @@ def load_run(path: Path | str, cell: Cell | None = None, lossy: LossyLogs = Loss
             path,
             100.0 * speed,
         )
-    known = cell_from_bundle(log.head.files, names={"cell.yaml": f"{path}, cell.yaml"}) if cell is None else cell
-    run = run_from_log(log, known, lossy)
-    if cell is not None and (payload := run.payload) is not None and "m" in payload.known:
+    if cell is None:
+        own = cell_from_bundle(log.head.files, names={"cell.yaml": f"{path}, cell.yaml"})
+        return run_from_log(log, own, lossy), own
+    serials = [_serial(axis.drive) for axis in log.head.readback.axes]
+    correction = correction_of(str(path), log.head.files, cell, serials)
+    return _corrected(run_from_log(log, cell, lossy), cell, correction), cell
+
+
+def _corrected(run: Run, cell: Cell, correction: Correction | None) -> Run:
+    """Return a run with the payload's mass of a given description, and the record of what that corrects."""
+    payload = run.payload
+    if payload is not None and "m" in payload.known:
         for weighed in cell.payloads:
             if (weighed.name, weighed.mounting) == (payload.name, payload.mounting):
                 run = replace(run, payload=replace(payload, known={**payload.known, "m": weighed.mass_kg}))
-    return run, known
+    if correction is None or run.recording is None:
+        return run
+    recording = replace(
+        run.recording,
+        replaced_configuration_sha256=correction.configuration_sha256,
+        corrected=correction.sections,
+    )
+    return replace(run, recording=recording)
 
 
 def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> Run:
