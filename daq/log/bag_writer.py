@@ -37,6 +37,7 @@ from daq.log.message import (
     reading_bytes,
     text_bytes,
 )
+from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import Log, SampleChecks, read_log
 from ident.arrays import FloatArray
 from ident.calibration import Calibration
@@ -101,7 +102,9 @@ def export_bag(path: Path, out: Path, calibration: Calibration | None = None) ->
         raise OutputFailed.of(out, error) from error
     checks = SampleChecks(path)
     checks.take(log.samples)
-    verdict = checks.verdict(log.head.run.rate_hz, log.statistics)
+    watch = MotionWatch(cell, log.head)
+    watch.take(log.samples)
+    verdict = log_verdict(cell, log.head, checks, log.statistics, watch, lambda: (log.samples,))
     return BagWritten(dict(sorted(counts.items())), (last_ns - first_ns) * 1e-9, log.partial, *verdict)
 
 

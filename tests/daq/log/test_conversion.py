@@ -166,11 +166,11 @@ def test_a_wrap_in_a_log_is_no_turn_of_the_joint(record: Recorder) -> None:
 def test_the_scaled_numbers_of_an_import_do_not_wrap(checkout: Path, tmp_path: Path) -> None:
     start = demo_content(checkout)
     top = 2**31 - 1
-    quantum = 1.0 / top
+    quantum = 0.01 / top
     readback = Readback(tuple(replace(axis, position_rad_per_count=quantum) for axis in start.readback.axes))
     rows = [Sample(k, k * 1_000_000, (sign * top,) * 6, (0,) * 6, (0,) * 6) for k, sign in enumerate((1, -1))]
     run, _ = load_run(write(tmp_path / "i.mcap", replace(start, readback=readback), rows))
-    np.testing.assert_allclose(run.position_rad[:, 0], [1 / 32, -1 / 32])
+    np.testing.assert_allclose(run.position_rad[:, 0], [0.01 / 32, -0.01 / 32])
 
 
 def test_an_invalid_run_is_refused(record: Recorder) -> None:
