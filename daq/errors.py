@@ -5,7 +5,7 @@ DaqError
 ├── CalibrationRefused    exit 3    ControllerUnfit, ControllerChanged, SignatureInvalid, AuditUnusable
 ├── DataError             exit 4    CalibrationMissing, CalibrationUnreadable, TableUnfit, HistoryUnreadable,
 │   │                               LogsDiffer, LogRepeated, RunInvalid, CyclesLost, ClockImplausible,
-│   │                               CurrentSaturated, PositionImplausible, EffectsRefuted
+│   │                               CurrentSaturated, CurrentImplausible, PositionImplausible, EffectsRefuted
 │   └── LogUnreadable               LogMissing, LogForeign, LogTruncated, LogCorrupt, LogIncomplete
 ├── ConfigurationError    exit 6    ConfigurationMissing, YamlInvalid, SchemaMismatch, ConfigurationInconsistent
 ├── VirtualBusEmpty       exit 5
@@ -170,8 +170,12 @@ class CurrentSaturated(DataError):
     """A limit was active in too large a part of the run."""
 
 
+class CurrentImplausible(DataError):
+    """A current is an outlier that no amplifier sets."""
+
+
 class PositionImplausible(DataError):
-    """Positions are far outside the joint limits: degrees for radians, or a wrong drive train."""
+    """Positions far outside the joint limits (degrees for radians, a wrong drive train), or a step no motor makes."""
 
 
 class EffectsRefuted(DataError):

@@ -74,13 +74,13 @@ def export_bag_verb(
     from daq.log.bag_writer import export_bag
     from daq.workflow.calibration_file import load_calibration
 
-    gains = None if calibration is None else {gain.axis: gain.value for gain in load_calibration(calibration).gains}
+    known = None if calibration is None else load_calibration(calibration)
     with status("writing the bag"):
-        done = export_bag(log, out, gains)
+        done = export_bag(log, out, known)
     _warn(log, done.partial, done.valid, done.reason)
     if json:
         print_json({"log": str(log), "bag": str(out), "duration_s": done.duration_s, "messages": done.messages,
-                    "effort": gains is not None, "partial": done.partial, "valid": done.valid})  # fmt: skip
+                    "effort": known is not None, "partial": done.partial, "valid": done.valid})  # fmt: skip
     else:
         print_view([f"{topic}: {count} messages" for topic, count in done.messages.items()], out)
 
@@ -181,14 +181,13 @@ def joint_updates(robot: PhysicalRobot) -> dict[str, JointUpdate]:
 
 def _declared(calibration: Calibration, path: Path) -> Cell:
     from daq.config.cell_file import load_cell
+    from daq.config.same_cell import mismatch_of_calibration
 
     cell = load_cell(path)
-    if cell.name != calibration.cell:
+    found = mismatch_of_calibration(calibration, cell)
+    if found is not None:
         raise ConfigurationInconsistent(
-            str(path),
-            found=f"cell {cell.name!r}",
-            expected=f"cell {calibration.cell!r}, as in the calibration",
-            remedy="give the cell that was calibrated",
+            str(path), found=found.found, expected=found.expected, remedy="give the cell that was calibrated"
         )
     return cell
 

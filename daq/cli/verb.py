@@ -27,7 +27,9 @@ from daq.report.text import json_text
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 CellArgument = Annotated[Path, typer.Argument(help="Cell file.")]
-CellOption = Annotated[Path | None, typer.Option("--cell", help="Another cell file than the one in the logs.")]
+CellOption = Annotated[
+    Path | None, typer.Option("--cell", help="Corrected file of the same cell, in place of the one in the logs.")
+]
 CalibrationArgument = Annotated[Path, typer.Argument(help="calibration.yaml written by `drivegain fit`.")]
 
 

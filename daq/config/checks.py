@@ -17,6 +17,7 @@ from daq.config.cell_schema import AxisModel, CellModel, gain_joints, ratio_of
 from daq.config.clearance import clearance_faults
 from daq.config.closed_chain import chain_faults, chain_of, mechanism_faults, platform_frame, robot_with
 from daq.config.controller import controller_faults
+from daq.config.hold import mimic_faults
 from daq.config.policy import max_change_faults
 from daq.config.signers import signer_faults
 from daq.config.yaml_file import Document, Fault, Location, describe
@@ -96,6 +97,9 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
     if not urdf.strip():
         return None, [*faults, Fault(("robot", "urdf"), "an empty file", "a URDF of an arm")]
     try:
+        following = [*mimic_faults([axis.name for axis in model.axes], urdf)]
+        if following:
+            return None, [*faults, *following]
         of_chain = [*chain_faults(model.robot, model.closures, urdf)]
         if of_chain:
             return None, [*faults, *of_chain]

@@ -154,9 +154,9 @@ def _record_valid(context: JobContext, session: Session, planned: PlannedRun, pl
         context.journal.say(Level.WARNING, "recording is invalid", reason=log.reason, attempt=attempt)
     raise RunInvalid(
         str(out),
-        found=f"{context.section.retries + 1} recordings, none without losses (the last: {log.reason})",
+        found=f"{context.section.retries + 1} recordings, none of them valid (the last: {log.reason})",
         expected="a valid one",
-        remedy="see to the bus and to the load of this computer; the next job records this run again",
+        remedy="see to the bus, the load of this computer and the encoders; the next job records this run again",
     )
 
 

@@ -196,12 +196,22 @@ def _field_and_joint(path: Path, column: Column) -> tuple[str, str]:
     return field, joint
 
 
+SINCE_1970_NS = 10**18  #: Stamps from here on, 2001, are times of day; earlier ones are since some start
+UNDECIDED = 1000  #: Messages with a stamp of 0 that wait for a later one, which says what 0 means
+
+
 class _Rows:
-    """Rows of joint states: a message begins one, or completes that of its stamp."""
+    """Rows of joint states: a message begins one, or completes that of its stamp.
+
+    A stamp of 0 is the first instant of a clock that starts at 0, as simulation time does, or the stamp that a
+    publisher left out. The first other stamp of the bag tells the two apart.
+    """
 
     def __init__(self, path: Path, columns: tuple[tuple[str, str], ...]) -> None:
         """Store the columns, each with field and joint."""
         self._path = path
+        self._zero_is_a_time: bool | None = None  # None until a stamp has shown it
+        self._undecided: list[tuple[JointState, int]] = []  # with the time of their recording
         self._columns = columns
         self._stamp_ns = array("q")
         self._values = array("d")
@@ -226,13 +236,35 @@ class _Rows:
                 for column, (field, joint) in enumerate(self._columns)
                 if joint in state.names
             ]
-        places, width = self._places[state.names], len(self._columns)
-        if not places:
+        if not self._places[state.names]:
             return  # joints of something else
-        self._unstamped += state.stamp_ns == 0
-        stamp_ns = state.stamp_ns or log_time_ns
-        if stamp_ns >= LATEST_NS:
-            raise ValueError(f"a time of {stamp_ns} ns")
+        if self._zero_is_a_time is None:
+            if state.stamp_ns == 0:
+                _require_possible(log_time_ns)
+                self._undecided.append((state, log_time_ns))
+                if len(self._undecided) == UNDECIDED:
+                    self._decide(zero_is_a_time=False)
+                return
+            self._decide(zero_is_a_time=state.stamp_ns < SINCE_1970_NS)
+        self._take(state, log_time_ns)
+
+    def _decide(self, *, zero_is_a_time: bool) -> None:
+        """Fix the meaning of a stamp of 0, and take the messages that waited for it."""
+        self._zero_is_a_time = zero_is_a_time
+        waiting = self._undecided
+        self._undecided = []
+        for state, log_time_ns in waiting:
+            self._take(state, log_time_ns)
+
+    def _take(self, state: JointState, log_time_ns: int) -> None:
+        """Begin or complete the row of a message."""
+        places = self._places[state.names]
+        width = len(self._columns)
+        stamp_ns = state.stamp_ns
+        if stamp_ns == 0 and not self._zero_is_a_time:
+            self._unstamped += 1
+            stamp_ns = log_time_ns
+        _require_possible(stamp_ns)
         row = self._begun.get(stamp_ns)
         if row is None or any(self._present[row * width + column] for _, _, column in places):
             row = self._begun[stamp_ns] = len(self._stamp_ns)
@@ -255,6 +287,7 @@ class _Rows:
         Raises:
             TableUnfit: a joint is missing in every row or between complete ones, or a number is not finite.
         """
+        self._decide(zero_is_a_time=self._zero_is_a_time is True)
         width = len(self._columns)
         present = np.frombuffer(self._present, dtype=np.bool_).reshape(-1, width)
         joints = sorted({name for names in self._places for name in names})
@@ -282,6 +315,11 @@ class _Rows:
         stamps = None if time is None else clock
         table = Table(self._path, columns, values, digest_of(values, clock), stamps, remarks=tuple(remarks))
         return require_finite(table)
+
+
+def _require_possible(time_ns: int) -> None:
+    if time_ns >= LATEST_NS:
+        raise ValueError(f"a time of {time_ns} ns")
 
 
 EXAMINED = 10_000  #: Messages that are examined to say what a file is

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from daq.config.cell import Cell, joint_names
 from daq.config.cell_file import cell_from_bundle
+from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
 from daq.files import fsync_folder
 from daq.log.conversion import scaling, unwrapped
@@ -36,8 +37,10 @@ from daq.log.message import (
     reading_bytes,
     text_bytes,
 )
+from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import Log, SampleChecks, read_log
 from ident.arrays import FloatArray
+from ident.calibration import Calibration
 from ident.model.model import DriveTrain
 
 VELOCITY_S = 0.02  #: Time over which a velocity is the mean, as in a log's own joint states
@@ -55,19 +58,18 @@ class BagWritten:
     reason: str  #: why not
 
 
-def export_bag(path: Path, out: Path, gains: Mapping[str, float] | None = None) -> BagWritten:
+def export_bag(path: Path, out: Path, calibration: Calibration | None = None) -> BagWritten:
     """Write a bag from a log: joint states and currents at every SYNC, events, slow readings, the URDF.
 
     Args:
         path: log to read.
         out: folder to make; must not exist.
-        gains: drive gain of each axis by its name [Nm or N per unit of the current], for the effort of the joint
-            states; None without a calibration.
+        calibration: of the log's cell; its gains give the effort of the joint states. None: no effort.
 
     Raises:
         UsageError: a file or folder of that name exists.
         OutputFailed: the file system refuses; nothing is left.
-        ConfigurationInconsistent: the gains are of other axes than the log.
+        ConfigurationInconsistent: the calibration is of another cell than the log.
         LogUnreadable: the log is damaged or incomplete; nothing is written.
     """
     if out.exists():
@@ -76,14 +78,12 @@ def export_bag(path: Path, out: Path, gains: Mapping[str, float] | None = None) 
         )
     log = read_log(path)
     cell = cell_from_bundle(log.head.files, names={"cell.yaml": f"{path}, cell.yaml"})
-    if gains is not None and set(gains) != set(cell.axis_names):
+    found = None if calibration is None else mismatch_of_calibration(calibration, cell)
+    if found is not None:
         raise ConfigurationInconsistent(
-            str(path),
-            found=f"axes {', '.join(cell.axis_names)}",
-            expected=f"those of the calibration, {', '.join(gains)}",
-            remedy="give a calibration of this cell",
+            str(path), found=found.found, expected=found.expected, remedy="give a calibration of this cell"
         )
-    ordered = [] if gains is None else [gains[name] for name in cell.axis_names]
+    ordered = [] if calibration is None else [gain.value for gain in calibration.gains]
     messages = sorted(_messages(log, cell, ordered), key=lambda message: message[0])
     counts = Counter(topic for _, topic, _ in messages)
     first_ns, last_ns = messages[0][0], messages[-1][0]
@@ -102,7 +102,9 @@ def export_bag(path: Path, out: Path, gains: Mapping[str, float] | None = None) 
         raise OutputFailed.of(out, error) from error
     checks = SampleChecks(path)
     checks.take(log.samples)
-    verdict = checks.verdict(log.head.run.rate_hz, log.statistics)
+    watch = MotionWatch(cell, log.head)
+    watch.take(log.samples)
+    verdict = log_verdict(cell, log.head, checks, log.statistics, watch, lambda: (log.samples,))
     return BagWritten(dict(sorted(counts.items())), (last_ns - first_ns) * 1e-9, log.partial, *verdict)
 
 

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from daq.config.cell import DEGREE, Cell
 from daq.config.cell_file import cell_from_bundle
+from daq.config.same_cell import Correction, correction_of
 from daq.errors import CurrentSaturated, LogIncomplete, PositionImplausible, RunInvalid
 from daq.log.metadata import Readback, reports_only_losses
+from daq.log.plausibility import motion_fault
 from daq.log.reader import Log, LossyLogs, SampleChecks, read_log
 from drivers.stream.sample import CellEvent, EventKind, Quantity
 from ident.arrays import BoolArray, FloatArray
@@ -43,6 +45,12 @@ class SiScaling:
         """Return joint positions [rad or m] of motor counts, shape (..., n): q = R⁻¹ q_motor + offset (paper eq. 24)"""
         motor_rad = counts * self.rad_per_count
         return np.asarray(motor_rad @ self.to_joint.T + self.offset_rad, dtype=np.float64)
+
+    def joints_known(self, answered: BoolArray) -> BoolArray:
+        """Return whether every motor that moves a joint answered, shape (k, n), from the answers of the motors."""
+        size = np.abs(self.to_joint)
+        moves = size > 1e-12 * size.max()
+        return np.asarray(~(~answered @ moves.T), dtype=np.bool_)
 
     def joint_position_of(self, counts: tuple[int, ...]) -> list[float]:
         """Convert one sample, for /joint_states."""
@@ -87,10 +95,12 @@ def scaling(cell: Cell, readback: Readback) -> SiScaling:
 def load_run(path: Path | str, cell: Cell | None = None, lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
     """Read a log as a run, with the cell in the log or another description of it.
 
-    A given description also replaces the mass of the payload that the log records. Warns of a partial log, of accepted
-    losses, and of a run slower than planned.
+    A given description has to be of the same cell (`daq.config.same_cell`), and also replaces the mass of the payload
+    that the log records; `Run.recording` says what it corrects. Warns of a partial log, of accepted losses, and of a
+    run slower than planned.
 
     Raises:
+        LogsDiffer: the given description is of another cell.
         DataError: the log cannot be read, or its samples cannot be used.
         ConfigurationError: the cell in the log is inconsistent.
     """
@@ -106,13 +116,29 @@ def load_run(path: Path | str, cell: Cell | None = None, lossy: LossyLogs = Loss
             path,
             100.0 * speed,
         )
-    known = cell_from_bundle(log.head.files, names={"cell.yaml": f"{path}, cell.yaml"}) if cell is None else cell
-    run = run_from_log(log, known, lossy)
-    if cell is not None and (payload := run.payload) is not None and "m" in payload.known:
+    if cell is None:
+        own = cell_from_bundle(log.head.files, names={"cell.yaml": f"{path}, cell.yaml"})
+        return run_from_log(log, own, lossy), own
+    serials = [_serial(axis.drive) for axis in log.head.readback.axes]
+    correction = correction_of(str(path), log.head.files, cell, serials)
+    return _corrected(run_from_log(log, cell, lossy), cell, correction), cell
+
+
+def _corrected(run: Run, cell: Cell, correction: Correction | None) -> Run:
+    """Return a run with the payload's mass of a given description, and the record of what that corrects."""
+    payload = run.payload
+    if payload is not None and "m" in payload.known:
         for weighed in cell.payloads:
             if (weighed.name, weighed.mounting) == (payload.name, payload.mounting):
                 run = replace(run, payload=replace(payload, known={**payload.known, "m": weighed.mass_kg}))
-    return run, known
+    if correction is None or run.recording is None:
+        return run
+    recording = replace(
+        run.recording,
+        replaced_configuration_sha256=correction.configuration_sha256,
+        corrected=correction.sections,
+    )
+    return replace(run, recording=recording)
 
 
 def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> Run:
@@ -123,7 +149,8 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
         CyclesLost: SYNC cycles are missing.
         ClockImplausible: the time stamps show another rate, or one of them is early or late.
         CurrentSaturated: a limit was active in more than a tenth of an axis's samples.
-        PositionImplausible: positions far outside the joint limits.
+        PositionImplausible: positions far outside the joint limits, or a step or a speed that no motor makes.
+        CurrentImplausible: a current is an outlier.
         LogIncomplete: cell and log do not belong together.
     """
     name, samples, rate_hz = log.path.stem, log.samples, log.head.run.rate_hz
@@ -147,9 +174,7 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
     if (fault := checks.fault(rate_hz)) is not None:
         raise fault
     scale = scaling(cell, log.head.readback)
-    is_counter = [axis.position_rad_per_count is None for axis in log.head.readback.axes]
-    counts = np.where(is_counter, unwrapped(samples.position_counts), samples.position_counts)
-    position_rad = scale.joint_position(counts)
+    position_rad = scale.joint_position(continuous_counts(samples.position_counts, log.head.readback))
     bits = [None if axis.profile is None else axis.profile.saturation_bit for axis in cell.axes]
     limited = samples.statusword & np.array([0 if bit is None else 1 << bit for bit in bits], dtype=np.uint16) != 0
     share = limited.mean(axis=0)
@@ -161,15 +186,19 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
             expected=f"at most {100.0 * LARGEST_SATURATED:g} %",
             remedy="plan slower moves, or a smaller payload",
         )
-    answered = samples.missing[:, None] >> np.arange(len(cell.axes), dtype=np.uint32) & 1 == 0
+    answered = answers(samples.missing, len(cell.axes))
     valid = answered & ~limited
     check_limits(str(log.path), position_rad, cell, valid)
+    current = samples.current_raw * scale.current_per_unit
+    known = scale.joints_known(answered)
+    if (fault := motion_fault(str(log.path), cell, rate_hz, position_rad, current, known)) is not None:
+        raise fault
     run, drives = log.head.run, [axis.drive for axis in log.head.readback.axes]
     return Run(
         name=name,
         time_s=(samples.cycle - samples.cycle[0]).astype(np.float64) / rate_hz,
         position_rad=position_rad,
-        current_a=samples.current_raw * scale.current_per_unit,
+        current_a=current,
         payload=run.payload,
         move=moves(log.events, samples.time_ns),
         digest=log.digest,
@@ -177,7 +206,7 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
         started_s=float(samples.time_ns[0]) * 1e-9 if run.has_clock else None,
         partial=log.partial or accepted,
         temperature_c=temperatures(log),
-        torque_channels=torque_channels(log, cell, samples.current_raw * scale.current_per_unit, valid),
+        torque_channels=torque_channels(log, cell, current, valid),
         recording=Recording(
             # An import without the time of day writes 0.
             recorded_s=run.started_wall_ns * 1e-9 if run.started_wall_ns else None,
@@ -190,6 +219,17 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
             operator=run.operator or None,
         ),
     )
+
+
+def answers(missing: NDArray[np.uint32], axes: int) -> BoolArray:
+    """Return whether each axis answered in each cycle, shape (k, n), from the bits of those that did not."""
+    return np.asarray(missing[:, None] >> np.arange(axes, dtype=np.uint32) & 1 == 0, dtype=np.bool_)
+
+
+def continuous_counts(position_counts: NDArray[np.int32], readback: Readback) -> NDArray[np.int64]:
+    """Return positions without the wraps of an encoder's counter, shape (k, n)."""
+    is_counter = [axis.position_rad_per_count is None for axis in readback.axes]
+    return np.where(is_counter, unwrapped(position_counts), position_counts)
 
 
 def _serial(drive: Mapping[str, Any]) -> int | None:

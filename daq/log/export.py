@@ -21,6 +21,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import cell_from_bundle
 from daq.errors import ConfigurationMissing, OutputFailed, UsageError
 from daq.log.conversion import moves, scaling, unwrapped
+from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import LogReader, SampleBlock
 from drivers.stream.sample import CellEvent, Quantity, SlowReading
 
@@ -82,9 +83,13 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
         )
     reader = LogReader(log)
     # The first pass finds all damage and all moves; the second writes, a block at a time.
-    for _ in reader:
-        pass
-    cell = cell_from_bundle(reader.head.files, names={"cell.yaml": f"{log}, cell.yaml"})
+    watch: MotionWatch | None = None
+    for block in reader:
+        if watch is None:
+            cell = cell_from_bundle(reader.head.files, names={"cell.yaml": f"{log}, cell.yaml"})
+            watch = MotionWatch(cell, reader.head)
+        watch.take(block)
+    assert watch is not None  # the reader refuses a log without samples
     names: tuple[str, ...] = ()
     rows = 0
     unfinished = out.with_name(out.name + ".part")
@@ -103,7 +108,8 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
             unfinished.replace(out)
     except OSError as error:
         raise OutputFailed.of(out, error) from error
-    return Exported(names, rows, reader.partial, *reader.checks.verdict(reader.head.run.rate_hz, reader.statistics))
+    verdict = log_verdict(cell, reader.head, reader.checks, reader.statistics, watch, lambda: LogReader(log))
+    return Exported(names, rows, reader.partial, *verdict)
 
 
 def tables(

@@ -402,13 +402,18 @@ def read_log(path: Path | str) -> Log:
     """
     path = Path(path)
     reader = LogReader(path)
-    blocks = list(reader)
+    samples = joined(reader)
     head, statistics = reader.head, reader.statistics
-    columns = {name: [getattr(block, name) for block in blocks] for name in SampleBlock.__slots__}
-    blocks.clear()  # so that a long log is not in memory twice
-    samples = SampleBlock(**{name: np.concatenate(columns.pop(name)) for name in SampleBlock.__slots__})
     events, readings = tuple(reader.events), tuple(reader.readings)
     return Log(path, reader.digest, head, samples, events, readings, statistics, reader.partial)
+
+
+def joined(blocks: Iterable[SampleBlock]) -> SampleBlock:
+    """Return all samples of a log, of one block at least, as one block."""
+    waiting = list(blocks)
+    columns = {name: [getattr(block, name) for block in waiting] for name in SampleBlock.__slots__}
+    waiting.clear()  # so that a long log is not in memory twice
+    return SampleBlock(**{name: np.concatenate(columns.pop(name)) for name in SampleBlock.__slots__})
 
 
 class LossyLogs(Enum):

@@ -9,12 +9,14 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
+from daq.config.cell import Cell
 from daq.config.cell_file import cell_from_bundle
 from daq.errors import LogIncomplete, LogUnreadable, UsageError
 from daq.files import open_regular
 from daq.log.container import UNFINISHED
 from daq.log.conversion import scaling
 from daq.log.metadata import RunStatistics
+from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import LogReader, SampleBlock
 from daq.log.writer import NOTHING_KEPT, LogContent, LogWriter
 from drivers.stream.sample import EventKind, Sample
@@ -87,7 +89,7 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
     log = LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0, remedy=NOTHING_KEPT)
     with log:
         try:
-            _copy(reader, chain((first,), blocks), log, len(cell.axes), progress)
+            _copy(reader, chain((first,), blocks), log, cell, progress)
         except BaseException:
             log.part.unlink(missing_ok=True)  # half of what was saved is of no use
             raise
@@ -98,9 +100,11 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
 
 
 def _copy(
-    reader: LogReader, blocks: Iterable[SampleBlock], log: LogWriter, axes: int, progress: Callable[[int], None]
+    reader: LogReader, blocks: Iterable[SampleBlock], log: LogWriter, cell: Cell, progress: Callable[[int], None]
 ) -> None:
     known_events = known_readings = 0
+    axes = len(cell.axes)
+    watch = MotionWatch(cell, reader.head)
     for block in blocks:
         width = block.position_counts.shape[1]
         if width != axes:
@@ -110,6 +114,7 @@ def _copy(
                 expected=f"{axes}, as in its cell configuration",
                 remedy="it is not a recording of this software",
             )
+        watch.take(block)
         for event in reader.events[known_events:]:
             log.event(event)
         known_events = len(reader.events)
@@ -140,7 +145,10 @@ def _copy(
         found += [f"{sum(counted.missing)} missing answers"] if any(counted.missing) else []
         found += [f"{event.kind.value} ({event.text})" for event in reader.events if event.kind not in _HARMLESS][:3]
     judged = RunStatistics(0, 0, (), valid=not found, reason=", ".join(found))
-    log.conclude(*reader.checks.verdict(reader.head.run.rate_hz, judged), partial=True)
+    verdict = log_verdict(
+        cell, reader.head, reader.checks, judged, watch, lambda: LogReader(reader.path).until_damage()
+    )
+    log.conclude(*verdict, partial=True)
 
 
 def _refuse_running(damaged: Path) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 from daq.config.cell import Cell
 from daq.config.policy import ApplyPolicy
+from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationRefused, DaqError
 from daq.ledger.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, judge, noise_note, query_history
 from daq.report.effect_names import accepted_text, size_text
@@ -103,7 +104,18 @@ def compare(cell: Cell, request: Request, command: str = "") -> Comparison:
         cell: from its file.
         request: calibration to judge.
         command: that shows the change; see `Comparison`.
+
+    Raises:
+        CalibrationRefused: it is of another cell.
     """
+    mismatch = mismatch_of_calibration(request.calibration, cell)
+    if mismatch is not None:
+        raise CalibrationRefused(
+            f"calibration of cell {request.calibration.cell!r}",
+            found=mismatch.found,
+            expected=mismatch.expected,
+            remedy="give the cell that was calibrated",
+        )
     if cell.controller is not None and not cell.controller.gains:
         places = zip(cell.axis_names, cell.controller.objects, strict=True)
         listed = ", ".join(f"{axis} {entry.parameter}" for axis, entry in places)

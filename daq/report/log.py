@@ -12,8 +12,8 @@ from typing import Any
 from rich.text import Text
 
 from daq.config.cell_file import cell_from_bundle
-from daq.log.conversion import scaling
 from daq.log.metadata import Timing
+from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import LogReader
 from daq.report.bus import current_signals
 from daq.report.text import entry_lines, picked, printable
@@ -31,15 +31,21 @@ def describe_log(path: Path) -> dict[str, Any]:
         ConfigurationError: the cell in it is inconsistent.
     """
     reader = LogReader(path)
-    first_ns = last_ns = 0
+    first_ns: int | None = None
+    last_ns = 0
+    watch: MotionWatch | None = None
     for block in reader:
-        first_ns = first_ns or int(block.time_ns[0])
+        if watch is None:
+            first_ns = int(block.time_ns[0])
+            cell = cell_from_bundle(reader.head.files, names={"cell.yaml": f"{path}, cell.yaml"})
+            watch = MotionWatch(cell, reader.head)
+        watch.take(block)
         last_ns = int(block.time_ns[-1])
+    assert first_ns is not None  # the reader refuses a log without samples
+    assert watch is not None
     head, statistics = reader.head, reader.statistics
-    cell = cell_from_bundle(head.files, names={"cell.yaml": f"{path}, cell.yaml"})
-    scaling(cell, head.readback)
     run, samples = head.run, reader.checks.samples
-    valid, reason = reader.checks.verdict(run.rate_hz, statistics)
+    valid, reason = log_verdict(cell, head, reader.checks, statistics, watch, lambda: LogReader(path))
     return {
         "log": str(path),
         "sha256": reader.digest,

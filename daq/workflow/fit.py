@@ -19,6 +19,7 @@ from daq.environment import software
 from daq.errors import EffectsRefuted, LogRepeated, LogsDiffer, UsageError
 from daq.log.conversion import load_run
 from daq.log.reader import LossyLogs
+from daq.workflow.corrections import Corrections
 from daq.workflow.declared_effects import (
     BOOTSTRAP_SEED,
     declared_effects,
@@ -99,6 +100,7 @@ class Reading:
         self._read = read
         self._seen: dict[str, Path] = {}
         self._torques: list[tuple[TorqueChannel, ...]] = []
+        self._corrections = Corrections()
 
     @classmethod
     def of(cls, logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs = LossyLogs.REFUSED) -> Reading:
@@ -129,6 +131,7 @@ class Reading:
                     expected=f"cell {self.cell.name!r}, configuration {self.cell.digest[:12]}, as in the first log",
                     remedy="fit logs of one cell and one configuration, or name the right one with --cell",
                 )
+            self._corrections.note(log, run)
             # By its samples: a file that was rewritten is the same recording still.
             content = hashlib.sha256(run.position_rad.tobytes() + run.current_a.tobytes()).hexdigest()
             if content in self._seen:
@@ -167,7 +170,7 @@ def fit_logs(
     Args:
         logs: at least one run without load and one with a weighed payload.
         holdout: held-out logs, on which the errors are reported.
-        cell: description that replaces the one in the logs.
+        cell: corrected description of the same cell, which replaces the one in the logs.
         effects: detect effects that the declared model lacks, and refit with those that pass.
         created: time stamp of the calibration, with its time zone; now when None.
         progress: receives a line for each step.
@@ -201,7 +204,7 @@ def fit(
         holdout: logs that the fit must not see.
         method: estimator; ``ml``, or with fixed gains the classical IDIM-WLS, when None.
         gains_fixed: hold the gains at their nameplate values.
-        cell: another description of the cell than the one in the logs.
+        cell: corrected description of the same cell, which replaces the one in the logs.
         lossy: how to handle logs with losses.
         keep_rows: keep all rows for a search for effects, which then need not read the logs again.
 

@@ -22,6 +22,7 @@ from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShor
 from daq.files import sha256
 from daq.log.conversion import SiScaling, scaling
 from daq.log.metadata import Loss, RunInfo, RunStatistics, loss_reason, readback_of_drives
+from daq.log.motion import RecordedMotion
 from daq.log.writer import LogContent, LogWriter
 from daq.workflow.experiment import path_of
 from daq.workflow.feed import Feed, RunFacts
@@ -211,7 +212,9 @@ def record(
         )
         content = LogContent.of(cell, run, files, readback)
         with LogWriter(out, content, scale.joint_position_of, clocks.monotonic_ns) as log:
-            kept = Kept(log, feed or Feed(cell_file), lambda done: progress(done, len(moves)))
+            kept = Kept(
+                log, feed or Feed(cell_file), lambda done: progress(done, len(moves)), RecordedMotion(len(cell.axes))
+            )
             kept.feed.begin(_facts(cell, scale, run, out, len(moves)), lambda: log.statistics)
             log.readings(temperatures)
             stream = SyncStream(network, _pacing(cell, run.started_wall_ns, clocks, producer), kept.event)
@@ -225,10 +228,10 @@ def record(
                     short = error
             stream.read_on(LATE_LOSSES_S)
             log.readings(polling.temperatures(stream.time_ns))
-            verdict = (
-                _verdict(stream.statistics)
-                if short is None
-                else (False, f"stopped after {kept.done} of {len(moves)} moves: {short.found}")
+            verdict = _judged(
+                stream.statistics,
+                _stopped(short, kept, len(moves)),
+                impossible=partial(kept.motion.reason, cell, readback, rate_hz),
             )
             log.conclude(*verdict, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns())
         kept.feed.finish()
@@ -272,11 +275,13 @@ class Kept:
     log: LogWriter
     feed: Feed
     progress: Callable[[int], None]  #: receives the number of finished moves
+    motion: RecordedMotion  #: by which the run is judged at its end
     done: int = 0  #: finished moves
 
     def sample(self, sample: Sample) -> None:
         """Log and publish one sample."""
         self.log.write(sample)
+        self.motion.take(sample)
         self.feed.sample(sample)
 
     def event(self, event: CellEvent) -> None:
@@ -455,6 +460,27 @@ def _checked_moves(
     moves = motor_moves(cell, plan, scale, start_counts)
     check_moves(start_counts, moves, permission, cell.axis_names)
     return moves
+
+
+def _stopped(short: DiskSpaceShort | None, kept: Kept, moves: int) -> str:
+    """Return why the moves were not finished; empty where they were."""
+    return "" if short is None else f"stopped after {kept.done} of {moves} moves: {short.found}"
+
+
+def _judged(statistics: StreamStatistics, stopped: str, impossible: Callable[[], str]) -> tuple[bool, str]:
+    """Return whether a run is valid, and why not.
+
+    Args:
+        statistics: of its stream.
+        stopped: why the moves were not finished; empty where they were.
+        impossible: says why no robot moves by the samples, as a fit judges them; empty where one may.
+    """
+    if stopped:
+        return False, stopped
+    valid, reason = _verdict(statistics)
+    if valid:
+        reason = impossible()
+    return not reason, reason
 
 
 def _verdict(statistics: StreamStatistics) -> tuple[bool, str]:

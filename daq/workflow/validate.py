@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 
 from daq.config.cell import Cell, model_of
+from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationUnreadable, LogsDiffer
 from daq.log.conversion import load_run
+from daq.workflow.corrections import Corrections
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
@@ -92,7 +94,7 @@ def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None =
     Args:
         calibration: with the filter of its fit.
         logs: of the calibration's cell, at any date.
-        cell: another description of the cell than the one that the logs carry.
+        cell: corrected description of the same cell, which replaces the one in the logs.
 
     Raises:
         DataError, ConfigurationError: a log cannot be used.
@@ -102,8 +104,10 @@ def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None =
     """
     conditioning = conditioning_of(calibration)
     validations: list[Validation] = []
+    corrections = Corrections()
     for log in logs:
         run, described = load_run(log, cell)
+        corrections.note(log, run)
         check_cell(calibration, log, described)
         validations.append(predicted(calibration, conditioning, model_of(described), log, run, described.digest))
     return tuple(validations)
@@ -144,12 +148,12 @@ def check_cell(calibration: Calibration, log: Path, cell: Cell) -> None:
     Raises:
         LogsDiffer: it is one.
     """
-    axes = tuple(gain.axis for gain in calibration.gains)
-    if (cell.name, cell.axis_names) != (calibration.cell, axes):
+    found = mismatch_of_calibration(calibration, cell)
+    if found is not None:
         raise LogsDiffer(
             str(log),
-            found=f"cell {cell.name!r} with the axes {', '.join(cell.axis_names)}",
-            expected=f"cell {calibration.cell!r} with the axes {', '.join(axes)}, as in the calibration",
+            found=found.found,
+            expected=found.expected,
             remedy="give logs of that cell, or the calibration of this one",
         )
 
@@ -280,7 +284,7 @@ def cross_validate(
     Args:
         calibrations: by label, made under one filter; the first one is what is being validated.
         logs: of their cell, without load or with any payload.
-        cell: another description of the cell than the one that the logs carry.
+        cell: corrected description of the same cell, which replaces the one in the logs.
 
     Raises:
         DataError, ConfigurationError: a log cannot be used.
@@ -299,8 +303,10 @@ def cross_validate(
             )
     runs, bare, loaded, validations = [], [], [], []
     diagnoses: list[Diagnosis] = []
+    corrections = Corrections()
     for log in logs:
         run, described = load_run(log, cell)
+        corrections.note(log, run)
         model = model_of(described)
         found: dict[str, Validation] = {}
         reasons: dict[str, list[str]] = {}

@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from daq.config.cell import Cell, model_of
+from daq.config.same_cell import differing_sections
 from daq.errors import ConfigurationError, LogRepeated, LogsDiffer
 from daq.log.conversion import load_run
+from daq.workflow.corrections import Corrections
 from daq.workflow.experiment import experiment_of, extra_moves
 from daq.workflow.validate import (
     check_cell,
@@ -47,7 +49,7 @@ def weigh_logs(
         calibration: of the cell.
         logs: with one body, mounted one way; the payload that they declare is only reported.
         bare: of the same robot without load.
-        cell: another description of the cell than the one that the logs carry.
+        cell: corrected description of the same cell, which replaces the one in the logs.
 
     Raises:
         DataError, ConfigurationError: a log cannot be used.
@@ -55,10 +57,11 @@ def weigh_logs(
         LogRepeated: a log was given twice: its moves would count twice.
         IdentificationError: see `ident.weigh`.
     """
-    loaded, cells = zip(*(_loaded(calibration, log, cell) for log in logs), strict=True)
+    reading = _Logs(calibration, cell)
+    loaded = [reading.load(log) for log in logs]
     without = []
     for log in bare:
-        run, _ = _loaded(calibration, log, cell)
+        run = reading.load(log)
         if run.payload is not None:
             raise LogsDiffer(
                 str(log),
@@ -71,7 +74,7 @@ def weigh_logs(
         warn_without_temperature(calibration, run.name, run.temperature_c)
     _require_once((*logs, *bare), (*loaded, *without))
     fitted = warn_of_fitted(calibration, loaded, "the agreement proves nothing; weigh a log that the fit has not seen")
-    described: Cell = cells[0]
+    described = reading.described
     body = weigh(calibration, model_of(described), loaded, conditioning_of(calibration), bare=without)
     help_: tuple[Help, ...] = ()
     if not body.identifiable.all():
@@ -94,11 +97,13 @@ def contact_in(
         IdentificationError: see `ident.external_torque`.
     """
     conditioning = conditioning_of(calibration)
-    run, described = _loaded(calibration, log, cell)
+    reading = _Logs(calibration, cell)
+    run = reading.load(log)
+    described = reading.described
     model = model_of(described)
     band = None
     if quiet:
-        calm = [_loaded(calibration, one, cell)[0] for one in quiet]
+        calm = [reading.load(one) for one in quiet]
         _require_once((log, *quiet), (run, *calm))
         warn_of_fitted(calibration, calm, "other motion has larger errors than it, and the threshold is too low")
         known = (_predictable(calibration, one, other) for one, other in zip(quiet, calm, strict=True))
@@ -113,10 +118,43 @@ def _require_once(logs: Sequence[Path], runs: Sequence[Run]) -> None:
             raise LogRepeated(str(log), found="the same log twice", expected="every log once", remedy="name other logs")
 
 
-def _loaded(calibration: Calibration, log: Path, cell: Cell | None) -> tuple[Run, Cell]:
-    run, described = load_run(log, cell)
-    check_cell(calibration, log, described)
-    return run, described
+class _Logs:
+    """Logs of the cell of a calibration, all read by one description: the model of the first is that of all."""
+
+    def __init__(self, calibration: Calibration, given: Cell | None) -> None:
+        self._calibration = calibration
+        self._given = given
+        self._corrections = Corrections()
+        self._first: tuple[Path, Cell] | None = None
+
+    @property
+    def described(self) -> Cell:
+        """The cell as the first log describes it, or as given."""
+        assert self._first is not None  # a log was read before
+        return self._first[1]
+
+    def load(self, log: Path) -> Run:
+        """Read a log.
+
+        Raises:
+            DataError, ConfigurationError: it cannot be used.
+            LogsDiffer: it is of another cell, or of another description of it than the first log.
+        """
+        run, described = load_run(log, self._given)
+        self._corrections.note(log, run)
+        check_cell(self._calibration, log, described)
+        if self._first is None:
+            self._first = log, described
+        first_log, first = self._first
+        if described.recording_digest != first.recording_digest:
+            sections = ", ".join(differing_sections(first, described)) or "the files of the cell"
+            raise LogsDiffer(
+                str(log),
+                found=f"a description of the cell that differs from that of {first_log} in {sections}",
+                expected="one description for all logs",
+                remedy="give the right one for all of them with --cell, or logs of one description",
+            )
+        return run
 
 
 def _predictable(calibration: Calibration, log: Path, run: Run) -> Run:

@@ -108,10 +108,11 @@ class Batch:
             raise OSError(ctypes.get_errno(), "recvmmsg")
         return count
 
-    def about(self, number: int) -> tuple[int, int, int, int | None]:
-        """Return bytes, flags, time stamp [ns since 1970; 0 without] and drop counter of a received frame."""
+    def about(self, number: int) -> tuple[int, int, int | None, int | None]:
+        """Return bytes, flags, time stamp [ns since 1970; None without] and drop counter of a received frame."""
         message = self._messages[number]
-        stamp_ns, drops = 0, None
+        stamp_ns: int | None = None
+        drops: int | None = None
         at, end = number * _ANCILLARY_BYTES, number * _ANCILLARY_BYTES + message.control_length
         while at + _ANCILLARY_HEAD.size <= end:
             length, level, kind = _ANCILLARY_HEAD.unpack_from(self._control, at)
@@ -256,13 +257,15 @@ class Capture:
             can_id, length, payload = FRAME.unpack_from(self._batch.frames, index * FRAME.size)
             if flags & MSG_OWN and can_id != SYNC:
                 continue  # of our own frames only SYNC is of interest: its actual time
-            monotonic_ns = self._time.of(stamp_ns or wall_ns, wall_ns, now_ns)
+            if stamp_ns is None:
+                stamp_ns = wall_ns
+            monotonic_ns = self._time.of(stamp_ns, wall_ns, now_ns)
             if len(self._backlog) >= self._most_bytes:
                 self._backlog_dropped += 1
                 continue
             self._reported_drops = self._counts
             own, local = bool(flags & MSG_OWN), bool(flags & MSG_LOCAL)
-            head = (stamp_ns or wall_ns, monotonic_ns, *self._reported_drops)
+            head = (stamp_ns, monotonic_ns, *self._reported_drops)
             self._backlog += RECORD.pack(*head, can_id, Kind.FRAME, length, own, local, payload)
         return number
 

@@ -94,6 +94,15 @@ def read_until_ns(bus: can.BusABC) -> int | None:
     return found if isinstance(found, int) else None
 
 
+def lags_behind(bus: can.BusABC, time_ns: int) -> bool:
+    """Return whether frames from before a monotonic time may still come; never on a bus whose frames have no stamps.
+
+    A bus that has received nothing yet has read until 0, and is behind too.
+    """
+    until_ns = read_until_ns(bus)
+    return until_ns is not None and until_ns < time_ns
+
+
 def remarks_of(bus: can.BusABC) -> tuple[str, ...]:
     """Return remarks for the operator on how a bus was opened."""
     return tuple(getattr(bus, "remarks", ()))

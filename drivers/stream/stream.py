@@ -17,7 +17,7 @@ import can
 from drivers.canopen.bus import bus_errors
 from drivers.canopen.link import SYNC_COB_ID
 from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.socketcan import CapturedMessage, Losses, losses_of, read_until_ns, remarks_of
+from drivers.canopen.socketcan import CapturedMessage, Losses, lags_behind, losses_of, read_until_ns, remarks_of
 from drivers.errors import BusError, DriveFault, NodeMisplaced, SampleLost, node_label
 from drivers.motion.watch import Watch
 from drivers.stream.answers import Answers, Slot, StreamStatistics
@@ -199,7 +199,7 @@ class SyncStream:
             return None
         message = bus.recv(0.0)
         # A capture process that was stopped has not received all of it yet.
-        while message is None and now_ns < end_ns + LARGEST_LAG_NS and (read_until_ns(bus) or end_ns) < end_ns:
+        while message is None and now_ns < end_ns + LARGEST_LAG_NS and lags_behind(bus, end_ns):
             self._link.beat()
             message = bus.recv(PATIENCE_S)
             now_ns = pacing.clock()
@@ -424,7 +424,7 @@ class SyncStream:
         with bus_errors(self._link.address):
             if counted and isinstance(pacing, FollowedSync) and pacing.stop is not None:
                 pacing.stop()
-            while (now_ns := clock()) < end_ns or (now_ns < last_ns and (read_until_ns(bus) or end_ns) < end_ns):
+            while (now_ns := clock()) < end_ns or (now_ns < last_ns and lags_behind(bus, end_ns)):
                 self._link.beat()
                 late = bus.recv((end_ns - now_ns) * 1e-9 if now_ns < end_ns else PATIENCE_S)
                 if late is None:

@@ -23,6 +23,10 @@ class Recording:
     #: Digest of the controller's file when it was recorded; None where the cell named none.
     controller_sha256: str | None
     operator: str | None = None  #: person or job responsible for it; None in calibrations of earlier versions
+    #: Digest of the description in the log, where a corrected description of the cell replaced it; None where none did,
+    #: and empty where the one in the log could not be read.
+    replaced_configuration_sha256: str | None = None
+    corrected: tuple[str, ...] = ()  #: sections in which the corrected description differs from the one in the log
 
 
 @dataclass(frozen=True, slots=True)

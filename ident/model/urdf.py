@@ -19,6 +19,13 @@ from ident.errors import ModelError
 from ident.model.bodies import Body
 from ident.model.robot import DIRECTIONS, Closure, Joint, JointKind, Place, Robot, poses
 
+HELD_ALIKE = 1e-3  #: Largest difference of two statements of one position [rad or m]
+LINKAGE = (
+    "no <mimic>: it is a joint without a motor, and what couples it is described by `closures` and `motors`, as of a "
+    "closed chain (of a parallelogram, the link behind it keeps the direction of the link before its leader: one "
+    "closure of the two links about the joints' axis); a gear or belt of another ratio between joints is not supported"
+)
+"""What to do about a joint that follows an axis."""
 LARGEST_DISTANCE_M = 50.0  #: Between joints that follow each other: more than any gantry has
 
 
@@ -67,10 +74,14 @@ def robot_from_urdf(
         platform: link that carries the payload; that of the last joint when None.
 
     Raises:
-        ModelError: the text is no URDF, has no moving joint, or a joint of more than one degree of freedom; a closure,
+        ModelError: the text is no URDF, has no moving joint, one of more than one degree of freedom, or one that
+            mimics another (`hold_joints` fixes those of a gripper with their leader); a closure,
             motor, assembly pose or platform names what it does not have.
     """
     found = read_urdf(urdf)
+    for name, mimic in mimics_of(urdf).items():
+        followed = f"joint {mimic.leader!r} (multiplier {mimic.multiplier:g})"
+        raise ModelError(f"joint {name!r} mimics {followed}; expected {LINKAGE}")
     index = {joint.name: number for number, joint in enumerate(found.joints)}
 
     def link(name: str, what: str) -> Place:
@@ -104,33 +115,107 @@ def robot_from_urdf(
     )
 
 
+@dataclass(frozen=True, slots=True)
+class Mimic:
+    """A joint that follows another one: q = multiplier · q_leader + offset, the `<mimic>` of a URDF."""
+
+    leader: str  #: name of the joint that it follows
+    multiplier: float
+    offset: float  #: [rad or m]
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether it stays at its offset, wherever the leader is."""
+        return self.multiplier == 0.0
+
+
 def hold_joints(urdf: str, position_rad: Mapping[str, float]) -> str:
     """Return a URDF in which joints that are no axes of the arm (a gripper's, a mobile base's) are fixed.
 
     Args:
         urdf: text of the URDF.
         position_rad: position of each held joint [rad; m for a prismatic joint], by name. A joint that mimics a held
-            one follows it. Joints of type floating and planar can only be held at 0.
+            one, directly or through others, follows it. Joints of type floating and planar can only be held at 0.
 
     Raises:
-        ModelError: the text is no URDF, a name is no movable joint, or a joint cannot be held there.
+        ModelError: the text is no URDF, a name is no movable joint, or a joint cannot be held there: it mimics one that
+            moves, or one by which it is elsewhere.
     """
     robot = _root(urdf)
-    movable = {_name(joint): joint for joint in robot.findall("joint") if joint.get("type") != "fixed"}
-    followed = {}
-    for name, joint in movable.items():
-        mimic = joint.find("mimic")
-        leader = None if mimic is None else position_rad.get(mimic.get("joint", ""))
-        if mimic is not None and leader is not None:
-            factor, offset = (_finite(mimic.get(*one)) for one in (("multiplier", "1"), ("offset", "0")))
-            if factor is None or offset is None:
-                raise ModelError(f"<mimic> of {name!r} in the URDF has a multiplier or offset that is no number")
-            followed[name] = factor * leader + offset
-    for name, position in {**followed, **position_rad}.items():
+    movable = _movable(robot)
+    for name in position_rad:
         if name not in movable:
             raise ModelError(f"no movable joint {name!r} in the URDF; expected one of {', '.join(movable)}")
+    mimics = _mimics(movable)
+    followed = _followed(mimics, position_rad)
+    for name, position in position_rad.items():
+        _require_free(name, position, mimics, followed, movable)
+    for name, position in {**followed, **position_rad}.items():
         _fix(movable[name], position)
     return tostring(robot, encoding="unicode")
+
+
+def mimics_of(urdf: str) -> dict[str, Mimic]:
+    """Return the joints of a URDF that move and mimic another one, by name.
+
+    Raises:
+        ModelError: the text is no URDF, or a multiplier or an offset is no number.
+    """
+    return _mimics(_movable(_root(urdf)))
+
+
+def _movable(robot: Element) -> dict[str, Element]:
+    return {_name(joint): joint for joint in robot.findall("joint") if joint.get("type") != "fixed"}
+
+
+def _mimics(movable: Mapping[str, Element]) -> dict[str, Mimic]:
+    found = {}
+    for name, joint in movable.items():
+        mimic = joint.find("mimic")
+        if mimic is None:
+            continue
+        multiplier = _finite(mimic.get("multiplier", "1"))
+        offset = _finite(mimic.get("offset", "0"))
+        if multiplier is None or offset is None:
+            raise ModelError(f"<mimic> of {name!r} in the URDF has a multiplier or offset that is no number")
+        found[name] = Mimic(mimic.get("joint", ""), multiplier, offset)
+    return found
+
+
+def _followed(mimics: Mapping[str, Mimic], position_rad: Mapping[str, float]) -> dict[str, float]:
+    """Return the position of every joint that follows held ones, through any number of others [rad or m]."""
+    followed: dict[str, float] = {}
+    for _ in mimics:  # a chain is no longer than the number of its followers
+        for name, mimic in mimics.items():
+            leader = followed.get(mimic.leader, position_rad.get(mimic.leader))
+            if leader is not None:
+                followed[name] = mimic.multiplier * leader + mimic.offset
+    return followed
+
+
+def _require_free(
+    name: str,
+    position: float,
+    mimics: Mapping[str, Mimic],
+    followed: Mapping[str, float],
+    movable: Mapping[str, Element],
+) -> None:
+    """Refuse to hold a joint that another one moves, or holds elsewhere."""
+    mimic = mimics.get(name)
+    if mimic is None:
+        return
+    elsewhere = mimic.offset if mimic.at_rest else followed.get(name)
+    if elsewhere is not None:
+        if not np.isclose(position, elsewhere, rtol=0.0, atol=HELD_ALIKE):
+            raise ModelError(
+                f"joint {name!r} is held at {position:g} and mimics joint {mimic.leader!r}, by which it is at "
+                f"{elsewhere:g}; expected the same position [rad or m], or `hold` of one of the two"
+            )
+    elif mimic.leader in movable:
+        raise ModelError(
+            f"joint {name!r} mimics joint {mimic.leader!r} (multiplier {mimic.multiplier:g}), which moves: it follows "
+            f"and cannot be held; expected {LINKAGE}"
+        )
 
 
 def _fix(element: Element, position: float) -> None:

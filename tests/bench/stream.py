@@ -34,6 +34,7 @@ import numpy as np
 
 from daq.config.cell_file import load_cell
 from daq.log.conversion import scaling
+from daq.log.motion import RecordedMotion
 from daq.log.writer import LogWriter
 from daq.workflow.feed import Feed
 from daq.workflow.record import SPACE_CHECK_S, Kept, _facts
@@ -265,7 +266,7 @@ def _kept(path: Path, rate_hz: float) -> Iterator[tuple[Kept, DiskRoom]]:
     scale = scaling(cell, content.readback)
     with LogWriter(path, content, scale.joint_position_of, time.monotonic_ns) as log, Feed(DEMO) as feed:
         feed.begin(replace(_facts(cell, scale, content.run, path, 0), rate_hz=rate_hz), lambda: log.statistics)
-        yield Kept(log, feed, lambda _moves: None), DiskRoom(path, free_bytes)
+        yield Kept(log, feed, lambda _moves: None, RecordedMotion(len(cell.axes))), DiskRoom(path, free_bytes)
         log.conclude(valid=False, reason="a benchmark")
 
 

@@ -420,6 +420,49 @@ def test_a_joint_is_an_axis_or_held(with_gripper: Path, hold: str, message: str)
         load_cell(_spoil(with_gripper, "\naxes:", f"\n{hold}\naxes:"))
 
 
+FOLLOWER = """
+  <link name="behind"/>
+  <joint name="rod" type="revolute"><origin xyz="0 0 0.1"/><parent link="link6"/><child link="behind"/>
+    <axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/>
+    <mimic joint="J5" multiplier="-1"/></joint>
+</robot>"""
+
+
+@pytest.mark.parametrize("hold", ["", "hold: {rod: 0.0}"], ids=["not held", "held"])
+@pytest.mark.parametrize("logged", [False, True], ids=["a file", "a log"])
+def test_a_joint_that_follows_an_axis_cannot_be_held(configurations: Path, hold: str, logged: bool) -> None:
+    _spoil(configurations / "robots/tx40.urdf", "</robot>", FOLLOWER)
+    cell = _spoil(configurations / "cells/tx40.yaml", "\naxes:", f"\n{hold}\naxes:")
+    with pytest.raises(ConfigurationInconsistent, match=r"joint '?rod'? mimics .*J5.* \(multiplier -1\)") as refused:
+        if logged:
+            cell_from_bundle(bundle(cell))
+        else:
+            load_cell(cell)
+    assert "`closures`" in str(refused.value)
+    assert "`hold` of" not in str(refused.value)
+    assert "hold: {" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("mimic", "advice"),
+    [
+        ('<mimic joint="swivel"/>', r"slide mimics swivel .*; expected `hold` of swivel if that is no axis, and slide"),
+        ('<mimic joint="J6" multiplier="0"/>', "slide mimics J6 .*; expected `hold` of slide at its offset, 0 rad"),
+    ],
+    ids=["of a gripper", "that never moves"],
+)
+def test_a_joint_that_follows_no_axis_is_held_with_its_leader(with_gripper: Path, mimic: str, advice: str) -> None:
+    slide = '<axis xyz="0 1 0"/><limit lower="0"'
+    urdf = with_gripper.parent.parent / "robots/tx40.urdf"
+    urdf.write_text(urdf.read_text().replace(slide, mimic + slide))
+    with pytest.raises(ConfigurationInconsistent, match=advice):
+        load_cell(with_gripper)
+    follows = "swivel" in mimic
+    hold = "hold: {swivel: 0.5}" if follows else "hold: {swivel: 0.5, slide: 0.0}"
+    cell = load_cell(_spoil(with_gripper, "\naxes:", f"\n{hold}\naxes:"))
+    assert model_of(cell).robot.joint_count == 6
+
+
 def test_a_base_that_floats_is_held_to_be_an_arm(configurations: Path) -> None:
     world = '<link name="w"/><joint name="f" type="floating"><parent link="w"/><child link="base"/></joint></robot>'
     _spoil(configurations / "robots/tx40.urdf", "</robot>", world)

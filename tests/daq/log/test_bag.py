@@ -154,6 +154,32 @@ def test_without_stamps_the_time_of_recording_is_used(tmp_path: Path) -> None:
     assert table.remarks == ("200 messages have no stamp; the time of their recording is used",)
 
 
+def _simulated(row: int, joints: Sequence[int] = range(6)) -> dict[str, Any]:
+    """A message of a simulator, whose clock starts at 0."""
+    seconds, nanoseconds = divmod(row * STEP_NS, 10**9)
+    header = {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": ""}
+    return message(row, joints, header=header)
+
+
+@pytest.mark.parametrize("parts", [(range(6),), ((2, 0, 1), (5, 3, 4))], ids=["one publisher", "two publishers"])
+def test_a_clock_that_starts_at_0_keeps_its_first_stamp(parts: tuple[Sequence[int], ...], tmp_path: Path) -> None:
+    messages = [("/joint_states", _simulated(row, joints)) for row in range(ROWS) for joints in parts]
+    table = read(write_bag(tmp_path / "run.mcap", messages))
+    np.testing.assert_array_equal(table.values, np.hstack((POSITION, EFFORT)))
+    assert table.stamps is not None
+    assert table.stamps.first_ns == 0
+    np.testing.assert_allclose(table.stamps.time_s, np.arange(ROWS) * 4e-3, atol=1e-12)
+    assert table.remarks == ()
+
+
+def test_a_message_without_stamp_among_times_of_day_has_the_time_of_its_recording(tmp_path: Path) -> None:
+    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
+    (topic, first), *others = whole()
+    table = read(write_bag(tmp_path / "run.mcap", [(topic, {**first, "header": header}), *others]))
+    assert_whole(table)
+    assert table.remarks == ("1 messages have no stamp; the time of their recording is used",)
+
+
 def test_a_folder_is_one_bag_of_several_files(tmp_path: Path) -> None:
     folder = tmp_path / "bag"
     folder.mkdir()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from daq.log.bag_writer import export_bag, joint_effort, mean_velocity
 from daq.log.conversion import load_run
 from daq.log.writer import LogWriter
 from drivers.stream.sample import CellEvent, EventKind, Quantity, SlowReading
+from ident.calibration import Calibration
+from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import START_NS, demo_content, joints, samples
 
 AXES, ROWS = 6, 200
@@ -38,6 +41,11 @@ def log(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> Path:
     return path
 
 
+def _calibration() -> Calibration:
+    made = demo_calibration()
+    return replace(made, gains=tuple(replace(gain, value=GAINS[gain.axis]) for gain in made.gains))
+
+
 def _read(path: Path) -> dict[str, list[Any]]:
     found: dict[str, list[Any]] = {}
     with AnyReader([path]) as reader:
@@ -47,7 +55,7 @@ def _read(path: Path) -> dict[str, list[Any]]:
 
 
 def test_rosbags_reads_a_bag_with_the_numbers_of_the_fit(log: Path, tmp_path: Path, checkout: Path) -> None:
-    done = export_bag(log, tmp_path / "bag", GAINS)
+    done = export_bag(log, tmp_path / "bag", _calibration())
     found = _read(tmp_path / "bag")
     assert {topic: len(messages) for topic, messages in found.items()} == done.messages
     run, cell = load_run(log)
@@ -122,6 +130,7 @@ def test_the_verb_says_what_it_wrote_and_refuses_what_is_there(
     assert said["effort"] is False
     with pytest.raises(UsageError, match="file or folder of that name"):
         export_bag(log, out)
-    with pytest.raises(ConfigurationInconsistent, match="those of the calibration, A"):
-        export_bag(log, tmp_path / "other", {"A": 1.0})
+    for other in (replace(_calibration(), cell="other"), replace(_calibration(), gains=_calibration().gains[::-1])):
+        with pytest.raises(ConfigurationInconsistent, match="as in the calibration"):
+            export_bag(log, tmp_path / "other", other)
     assert [path.name for path in tmp_path.iterdir()] == ["bag"]

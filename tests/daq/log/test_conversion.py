@@ -13,9 +13,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from daq.config.cell_file import load_cell
-from daq.errors import ClockImplausible, CurrentSaturated, CyclesLost, LogIncomplete, PositionImplausible, RunInvalid
-from daq.log.conversion import load_run, scaling, unwrapped
+from daq.errors import (
+    ClockImplausible,
+    CurrentSaturated,
+    CyclesLost,
+    LogIncomplete,
+    LogsDiffer,
+    PositionImplausible,
+    RunInvalid,
+)
+from daq.log.conversion import load_run, run_from_log, scaling, unwrapped
 from daq.log.metadata import AxisReadback, Readback, readback_of_drives
+from daq.log.reader import read_log
 from drivers.stream.sample import CellEvent, EventKind, Sample
 from tests.conftest import CHECKOUT
 from tests.daq.logs import DISC, START_NS, content, demo_content, samples, write
@@ -157,11 +166,11 @@ def test_a_wrap_in_a_log_is_no_turn_of_the_joint(record: Recorder) -> None:
 def test_the_scaled_numbers_of_an_import_do_not_wrap(checkout: Path, tmp_path: Path) -> None:
     start = demo_content(checkout)
     top = 2**31 - 1
-    quantum = 1.0 / top
+    quantum = 0.01 / top
     readback = Readback(tuple(replace(axis, position_rad_per_count=quantum) for axis in start.readback.axes))
     rows = [Sample(k, k * 1_000_000, (sign * top,) * 6, (0,) * 6, (0,) * 6) for k, sign in enumerate((1, -1))]
     run, _ = load_run(write(tmp_path / "i.mcap", replace(start, readback=readback), rows))
-    np.testing.assert_allclose(run.position_rad[:, 0], [1 / 32, -1 / 32])
+    np.testing.assert_allclose(run.position_rad[:, 0], [0.01 / 32, -0.01 / 32])
 
 
 def test_an_invalid_run_is_refused(record: Recorder) -> None:
@@ -177,8 +186,10 @@ def test_positions_outside_the_limits_are_refused(record: Recorder) -> None:
 
 def test_a_log_of_another_cell_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path / "b.mcap", content(2), samples([[0, 0]] * 3))
-    with pytest.raises(LogIncomplete, match="a readback of J1, J2; expected one of J1, J2, J3"):
+    with pytest.raises(LogsDiffer, match="a log of cell 'x'; expected one of cell 'demo'"):
         load_run(path, CELL)
+    with pytest.raises(LogIncomplete, match="a readback of J1, J2; expected one of J1, J2, J3"):
+        run_from_log(read_log(path), CELL)
 
 
 def test_the_readback_of_drives_keeps_their_answers() -> None:

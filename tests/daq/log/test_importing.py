@@ -333,6 +333,14 @@ def test_a_step_that_no_motor_makes(bench: Bench, capsys: pytest.CaptureFixture[
     )
 
 
+def test_a_step_of_an_axis_that_rests_is_refused_too(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nothing else of that axis changes, and the step itself is no noise to compare it with."""
+    bench.joint_deg[:, 2] = 60.0
+    bench.joint_deg[120, 2] += np.degrees(0.5)
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    _refused(bench, capsys, 4, "column q3, axis J3", "in one sample", "the limit in the cell configuration")
+
+
 def test_a_step_is_found_in_resampled_samples_too(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     bench.joint_deg = 20.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))
     bench.joint_deg[150:, 3] += np.degrees(0.5)

@@ -31,7 +31,7 @@ from daq.log.metadata import (
     sealed,
     statistics_record,
 )
-from daq.log.reader import LARGEST_ENTRIES, LogReader, read_log
+from daq.log.reader import BLOCK_SAMPLES, LARGEST_ENTRIES, LogReader, read_log
 from daq.log.salvage import salvage
 from daq.report.log import describe_log
 from drivers.stream.sample import CellEvent, EventKind
@@ -117,6 +117,16 @@ READERS: dict[str, Callable[[Path, Path], object]] = {
 def test_the_log_that_the_others_are_made_of_is_sound(reader: str, made: MadeUp, tmp_path: Path) -> None:
     READERS[reader](made.write(tmp_path / "a.mcap"), tmp_path)
     assert describe_log(tmp_path / "a.mcap")["valid"]
+
+
+@pytest.mark.parametrize("start_ns", [0, START_NS])
+def test_a_log_of_several_blocks_lasts_from_its_first_stamp_on(start_ns: int, checkout: Path, tmp_path: Path) -> None:
+    count = 2 * BLOCK_SAMPLES
+    log = MadeUp(checkout, list(range(count)), [start_ns + k * 1_000_000 for k in range(count)])
+    log.counted()
+    described = describe_log(log.write(tmp_path / "a.mcap"))
+    assert described["samples"] == count
+    assert described["stamped_duration_s"] == pytest.approx((count - 1) * 1e-3)
 
 
 def _renumbered(made: MadeUp) -> None:

@@ -140,6 +140,33 @@ def test_a_sound_run_is_valid_and_starts_at_wall_time(
     assert load_run(rig.out)[0].move is not None
 
 
+def test_a_glitch_of_an_encoder_makes_the_run_invalid(lockstep: Rig) -> None:
+    """One answer of the elbow, in the middle of the run, has a position that is 0.9 rad away."""
+    sound = lockstep.run()
+    assert (sound.log.valid, sound.log.reason) == (True, "")
+    middle = lockstep.bus.cycle // 2
+    lockstep.out.unlink()
+    begun = lockstep.bus.cycle
+    wrong: list[int] = []
+
+    def tamper(message: can.Message) -> Iterable[can.Message]:
+        if message.arbitration_id == 0x180 + ELBOW and lockstep.bus.cycle == begun + middle:
+            position = int.from_bytes(message.data[:4], "little", signed=True)
+            assert abs(position - ELBOW_COUNTS) < ELBOW_COUNTS // 4
+            wrong.append(position)
+            glitch = position + round(0.9 * 45 / (2 * 3.141592653589793) * 65536)
+            message.data[:4] = glitch.to_bytes(4, "little", signed=True)
+        return (message,)
+
+    lockstep.bus.tamper = tamper
+    done = lockstep.run()
+    assert len(wrong) == 1
+    assert not done.log.valid
+    assert done.log.reason.startswith("axis J3: a step of 51.")
+    with pytest.raises(RunInvalid, match="axis J3: a step of 51"):
+        load_run(lockstep.out)
+
+
 def test_what_is_done_before_the_first_sample_costs_no_period(timed: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     def slow_bundle(cell_file: Path) -> dict[str, bytes]:
         timed.bus.clock.now_ns += 30_000_000

@@ -7,9 +7,11 @@ import os
 import signal
 import socket
 import struct
+import time
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import can
 import pytest
@@ -20,7 +22,15 @@ from drivers.canopen.bus import BusAddress
 from drivers.canopen.capture import RECORD, Capture, DropCounter, Kind, MonotonicTime
 from drivers.canopen.link import SYNC_COB_ID, Link
 from drivers.canopen.sdo import SdoPolicy
-from drivers.canopen.socketcan import CapturedMessage, Losses, SocketcanBus, losses_of, open_socketcan, remarks_of
+from drivers.canopen.socketcan import (
+    CapturedMessage,
+    Losses,
+    SocketcanBus,
+    lags_behind,
+    losses_of,
+    open_socketcan,
+    remarks_of,
+)
 from drivers.errors import BusError
 from drivers.stream.sample import EventKind
 from tests.drivers.scripted import FakeClock, cell
@@ -142,6 +152,35 @@ def test_stamps_are_whole_nanoseconds_that_never_go_back(pair: Pair) -> None:
     assert stamps == sorted(stamps)
     assert losses_of(bus) == Losses()
     assert remarks_of(bus) == ()
+
+
+def test_a_stamp_of_0_is_a_stamp(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only a frame without any stamp gets the time at which it was read."""
+    wire, bus = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    out, parent = socket.socketpair()
+    with wire, bus, out, parent:
+        capture = Capture(bus, out, NO_INTERFACE)
+        stamps = iter((0, None))
+        monkeypatch.setattr(capture._batch, "about", lambda _number: (FRAME.size, 0, next(stamps), None))
+        for _ in range(2):
+            wire.send(FRAME.pack(0x181, 0, bytes(8)))
+        before_ns = time.time_ns()
+        assert capture.receive() == 0
+        assert capture.forward()
+        records = RECORD.iter_unpack(parent.recv(1 << 20))
+        stamped_ns, unstamped_ns = (record[0] for record in records)
+    assert stamped_ns == 0
+    assert unstamped_ns >= before_ns
+
+
+@pytest.mark.parametrize(
+    ("until_ns", "behind"),
+    [(0, True), (4, True), (5, False), (None, False)],
+    ids=["nothing yet", "4", "5", "no stamps"],
+)
+def test_a_bus_is_behind_until_it_has_read_to_a_time(until_ns: int | None, behind: bool) -> None:
+    bus = SimpleNamespace(read_until_ns=until_ns)
+    assert lags_behind(cast("can.BusABC", bus), 5) is behind
 
 
 def test_a_full_backlog_is_counted_to_the_frame() -> None:

@@ -339,3 +339,32 @@ def test_every_pose_of_a_recording_is_reached_from_the_assembly_pose(mechanism: 
     assert smooth.closed.all()
     assert apart.closed.all()
     assert np.max(np.abs(apart.position_rad - smooth.position_rad[::97])) < 1e-8
+
+
+PARALLELOGRAM = """<robot name="lifter">
+  <link name="base"/><link name="column"/><link name="upper arm"/><link name="forearm"/><link name="hand"/>
+  <joint name="J1" type="revolute"><parent link="base"/><child link="column"/><axis xyz="0 0 1"/>
+    <limit velocity="1" effort="1"/></joint>
+  <joint name="J2" type="revolute"><parent link="column"/><child link="upper arm"/><origin xyz="0.05 0 0.2"/>
+    <axis xyz="0 1 0"/><limit velocity="1" effort="1"/></joint>
+  <joint name="rod" type="revolute"><parent link="upper arm"/><child link="forearm"/><origin xyz="0 0 0.35"/>
+    <axis xyz="0 1 0"/><limit velocity="1" effort="1"/></joint>
+  <joint name="J4" type="revolute"><parent link="forearm"/><child link="hand"/><origin xyz="0 0 0.3"/>
+    <axis xyz="1 0 0"/><limit velocity="1" effort="1"/></joint>
+</robot>"""
+
+
+def test_a_follower_is_described_by_one_closure_of_a_direction() -> None:
+    """What the refusal of <mimic> proposes: the forearm keeps its direction, so its joint turns back as J2 turns."""
+    keeps = LinkPair("parallelogram", "column", "forearm", ("ry",))
+    robot = robot_from_urdf(PARALLELOGRAM, closures=(keeps,), motors=("J1", "J2", "J4"))
+    rng = np.random.default_rng(5)
+    axes = Motion(*(rng.uniform(-0.8, 0.8, (20, 3)) for _ in range(3)))
+    joints = follow(robot, assemble(robot, 3), axes).joints
+    for found, wanted in (
+        (joints.position_rad, axes.position_rad),
+        (joints.velocity_rad_s, axes.velocity_rad_s),
+        (joints.acceleration_rad_s2, axes.acceleration_rad_s2),
+    ):
+        np.testing.assert_allclose(found[:, [0, 1, 3]], wanted, atol=TOLERANCE)
+        np.testing.assert_allclose(found[:, 2], -wanted[:, 1], atol=1e-8)

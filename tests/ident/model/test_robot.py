@@ -139,6 +139,52 @@ def test_what_cannot_be_held_is_refused(urdf: str, held: dict[str, float], messa
         hold_joints(urdf, held)
 
 
+CHAINED = _with_gripper(TURNING, TURNING + '<mimic joint="finger" multiplier="2"/>').replace(
+    "</robot>",
+    '<link name="u"/><joint name="tip" type="revolute"><parent link="t"/><child link="u"/><axis xyz="0 0 1"/>'
+    + LIMIT
+    + '<mimic joint="thumb" multiplier="-3" offset="0.5"/></joint></robot>',
+)
+"""A finger, a thumb that follows it, and a tip that follows the thumb."""
+
+
+def test_a_follower_of_a_follower_is_where_the_chain_puts_it() -> None:
+    held = hold_joints(CHAINED, {"finger": 0.1})
+    by_hand = hold_joints(CHAINED, {"finger": 0.1, "thumb": 0.2, "tip": -0.1})
+    assert [joint.name for joint in read_urdf(held).joints] == ["j"]
+    _assert_same_robot(held, by_hand)
+
+
+@pytest.mark.parametrize(
+    ("mimic", "held", "message"),
+    [
+        ('<mimic joint="j" multiplier="-1"/>', {"finger": 0.0}, "joint 'finger' mimics joint 'j' .* which moves"),
+        ('<mimic joint="thumb"/>', {"finger": 0.0}, "'finger' mimics joint 'thumb' .multiplier 1., which moves"),
+        ('<mimic joint="thumb"/>', {"finger": 0.2, "thumb": 0.1}, "held at 0.2 and mimics joint 'thumb', by which"),
+        ('<mimic joint="j" multiplier="0" offset="0.3"/>', {"finger": 0.0}, "held at 0 .*by which it is at 0.3"),
+    ],
+)
+def test_a_follower_is_held_only_where_it_is(mimic: str, held: dict[str, float], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        hold_joints(_with_gripper(TURNING + mimic, TURNING), held)
+
+
+def test_a_follower_is_held_where_its_leader_puts_it() -> None:
+    same = hold_joints(_with_gripper(TURNING + '<mimic joint="thumb"/>', TURNING), {"finger": 0.1, "thumb": 0.1})
+    assert [joint.name for joint in read_urdf(same).joints] == ["j"]
+    still = _with_gripper(TURNING + '<mimic joint="j" multiplier="0" offset="0.3"/>', TURNING)
+    assert len(read_urdf(hold_joints(still, {"finger": 0.3, "thumb": 0.0})).joints) == 1
+    # Nothing of this URDF moves a follower of a joint that it does not have.
+    of_another = _with_gripper(TURNING + '<mimic joint="elsewhere"/>', TURNING)
+    assert len(read_urdf(hold_joints(of_another, {"finger": 0.3, "thumb": 0.0})).joints) == 1
+
+
+def test_a_robot_whose_joint_mimics_another_is_refused() -> None:
+    """The equations would give it a motion of its own."""
+    with pytest.raises(ModelError, match=r"joint 'j' \(multiplier 2\); expected no <mimic>.*`closures`"):
+        robot_from_urdf(_with_gripper(TURNING + '<mimic joint="j" multiplier="2"/>', TURNING))
+
+
 def test_a_floating_base_is_held_where_it_is() -> None:
     base = _with_gripper('type="floating"><origin xyz="1 2 3"/>', 'type="planar">')
     held = hold_joints(base, {"finger": 0.0, "thumb": 0.0})

@@ -1,0 +1,201 @@
+"""Whether a log, a calibration and a description are of one cell, and in what a corrected description differs.
+
+A description that replaces the one in a log corrects it: gravity, zero offsets, ratios, geometry, masses, nameplate.
+It is of the same cell where the name, the axes, their joints and their drives are the same. All of these are needed:
+two robots of one make have the same axes and joints, and a copied cell file even the same name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from daq.config.cell import Axis, Cell
+from daq.config.cell_file import CELL, cell_from_bundle
+from daq.config.yaml_file import parse_yaml
+from daq.errors import ConfigurationInconsistent, LogsDiffer, SchemaMismatch
+from ident.calibration import Calibration
+from ident.model.urdf import read_urdf
+
+_REMEDY = (
+    "another robot's description gives wrong gains: give the description of this cell, or none, since the log has its "
+    "own; `cell`, `axes`, joints and drives have to be as in the log, and everything else may be corrected"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Mismatch:
+    """What shows that two descriptions are of different cells."""
+
+    found: str
+    expected: str
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """What a description replaced in that of a log."""
+
+    configuration_sha256: str  #: of the description in the log
+    sections: tuple[str, ...]  #: of the cell file that differ, such as `robot.gravity_m_s2`
+
+
+def correction_of(
+    log: str, files: Mapping[str, bytes], given: Cell, serials: Sequence[int | None] = ()
+) -> Correction | None:
+    """Return what a given description replaces in that of a log; None where nothing of a fit depends on it.
+
+    Args:
+        log: name of the log in messages.
+        files: the description in the log, as by `daq.config.cell_file.bundle`.
+        given: the description that replaces it.
+        serials: serial number that the drive of each axis reported; None for one that reported none.
+
+    Raises:
+        LogsDiffer: the description is of another cell.
+        ConfigurationError: the log has no description that can be compared.
+    """
+    name = f"{log}, {CELL}"
+    try:
+        own = cell_from_bundle(files, names={CELL: name})
+    except (ConfigurationInconsistent, SchemaMismatch):
+        # A description that this version refuses may be what the given one corrects: its names are compared.
+        found = _mismatch_of_names(files, given, name) or _mismatch_of_drives(None, given, serials)
+        correction = Correction("", (CELL,))
+    else:
+        found = mismatch(own, given) or _mismatch_of_drives(own, given, serials)
+        correction = Correction(own.digest, differing_sections(own, given))
+    if found is not None:
+        raise LogsDiffer(log, found=found.found, expected=found.expected, remedy=_REMEDY)
+    return correction if correction.sections else None
+
+
+def mismatch(own: Cell, given: Cell) -> Mismatch | None:
+    """Return what shows that a description is of another cell than that of a log; None for the same cell."""
+    found = _mismatch_of_axes((own.name, own.axis_names), (given.name, given.axis_names))
+    if found is not None:
+        return found
+    joints = _joints(own)
+    expected = _joints(given)
+    if joints != expected:
+        return Mismatch(f"joints {', '.join(joints)}", f"{', '.join(expected)}, as in the given description")
+    for one, other in zip(own.axes, given.axes, strict=True):
+        for label, recorded, wanted in _drive_of(one, other):
+            if recorded is not None and wanted is not None and recorded != wanted:
+                found_text = f"{label} {recorded} of axis {one.name}"
+                return Mismatch(found_text, f"{wanted}, as in the given description")
+    return None
+
+
+def mismatch_of_calibration(calibration: Calibration, cell: Cell) -> Mismatch | None:
+    """Return what shows that a calibration is of another cell; None for the same one."""
+    axes = tuple(gain.axis for gain in calibration.gains)
+    if (cell.name, cell.axis_names) == (calibration.cell, axes):
+        return None
+    return Mismatch(
+        f"cell {cell.name!r} with the axes {', '.join(cell.axis_names)}",
+        f"cell {calibration.cell!r} with the axes {', '.join(axes)}, as in the calibration",
+    )
+
+
+def differing_sections(own: Cell, given: Cell) -> tuple[str, ...]:
+    """Name the sections in which two descriptions of one cell differ, as far as a recording or its fit needs them."""
+    of_robot = (
+        ("robot.urdf", own.urdf == given.urdf),
+        ("robot.gravity_m_s2", own.gravity_m_s2 == given.gravity_m_s2),
+        ("closures", _closing(own) == _closing(given)),
+        ("drive_train.ratio", np.array_equal(own.ratio, given.ratio)),
+        ("bus", own.buses == given.buses),
+        ("sync", own.sync == given.sync),
+    )
+    of_fit = (
+        ("payloads", own.payloads == given.payloads),
+        ("effects", own.effects == given.effects),
+        ("conditioning", own.conditioning == given.conditioning),
+    )
+    return (
+        *(name for name, same in of_robot if not same),
+        *_differing_axes(own.axes, given.axes),
+        *(name for name, same in of_fit if not same),
+    )
+
+
+def _closing(cell: Cell) -> tuple[object, ...]:
+    """How the loops of a closed chain close; empty for a serial robot."""
+    chain = cell.chain
+    return () if chain is None else (chain.closures, chain.motors, chain.platform, chain.assembly_rad)
+
+
+def _differing_axes(own: Sequence[Axis], given: Sequence[Axis]) -> list[str]:
+    """Name each key of the axes that differs, with its axes: `axes.limits (J1, J2)`."""
+    sections = []
+    for field in fields(Axis):
+        pairs = zip(own, given, strict=True)
+        differing = [one.name for one, other in pairs if getattr(one, field.name) != getattr(other, field.name)]
+        if differing:
+            key = _KEYS.get(field.name, field.name)
+            sections.append(f"axes.{key} ({', '.join(differing)})")
+    return sections
+
+
+_KEYS = {"zero_offset_rad": "zero_offset", "profile": "drive profile", "unit": "limits"}
+"""Key of the cell file behind a field of `Axis` with another name."""
+
+
+def _joints(cell: Cell) -> tuple[str, ...]:
+    """Return name and kind of every joint that moves."""
+    joints = tuple(f"{joint.name} ({joint.kind.value})" for joint in read_urdf(cell.urdf).joints)
+    return joints if cell.chain is None else (*joints, f"with motors on {', '.join(cell.chain.motors)}")
+
+
+def _drive_of(own: Axis, given: Axis) -> tuple[tuple[str, int | None, int | None], ...]:
+    """Pairs of numbers that tell one drive from another; a number that one of the two leaves open is None."""
+    first = own.identity
+    second = given.identity
+    node = ("node id", own.node_id, given.node_id)
+    if first is None or second is None:
+        return (node,)
+    return (
+        node,
+        ("vendor id", first.vendor_id, second.vendor_id),
+        ("product code", first.product_code, second.product_code),
+        ("serial number", first.serial, second.serial),
+    )
+
+
+def _mismatch_of_axes(own: tuple[str, tuple[str, ...]], given: tuple[str, tuple[str, ...]]) -> Mismatch | None:
+    if own[0] != given[0]:
+        return Mismatch(f"a log of cell {own[0]!r}", f"one of cell {given[0]!r}, as in the given description")
+    if own[1] != given[1]:
+        return Mismatch(f"axes {', '.join(own[1])}", f"{', '.join(given[1])}, as in the given description")
+    return None
+
+
+def _mismatch_of_names(files: Mapping[str, bytes], given: Cell, name: str) -> Mismatch | None:
+    """Compare name and axes with those of a description that this version refuses otherwise."""
+    tree = parse_yaml(files[CELL], name).tree
+    own = tree.get("name") if isinstance(tree, dict) else None
+    axes = tree.get("axes") if isinstance(tree, dict) else None
+    entries = axes if isinstance(axes, list) else []
+    names = tuple(str(entry.get("name")) for entry in entries if isinstance(entry, dict))
+    return _mismatch_of_axes((str(own), names or given.axis_names), (given.name, given.axis_names))
+
+
+def _mismatch_of_drives(own: Cell | None, given: Cell, serials: Sequence[int | None]) -> Mismatch | None:
+    """Compare the serial numbers that the drives reported at the recording with those of a description.
+
+    Where the description in the log has a serial number, that one is compared (`mismatch`).
+    """
+    declared = (None,) * len(given.axes) if own is None else tuple(map(_serial, own.axes))
+    for axis, in_log, recorded in zip(given.axes, declared, serials, strict=False):
+        wanted = _serial(axis)
+        if in_log is None and recorded is not None and wanted is not None and recorded != wanted:
+            found = f"serial number {recorded}, reported by the drive of axis {axis.name}"
+            return Mismatch(found, f"{wanted}, as in the given description")
+    return None
+
+
+def _serial(axis: Axis) -> int | None:
+    """Serial number that a description gives to the drive of an axis; None where it leaves it open."""
+    return None if axis.identity is None else axis.identity.serial

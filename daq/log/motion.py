@@ -1,0 +1,149 @@
+"""Judge the motion in a log wherever a log is called valid: at the end of its recording, by `info`, by the exports.
+
+A fit refuses a log that no robot moves by (`daq.log.plausibility.motion_fault`); what is said of a log before agrees.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daq.config.cell import Cell
+from daq.errors import DataError
+from daq.log.conversion import answers, continuous_counts, scaling
+from daq.log.metadata import Readback, RunStatistics
+from daq.log.plausibility import LARGEST_OUTLIER, SPEED_MARGIN, motion_fault
+from daq.log.reader import LogHead, SampleBlock, SampleChecks, joined
+from drivers.stream.sample import Sample
+
+
+def motion_reason(
+    cell: Cell,
+    readback: Readback,
+    rate_hz: float,
+    position_counts: NDArray[np.int32],
+    current_raw: NDArray[np.int32],
+    missing: NDArray[np.uint32],
+) -> str:
+    """Return why no robot moves by the samples of a log, with the axis; empty where one may.
+
+    Args:
+        cell: with the limits.
+        readback: answers of the amplifiers.
+        rate_hz: rate of the samples.
+        position_counts: positions of the motors, shape (k, n).
+        current_raw: currents of the motors, shape (k, n).
+        missing: bit i for axis i without an answer, shape (k,).
+
+    Raises:
+        LogIncomplete: cell and readback do not belong together.
+    """
+    scale = scaling(cell, readback)
+    position_rad = scale.joint_position(continuous_counts(position_counts, readback))
+    known = scale.joints_known(answers(missing, len(cell.axes)))
+    fault = motion_fault("", cell, rate_hz, position_rad, current_raw * scale.current_per_unit, known)
+    return "" if fault is None else _reason(fault)
+
+
+def _reason(fault: DataError) -> str:
+    axis = fault.subject.removeprefix(", ")
+    return f"{axis}: {fault.found}"
+
+
+class MotionWatch:
+    """Finds block by block, in bounded memory, the logs of which all samples have to be judged: few have a fast step.
+
+    What it does not suspect, `motion_fault` does not refuse: a speed over many samples has a step as fast among them,
+    and the 99th percentile of a current is at least the smallest one of the blocks.
+    """
+
+    def __init__(self, cell: Cell, head: LogHead) -> None:
+        """Store what turns counts to positions."""
+        self._rate_hz = head.run.rate_hz
+        self._readback = head.readback
+        self._scale = scaling(cell, head.readback)
+        self._limits = np.array([axis.limits.velocity for axis in cell.axes])
+        self._last: NDArray[np.int32] | None = None
+        self._fastest = 0.0  # in multiples of the velocity limit
+        self._peak = np.zeros(len(cell.axes))
+        self._usual = np.full(len(cell.axes), np.inf)
+
+    def take(self, block: SampleBlock) -> None:
+        """Take the next samples."""
+        counts = block.position_counts
+        if counts.shape[1] != len(self._limits):
+            return  # the reader refuses the log at its end
+        if self._last is not None:
+            counts = np.concatenate((self._last[None, :], counts))
+        self._last = counts[-1]
+        position_rad = self._scale.joint_position(continuous_counts(counts, self._readback))
+        speeds = np.abs(np.diff(position_rad, axis=0)) * self._rate_hz / self._limits
+        if speeds.size:
+            self._fastest = max(self._fastest, float(speeds.max()))
+        size = np.abs(block.current_raw.astype(np.float64))
+        self._peak = np.maximum(self._peak, size.max(axis=0))
+        self._usual = np.minimum(self._usual, np.percentile(size, 99.0, axis=0))
+
+    @property
+    def suspects(self) -> bool:
+        """Whether all samples have to be judged together."""
+        outlier = self._peak > LARGEST_OUTLIER * self._usual
+        return self._fastest > SPEED_MARGIN or bool(outlier.any())
+
+
+def log_verdict(
+    cell: Cell,
+    head: LogHead,
+    checks: SampleChecks,
+    statistics: RunStatistics,
+    watch: MotionWatch,
+    again: Callable[[], Iterable[SampleBlock]],
+) -> tuple[bool, str]:
+    """Return whether a log is valid by its recorder, its cycles and its motion, and why not.
+
+    Args:
+        cell: of the log.
+        head: of the log.
+        checks: that took every block.
+        statistics: of its recorder.
+        watch: that took every block.
+        again: reads the blocks once more, where the motion is suspect.
+    """
+    valid, reason = checks.verdict(head.run.rate_hz, statistics)
+    if not valid or not watch.suspects:
+        return valid, reason
+    samples = joined(again())
+    found = motion_reason(
+        cell, head.readback, head.run.rate_hz, samples.position_counts, samples.current_raw, samples.missing
+    )
+    return not found, found or reason
+
+
+class RecordedMotion:
+    """Positions and currents of a recording, by which it is judged at its end: 8 bytes for each sample of an axis."""
+
+    def __init__(self, axes: int) -> None:
+        """Store the number of axes."""
+        self._axes = axes
+        self._position_counts = array("i")
+        self._current_raw = array("i")
+        self._missing = array("I")
+
+    def take(self, sample: Sample) -> None:
+        """Take the next sample."""
+        self._position_counts.extend(sample.position_counts)
+        self._current_raw.extend(sample.current_raw)
+        self._missing.append(sample.missing)
+
+    def reason(self, cell: Cell, readback: Readback, rate_hz: float) -> str:
+        """Return why no robot moves by the recording; empty where one may."""
+        if not self._missing:
+            return ""
+        shape = len(self._missing), self._axes
+        position_counts = np.frombuffer(self._position_counts, dtype=np.int32).reshape(shape)
+        current_raw = np.frombuffer(self._current_raw, dtype=np.int32).reshape(shape)
+        missing = np.frombuffer(self._missing, dtype=np.uint32)
+        return motion_reason(cell, readback, rate_hz, position_counts, current_raw, missing)

@@ -1,0 +1,219 @@
+"""A log, a calibration and a description are of one cell, or are refused; a corrected description is named."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from daq.cli.app import main
+from daq.config.cell import Cell
+from daq.config.cell_file import bundle, load_cell
+from daq.config.same_cell import correction_of, differing_sections, mismatch
+from daq.errors import ExitCode, LogsDiffer
+from daq.log.conversion import load_run
+from daq.workflow.calibration_file import decode, encode, save_calibration
+from daq.workflow.fit import Reading
+from daq.workflow.weigh import weigh_logs
+from ident.calibration import Calibration, Source
+from ident.data.conditioning import Conditioning
+from tests.daq.calibrations import demo_calibration
+from tests.daq.logs import DISC, demo_content, samples, write
+
+ROWS = samples([[100 * k + axis for axis in range(6)] for k in range(60)])
+
+
+@pytest.fixture
+def demo(checkout: Path, tmp_path: Path) -> Path:
+    """A copy of the demo cell's file, in a folder of its own."""
+    return _copy(checkout, tmp_path, lambda text: text)
+
+
+@pytest.fixture
+def log(checkout: Path, tmp_path: Path) -> Path:
+    """A log of the demo cell, without load."""
+    return write(tmp_path / "bare.mcap", demo_content(checkout), ROWS)
+
+
+def _copy(checkout: Path, folder: Path, change: Callable[[str], str], name: str = "cell.yaml") -> Path:
+    text = (checkout / "configs/cells/demo.yaml").read_text(encoding="utf-8")
+    changed = change(text.replace("../", f"{checkout}/configs/"))
+    path = folder / name
+    path.write_text(changed, encoding="utf-8")
+    return path
+
+
+def _replaced(old: str, new: str) -> Callable[[str], str]:
+    def change(text: str) -> str:
+        assert old in text
+        return text.replace(old, new, 1)
+
+    return change
+
+
+def _calibration(cell: str) -> Calibration:
+    """A calibration of a cell with these axes, with every setting of its filter."""
+    document = Conditioning(standstill_rad_s=(0.03,) * 6).document()
+    return replace(demo_calibration(), cell=cell, filter=document)
+
+
+OTHERS: dict[str, tuple[Callable[[str], str], str]] = {
+    "another name": (_replaced("name: demo", "name: press"), "a log of cell 'demo'; expected one of cell 'press'"),
+    "another axis": (_replaced("name: J2", "name: A2"), "axes J1, J2, .*; expected J1, A2"),
+    "another node": (_replaced("node_id: 3", "node_id: 33"), "node id 3 of axis J3; expected 33"),
+}
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_another_cell_is_refused_with_what_shows_it(kind: str, checkout: Path, tmp_path: Path, log: Path) -> None:
+    change, message = OTHERS[kind]
+    other = load_cell(_copy(checkout, tmp_path, change))
+    with pytest.raises(LogsDiffer, match=f"{message}.*another robot's description gives wrong gains"):
+        load_run(log, other)
+
+
+def test_a_robot_with_other_joints_is_another_one(checkout: Path) -> None:
+    demo = load_cell(checkout / "configs/cells/demo.yaml")
+    for old, new in (('<joint name="J2"', '<joint name="elbow"'), ('type="revolute"', 'type="prismatic"')):
+        assert old in demo.urdf
+        found = mismatch(demo, replace(demo, urdf=demo.urdf.replace(old, new, 1)))
+        assert found is not None
+        assert "as in the given description" in found.expected
+
+
+def test_drives_of_other_serial_numbers_are_of_another_robot(checkout: Path, tmp_path: Path) -> None:
+    """The drives of this log reported the serial number 7, and its description names none."""
+    unnamed = _copy(checkout, tmp_path, lambda text: re.sub(r", serial: \d+", "", text))
+    content = replace(demo_content(checkout), files=bundle(unnamed))
+    log = write(tmp_path / "bare.mcap", content, ROWS)
+    declared = load_cell(checkout / "configs/cells/demo.yaml")
+
+    def with_serial(serial: int) -> Cell:
+        axes = load_cell(unnamed).axes
+        assert axes[0].identity is not None
+        identity = replace(axes[0].identity, serial=serial)
+        return replace(declared, axes=(replace(axes[0], identity=identity), *axes[1:]))
+
+    load_run(log, with_serial(7))
+    with pytest.raises(LogsDiffer, match="serial number 7, reported by the drive of axis J1; expected 8"):
+        load_run(log, with_serial(8))
+    found = mismatch(with_serial(7), with_serial(8))
+    assert found is not None
+    assert found.found == "serial number 7 of axis J1"
+
+
+UPSIDE_DOWN = _replaced("gravity_m_s2: [0.0, 0.0, -9.81]", "gravity_m_s2: [0.0, 0.0, 9.81]")
+CORRECTIONS: dict[str, tuple[Callable[[str], str], tuple[str, ...]]] = {
+    "gravity": (UPSIDE_DOWN, ("robot.gravity_m_s2",)),
+    "nameplate": (_replaced("nameplate_gain_nm_per_a: ", "nameplate_gain_nm_per_a: 1"), ("axes.nameplate_gain (J1)",)),
+    "mass": (_replaced("mass_kg: 4.59", "mass_kg: 4.60"), ("payloads",)),
+    "filter": (_replaced("position_cutoff_hz: 40", "position_cutoff_hz: 41"), ("conditioning",)),
+    "comment": (lambda text: f"# later\n{text}", ()),
+}
+
+
+@pytest.mark.parametrize("kind", CORRECTIONS)
+def test_a_corrected_description_is_taken_and_recorded(kind: str, checkout: Path, tmp_path: Path, log: Path) -> None:
+    change, sections = CORRECTIONS[kind]
+    corrected = load_cell(_copy(checkout, tmp_path, change))
+    run, described = load_run(log, corrected)
+    assert described is corrected
+    assert run.recording is not None
+    assert run.recording.corrected == sections
+    own = load_cell(checkout / "configs/cells/demo.yaml")
+    assert run.recording.replaced_configuration_sha256 == (own.digest if sections else None)
+    plain, _ = load_run(log)
+    assert plain.recording is not None
+    assert plain.recording.replaced_configuration_sha256 is None
+
+
+def test_geometry_ratio_and_zero_are_corrections(checkout: Path) -> None:
+    demo = load_cell(checkout / "configs/cells/demo.yaml")
+    axes = (replace(demo.axes[0], zero_offset_rad=0.1), *demo.axes[1:-1], replace(demo.axes[-1], zero_offset_rad=0.2))
+    mended = replace(demo, urdf=demo.urdf.replace("0.225", "0.2251"), ratio=2.0 * demo.ratio, axes=axes)
+    assert mended.urdf != demo.urdf
+    assert mismatch(demo, mended) is None
+    assert differing_sections(demo, mended) == ("robot.urdf", "drive_train.ratio", "axes.zero_offset (J1, J6)")
+
+
+def test_a_description_that_is_refused_now_can_be_corrected_by_one_of_its_name(checkout: Path, demo: Path) -> None:
+    files = bundle(demo)
+    given = load_cell(demo)
+    broken = {**files, "cell.yaml": files["cell.yaml"].replace(b"node_id: 3", b"node_id: 2")}
+    correction = correction_of("a.mcap", broken, given)
+    assert correction is not None
+    assert correction.sections == ("cell.yaml",)
+    other = {**broken, "cell.yaml": broken["cell.yaml"].replace(b"name: demo", b"name: press")}
+    with pytest.raises(LogsDiffer, match="a log of cell 'press'; expected one of cell 'demo'"):
+        correction_of("a.mcap", other, given)
+
+
+def test_a_correction_is_said_once_for_logs_that_share_a_description(
+    checkout: Path, tmp_path: Path, log: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    loaded = write(tmp_path / "loaded.mcap", demo_content(checkout, DISC), samples([[k] * 6 for k in range(60)]))
+    corrected = load_cell(_copy(checkout, tmp_path, UPSIDE_DOWN))
+    reading = Reading.of([log, loaded], corrected)
+    list(reading.runs([log, loaded], "fit"))
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{log}: the given description of the cell replaces the one in the log; they differ in robot.gravity_m_s2"
+    ]
+    found = [source.recording.corrected for source in reading.sources if source.recording is not None]
+    assert found == [("robot.gravity_m_s2",)] * 2
+    # As the calibration keeps it.
+    calibration = replace(demo_calibration(), sources=tuple(reading.sources))
+    again: tuple[Source, ...] = decode(encode(calibration), "calibration.yaml").sources
+    assert again == tuple(reading.sources)
+
+
+def test_logs_of_two_descriptions_are_not_weighed_by_one_model(checkout: Path, tmp_path: Path, log: Path) -> None:
+    content = replace(demo_content(checkout), files=bundle(_copy(checkout, tmp_path, UPSIDE_DOWN)))
+    other = write(tmp_path / "other.mcap", content, samples([[k] * 6 for k in range(60)]))
+    calibration = _calibration("demo")
+    with pytest.raises(LogsDiffer, match=r"in robot\.gravity_m_s2; expected one description for all logs"):
+        weigh_logs(calibration, [log, other])
+    with pytest.raises(LogsDiffer, match=r"in robot\.gravity_m_s2; expected one description for all logs"):
+        weigh_logs(calibration, [log], bare=[other])
+
+
+VERBS: dict[str, tuple[list[str], ExitCode]] = {
+    "fit": (["fit", "LOG", "LOG", "--cell", "CELL"], ExitCode.DATA_UNFIT),
+    "fit with fixed gains": (["fit", "LOG", "--gains", "fixed", "--cell", "CELL"], ExitCode.DATA_UNFIT),
+    "fit of cases": (["fit", "LOG", "LOG", "--cases", "out", "--cell", "CELL"], ExitCode.DATA_UNFIT),
+    "residual": (["residual", "LOG", "LOG", "--cell", "CELL"], ExitCode.DATA_UNFIT),
+    "validate": (["validate", "CALIBRATION", "LOG", "--cell", "CELL"], ExitCode.DATA_UNFIT),
+    "weigh": (["weigh", "CALIBRATION", "LOG", "--cell", "CELL"], ExitCode.DATA_UNFIT),
+    "contact": (["contact", "CALIBRATION", "LOG", "--cell", "CELL"], ExitCode.DATA_UNFIT),
+    "report": (["report", "DEMO", "--cell", "CELL"], ExitCode.CALIBRATION_REFUSED),
+    "export urdf": (["export", "urdf", "CELL", "DEMO", "--out", "out.urdf"], ExitCode.CONFIGURATION),
+    "export bag": (["export", "bag", "LOG", "--calibration", "CALIBRATION", "--out", "bag"], ExitCode.CONFIGURATION),
+    "monitor": (["monitor", "CELL", "--calibration", "DEMO", "--once"], ExitCode.DATA_UNFIT),
+    "apply": (["apply", "CELL", "DEMO", "--configuration-changed"], ExitCode.CALIBRATION_REFUSED),
+}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_refuses_the_description_of_another_robot(
+    verb: str,
+    checkout: Path,
+    tmp_path: Path,
+    log: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The log is of cell demo; the description is of cell press, with the same axes; a calibration of each."""
+    monkeypatch.chdir(tmp_path)
+    cell = _copy(checkout, tmp_path, OTHERS["another name"][0])
+    calibration = tmp_path / "press-calibration.yaml"
+    save_calibration(_calibration("press"), calibration)
+    of_demo = tmp_path / "demo-calibration.yaml"
+    save_calibration(_calibration("demo"), of_demo)
+    files = {"LOG": str(log), "CELL": str(cell), "CALIBRATION": str(calibration), "DEMO": str(of_demo)}
+    arguments, code = VERBS[verb]
+    assert main([files.get(word, word) for word in arguments]) == code
+    said = " ".join(capsys.readouterr().err.split())
+    assert "'demo'" in said
+    assert "'press'" in said

@@ -1,0 +1,221 @@
+"""An encoder glitch in a log of our own is refused as in an import, wherever the log is read or called valid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import radians
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daq.cli.app import main
+from daq.config.cell_file import load_cell
+from daq.errors import CurrentImplausible, DataError, ExitCode, PositionImplausible
+from daq.log.bag_writer import export_bag
+from daq.log.conversion import load_run
+from daq.log.export import TableFormat, export_log
+from daq.log.metadata import AxisReadback, Readback
+from daq.log.motion import RecordedMotion
+from daq.log.plausibility import impossible_current, impossible_step
+from daq.log.reader import LossyLogs
+from daq.log.salvage import salvage
+from daq.report.log import describe_log
+from daq.workflow.calibration_file import save_calibration
+from drivers.stream.sample import Sample
+from ident.arrays import FloatArray
+from ident.data.conditioning import Conditioning
+from tests.conftest import CHECKOUT
+from tests.daq.calibrations import demo_calibration
+from tests.daq.logs import START_NS, demo_content, write
+
+COUNT, RATE_HZ, AXES = 5000, 1000.0, 6
+GLITCH_RAD = 0.9
+CELL = load_cell(CHECKOUT / "configs/cells/demo.yaml")
+REST_RAD = np.array([0.0, 0.0, radians(60.0), 0.0, 0.0, 0.0])  # the elbow's limits leave zero out
+
+
+def _joints(*, resting: int | None = None) -> FloatArray:
+    """Smooth motion of every joint within its limits [rad], shape (COUNT, AXES); one may rest."""
+    time_s = np.arange(COUNT) / RATE_HZ
+    joint_rad = REST_RAD + 0.2 * np.sin(2.0 * np.pi * 0.5 * time_s[:, None] + np.arange(AXES))
+    if resting is not None:
+        joint_rad[:, resting] = REST_RAD[resting]
+    return joint_rad
+
+
+def _samples(joint_rad: FloatArray, missing: Callable[[int], int] = lambda _: 0) -> list[Sample]:
+    """Samples of the demo cell at these positions, with a smooth current."""
+    motor_rad = joint_rad @ CELL.ratio.T
+    counts = np.rint(motor_rad / (2.0 * np.pi) * 65536).astype(np.int64).tolist()
+    current = np.rint(200.0 * np.cos(np.arange(COUNT)[:, None] / 90.0 + np.arange(AXES))).astype(np.int64).tolist()
+    return [
+        Sample(10 + k, START_NS + k * 1_000_000, tuple(counts[k]), tuple(current[k]), (0x1237,) * AXES, missing(k))
+        for k in range(COUNT)
+    ]
+
+
+def _glitch(rows: slice, axis: int = 1) -> Callable[[FloatArray], None]:
+    def change(joint_rad: FloatArray) -> None:
+        joint_rad[rows, axis] += GLITCH_RAD
+
+    return change
+
+
+GLITCHES: dict[str, tuple[int | None, Callable[[FloatArray], None], str]] = {
+    "one sample": (None, _glitch(slice(1500, 1501)), "at 1.5 s"),
+    "the first sample": (None, _glitch(slice(0, 1)), "at 0.001 s"),
+    "the last sample": (None, _glitch(slice(-1, None)), "at 4.999 s"),
+    "a run of wrong samples": (None, _glitch(slice(1500, 1507)), "at 1.5"),
+    "a step that stays": (None, _glitch(slice(1500, None)), "at 1.5 s"),
+    "one sample of an axis that rests": (1, _glitch(slice(1500, 1501)), "at 1.5"),
+    "a step of an axis that rests": (1, _glitch(slice(1500, None)), "at 1.5 s"),
+    "between two blocks": (None, _glitch(slice(4096, 4097)), "at 4.09"),
+}
+
+
+def _log(path: Path, rows: list[Sample]) -> Path:
+    return write(path, demo_content(CHECKOUT), rows)
+
+
+@pytest.mark.parametrize("kind", GLITCHES)
+def test_a_glitch_of_the_encoder_is_refused_and_called_invalid_by_all(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    resting, change, when = GLITCHES[kind]
+    joint_rad = _joints(resting=resting)
+    sound = _log(tmp_path / "sound.mcap", _samples(joint_rad))
+    load_run(sound)
+    assert describe_log(sound)["valid"]
+    change(joint_rad)
+    rows = _samples(joint_rad)
+    log = _log(tmp_path / "a.mcap", rows)
+    with pytest.raises(PositionImplausible) as refused:
+        load_run(log)
+    assert refused.value.subject == f"{log}, axis J2"
+    assert "deg in one sample, 51" in refused.value.found  # 0.9 rad in 1 ms
+    assert when in refused.value.found
+    assert refused.value.expected == "at most 600 deg/s, 3 times 200 deg/s, the limit in the cell configuration"
+    reason = f"axis J2: {refused.value.found}"
+    described = describe_log(log)
+    assert (described["valid"], described["reason"]) == (False, reason)
+    table = export_log(log, tmp_path / "a.csv", TableFormat.CSV)
+    bag = export_bag(log, tmp_path / "bag")
+    assert (table.valid, table.reason, bag.valid, bag.reason) == (False, reason, False, reason)
+    recorded = RecordedMotion(AXES)
+    for row in rows:
+        recorded.take(row)
+    readback = Readback(tuple(AxisReadback(name, 0.002) for name in CELL.axis_names))
+    assert recorded.reason(CELL, readback, RATE_HZ) == reason
+    saved = salvage(log.rename(tmp_path / "b.mcap.part"), tmp_path / "saved.mcap")
+    assert (saved.statistics.valid, saved.statistics.reason) == (False, reason)
+    assert main(["fit", str(sound), str(saved.log)]) == ExitCode.DATA_UNFIT
+    assert "axis J2: a step of" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("verb", ["fit", "residual", "validate", "weigh", "contact"])
+def test_every_verb_refuses_a_glitch(
+    verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], full_calibration: Path
+) -> None:
+    joint_rad = _joints()
+    joint_rad[1500, 1] += GLITCH_RAD
+    log = str(_log(tmp_path / "a.mcap", _samples(joint_rad)))
+    arguments = [log, log] if verb in {"fit", "residual"} else [str(full_calibration), log]
+    assert main([verb, *arguments]) == ExitCode.DATA_UNFIT
+    said = " ".join(capsys.readouterr().err.split())
+    assert "a step of" in said
+    assert "axis J2" in said
+
+
+def test_a_current_that_no_amplifier_sets_is_refused_and_called_invalid(tmp_path: Path) -> None:
+    rows = _samples(_joints())
+    (first, *others) = rows[1000].current_raw
+    rows[1000] = Sample(
+        rows[1000].cycle, rows[1000].time_ns, rows[1000].position_counts, (2**30, *others), (0x1237,) * AXES, 0
+    )
+    assert abs(first) <= 200
+    log = _log(tmp_path / "a.mcap", rows)
+    with pytest.raises(CurrentImplausible, match=r"axis J1: found a current of .*at 1 s; expected a current"):
+        load_run(log)
+    described = describe_log(log)
+    assert not described["valid"]
+    assert described["reason"].startswith("axis J1: a current of")
+
+
+def test_a_short_motion_after_a_long_rest_is_no_outlier() -> None:
+    current = np.ones((COUNT, 2))
+    current[100:120] = 1500.0
+    assert impossible_current(current) is None
+    current[100:120] = 1.0
+    current[100, 1] = 1500.0
+    found = impossible_current(current)
+    assert found is not None
+    assert (found.axis, found.row) == (1, 100)
+
+
+def test_answers_that_are_missing_are_no_steps(tmp_path: Path) -> None:
+    """Where an axis did not answer, a log has a number that means nothing; the next answer is some periods away."""
+    joint_rad = _joints()
+    gap = range(1500, 1540)
+    joint_rad[1500:1540, 1] = 0.0
+    rows = _samples(joint_rad, lambda k: 2 if k in gap else 0)
+    log = write(tmp_path / "a.mcap", demo_content(CHECKOUT), rows, verdict=(False, "40 missing answers"))
+    run, _ = load_run(log, lossy=LossyLogs.ACCEPTED)
+    assert run.valid is not None
+    assert not run.valid[1500:1540, 1].any()
+    joint_rad[1540:, 1] += GLITCH_RAD  # 22 mrad for each of the 41 periods are too fast all the same
+    wrong = write(
+        tmp_path / "b.mcap",
+        demo_content(CHECKOUT),
+        _samples(joint_rad, lambda k: 2 if k in gap else 0),
+        verdict=(False, "40 missing answers"),
+    )
+    with pytest.raises(PositionImplausible, match="in one sample"):
+        load_run(wrong, lossy=LossyLogs.ACCEPTED)
+
+
+def test_a_counter_that_wraps_at_32_bits_is_no_step() -> None:
+    joint_rad = _joints()
+    recorded = RecordedMotion(AXES)
+    for row in _samples(joint_rad):
+        # The counter of the first motor begins just below its end.
+        first = (row.position_counts[0] + 2**31 - 10) % 2**32
+        signed = first - 2**32 if first >= 2**31 else first
+        recorded.take(replace(row, position_counts=(signed, *row.position_counts[1:])))
+    readback = Readback(tuple(AxisReadback(name, 0.002) for name in CELL.axis_names))
+    assert recorded.reason(CELL, readback, RATE_HZ) == ""
+
+
+def test_a_coarse_encoder_that_hardly_moves_has_no_glitch() -> None:
+    """Few steps of one degree on an axis at rest are its resolution; one of a radian is not."""
+    joint_rad = np.zeros((COUNT, AXES))
+    joint_rad[1000:2000, 0] = radians(1.0)
+    assert impossible_step(joint_rad, RATE_HZ, CELL) is None
+    joint_rad[1000:2000, 0] = 1.0
+    found = impossible_step(joint_rad, RATE_HZ, CELL)
+    assert found is not None
+    assert (found.axis, found.row) == (0, 1000)
+
+
+def test_an_import_and_a_recording_are_judged_by_one_function(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Both refuse what `impossible_step` refuses, whatever it is."""
+    log = _log(tmp_path / "a.mcap", _samples(_joints()))
+    load_run(log)
+
+    def refuse(*_: Any) -> Any:
+        raise DataError("the one function", found="", expected="", remedy="")
+
+    monkeypatch.setattr("daq.log.plausibility.impossible_step", refuse)
+    with pytest.raises(DataError, match="the one function"):
+        load_run(log)
+
+
+@pytest.fixture
+def full_calibration(tmp_path: Path) -> Path:
+    """A calibration of the demo cell, with every setting of its filter."""
+    file = tmp_path / "calibration.yaml"
+    document = Conditioning(standstill_rad_s=(0.03,) * AXES).document()
+    save_calibration(replace(demo_calibration(), filter=document), file)
+    return file
