@@ -21,6 +21,7 @@ from drivers.stream.sample import CellEvent, EventKind, Quantity
 from ident.arrays import BoolArray, FloatArray
 from ident.data.run import Recording, Run
 from ident.data.torque_channel import TorqueChannel
+from ident.data.unsigned_current import require_signed_currents
 from ident.model.model import DriveTrain
 
 _LOG = logging.getLogger("drivegain")
@@ -92,6 +93,7 @@ def load_run(path: Path | str, cell: Cell | None = None, lossy: LossyLogs = Loss
 
     Raises:
         DataError: the log cannot be read, or its samples cannot be used.
+        ident.CurrentUnsigned: drives report the size of the current only.
         ConfigurationError: the cell in the log is inconsistent.
     """
     path = Path(path)
@@ -125,6 +127,7 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
         CurrentSaturated: a limit was active in more than a tenth of an axis's samples.
         PositionImplausible: positions far outside the joint limits.
         LogIncomplete: cell and log do not belong together.
+        ident.CurrentUnsigned: drives report the size of the current only.
     """
     name, samples, rate_hz = log.path.stem, log.samples, log.head.run.rate_hz
     only_losses = reports_only_losses(log.statistics.reason)
@@ -165,7 +168,7 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
     valid = answered & ~limited
     check_limits(str(log.path), position_rad, cell, valid)
     run, drives = log.head.run, [axis.drive for axis in log.head.readback.axes]
-    return Run(
+    converted = Run(
         name=name,
         time_s=(samples.cycle - samples.cycle[0]).astype(np.float64) / rate_hz,
         position_rad=position_rad,
@@ -190,6 +193,8 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
             operator=run.operator or None,
         ),
     )
+    require_signed_currents(converted, cell.ratio, cell.axis_names)
+    return converted
 
 
 def _serial(drive: Mapping[str, Any]) -> int | None:
