@@ -1,5 +1,6 @@
 # drivegain: `make demo` and `make test` are all that a fresh machine needs (Python >= 3.11, pip, make).
 # PYTHON=python3.12 make setup   chooses another interpreter; the environment is made in .venv.
+# make VENV=out/venv-3.12 PYTHON=python3.12 test   leaves .venv as it is, and uses another environment.
 
 PYTHON ?= python3
 VENV := .venv
@@ -51,6 +52,16 @@ help:
 
 setup: $(STAMP)
 
+# Where PYTHON is named and the environment is of another interpreter, the environment is made again.
+# Without PYTHON an environment stays as it is, whatever interpreter it was made by.
+IDENTITY := import sys; print(sys.version, sys.base_prefix)
+ifneq ($(origin PYTHON),file)
+ifneq ($(shell $(PYTHON) -c '$(IDENTITY)' 2>&1),$(shell $(BIN)/python -c '$(IDENTITY)' 2>/dev/null))
+OTHER_PYTHON := yes
+.PHONY: $(STAMP)
+endif
+endif
+
 # The stamp is written last: a set-up that was interrupted is taken up again. Where Debian's python3 comes without
 # python3-venv, pip is put into the environment from outside.
 $(STAMP): requirements.lock pyproject.toml
@@ -58,6 +69,8 @@ $(STAMP): requirements.lock pyproject.toml
 		echo "drivegain needs Python 3.11 or later; found: $$($(PYTHON) --version 2>&1)." >&2; \
 		echo "Install one (Debian, Ubuntu: apt install python3 python3-pip) or name it: make PYTHON=python3.12 ..." >&2; \
 		exit 1; }
+	@[ -z "$(OTHER_PYTHON)" ] || [ ! -e $(VENV) ] || { \
+		echo "$(VENV) is of another interpreter than $(PYTHON) and is made again"; rm -rf $(VENV); }
 	@echo "setting up $(VENV), once: 1.3 GB of tools and locked packages"
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || { rm -rf $(VENV); $(PYTHON) -m venv $(VENV) >/dev/null 2>&1; } || { \
 		rm -rf $(VENV); $(PYTHON) -m venv --without-pip $(VENV) && \

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from ident.discovery.evidence import gather as gather
     from ident.discovery.loop import Step as Step
     from ident.discovery.loop import find_effects as find_effects
+    from ident.errors import CurrentUnsigned as CurrentUnsigned
     from ident.errors import DataUnfit as DataUnfit
     from ident.errors import Diagnosis as Diagnosis
     from ident.errors import EffectRefused as EffectRefused
@@ -80,8 +81,8 @@ _HOMES = {
     "ident.data.run": "Run",
     "ident.discovery.evidence": "Evidence gather",
     "ident.discovery.loop": "Step find_effects",
-    "ident.errors": "DataUnfit Diagnosis EffectRefused IdentificationError ModelContradicted ModelError "
-    "NotConverged PayloadUnseen RankDeficient RolesExchanged TooFewMoves",
+    "ident.errors": "CurrentUnsigned DataUnfit Diagnosis EffectRefused IdentificationError ModelContradicted "
+    "ModelError NotConverged PayloadUnseen RankDeficient RolesExchanged TooFewMoves",
     "ident.estimators.diagnosis": "diagnose exchanged_channels",
     "ident.estimators.estimate": "Estimate RelativeError",
     "ident.estimators.identify": "Identification identify",

@@ -3,7 +3,8 @@
 IdentificationError
 ├── ModelError            the URDF or drive train does not describe this robot
 ├── DataUnfit             the recording cannot be used: NaN, too short, too slow, wrong shape
-│   └── PayloadMissing    no run has a payload of known mass, which free gains need
+│   ├── PayloadMissing    no run has a payload of known mass, which free gains need
+│   └── CurrentUnsigned   drives report the size of the current only
 ├── ModelContradicted     the declared model explains less of the data than it leaves
 │   ├── RolesExchanged    loaded and unloaded runs are mistaken for each other
 │   ├── ChannelsExchanged the currents of some axes are each other's
@@ -22,6 +23,8 @@ What leaves usable numbers is no error but a `Diagnosis`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+
+from ident.plausible import LARGEST_GAIN_STD
 
 
 class IdentificationError(Exception):
@@ -55,6 +58,22 @@ class PayloadMissing(DataUnfit):
         self.expected = "at least one; without it all gains could be scaled at will"
         self.remedy = "record one (`record --payload NAME --mass KG`), or hold the gains (`--gains fixed`)"
         super().__init__(", ".join(runs), f"found {self.found}; expected {self.expected}; {self.remedy}")
+
+
+class CurrentUnsigned(DataUnfit):
+    """Drives report the size of the current only."""
+
+    def __init__(self, run: str, axes: tuple[str, ...], missing_sign: str) -> None:
+        names = ", ".join(axes)
+        self.subject = f"{'runs' if ', ' in run else 'run'} {run}, axis {names}"
+        self.found = (
+            f"currents that are never {missing_sign} while the axes move both ways, and that no load which is always "
+            "carried explains"
+        )
+        self.expected = "a current with its sign: that of the torque"
+        self.remedy = "the drive, or the export, gives the size of the current only; take its signed value"
+        super().__init__(run, f"axis {names}: found {self.found}; expected {self.expected}; {self.remedy}")
+        self.axes = axes
 
 
 class ModelContradicted(IdentificationError):
@@ -114,7 +133,8 @@ class PayloadUnseen(IdentificationError):
 
     def __init__(self, std_percent: tuple[float, ...], runs: tuple[str, ...], hint: str = "") -> None:
         super().__init__(
-            f"runs {', '.join(runs)}: every gain is uncertain by {min(std_percent):.0f} % or more, expected some 1 %: "
+            f"runs {', '.join(runs)}: every gain is uncertain by {min(std_percent):.0f} % or more, expected some 1 %, "
+            f"and on one at most {100.0 * LARGEST_GAIN_STD:g} %: "
             "the runs declared loaded and those declared unloaded do not differ by the weight of the payload, or are "
             "positions not in rad, or columns in another order than the joints? "
             + (hint or "was it mounted in every loaded run, and in no other? is its mass right?")

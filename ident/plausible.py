@@ -5,10 +5,20 @@ A number beyond its limit is in another unit, of another axis or mistyped; no pr
 
 from __future__ import annotations
 
-GAIN_RATIO = 3.0
-"""Largest ratio of two gains of one axis, and smallest inverse: identified, nameplate, N·Kt of the motor's data, the
-controller's. Tolerances and losses give 0.7 to 1.3."""
+GAIN_RANGE = (0.7, 1.3)
+"""An identified gain relative to its nameplate, by tolerances of the motor and losses of the gear. Those of the paper
+differ by up to 30 % (Table 2, J4)."""
+CURRENT_RANGE = (0.7, 1.3)
+"""Torque of an axis, by its current and its gain, relative to the predicted one: a gain drifts no further in years."""
+NAMEPLATE_RATIO = 3.0
+"""Largest ratio of two sources of a gain that nothing identified, and smallest inverse: nameplate, N·Kt of the motor's
+data, the controller's. What is beyond is refused before anything moves."""
+WEIGHT_RATIO = 3.0
+"""Largest ratio of a payload's weight by fixed gains to its declared one, and smallest inverse. Gains at the ends of
+GAIN_RANGE and friction that is not declared change the weight, too."""
 UNIT_RATIO = 30.0  #: Ratio of all gains to their nameplates that no drive explains, only a unit
+LARGEST_GAIN_STD = 0.1
+"""Relative σ of every gain at once. Twenty short moves give 0.02; a payload in the wrong runs 0.25 and more."""
 TORQUE_RATIO = 10.0  #: Torque on every axis (root mean square), relative to the URDF's effort limit
 GRAVITY_M_S2 = (9.7, 9.9)  #: Size of gravity anywhere on Earth [m/s²]
 HEAVIEST_PAYLOAD_KG = 2500.0  #: The strongest arms carry 2300 kg; a cell that carries more states its rated payload
@@ -29,6 +39,11 @@ RAW_GAIN = (1e-9, 1e9)  #: The same per unit of another current, such as thousan
 LIGHTEST_PAYLOAD_KG = 1e-3  #: Mass of a payload; lighter ones show no gain
 FARTHEST_CENTRE_M = 3.0  #: Distance of a payload's centre of mass from its frame: longer than any tool
 LARGEST_GYRATION_M = 5.0  #: Radius of gyration √(I/m) of a payload, also about the joint that carries it
+
+
+def range_text(bounds: tuple[float, float]) -> str:
+    """Write a range for a message: what it says is what is tested."""
+    return f"{bounds[0]:g} to {bounds[1]:g}"
 
 
 def within(value: float, bounds: tuple[float, float]) -> bool:

@@ -21,6 +21,9 @@ from daq.report.text import printable, spelled_bytes
 from drivers import errors as driver
 from ident import errors as identification
 
+WITH_EVIDENCE = (
+    identification.ModelContradicted | identification.PayloadMissing | identification.CurrentUnsigned
+)  #: Errors of the identification that have found, expected and remedy
 NOTES = ("kept", "hint")
 """Labels of the notes that are shown; a verb adds them to an error with ``error.add_note("hint: …")``."""
 NOT_STOPPED = "{} NOT CONFIRMED WITHOUT POWER: use the emergency stop"
@@ -200,7 +203,7 @@ def may_have_power(error: BaseException | None) -> str:
 
 def _parts(error: Exception) -> tuple[str, str, str, str]:
     """Subject, found, expected and remedy."""
-    if isinstance(error, DaqError | identification.ModelContradicted | identification.PayloadMissing):
+    if isinstance(error, DaqError | WITH_EVIDENCE):
         return error.subject, error.found, error.expected, error.remedy
     if isinstance(error, driver.BusError):
         known = _BY_NUMBER.get(_number(error) or 0)

@@ -93,7 +93,7 @@ def fit_verb(
     from daq.report.fit import fit_document, fit_view
     from daq.workflow.cases import CaseFit, calibration_of_case, essential_fit, fit_case, reduce_logs
     from daq.workflow.fit import compare_estimators, fit
-    from ident.estimators.identify import require_plausible
+    from ident.estimators.refusals import require_plausible
 
     if cases is not None:
         other = {"known": known is not Known.MASS, "gains": gains is not Gains.FREE}  # every case has its own

@@ -42,6 +42,7 @@ from ident.plausible import (
     SMALLEST_COUPLING,
     SPEED,
     TOLERANCE_SHARE,
+    range_text,
     within,
 )
 
@@ -93,7 +94,7 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
     gravity = hypot(*model.robot.gravity_m_s2)
     if not GRAVITY_M_S2[0] < gravity < GRAVITY_M_S2[1]:
         found = f"{gravity:.4g} m/s² in all"
-        faults.append(Fault(("robot", "gravity_m_s2"), found, "9.78 to 9.83 m/s², anywhere on Earth"))
+        faults.append(Fault(("robot", "gravity_m_s2"), found, f"{range_text(GRAVITY_M_S2)} m/s², as anywhere on Earth"))
     if not urdf.strip():
         return None, [*faults, Fault(("robot", "urdf"), "an empty file", "a URDF of an arm")]
     try:

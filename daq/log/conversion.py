@@ -23,6 +23,7 @@ from drivers.stream.sample import CellEvent, EventKind, Quantity
 from ident.arrays import BoolArray, FloatArray
 from ident.data.run import Recording, Run
 from ident.data.torque_channel import TorqueChannel
+from ident.data.unsigned_current import require_signed_currents
 from ident.model.model import DriveTrain
 
 _LOG = logging.getLogger("drivegain")
@@ -102,6 +103,7 @@ def load_run(path: Path | str, cell: Cell | None = None, lossy: LossyLogs = Loss
     Raises:
         LogsDiffer: the given description is of another cell.
         DataError: the log cannot be read, or its samples cannot be used.
+        ident.CurrentUnsigned: drives report the size of the current only.
         ConfigurationError: the cell in the log is inconsistent.
     """
     path = Path(path)
@@ -152,6 +154,7 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
         PositionImplausible: positions far outside the joint limits, or a step or a speed that no motor makes.
         CurrentImplausible: a current is an outlier.
         LogIncomplete: cell and log do not belong together.
+        ident.CurrentUnsigned: drives report the size of the current only.
     """
     name, samples, rate_hz = log.path.stem, log.samples, log.head.run.rate_hz
     only_losses = reports_only_losses(log.statistics.reason)
@@ -194,7 +197,7 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
     if (fault := motion_fault(str(log.path), cell, rate_hz, position_rad, current, known)) is not None:
         raise fault
     run, drives = log.head.run, [axis.drive for axis in log.head.readback.axes]
-    return Run(
+    converted = Run(
         name=name,
         time_s=(samples.cycle - samples.cycle[0]).astype(np.float64) / rate_hz,
         position_rad=position_rad,
@@ -219,6 +222,8 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
             operator=run.operator or None,
         ),
     )
+    require_signed_currents(converted, cell.ratio, cell.axis_names)
+    return converted
 
 
 def answers(missing: NDArray[np.uint32], axes: int) -> BoolArray:

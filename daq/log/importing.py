@@ -38,6 +38,7 @@ from daq.log.plausibility import (
     check_speed,
     check_steps,
     check_velocity,
+    warn_of_unsigned,
 )
 from daq.log.resampling import Clock, clock_of, on_clock
 from daq.log.table import Table
@@ -113,6 +114,7 @@ def import_recording(
     check_steps(wanted, table, joint_rad, rate_hz, clock, cell)
     check_speed(str(table.path), joint_rad, rate_hz, cell)
     check_velocity(wanted, cell, files, clock, joint_rad, rate_hz)
+    warn_of_unsigned(wanted.name, joint_rad, raw * unit, rate_hz, cell)
     digests = {name: file.digest for name, file in files.items()}
     slow = _slow(wanted, cell, files, clock)
     started_ns, started_wall_ns, timing = _start(wanted, files, clock)

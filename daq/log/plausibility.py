@@ -18,6 +18,9 @@ from daq.errors import CurrentImplausible, DataError, PositionImplausible, Table
 from daq.log.resampling import Clock, on_clock
 from daq.log.table import Table
 from ident.arrays import BoolArray, FloatArray
+from ident.data.run import Run
+from ident.data.unsigned_current import require_signed_currents
+from ident.errors import CurrentUnsigned
 
 _LOG = logging.getLogger("drivegain")
 LARGEST_RAW = 2**31 - 1
@@ -399,3 +402,19 @@ def check_motion(name: str, joint_rad: FloatArray, cell: Cell) -> None:
             expected=f"at least {100.0 * SMALLEST_MOTION:g} % on one joint",
             remedy="most likely radians were taken for degrees, or joint for motor side; correct the description",
         )
+
+
+def warn_of_unsigned(name: str, joint_rad: FloatArray, current_a: FloatArray, rate_hz: float, cell: Cell) -> None:
+    """Warn of currents without their sign: the log can be read, but no fit takes it.
+
+    Args:
+        name: of the recording.
+        joint_rad, current_a: joint positions and currents, shape (k, n).
+        rate_hz: rate of the samples.
+        cell: with drive train and names of the axes.
+    """
+    run = Run(name, np.arange(len(joint_rad)) / rate_hz, joint_rad, current_a)
+    try:
+        require_signed_currents(run, cell.ratio, cell.axis_names)
+    except CurrentUnsigned as error:
+        _LOG.warning("warning: %s; no fit takes this log", error)

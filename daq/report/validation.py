@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,6 @@ from daq.report.text import percent_text, picked, plain_table, printable, termin
 from daq.workflow.fit import DOUBTFUL_PERCENT
 from daq.workflow.validate import CrossValidation, DataUse, Validation, WeighedRun, conditioning_of, together
 from ident.calibration import Calibration
-from ident.errors import Diagnosis
 
 
 def validation_view(calibration: Calibration, found: CrossValidation) -> Iterator[RenderableType]:
@@ -40,7 +39,7 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
         f"Position filter {filter_.position_cutoff_hz:g} Hz, decimation {filter_.decimation_cutoff_hz:g} Hz, as in the "
         "fit. Compare relative errors only under the same filters."
     )
-    doubts = [*diagnosis_texts((*found.diagnoses, *_not_repeated(calibration.diagnoses, found.diagnoses)))]
+    doubts = [*diagnosis_texts(found.diagnoses)]
     doubts += [
         f"{validation.log} carries another cell configuration than the logs of the fit; check the difference."
         for validation in validations
@@ -57,14 +56,6 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
     for paper_table in validation_tables(found, complete=False):
         yield ""
         yield from paper_table.view(numbered=False)
-
-
-def _not_repeated(stored: Iterable[Diagnosis], fresh: Iterable[Diagnosis]) -> Iterator[Diagnosis]:
-    """Stored diagnoses, less those that were made again of each of their runs."""
-    again = {(one.name, run, one.axes) for one in fresh for run in one.runs}
-    for one in stored:
-        if not one.runs or any((one.name, run, one.axes) not in again for run in one.runs):
-            yield one
 
 
 def validation_tables(found: CrossValidation, *, complete: bool) -> list[paper_tables.PaperTable]:

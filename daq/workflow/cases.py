@@ -13,12 +13,13 @@ from daq.config.cell import Cell, model_of
 from daq.errors import ConfigurationInconsistent
 from daq.workflow.choices import Known
 from daq.workflow.declared_effects import refuse_effects
-from daq.workflow.fit import Fit, Reading, calibration_of, check_signs, with_diagnoses
+from daq.workflow.diagnoses import currents_as_cause
+from daq.workflow.fit import Fit, Reading, calibration_of, judged
 from ident.calibration import Calibration, Parameter, Source, factor_of
 from ident.equations.reduction import Reduction, reduce_runs
 from ident.equations.system import require_distinct
 from ident.estimators.comparison import Essential, essential
-from ident.estimators.identify import Identification, each_run, estimate_with, require_seen_payload
+from ident.estimators.identify import Identification, each_run, estimate_with
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, Payload
@@ -102,14 +103,12 @@ def fit_case(
     require_distinct(system, gains=not gains_fixed)
     nameplate = np.array([axis.nameplate_gain for axis in logs.cell.axes])
     estimate = estimate_with(method, system, nameplate if gains_fixed else None)
-    if not gains_fixed:
-        check_signs(estimate, nameplate)
-        if method is Method.ML:
-            require_seen_payload(estimate, system)
     rest = unseen.system(system.base, system.payload_columns) if unseen.runs else None
     result = Identification(used.model, used.conditioning, system, rest, estimate)
     paper = None if gains_fixed else tls(system)
-    fitted = with_diagnoses(Fit(logs.cell, logs.logs, logs.holdout, logs.sources, result, (), paper))
+    start = Fit(logs.cell, logs.logs, logs.holdout, logs.sources, result, (), paper, given_cell=logs.cell)
+    with currents_as_cause(start.logs, start.read):
+        fitted = judged(start)
     if ratio is None:
         return CaseFit(fitted, payloads, None)
     return replace(essential_fit(fitted, ratio), payloads=payloads)

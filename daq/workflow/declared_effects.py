@@ -15,8 +15,9 @@ from ident.discovery.evidence import Evidence, gather, with_effects, without_eff
 from ident.discovery.loop import Step, with_declared
 from ident.effects.effect import PlacedEffect
 from ident.estimators.estimate import Estimate
-from ident.estimators.identify import Identification, estimate_with, require_plausible
+from ident.estimators.identify import Identification, estimate_with
 from ident.estimators.method import Method
+from ident.estimators.refusals import require_plausible
 
 BOOTSTRAP_SEED = 0  #: Fixes the verdict of a significance test; no decision depends on it for declared effects
 

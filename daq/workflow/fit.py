@@ -7,13 +7,11 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from daq.config.cell import Cell, model_of, robot_of
+from daq.config.cell import Cell, model_of
 from daq.config.policy import DEFAULT_APPLY_POLICY
 from daq.environment import software
 from daq.errors import EffectsRefuted, LogRepeated, LogsDiffer, UsageError
@@ -27,6 +25,8 @@ from daq.workflow.declared_effects import (
     with_declared_again,
     with_effects_of_cell,
 )
+from daq.workflow.diagnoses import currents_as_cause, diagnose_fit
+from daq.workflow.validate import diagnose_log
 from ident.calibration import Calibration, Source
 from ident.calibration import calibration_of as identified_calibration
 from ident.data.run import Run
@@ -35,22 +35,12 @@ from ident.discovery.before_after import error_on, holdout_change
 from ident.discovery.evidence import Evidence, gather, without_effects
 from ident.discovery.loop import Step, find_effects
 from ident.effects.friction import TemperatureFriction
-from ident.errors import (
-    ChannelsExchanged,
-    Diagnosis,
-    IdentificationError,
-    ModelContradicted,
-    NotConverged,
-    PayloadUnseen,
-    RolesExchanged,
-)
+from ident.errors import Diagnosis, IdentificationError, PayloadUnseen
 from ident.estimators.comparison import Comparison, compare
-from ident.estimators.diagnosis import diagnose, exchanged_channels
 from ident.estimators.estimate import Estimate, RelativeError, of_squares
 from ident.estimators.identify import Identification, estimate_with, identify
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
-from ident.model.urdf import read_urdf
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +56,8 @@ class Fit:
     steps: tuple[Step, ...]
     paper: Estimate | None  #: the paper's total least squares on the same equations, None with fixed gains
     lossy: LossyLogs = LossyLogs.REFUSED  #: how logs with losses were handled
-    diagnoses: tuple[Diagnosis, ...] = ()  #: of the fit, or with effects of the last one
+    given_cell: Cell | None = None  #: description that replaces the one in the logs; None where that is used
+    diagnoses: tuple[Diagnosis, ...] = ()  #: of the fit, with effects of the last one, and of each held-out log
     #: Slope of each axis's own torque over its current, beside the gains; empty where no log has such torques.
     torque_slopes: tuple[TorqueSlope | None, ...] = ()
     #: The operator takes effects that held-out runs refute: these have then taken part in the choice.
@@ -81,6 +72,10 @@ class Fit:
     def final(self) -> Identification:
         """Identification with all accepted effects; their rows are reduced anew at each call."""
         return self.steps[-1].after.identification if self.steps else self.identification
+
+    def read(self, log: Path) -> tuple[Run, Cell]:
+        """Read a log as the fit did, with the description of its cell."""
+        return load_run(log, self.given_cell, self.lossy)
 
     def evidence(self) -> Evidence:
         """The rows behind the identification, without effects; the logs are read again unless it has kept them."""
@@ -232,8 +227,6 @@ def fit(
         )
         steps = with_effects_of_cell(result, effects, declared.place_names) if effects else ()
         last = steps[-1].after.identification if steps else result
-        if not gains_fixed:
-            check_signs(last.estimate, nameplate)
         paper = None if gains_fixed else tls(last.system)
         return Fit(
             cell=declared,
@@ -244,82 +237,44 @@ def fit(
             steps=steps,
             paper=paper,
             lossy=lossy,
+            given_cell=cell,
             torque_slopes=reading.torque_slopes(),
         )
 
+    chosen = method or (Method.WLS if gains_fixed else Method.ML)
     try:
-        fitted = with_diagnoses(attempt(logs, holdout, method or (Method.WLS if gains_fixed else Method.ML)))
-    except (ModelContradicted, NotConverged):
-        require_own_channels(logs, cell, lossy)
-        raise
+        with currents_as_cause(logs, lambda log: load_run(log, cell, lossy)):
+            return judged(attempt(logs, holdout, chosen))
     except PayloadUnseen as error:
-        require_own_channels(logs, cell, lossy)
-        contradicting = ""
-        for log in logs:
-            try:
-                rest = attempt([other for other in logs if other != log], (), Method.ML).estimate
-            except IdentificationError:
-                continue
-            std = 100.0 * float(np.max(rest.gains_std / np.abs(rest.gains)))
-            contradicting = (
-                f"without {log} they do (σ at most {std:.1f} %): was the payload of that run declared as it was?"
-            )
-            break
-        raise PayloadUnseen(error.std_percent, error.runs, contradicting) from error
-    suspect = bool(OF_CHANNELS & {one.name for one in fitted.diagnoses if not one.runs})
-    if gains_fixed or suspect:
-        require_own_channels(logs, cell, lossy, each=suspect)
-    if any(one.name == "axis-error" and one.runs for one in fitted.diagnoses):
-        exchanged = ((log, channels_of((log,), cell, lossy)) for log in holdout)
-        named = tuple(replace(one, runs=(log.stem,)) for log, one in exchanged if one is not None)
-        return replace(fitted, diagnoses=(*named, *fitted.diagnoses))
-    return fitted
+        hint = contradicting_log(logs, lambda rest: attempt(rest, (), Method.ML))
+        raise PayloadUnseen(error.std_percent, error.runs, hint) from error
 
 
-OF_CHANNELS = {"axis-error", "current-reversed", "gain-off-nameplate"}
-"""Diagnoses that exchanged currents may leave. Fixed gains need not leave any."""
+def contradicting_log(logs: Sequence[Path], fit_of: Callable[[Sequence[Path]], Fit]) -> str:
+    """Name the log without which the payload is seen; empty where there is none."""
+    for log in logs:
+        try:
+            rest = fit_of([other for other in logs if other != log]).estimate
+        except IdentificationError:
+            continue
+        std = 100.0 * float(np.max(rest.gains_std / np.abs(rest.gains)))
+        return f"without {log} they do (σ at most {std:.1f} %): was the payload of that run declared as it was?"
+    return ""
 
 
-def with_diagnoses(fitted: Fit) -> Fit:
-    """Add the diagnoses of a fit, with effects of the last one.
+def judged(fitted: Fit) -> Fit:
+    """Return a fit with all that is said of its recordings, or refuse it: `daq.workflow.diagnoses` has the order.
 
     Raises:
-        ModelContradicted: one of its kinds; see `ident.estimators.diagnosis.diagnose`.
+        IdentificationError: a mistake leaves no number that can be used.
     """
-    cell = fitted.cell
-    nameplate = np.array([axis.nameplate_gain for axis in cell.axes])
-    kept = (one for one in fitted.diagnoses if one.name == "channels-exchanged")
-    found = diagnose(
-        fitted.final, cell.axis_names, nameplate, read_urdf(cell.urdf).effort_limit[list(robot_of(cell).axis_joints)]
-    )
-    return replace(fitted, diagnoses=(*kept, *found))
-
-
-def channels_of(logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs) -> Diagnosis | None:
-    """Whether the currents of some axes are each other's; the logs are read again."""
-    first, declared = load_run(logs[0], cell, lossy)
-    runs = chain((first,), (load_run(log, cell, lossy)[0] for log in logs[1:]))
-    return exchanged_channels(model_of(declared), runs, declared.conditioning, declared.axis_names)
-
-
-def require_own_channels(logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs, *, each: bool = True) -> None:
-    """Refuse logs in which the currents of some axes are each other's; they are read again.
-
-    Args:
-        logs: of the fit.
-        cell: in place of the one in the logs.
-        lossy: how logs with losses are read.
-        each: look into each log alone, too: in one of several, an exchange is hidden by the others.
-
-    Raises:
-        ChannelsExchanged: they are, in all logs together or in one of them.
-    """
-    for part in (logs, *((log,) for log in logs if each and len(logs) > 1)):
-        found = channels_of(part, cell, lossy)
-        if found is not None:
-            where = "" if part is logs else f"log {part[0].stem}: "
-            subject = f"{where}the currents of {' and '.join(found.axes)}"
-            raise ChannelsExchanged(subject, found=found.found, expected=found.expected, remedy=found.remedy)
+    of_fit = diagnose_fit(fitted.final, fitted.cell, fitted.logs, fitted.read)
+    calibration = _calibration(fitted)
+    of_holdout: list[Diagnosis] = []
+    for log in fitted.holdout:
+        run, described = fitted.read(log)
+        of_holdout += diagnose_log(calibration, log, run, described)
+    return replace(fitted, diagnoses=(*of_fit, *of_holdout))
 
 
 def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: None) -> Comparison:
@@ -348,22 +303,6 @@ def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: 
 DOUBTFUL_PERCENT = DEFAULT_APPLY_POLICY.max_error_percent  #: In total
 
 
-def check_signs(estimate: Estimate, nameplate: NDArray[np.float64]) -> None:
-    """Refuse gains that all have the wrong sign: the payload was taken from the wrong runs.
-
-    Raises:
-        RolesExchanged: every sign is opposite to that of the nameplate.
-    """
-    if np.all(np.sign(estimate.gains) == -np.sign(nameplate)):
-        raise RolesExchanged(
-            "all drive gains",
-            found=", ".join(f"{gain:.3g}" for gain in estimate.gains),
-            expected="the signs of the nameplate: " + ", ".join(f"{gain:.3g}" for gain in nameplate),
-            remedy="were the payload's run and the run without load exchanged (look at `drivegain info` of each log), "
-            "or do all currents count the other way?",
-        )
-
-
 def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _: None) -> Fit:
     """Detect and add missing effects: refit with every effect that passes the gates.
 
@@ -389,7 +328,10 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
     rng = np.random.default_rng(seed)
     steps = find_effects(evidence, rng, progress=progress, axes=start.cell.place_names)
     closed = replace(start, identification=before, steps=(*known, *steps))
-    return closed if closed.estimate is start.estimate else with_diagnoses(closed)
+    if closed.estimate is start.estimate:
+        return closed
+    with currents_as_cause(closed.logs, closed.read):
+        return judged(closed)
 
 
 def check_holdout(fitted: Fit) -> None:
@@ -431,6 +373,17 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
         fitted: with or without effects.
         created: when, with its time zone.
     """
+    return replace(
+        _calibration(fitted),
+        created=created.isoformat(timespec="seconds"),
+        software=software(),
+        nameplate_holdout_error_percent=_nameplate_error(fitted),
+        diagnoses=fitted.diagnoses,
+    )
+
+
+def _calibration(fitted: Fit) -> Calibration:
+    """Make what a calibration predicts with."""
     cell = fitted.cell
     found = identified_calibration(
         fitted.identification,
@@ -444,11 +397,7 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
         found,
         sources=fitted.sources,
         configuration_sha256=cell.digest,
-        created=created.isoformat(timespec="seconds"),
-        software=software(),
-        nameplate_holdout_error_percent=_nameplate_error(fitted),
         recording_configuration_sha256=cell.recording_digest,
-        diagnoses=fitted.diagnoses,
     )
 
 

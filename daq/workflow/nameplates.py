@@ -16,7 +16,7 @@ from daq.writeback.formats.document import decode, read_bytes
 from drivers.profiles.profile import TapPoint
 from drivers.profiles.scale import ScaleReading, check_name_plate
 from ident.model.model import DriveTrain
-from ident.plausible import GAIN_RATIO
+from ident.plausible import NAMEPLATE_RATIO
 
 Reference = tuple[float, str]  #: a gain of an axis from elsewhere, in the unit of its nameplate, and its source
 
@@ -31,7 +31,7 @@ def check_controller(cell_file: Path, cell: Cell) -> None:
         cell: content of it.
 
     Raises:
-        ConfigurationInconsistent: one is more than GAIN_RATIO times the other.
+        ConfigurationInconsistent: one is more than NAMEPLATE_RATIO times the other.
     """
     controller, file = cell.controller, cell.controller_path
     if controller is None or file is None:
@@ -54,7 +54,7 @@ def check_nameplates(cell_file: Path, cell: Cell, readings: Sequence[ScaleReadin
         readings: of each drive; None for one that does not answer.
 
     Raises:
-        ConfigurationInconsistent: one is more than GAIN_RATIO times the other.
+        ConfigurationInconsistent: one is more than NAMEPLATE_RATIO times the other.
     """
     check_controller(cell_file, cell)
     references = list[Reference | None]()
@@ -109,7 +109,7 @@ def actual_current_note(cell: Cell) -> str | None:
 
 
 def _require_alike(cell_file: Path, cell: Cell, references: Sequence[Reference | None]) -> None:
-    """Refuse nameplates whose size is beyond GAIN_RATIO of a reference; signs are compared before a write."""
+    """Refuse nameplates whose size is beyond NAMEPLATE_RATIO of a reference; signs are compared before a write."""
     wrong = [
         (index, axis.nameplate_gain, axis.gain_unit, reference)
         for index, (axis, reference) in enumerate(zip(cell.axes, references, strict=True))
@@ -123,7 +123,7 @@ def _require_alike(cell_file: Path, cell: Cell, references: Sequence[Reference |
         keys = document.tree["axes"][index]
         key = next(key for key in keys if key.startswith("nameplate_gain"))
         found = f"{nameplate:g} {unit}, while it is {gain:.4g} {source}"
-        faults.append(Fault(("axes", index, key), found, f"the same within a factor of {GAIN_RATIO:g}"))
+        faults.append(Fault(("axes", index, key), found, f"the same within a factor of {NAMEPLATE_RATIO:g}"))
     raise ConfigurationInconsistent(
         **describe(document, faults),
         remedy="correct the nameplate, the gear ratio or the other number: is one of them in another unit (mA, mNm), "
@@ -132,4 +132,4 @@ def _require_alike(cell_file: Path, cell: Cell, references: Sequence[Reference |
 
 
 def _alike(one: float, other: float) -> bool:
-    return abs(one) < GAIN_RATIO * abs(other) and abs(other) < GAIN_RATIO * abs(one)
+    return abs(one) < NAMEPLATE_RATIO * abs(other) and abs(other) < NAMEPLATE_RATIO * abs(one)

@@ -20,6 +20,7 @@ from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationUnreadable, LogsDiffer
 from daq.log.conversion import load_run
 from daq.workflow.corrections import Corrections
+from daq.workflow.diagnoses import diagnose_run, not_repeated
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
@@ -27,19 +28,11 @@ from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.effects.friction import TemperatureFriction
 from ident.effects.signals import REFERENCE_C
-from ident.equations.reduction import Reduction, reduce_runs
+from ident.equations.reduction import reduce_runs
 from ident.equations.rows import row_filter, row_masks
 from ident.errors import DataUnfit, Diagnosis, IdentificationError
-from ident.estimators.diagnosis import (
-    axis_error_diagnoses,
-    exchanged_channels,
-    idle_joints,
-    scale_diagnoses,
-)
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.estimators.least_squares import wls
-from ident.estimators.payload_diagnosis import payload_diagnoses
-from ident.model.base import BaseParameters
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
 from ident.prediction import (
@@ -47,7 +40,6 @@ from ident.prediction import (
     measured_torque,
     mounted_parameters,
     predict_torque,
-    standard_parameters,
 )
 from ident.weighing import RowsToWeigh, rows_to_weigh, weigh_rows
 
@@ -83,6 +75,11 @@ class Validation:
         return relative_error(self.measured_nm, self.predicted_nm, self.use)
 
     @property
+    def is_judged(self) -> bool:
+        """Whether the fit has used the run and judged it, all of its runs together."""
+        return self.data_use is DataUse.FIT and self.same_configuration
+
+    @property
     def rows(self) -> int:
         """Equations that count, of all joints."""
         return int(np.count_nonzero(self.use))
@@ -109,6 +106,7 @@ def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None =
         run, described = load_run(log, cell)
         corrections.note(log, run)
         check_cell(calibration, log, described)
+        warn_without_temperature(calibration, run.name, run.temperature_c)
         validations.append(predicted(calibration, conditioning, model_of(described), log, run, described.digest))
     return tuple(validations)
 
@@ -177,7 +175,6 @@ def predicted(
     Raises:
         IdentificationError: the calibration cannot speak of this run.
     """
-    warn_without_temperature(calibration, run.name, run.temperature_c)
     run = replace(run, payload=as_calibrated(calibration, run.payload, run.name))
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
@@ -273,7 +270,7 @@ class CrossValidation:
     weighed: tuple[WeighedRun, ...]  #: those with a payload
     with_bare_runs: bool  #: the payloads were found together with the robot, from runs without load
     validations: tuple[Validation, ...]  #: of the first calibration, for the runs that it can predict
-    diagnoses: tuple[Diagnosis, ...]  #: of these runs under the first calibration
+    diagnoses: tuple[Diagnosis, ...]  #: of these runs under the first calibration, and of its fit
 
 
 def cross_validate(
@@ -312,6 +309,7 @@ def cross_validate(
         reasons: dict[str, list[str]] = {}
         for label, calibration in calibrations.items():
             check_cell(calibration, log, described)
+            warn_without_temperature(calibration, run.name, run.temperature_c)
             reason = unpredictable(calibration, run.payload)
             if reason:
                 reasons.setdefault(reason, []).append(label)
@@ -325,8 +323,8 @@ def cross_validate(
             # A payload without columns of its own is part of the link that carries it.
             system = reduction.system(reduction.base(), ((),) * len(reduction.payloads))
             condition = wls(system, _gains(calibrations[first])).condition
-        if reduction is not None and first in found:
-            diagnoses += _diagnosed(calibrations[first], found[first], model, run, reduction)
+        if reduction is not None and first in found and not found[first].is_judged:
+            diagnoses += diagnose_run(calibrations[first], found[first], model, run, reduction)
         if run.payload is not None:
             # From the log, else from the cell, since a body weighs the same anywhere.
             of_cell = (body.mass_kg for body in described.payloads if body.name == run.payload.name)
@@ -355,39 +353,35 @@ def cross_validate(
         except IdentificationError as error:
             rows = str(error)
         weighed.append(WeighedRun(log, log.stem, payload, kg, _masses(calibrations, rows, kg)))
-    axes = tuple(gain.axis for gain in calibrations[first].gains)
+    stored = not_repeated(calibrations[first].diagnoses, diagnoses)
     return CrossValidation(
-        axes, dict(calibrations), tuple(runs), tuple(weighed), bool(bare), tuple(validations), tuple(diagnoses)
+        axes=tuple(gain.axis for gain in calibrations[first].gains),
+        calibrations=dict(calibrations),
+        runs=tuple(runs),
+        weighed=tuple(weighed),
+        with_bare_runs=bool(bare),
+        validations=tuple(validations),
+        diagnoses=(*diagnoses, *stored),
     )
 
 
-def _diagnosed(
-    calibration: Calibration, validation: Validation, model: Model, run: Run, reduction: Reduction
-) -> list[Diagnosis]:
-    """Look for another payload, another scale or sign of a current, and exchanged currents in one run."""
-    name, axes = (run.name,), [gain.axis for gain in calibration.gains]
-    measured, predicted, use = validation.measured_nm, validation.predicted_nm, validation.use
-    rows = np.maximum(use.sum(axis=1), 1)
-    size, left = (np.sqrt(np.sum(v**2, axis=1, where=use) / rows) for v in (measured, measured - predicted))
-    idle = idle_joints(model, size, left)
-    found = list(scale_diagnoses(measured, predicted, use & ~idle[:, None], axes, name))
-    if run.payload is not None and not found:
-        of_mounting = mounted_parameters(calibration, run.payload.mounting)
-        of_payload = {one: parameter.value for one, parameter in of_mounting.items()}
-        unknown = tuple(
-            index
-            for index, parameter in enumerate(LINK_PARAMETERS)
-            if parameter not in run.payload.known and parameter in of_payload
-        )
-        standard, every = standard_parameters(calibration, model), tuple(column.name for column in model.columns)
-        system = reduction.system(BaseParameters(tuple(range(len(every))), np.eye(len(every)), every), (unknown,))
-        values = np.concatenate((standard, [of_payload[LINK_PARAMETERS[index]] for index in unknown]))
-        found += payload_diagnoses(system, _gains(calibration), values)
-    wrong = list(axis_error_diagnoses(size, left, idle, axes, name))
-    exchanged = exchanged_channels(model, (run,), reduction.conditioning, axes) if wrong else None
-    if exchanged is not None:
-        return [replace(exchanged, runs=name)]
-    return found or wrong  # a cause rather than its trace
+def diagnose_log(calibration: Calibration, log: Path, run: Run, described: Cell) -> tuple[Diagnosis, ...]:
+    """Judge a log that the fit of a calibration has not seen, as `cross_validate` does.
+
+    Args:
+        calibration: of the cell.
+        log: where the run was read.
+        run: as it was read.
+        described: the cell, as the log or another description has it.
+    """
+    if unpredictable(calibration, run.payload):
+        return ()
+    model = model_of(described)
+    conditioning = conditioning_of(calibration)
+    validation = predicted(calibration, conditioning, model, log, run, described.digest)
+    with suppress(IdentificationError):
+        return diagnose_run(calibration, validation, model, run, reduce_runs(model, (run,), conditioning))
+    return ()
 
 
 def _masses(

@@ -10,9 +10,9 @@ The limits were set by `make diagnosis-study`; those of a single number are in `
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,38 +22,38 @@ from ident.arrays import BoolArray, FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
+from ident.data.unsigned_current import missing_sign, one_sided_currents
 from ident.equations.reduction import layout
 from ident.equations.rows import rows_of
 from ident.equations.system import System
-from ident.equations.triangles import qr_update, solve
-from ident.errors import CurrentReversed, Diagnosis, IdentificationError, UnitsMistaken
+from ident.equations.triangles import qr_update
+from ident.errors import CurrentUnsigned, Diagnosis, IdentificationError
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import wls
 from ident.estimators.maximum_likelihood import ml
+from ident.estimators.method import Method
 from ident.estimators.payload_diagnosis import payload_diagnoses
+from ident.estimators.refusals import (
+    EXCHANGE,
+    idle_joints,
+    joint_torques,
+    numbers_text,
+    refuse_mistakes,
+    weight_ratio,
+)
 from ident.model.model import Model
-from ident.plausible import GAIN_RATIO, TORQUE_RATIO, UNIT_RATIO
+from ident.plausible import CURRENT_RANGE, GAIN_RANGE, TORQUE_RATIO, WEIGHT_RATIO, range_text
 
-if TYPE_CHECKING:  # which refuses a fit by the checks below
+if TYPE_CHECKING:  # which refuses a fit by the same checks
     from ident.estimators.identify import Identification
 
 LARGEST_AXIS_ERROR_PERCENT = 20.0  #: Clean recordings stay below 15, with every effect undeclared below 40
-IDLE_TORQUE, IDLE_ERROR = 1e-3, 1e-2
-"""Torque and error of an idle axis, relative to the largest torque of any: 0.01 Nm of a wrist beside the 30 Nm of a
-shoulder is below every friction. The wrist of a real robot carries 0.02 of it and more."""
 LARGEST_CONDITION = 1e6
 """Largest condition number. An error of one σ along the weakest direction of the parameters is 1/s_min, and it exceeds
 all parameters together where the condition exceeds s_max ‖χ‖. That is 1e4 to 2e5 in real and simulated recordings."""
 GAIN_DIFFERENCE, GAIN_SIGMAS = 0.1, 3.0  #: Of another estimator's gain from that of ml: relative, and in σ of ml
+SCALE_BLOCKS = 20  #: Stretches of a run of which each is left out once, for σ of the scale of a current
 ALIKE = 0.25  #: Least squared correlation of two torques of which one is the other's, reversed
-EXCHANGE = 0.4
-"""Least fall of the logarithm of the motors' errors, in sum, of exchanged channels; with the right ones it is zero. Of
-all pairs of channels of two real robots and of five simulated arms the smallest is 0.6."""
-LEVEL = 0.05  #: Largest rise of the same, where it decides nothing and the sign of the friction must
-SMALL_ERROR = 0.02  #: Relative error of a motor below which its current needs no other explanation
-FRICTION = re.compile(r"f[vs](m?)([0-9]+)\b")  #: Names of the friction of a joint or of its coupled motor
-FRICTION_SIGMAS = 15.0  #: In the σ of independent rows, which is some three times too small
-WEIGHT_SIGMAS = 30.0  #: Likewise, for the weight of a payload
 
 
 def diagnose(
@@ -62,7 +62,9 @@ def diagnose(
     nameplate: FloatArray | None = None,
     effort_limit: FloatArray | None = None,
 ) -> tuple[Diagnosis, ...]:
-    """Test a fit for mistakes in its recordings and declarations.
+    """Judge a fit: refuse mistakes that leave no usable number, and name all others.
+
+    A mistake of a recording is the same whatever estimator was asked for, so it is judged by `judged_estimate`.
 
     Args:
         found: with or without effects; of any estimator.
@@ -71,91 +73,53 @@ def diagnose(
         effort_limit: of the joints, inf where unknown [Nm or N], shape (m,).
 
     Raises:
-        UnitsMistaken: see `require_units`.
+        PayloadUnseen, UnitsMistaken, CurrentReversed, ModelContradicted, RolesExchanged: see `refuse_mistakes`.
         PayloadDiffers: see `payload_diagnoses`.
     """
-    system, estimate, diagnoses = found.system, found.estimate, list[Diagnosis]()
+    system = found.system
+    estimate = judged_estimate(system, found.estimate)
+    refuse_mistakes(system, estimate, axes, nameplate)
+    diagnoses = list[Diagnosis]()
     if nameplate is not None and not estimate.gains_fixed:
-        require_units(estimate.gains, nameplate)
         diagnoses += gain_diagnoses(estimate, nameplate, axes)
+    diagnoses += estimator_diagnoses(found.estimate, estimate, axes)
     likeliest = estimate
-    if not estimate.method.is_of_currents:
+    if estimate.gains_fixed:
         with suppress(IdentificationError):
-            likeliest = ml(system, estimate.gains if estimate.gains_fixed else None)
-        diagnoses += estimator_diagnoses(estimate, likeliest, axes)
-    held = len(estimate.gains) if estimate.gains_fixed else 0
-    for rows, runs in ((system, ()), (found.holdout, () if found.holdout is None else found.holdout.seen_runs)):
-        if rows is not None:
-            of_fit = held if rows is system else None
-            payloads = [] if of_fit is None else list(weight_diagnoses(rows, estimate))
-            payloads += list(payload_diagnoses(rows, likeliest.gains, likeliest.parameters, of_fit))
-            # A payload that differs is the cause, an axis error only its trace.
-            diagnoses += payloads or error_diagnoses(found.model, rows, estimate, axes, runs)
+            likeliest = ml(system, estimate.gains)
+    given = len(estimate.gains) if estimate.gains_fixed else 0
+    payloads = list(weight_diagnoses(system, estimate))
+    payloads += payload_diagnoses(system, likeliest.gains, likeliest.parameters, given)
+    # A payload that differs is the cause, an axis error only its trace.
+    diagnoses += payloads or error_diagnoses(found.model, system, estimate, axes)
+    unseen = found.holdout
+    if unseen is not None:
+        payloads = list(payload_diagnoses(unseen, likeliest.gains, likeliest.parameters))
+        diagnoses += payloads or error_diagnoses(found.model, unseen, estimate, axes, unseen.seen_runs)
     if effort_limit is not None:
         diagnoses += torque_diagnoses(system, estimate, effort_limit)
-    return (*diagnoses, *condition_diagnoses(estimate))
+    return (*diagnoses, *condition_diagnoses(found.estimate))
+
+
+def judged_estimate(system: System, estimate: Estimate) -> Estimate:
+    """Return the estimate by which recordings are judged: ``ml``, or with fixed gains IDIM-WLS, whatever was asked for.
+
+    The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and do not see that moves
+    contradict each other; those of ``ml`` do. With fixed gains IDIM-WLS always has an estimate.
+
+    Args:
+        system: the equations.
+        estimate: of these equations, by any method; it is judged itself where ``ml`` does not converge.
+    """
+    if estimate.gains_fixed:
+        return estimate if estimate.method is Method.WLS else wls(system, estimate.gains)
+    if not estimate.method.is_of_currents:
+        with suppress(IdentificationError):
+            return ml(system)
+    return estimate
 
 
 # Gains and units
-
-
-def require_units(gains: FloatArray, nameplate: FloatArray) -> None:
-    """Refuse gains that are all off the nameplate by a factor that only a unit has.
-
-    Raises:
-        UnitsMistaken: each is more than UNIT_RATIO times, or less than 1/UNIT_RATIO of, its nameplate.
-    """
-    ratio = np.abs(gains / nameplate)
-    if np.all(ratio < 1.0 / UNIT_RATIO):
-        cause = "are the currents in mA and read as A, or is the payload's mass in t?"
-    elif np.all(ratio > UNIT_RATIO):
-        cause = "is the payload's mass in g and read as kg, or are the currents in kA?"
-    else:
-        return
-    raise UnitsMistaken(
-        "all drive gains",
-        found=f"{_numbers(ratio)} times the nameplate",
-        expected=f"0.7 to 1.3, and within a factor of {UNIT_RATIO:g} at least on one axis",
-        remedy=cause,
-    )
-
-
-def require_weight(system: System, estimate: Estimate) -> None:
-    """Refuse fixed gains with which a weighed payload has another weight, by a factor that only a unit has.
-
-    Raises:
-        UnitsMistaken: more than UNIT_RATIO times, or less than 1/UNIT_RATIO of what was declared.
-    """
-    if not system.knows_payload:
-        return
-    ratio, std = weight_ratio(system, estimate)
-    if ratio - std > UNIT_RATIO or ratio + std < 1.0 / UNIT_RATIO:
-        raise UnitsMistaken(
-            "the weight of the payload",
-            found=f"{ratio:.3g} times the declared one, by these gains",
-            expected=f"0.7 to 1.3 times, and within a factor of {UNIT_RATIO:g} at least",
-            remedy="are the currents in mA and read as A, is its mass in g and read as kg, or was it not mounted?",
-        )
-
-
-def weight_ratio(system: System, estimate: Estimate) -> tuple[float, float]:
-    """Size of W_kL χ_kL that the currents ask for with given gains, and WEIGHT_SIGMAS of its σ."""
-    if system.model.is_redundant:  # no motor has an equation of its own
-        whitened = system.currents.whitened(estimate.gains, np.ones(len(estimate.gains)))
-        torque, right = np.column_stack((whitened.linear, whitened.known)), whitened.drive @ estimate.gains
-        return _last(torque, right, int(system.motors.rows.sum()))
-    # Weighted by the size of each current: the residuals of a fit with a wrong weight say nothing about noise.
-    factors = [factor / max(float(np.linalg.norm(factor[:, 0])), 1e-300) for factor in system.motors.factors]
-    rows = np.concatenate(factors)
-    scale = np.concatenate([np.full(len(f), 1.0 / g) for f, g in zip(factors, estimate.gains, strict=True)])
-    return _last(rows[:, 1:] * scale[:, None], rows[:, 0], int(system.motors.rows.sum()))
-
-
-def _last(columns: FloatArray, right: FloatArray, rows: int) -> tuple[float, float]:
-    """Size of the last unknown by least squares, and WEIGHT_SIGMAS of its σ."""
-    solution, inverse = solve(columns, right)
-    left = float(np.sum((right - columns @ solution) ** 2)) / rows
-    return abs(float(solution[-1])), WEIGHT_SIGMAS * float(np.sqrt(left * inverse[-1, -1]))
 
 
 def weight_diagnoses(system: System, estimate: Estimate) -> Iterator[Diagnosis]:
@@ -163,69 +127,20 @@ def weight_diagnoses(system: System, estimate: Estimate) -> Iterator[Diagnosis]:
     if not estimate.gains_fixed or not system.knows_payload:
         return
     ratio, std = weight_ratio(system, estimate)
-    if ratio - std > GAIN_RATIO or ratio + std < 1.0 / GAIN_RATIO:
+    if ratio - std > WEIGHT_RATIO or ratio + std < 1.0 / WEIGHT_RATIO:
         loaded = sorted({run for run, mounting in system.cluster_runs if mounting >= 0})
         yield Diagnosis(
             "payload-differs",
             tuple(system.runs[run] for run in loaded),
             (),
             f"{ratio:.2g} times the declared weight of the payload, by these gains",
-            "0.7 to 1.3 times",
+            f"1, and within a factor of {WEIGHT_RATIO:g}",
             "was it mounted in these runs? are its mass and the fixed gains right?",
         )
 
 
-def require_signs(system: System, estimate: Estimate, axes: Sequence[str]) -> None:
-    """Refuse fixed gains of which some explain the data with the other sign.
-
-    Raises:
-        CurrentReversed: with the other sign the errors fall by EXCHANGE, or they stay and the friction, which drove the
-            axis, brakes it.
-    """
-
-    def tried(signs: FloatArray) -> tuple[float, FloatArray]:
-        """Σ log of the motors' errors, and the friction of each axis in σ."""
-        one = wls(system, estimate.gains * signs)
-        friction = np.zeros(len(axes))
-        for column, value, std in zip(one.unknowns, one.parameters, one.parameters_std, strict=True):
-            if (of_friction := FRICTION.match(column.name)) is not None:
-                number = int(of_friction[2]) - 1
-                friction[number if of_friction[1] else joints.index(number)] += value / std
-        errors = np.maximum(system.currents.noise(one.gains, one.parameters), smallest)
-        return float(np.sum(np.log(errors))), friction
-
-    joints, redundant = system.model.robot.axis_joints, system.model.is_redundant
-    own = range(len(axes)) if redundant else [0] * len(axes)  # where a motor's rows have its current
-    size = np.array([np.linalg.norm(f[:, column]) for f, column in zip(system.motors.factors, own, strict=True)])
-    smallest = SMALL_ERROR * size / np.sqrt(np.maximum(system.motors.rows, 1))
-    smallest[smallest == 0.0] = 1.0  # a motor without current
-    signs = np.ones(len(axes))
-    before, friction = tried(signs)
-    for _ in axes:
-        better = []
-        for axis in range(len(axes)):
-            trial = signs * np.where(np.arange(len(axes)) == axis, -1.0, 1.0)
-            after, braking = tried(trial)
-            driven = friction[axis] < -FRICTION_SIGMAS < FRICTION_SIGMAS < braking[axis]
-            if after - before < (LEVEL if driven else -EXCHANGE):
-                better.append((after, axis, trial, braking))
-        if not better:
-            break
-        before, _, signs, friction = min(better, key=lambda one: one[:2])
-    if np.median(friction) < 0.0:  # without a payload the data fix the signs up to a common one, which friction shows
-        signs = -signs
-    turned = [axis for axis, sign in zip(axes, signs, strict=True) if sign < 0.0]
-    if 0 < len(turned) < len(axes):
-        raise CurrentReversed(
-            f"axis {', '.join(turned)}",
-            found="a current that explains the motion with the other sign of its gain",
-            expected="the sign of the fixed gain",
-            remedy="does the drive, or the import, count this current the other way? correct its sign",
-        )
-
-
 def gain_diagnoses(estimate: Estimate, nameplate: FloatArray, axes: Sequence[str]) -> Iterator[Diagnosis]:
-    """Compare free gains with the nameplate: signs, and sizes beyond GAIN_RATIO."""
+    """Compare free gains with the nameplate: signs, and sizes outside GAIN_RANGE by more than GAIN_SIGMAS σ."""
     ratio = estimate.gains / nameplate
     known = estimate.gains_std < np.abs(estimate.gains) / GAIN_SIGMAS
     for axis in np.flatnonzero(known & (ratio < 0.0)).tolist():
@@ -237,15 +152,21 @@ def gain_diagnoses(estimate: Estimate, nameplate: FloatArray, axes: Sequence[str
             f"the sign of the nameplate, {nameplate[axis]:.4g}",
             "does the drive, or the import, count this current the other way?",
         )
-    for axis in np.flatnonzero((np.abs(ratio) > GAIN_RATIO) | (np.abs(ratio) < 1.0 / GAIN_RATIO)).tolist():
+    margin = GAIN_SIGMAS * np.abs(estimate.gains_std / nameplate)
+    for axis in np.flatnonzero(outside(np.abs(ratio), margin, GAIN_RANGE)).tolist():
         yield Diagnosis(
             "gain-off-nameplate",
             (),
             (axes[axis],),
             f"a gain of {estimate.gains[axis]:.4g} ± {estimate.gains_std[axis]:.2g}, {ratio[axis]:.3g} nameplates",
-            f"0.7 to 1.3 of {nameplate[axis]:.4g}",
+            f"{range_text(GAIN_RANGE)} of {nameplate[axis]:.4g}, within {GAIN_SIGMAS:g} σ",
             "is the nameplate of this axis, its gear ratio, the scale of its current or the payload's mass wrong?",
         )
+
+
+def outside(values: FloatArray, margin: FloatArray | float, bounds: tuple[float, float]) -> BoolArray:
+    """Whether numbers are outside a range by more than a margin; NaN is not."""
+    return np.asarray((values + margin < bounds[0]) | (values - margin > bounds[1]))
 
 
 def scale_diagnoses(
@@ -253,34 +174,62 @@ def scale_diagnoses(
 ) -> Iterator[Diagnosis]:
     """Compare the torque of a run, from its currents and the gains of a calibration, with what that predicts.
 
+    A scale is named where it is outside CURRENT_RANGE by more than GAIN_SIGMAS σ and explains the axis: another payload
+    changes the torque of an axis, too, but leaves 28 % and more of it beside any scale.
+
     Args:
         measured_nm, predicted_nm: joint torque, shape (m, r).
         use: rows of each joint that count, shape (m, r).
         axes: name of each axis.
         runs: name of the run.
     """
-    product = np.sum(measured_nm * predicted_nm, axis=1, where=use)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = product / np.sum(predicted_nm**2, axis=1, where=use)
-        inverse = product / np.sum(measured_nm**2, axis=1, where=use)
-    for axis in np.flatnonzero((ratio < 0.0) & (ratio * inverse > ALIKE)).tolist():
-        yield Diagnosis(
-            "current-reversed",
-            runs,
-            (axes[axis],),
-            f"{ratio[axis]:.3g} times the predicted torque",
-            "1",
-            "does the drive, or the import, count this current the other way?",
-        )
-    for axis in np.flatnonzero((np.abs(ratio) > GAIN_RATIO) | (np.abs(inverse) > GAIN_RATIO)).tolist():
-        yield Diagnosis(
-            "current-off-scale",
-            runs,
-            (axes[axis],),
-            f"{ratio[axis]:.3g} times the predicted torque",
-            "1, and 0.7 to 1.3 after years",
-            "is the current in another unit (mA) than in the fit, or of another drive?",
-        )
+    for axis, name in enumerate(axes):
+        found = current_scale(measured_nm[axis, use[axis]], predicted_nm[axis, use[axis]])
+        evidence = f"{found.ratio:.3g} times the predicted torque"
+        if found.ratio < 0.0 and found.left**2 < 1.0 - ALIKE:
+            yield Diagnosis(
+                "current-reversed",
+                runs,
+                (name,),
+                evidence,
+                "1",
+                "does the drive, or the import, count this current the other way?",
+            )
+        is_off = outside(np.abs(found.ratio), GAIN_SIGMAS * found.std, CURRENT_RANGE)
+        if is_off and 100.0 * found.left < LARGEST_AXIS_ERROR_PERCENT:
+            yield Diagnosis(
+                "current-off-scale",
+                runs,
+                (name,),
+                evidence,
+                f"1, and {range_text(CURRENT_RANGE)} after years",
+                "is the current in another unit (mA) than in the fit, or of another drive?",
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class CurrentScale:
+    """Scale of the torque of an axis, from its current, beside the predicted one."""
+
+    ratio: float  #: by least squares; NaN without torque
+    std: float  #: σ of the ratio, from leaving out one of SCALE_BLOCKS stretches of time in turn
+    left: float  #: what no scale explains, relative to the measured torque (root mean squares)
+
+
+def current_scale(measured_nm: FloatArray, predicted_nm: FloatArray) -> CurrentScale:
+    """Fit measured = ratio · predicted over the rows of one axis, shape (r,) each."""
+    products = measured_nm * predicted_nm
+    squares = predicted_nm**2
+    product = float(products.sum())
+    square = float(squares.sum())
+    size = float(np.sum(measured_nm**2))
+    if product == 0.0 or len(products) < SCALE_BLOCKS:
+        return CurrentScale(np.nan, np.nan, 1.0)
+    starts = np.arange(SCALE_BLOCKS) * len(products) // SCALE_BLOCKS
+    others = (product - np.add.reduceat(products, starts)) / (square - np.add.reduceat(squares, starts))
+    std = float(np.sqrt((SCALE_BLOCKS - 1) * np.var(others)))
+    left = float(np.sqrt(max(0.0, 1.0 - product**2 / (square * size))))
+    return CurrentScale(product / square, std, left)
 
 
 def estimator_diagnoses(estimate: Estimate, likeliest: Estimate, axes: Sequence[str]) -> Iterator[Diagnosis]:
@@ -303,27 +252,6 @@ def estimator_diagnoses(estimate: Estimate, likeliest: Estimate, axes: Sequence[
 
 
 # Errors, torques and condition
-
-
-def joint_torques(system: System, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
-    """Torque of each joint, and what the model leaves of it: root mean squares [Nm or N], both of shape (m,)."""
-    gains = np.concatenate((estimate.gains, np.zeros(len(estimate.parameters) + 1)))
-    whole = np.concatenate((estimate.gains, estimate.parameters, [1.0]))
-    rows = np.maximum(system.joints.rows, 1)
-    size, left = (np.sqrt(system.joints.square_sum(vector) / rows) for vector in (gains, whole))
-    return size, left
-
-
-def idle_joints(model: Model, size: FloatArray, left: FloatArray) -> BoolArray:
-    """Joints whose torque and error are nothing beside the torque of another joint of the kind, shape (m,).
-
-    Args:
-        model: of the fit.
-        size, left: of `joint_torques`.
-    """
-    kinds = np.array([joint.kind.value for joint in model.robot.axes])
-    largest = np.array([size[kinds == kind].max() for kind in kinds])
-    return (size < IDLE_TORQUE * largest) & (left < IDLE_ERROR * largest)
 
 
 def error_diagnoses(
@@ -378,8 +306,8 @@ def torque_diagnoses(system: System, estimate: Estimate, effort_limit: FloatArra
             "torque-above-limit",
             (),
             (),
-            f"torques of {_numbers(torque)} Nm (or N; root mean square)",
-            f"less than the effort limits of the URDF, {_numbers(effort_limit)}",
+            f"torques of {numbers_text(torque)} Nm (or N; root mean square)",
+            f"less than the effort limits of the URDF, {numbers_text(effort_limit)}",
             "are the currents in mA and read as A, is the payload's mass in g and read as kg, or the URDF wrong?",
         )
 
@@ -438,6 +366,32 @@ def exchanged_channels(
     )
 
 
+def unsigned_channels(
+    model: Model, runs: Sequence[Run], conditioning: Conditioning, axes: Sequence[str]
+) -> CurrentUnsigned | None:
+    """Whether a current that has one sign in all runs is a size: while its motor turns both ways nothing explains it.
+
+    A load that is always carried has one sign, too, but the equation of its motor explains it. This finds a size that
+    `ident.data.unsigned_current` does not, because friction takes its current through zero between two samples.
+
+    Arguments as for `exchanged_channels`.
+
+    Raises:
+        DataUnfit: as of `ident.equations.reduction.reduce_runs`.
+    """
+    if model.is_redundant:
+        return None
+    one_sided = np.all([one_sided_currents(run, model.drive_train.ratio) for run in runs], axis=0)
+    if not one_sided.any():
+        return None
+    own_errors = np.diag(channel_errors(model, runs, conditioning))
+    unsigned = np.flatnonzero(one_sided & (100.0 * own_errors > LARGEST_AXIS_ERROR_PERCENT))
+    if not len(unsigned):
+        return None
+    names = tuple(axes[axis] for axis in unsigned.tolist())
+    return CurrentUnsigned(", ".join(run.name for run in runs), names, missing_sign(runs[0].current_a[:, unsigned]))
+
+
 def channel_errors(model: Model, runs: Iterable[Run], conditioning: Conditioning) -> FloatArray:
     """Share of the current k that the equation of motor i leaves, every gain and parameter of its own, shape (m, m).
 
@@ -464,7 +418,3 @@ def channel_errors(model: Model, runs: Iterable[Run], conditioning: Conditioning
             left = np.linalg.norm(factor[first:, first:], axis=0) / np.linalg.norm(factor[:, first:], axis=0)
             errors[motor] = left * np.sqrt(seen[motor] / (seen[motor] - first))
     return errors
-
-
-def _numbers(values: FloatArray) -> str:
-    return ", ".join(f"{value:.3g}" for value in values)

@@ -1,8 +1,9 @@
-"""Output of `make setup` while pip works."""
+"""Output of `make setup` while pip works, and the interpreter of the environment that it makes."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -55,3 +56,75 @@ def test_what_pip_complains_of_is_shown(checkout: Path, tmp_path: Path) -> None:
     )
     assert done.returncode == 1
     assert "ERROR: No matching distribution found for no-such-package==1.0" in done.stderr
+
+
+INTERPRETER = """\
+#!/bin/sh
+case "$1 $2" in
+    "-c import sys; sys.exit"*) ;;
+    "-c "*) echo {version} ;;
+    "-m venv") mkdir -p "$3/bin" && cp "$0" "$3/bin/python" ;;
+esac
+"""
+"""An interpreter that makes an environment of itself, and installs nothing into it."""
+
+
+@pytest.fixture
+def makefile(checkout: Path, tmp_path: Path) -> Path:
+    """A folder with the Makefile, and the interpreters one and two."""
+    for name in ("Makefile", "pyproject.toml", "requirements.lock"):
+        shutil.copy(checkout / name, tmp_path)
+    for version in ("one", "two"):
+        file = tmp_path / version
+        file.write_text(INTERPRETER.format(version=version))
+        file.chmod(0o755)
+    return tmp_path
+
+
+def set_up_with(folder: Path, *arguments: str, environment: str | None = None) -> subprocess.CompletedProcess[str]:
+    """Run `make setup`; environment is the PYTHON of the environment variables."""
+    variables = {name: value for name, value in os.environ.items() if name not in {"PYTHON", "MAKEFLAGS", "MAKELEVEL"}}
+    if environment is not None:
+        variables["PYTHON"] = environment
+    command = ["make", "setup", *arguments]
+    return subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True, check=False)
+
+
+def interpreter_of(environment: Path) -> str:
+    """Return which interpreter an environment was made by."""
+    said = subprocess.run([environment / "bin" / "python", "-c", "which"], capture_output=True, text=True, check=True)
+    return said.stdout.strip()
+
+
+def test_an_environment_of_another_interpreter_is_made_again(makefile: Path) -> None:
+    environment = makefile / ".venv"
+    assert set_up_with(makefile, "PYTHON=./one").returncode == 0
+    (environment / "of-one").touch()
+    assert set_up_with(makefile, "PYTHON=./one").stdout.count("setting up") == 0
+    assert (environment / "of-one").exists()
+    done = set_up_with(makefile, environment="./two")
+    assert done.returncode == 0
+    assert ".venv is of another interpreter than ./two and is made again" in done.stdout
+    assert interpreter_of(environment) == "two"
+    assert not (environment / "of-one").exists()
+
+
+def test_an_environment_stays_where_no_interpreter_is_named(makefile: Path) -> None:
+    set_up_with(makefile, "PYTHON=./two")
+    assert "setting up" not in set_up_with(makefile).stdout
+    assert interpreter_of(makefile / ".venv") == "two"
+
+
+def test_an_interpreter_that_does_not_run_destroys_no_environment(makefile: Path) -> None:
+    set_up_with(makefile, "PYTHON=./one")
+    done = set_up_with(makefile, "PYTHON=./three")
+    assert done.returncode != 0
+    assert "drivegain needs Python 3.11 or later" in done.stderr
+    assert interpreter_of(makefile / ".venv") == "one"
+
+
+def test_another_environment_leaves_the_usual_one_as_it_is(makefile: Path) -> None:
+    set_up_with(makefile, "PYTHON=./one")
+    assert set_up_with(makefile, "PYTHON=./two", "VENV=out/venv-two").returncode == 0
+    assert interpreter_of(makefile / "out" / "venv-two") == "two"
+    assert interpreter_of(makefile / ".venv") == "one"

@@ -15,9 +15,9 @@ from daq.config.cell import model_of
 from daq.errors import ExitCode
 from daq.log.conversion import load_run
 from daq.report.schemas import DemoReport
-from daq.workflow.fit import check_signs
 from ident.errors import RolesExchanged
 from ident.estimators.identify import identify
+from ident.estimators.refusals import require_roles
 
 
 @pytest.fixture(scope="module")
@@ -121,9 +121,9 @@ def test_exchanged_roles_turn_all_signs_and_are_named(demonstration: Path) -> No
         identify(model_of(cell), exchanged, cell.conditioning)
     estimate = identify(model_of(cell), (bare, loaded), cell.conditioning).estimate
     nameplate = np.array([axis.nameplate_gain for axis in cell.axes])
-    check_signs(estimate, nameplate)
+    require_roles(estimate.gains, nameplate)
     with pytest.raises(RolesExchanged, match="exchanged"):
-        check_signs(replace(estimate, gains=-estimate.gains), nameplate)
+        require_roles(-estimate.gains, nameplate)
 
 
 def test_validate_measures_the_calibration_on_the_holdout_run(

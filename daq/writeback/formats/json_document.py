@@ -71,6 +71,8 @@ class JsonDocument(ControllerDocument):
                 parse_constant=_refuse_constant,
                 object_pairs_hook=_unique,
             )
+        except json.JSONDecodeError as error:
+            raise self._no_json(_broken_place(error.doc, error.pos)) from error
         except (ValueError, RecursionError) as error:
             raise self._no_json(str(error)) from error
         return dict(_walk((), tree))
@@ -123,6 +125,21 @@ def json_document(content: bytes, name: str) -> JsonDocument:
         ControllerUnfit: the bytes are not UTF-8.
     """
     return JsonDocument(name, utf8(content, name, "JSON"))
+
+
+def _broken_place(text: str, position: int) -> str:
+    """Say where a text stops being JSON, and what is there: the parser's own words differ between versions of Python.
+
+    So does the place of a comma too many: the comma since 3.13, what follows it before.
+    """
+    before = text[:position].rstrip()
+    if text[position : position + 1] in ("}", "]") and before.endswith(","):
+        position = len(before) - 1
+    line = text.count("\n", 0, position) + 1
+    column = position - text.rfind("\n", 0, position)
+    rest = text[position:].partition("\n")[0].strip()
+    found = f"'{rest:.40}'" if rest else "the end of the line"
+    return f"line {line} column {column}: {found}"
 
 
 def _refuse_constant(name: str) -> None:

@@ -26,6 +26,7 @@ from daq.log.conversion import load_run, run_from_log, scaling, unwrapped
 from daq.log.metadata import AxisReadback, Readback, readback_of_drives
 from daq.log.reader import read_log
 from drivers.stream.sample import CellEvent, EventKind, Sample
+from ident.errors import CurrentUnsigned
 from tests.conftest import CHECKOUT
 from tests.daq.logs import DISC, START_NS, content, demo_content, samples, write
 
@@ -198,3 +199,27 @@ def test_the_readback_of_drives_keeps_their_answers() -> None:
         ("J1", 0.1, {"serial": 1}),
         ("J2", 0.2, {"serial": 2}),
     ]
+
+
+def bouncing(count: int = 3000, size: bool = True) -> list[Sample]:
+    """Moves both ways, and currents of 2 Hz, of which the second is a size, or has its sign."""
+    time_s = np.arange(count) / 1000.0
+    position = np.rint(20000.0 * np.sin(2.0 * pi * 0.7 * time_s)).astype(int)
+    current = np.rint(400.0 * np.sin(2.0 * pi * 2.0 * time_s + 0.3)).astype(int)
+    second = np.abs(current) if size else current
+    rows = samples([[int(one)] * 6 for one in position])
+    return [
+        replace(row, current_raw=(int(first), int(other), *(int(first),) * 4))
+        for row, first, other in zip(rows, current, second, strict=True)
+    ]
+
+
+def test_a_current_without_its_sign_is_refused_by_axis(record: Recorder) -> None:
+    with pytest.raises(CurrentUnsigned, match="axis J2: found currents that are never negative") as caught:
+        load_run(record(bouncing()))
+    assert caught.value.axes == ("J2",)
+
+
+def test_a_current_with_its_sign_is_taken(record: Recorder) -> None:
+    run, _ = load_run(record(bouncing(size=False)))
+    assert len(run.time_s) == 3000

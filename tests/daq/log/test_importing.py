@@ -323,6 +323,26 @@ def test_a_rate_that_is_ten_times_off_is_noticed(
     assert ("no joint is faster than" in caplog.text) is (wrong < 1.0)
 
 
+@pytest.mark.parametrize("size", [True, False])
+def test_currents_without_their_sign_are_noticed(
+    bench: Bench, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture, size: bool
+) -> None:
+    """The log is made, since other programs can read it; a fit refuses it."""
+    seconds = np.arange(2000)[:, None] / 1000.0
+    bench.joint_deg = 20.0 * np.sin(5.0 * seconds + np.arange(6))
+    current = np.cos(30.0 * seconds + np.arange(6))
+    bench.current_a = np.abs(current) if size else current
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    assert bench.run() == 0
+    assert ("J1, J2, J3, J4, J5, J6: found currents that are never negative" in caplog.text) is size
+    capsys.readouterr()
+    code = main(["fit", str(bench.out)])
+    said = capsys.readouterr().err
+    assert code == 4
+    assert ("never negative" in said) is size
+    assert "heavier payload" not in said
+
+
 @pytest.mark.parametrize("back", [False, True])
 def test_a_step_that_no_motor_makes(bench: Bench, capsys: pytest.CaptureFixture[str], back: bool) -> None:
     """A step of 0.5 rad in one sample: the speeds over many samples do not show it."""

@@ -79,14 +79,15 @@ def reduced(shelf: Shelf) -> ReducedLogs:
 
 
 @pytest.fixture(scope="module")
-def calibrations(reduced: ReducedLogs) -> dict[str, Calibration]:
+def calibrations(reduced: ReducedLogs, shelf: Shelf) -> dict[str, Calibration]:
     """One a case."""
-    return {
-        case.name: calibration_of_case(
-            fit_case(reduced, case.method, case.known, gains_fixed=case.gains_fixed, ratio=20.0), CREATED
-        )
-        for case in CASES
-    }
+    found = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_module, "load_run", shelf.load)
+        for case in CASES:
+            fitted = fit_case(reduced, case.method, case.known, gains_fixed=case.gains_fixed, ratio=20.0)
+            found[case.name] = calibration_of_case(fitted, CREATED)
+    return found
 
 
 def _paths(*names: str) -> list[Path]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,23 +12,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ident.data.run import Run
+from ident.data.unsigned_current import unsigned_currents
 from ident.discovery.evidence import gather
 from ident.errors import CurrentReversed, ModelContradicted, PayloadDiffers, UnitsMistaken
 from ident.estimators.diagnosis import (
     axis_error_diagnoses,
     diagnose,
     exchanged_channels,
-    idle_joints,
-    require_units,
+    gain_diagnoses,
     scale_diagnoses,
+    unsigned_channels,
 )
-from ident.estimators.estimate import RelativeError
-from ident.estimators.identify import identify, require_plausible
+from ident.estimators.estimate import Estimate, RelativeError
+from ident.estimators.identify import identify
 from ident.estimators.least_squares import wls
 from ident.estimators.method import Method
 from ident.estimators.payload_diagnosis import payload_differences
+from ident.estimators.refusals import idle_joints, require_plausible, require_units
 from ident.model.model import Column
-from ident.plausible import UNIT_RATIO
+from ident.plausible import UNIT_RATIO, WEIGHT_RATIO
 from tests.ident.mistaken import AXES, BODY, SMALL, diagnosed, small_recordings, turned, with_currents
 from tests.ident.recordings import MOUNTED, FloatArray, Truth, record
 
@@ -224,12 +227,111 @@ def test_the_instruments_need_not_agree_with_ml(small_truth: Truth, clean: list[
     assert "estimators-disagree" in {one.name for one in diagnose(other, AXES)}
 
 
-@given(scale=st.floats(0.01, 0.33) | st.floats(0.34, 2.9) | st.floats(3.1, 100.0), sign=st.sampled_from([1.0, -1.0]))
+def limits_in(text: str) -> tuple[float, float]:
+    """Return the range that a diagnosis promises, as `0.7 to 1.3`."""
+    found = re.search(r"([0-9.]+) to ([0-9.]+)", text)
+    assert found is not None
+    return float(found[1]), float(found[2])
+
+
+@given(scale=st.floats(0.01, 0.69) | st.floats(0.71, 1.29) | st.floats(1.31, 100.0), sign=st.sampled_from([1.0, -1.0]))
 def test_the_scale_of_a_current_beside_a_calibration(scale: float, sign: float) -> None:
     predicted = np.random.default_rng(0).standard_normal((2, 200))
     measured = predicted * np.array([[1.0], [sign * scale]])
-    names = {
-        one.name for one in scale_diagnoses(measured, predicted, np.ones((2, 200), dtype=bool), ("a", "b"), ("r",))
-    }
-    assert ("current-reversed" in names) == (sign < 0.0)
-    assert ("current-off-scale" in names) == (not 0.334 <= scale <= 3.0)
+    found = {one.name: one for one in scale_diagnoses(measured, predicted, np.ones((2, 200), dtype=bool), "ab", ("r",))}
+    assert ("current-reversed" in found) == (sign < 0.0)
+    assert ("current-off-scale" in found) == (not 0.7 <= scale <= 1.3)
+    if "current-off-scale" in found:
+        assert limits_in(found["current-off-scale"].expected) == (0.7, 1.3)
+        assert found["current-off-scale"].axes == ("b",)
+
+
+def test_noise_makes_no_scale(small_truth: Truth) -> None:
+    """Twenty times the same torque, at 1.3 of the prediction, with noise of a seventh of its size."""
+    predicted = np.random.default_rng(0).standard_normal((1, 400))
+    for seed in range(1, 21):
+        measured = 1.3 * predicted + 0.15 * np.random.default_rng(seed).standard_normal((1, 400))
+        assert not list(scale_diagnoses(measured, predicted, np.ones((1, 400), dtype=bool), "a", ("r",)))
+
+
+@given(
+    ratio=st.floats(0.05, 20.0),
+    std=st.floats(0.0, 0.5),
+    sign=st.sampled_from([1.0, -1.0]),
+)
+def test_a_gain_is_named_where_the_text_says(ratio: float, std: float, sign: float) -> None:
+    """Outside the range that the text has, by more than the σ that it has."""
+    nameplate = np.array([sign * 20.0])
+    estimate = an_estimate(ratio * nameplate, std * np.abs(nameplate))
+    found = [one for one in gain_diagnoses(estimate, nameplate, ("J1",)) if one.name == "gain-off-nameplate"]
+    is_off = ratio + 3.0 * std < 0.7 or ratio - 3.0 * std > 1.3
+    assert bool(found) == is_off
+    for one in found:
+        assert limits_in(one.expected) == (0.7, 1.3)
+        assert one.expected.endswith("within 3 σ")
+
+
+def test_the_papers_gains_are_not_off_their_nameplates() -> None:
+    """J4 in Tables 2 and 4: up to 30 % below the nameplate of 11.52, with σ of 2 to 3 %."""
+    nameplate = np.array([-11.52])
+    for gain, percent in ((-8.06, 3.33), (-8.27, 1.76), (-8.31, 1.99), (-9.21, 2.75)):
+        estimate = an_estimate(np.array([gain]), np.array([percent / 100.0 * abs(gain)]))
+        assert not list(gain_diagnoses(estimate, nameplate, ("J4",)))
+
+
+def an_estimate(gains: FloatArray, std: FloatArray) -> Estimate:
+    """An estimate of gains alone."""
+    return Estimate(
+        method=Method.ML,
+        gains=gains,
+        gains_fixed=False,
+        unknowns=(),
+        parameters=np.zeros(0),
+        covariance=np.diag(std**2),
+        axis_noise=np.ones(len(gains)),
+        singular_values=np.ones(1),
+        condition=1.0,
+        rows=9,
+    )
+
+
+def test_ranges_in_texts_are_those_that_are_tested(small_truth: Truth, clean: list[Run]) -> None:
+    """A factor that a refusal names is the one that it tests."""
+    with pytest.raises(UnitsMistaken, match=rf"0\.7 to 1\.3, and within a factor of {UNIT_RATIO:g} on one axis"):
+        require_units(np.full(3, 1.01 * UNIT_RATIO), np.ones(3))
+    forgotten = [clean[0], small_recordings(small_truth, 0, count=2, bodies={1: 0.0 * BODY})[1]]
+    (found,) = diagnosed(small_truth, forgotten, fixed=True)
+    assert found.expected == f"1, and within a factor of {WEIGHT_RATIO:g}"
+
+
+@pytest.mark.parametrize("factor", [0.51, 2.0])
+def test_a_current_in_another_ampere_is_named(small_truth: Truth, clean: list[Run], factor: float) -> None:
+    """A torque constant that is applied twice, or an ampere that is a peak value of two."""
+    (found,) = diagnosed(small_truth, with_currents(clean, np.array([1.0, factor, 1.0])))
+    assert (found.name, found.axes) == ("gain-off-nameplate", ("J2",))
+    ratio = re.search(r"([0-9.]+) nameplates$", found.found)
+    assert ratio is not None
+    assert float(ratio[1]) == pytest.approx(1.0 / factor, rel=0.05)
+
+
+def test_the_axis_whose_friction_jumps_through_zero_is_found_by_its_equation(small_truth: Truth) -> None:
+    """Without noise, and at 200 Hz, the current of J3 is near zero in two samples of 16 s."""
+    runs = small_recordings(small_truth, 3, count=1, noise_a=0.0)
+    assert unsigned_channels(small_truth.model, runs, SMALL, AXES) is None
+    size = np.abs(runs[0].current_a[:, 2])
+    sized = [replace(runs[0], current_a=np.column_stack((runs[0].current_a[:, :2], size)))]
+    assert not any(unsigned_currents(run, small_truth.model.drive_train.ratio).any() for run in sized)
+    found = unsigned_channels(small_truth.model, sized, SMALL, AXES)
+    assert found is not None
+    assert found.axes == ("J3",)
+    offset = np.array([0.0, 0.0, 2.0 * float(size.max())])
+    lifting = [replace(run, current_a=run.current_a + offset) for run in runs]
+    assert unsigned_channels(small_truth.model, lifting, SMALL, AXES) is None
+
+
+@pytest.mark.parametrize("method", [Method.LS, Method.WLS, Method.TLS, Method.ML])
+def test_a_recording_is_judged_alike_whatever_the_method(small_truth: Truth, clean: list[Run], method: Method) -> None:
+    """The estimator is named for what it makes of the noise, the recording for its mistake."""
+    found = diagnosed(small_truth, with_currents(clean, np.array([1.0, 0.51, 1.0])), method=method)
+    by_ml = diagnosed(small_truth, with_currents(clean, np.array([1.0, 0.51, 1.0])))
+    assert tuple(one for one in found if one.name != "estimators-disagree") == by_ml

@@ -13,9 +13,10 @@ from ident.data.run import Run
 from ident.equations.reduction import reduce_runs
 from ident.errors import ModelContradicted, PayloadUnseen, RolesExchanged
 from ident.estimators.estimate import Estimate, RelativeError
-from ident.estimators.identify import identify, require_plausible, require_seen_payload
+from ident.estimators.identify import identify
 from ident.estimators.maximum_likelihood import ml
 from ident.estimators.method import Method
+from ident.estimators.refusals import require_plausible, require_seen_payload
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, Truth, record
 
 

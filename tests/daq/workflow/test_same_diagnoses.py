@@ -1,0 +1,183 @@
+"""A recording gets the same diagnoses from `fit`, `residual`, `validate`, the report, and `daq.fit_logs`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+from html import unescape
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.log.reader import LossyLogs
+from daq.report.certificate import certify, without_controller
+from daq.report.certificate_page import certificate_page
+from daq.workflow import fit as fit_module
+from daq.workflow import validate as validate_module
+from daq.workflow.calibration_file import decode, encode
+from daq.workflow.fit import calibration_of, close_loop, fit, fit_logs
+from daq.workflow.validate import cross_validate
+from ident.data.run import Run
+from ident.errors import Diagnosis, IdentificationError
+from tests.ident.arms import THREE_AXES
+from tests.ident.mistaken import small_recordings, turned, with_currents
+from tests.ident.recordings import three_axes_truth
+
+WHEN = datetime(2025, 1, 2, tzinfo=UTC)
+CELL = """\
+name: three
+robot: {urdf: arm.urdf, gravity_m_s2: [0.0, 0.0, -9.81]}
+drive_train:
+  ratio: [[40, 0, 0], [0, 50, 0], [0, 0, -45]]
+axes:
+"""
+AXIS = (
+    "  - {{name: {name}, nameplate_gain: {gain}, gain_unit: Nm/A, "
+    "limits: {{position_deg: [-175, 175], velocity_deg_s: 400, acceleration_deg_s2: 4000}}}}\n"
+)
+REST = """\
+payloads:
+  - {name: disc, mounting: a, mass_kg: 4.59, mass_tolerance_kg: 0.005}
+conditioning:
+  {position_cutoff_hz: 40.0, position_order: 4, decimation_cutoff_hz: 20.0, standstill_rad_s: [0.03, 0.03, 0.03]}
+"""
+
+RUNS, USED = 8, 6  #: Recordings, and how many of them a fit uses; the others are held out
+Runs = list[Run]
+Mistake = Callable[[Runs], Runs]
+
+
+def in_one(number: int, change: Callable[[Run], Run]) -> Mistake:
+    """A mistake in one of the runs."""
+    return lambda runs: [change(run) if index == number else run for index, run in enumerate(runs)]
+
+
+def carrying(body: np.ndarray) -> Mistake:
+    """Another body than the payload in the second loaded run."""
+    return lambda runs: [*runs[:3], small_recordings(three_axes_truth(), 0, count=RUNS, bodies={3: body})[3], *runs[4:]]
+
+
+def scaled(*factors: float) -> Mistake:
+    """Currents that are recorded too large or too small."""
+    return lambda runs: with_currents(runs, np.array(factors))
+
+
+def of_size(*axes: int) -> Mistake:
+    """Drives that report the size of their current."""
+
+    def change(run: Run) -> Run:
+        current = run.current_a.copy()
+        current[:, axes] = np.abs(current[:, axes])
+        return replace(run, current_a=current)
+
+    return lambda runs: [change(run) for run in runs]
+
+
+def noisy(run: Run) -> Run:
+    """A run of which the last current is mostly noise."""
+    noise = np.random.default_rng(0).standard_normal(run.current_a.shape) * np.array([0.0, 0.0, 1.0])
+    return replace(run, current_a=run.current_a + noise)
+
+
+def exchanged(run: Run) -> Run:
+    """A run with the currents of J2 and J3 exchanged."""
+    return replace(run, current_a=run.current_a[:, [0, 2, 1]])
+
+
+def forgotten(run: Run) -> Run:
+    """A run without the payload that it declares."""
+    bare = small_recordings(three_axes_truth(), 7, count=1)[0]
+    return replace(bare, name=run.name, payload=run.payload)
+
+
+#: By mistake: how it is made in the runs r0 to r7, of which r6 and r7 are held out, and what is said of it.
+MISTAKES: dict[str, tuple[Mistake, str]] = {
+    "none": (lambda runs: runs, ""),
+    "J2 half as large": (scaled(1.0, 0.51, 1.0), "gain-off-nameplate J2"),
+    "J3 twice as large": (scaled(1.0, 1.0, 2.0), "gain-off-nameplate J3"),
+    "J2 reversed": (scaled(1.0, -1.0, 1.0), "current-reversed J2"),
+    "all reversed": (scaled(-1.0, -1.0, -1.0), "RolesExchanged"),
+    "mA": (scaled(1000.0, 1000.0, 1000.0), "UnitsMistaken"),
+    "sizes": (of_size(0, 1, 2), "CurrentUnsigned"),
+    "size of J3": (of_size(2), "CurrentUnsigned"),
+    "J2 and J3 exchanged": (lambda runs: [exchanged(run) for run in runs], "ChannelsExchanged"),
+    "payload turned": (carrying(turned(np.pi)), "payload-differs r3"),
+    "payload left off": (carrying(np.zeros(10)), "PayloadUnseen"),
+    "noise on J3": (lambda runs: [*map(noisy, runs[:USED]), *runs[USED:]], "axis-error J3"),
+    "held out: J2 half as large": (
+        in_one(7, lambda run: with_currents([run], np.array([1.0, 0.51, 1.0]))[0]),
+        "current-off-scale r7 J2",
+    ),
+    "held out: exchanged": (in_one(6, exchanged), "channels-exchanged r6 J2 J3"),
+    "held out: noise on J3": (in_one(6, noisy), "axis-error r6 J3"),
+    "held out: without payload": (in_one(7, forgotten), "payload-differs r7"),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Cell:
+    folder = tmp_path_factory.mktemp("cell")
+    (folder / "arm.urdf").write_text(THREE_AXES.urdf)
+    gains = three_axes_truth().gains
+    axes = "".join(AXIS.format(name=f"J{number}", gain=gain) for number, gain in enumerate(gains, start=1))
+    (folder / "cell.yaml").write_text(CELL + axes + REST)
+    return load_cell(folder / "cell.yaml")
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Runs:
+    return small_recordings(three_axes_truth(), 0, count=RUNS)
+
+
+def said(diagnoses: tuple[Diagnosis, ...]) -> set[str]:
+    """Names of diagnoses with their runs and axes."""
+    return {" ".join((one.name, *one.runs, *one.axes)) for one in diagnoses}
+
+
+def texts(diagnoses: tuple[Diagnosis, ...]) -> list[str]:
+    return sorted(one.text for one in diagnoses)
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_the_same_is_said_by_every_verb(
+    cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch, mistake: str
+) -> None:
+    change, expected = MISTAKES[mistake]
+    runs = {run.name: replace(run, digest=f"{int(run.name[1:]):064x}") for run in change(recorded)}
+
+    def load(path: Path, given: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+        return runs[path.name], given or cell
+
+    for module in (fit_module, validate_module):
+        monkeypatch.setattr(module, "load_run", load)
+    paths = [Path(f"r{number}") for number in range(RUNS)]
+    logs, holdout = paths[:USED], paths[USED:]
+    verbs: dict[str, Callable[[], tuple[Diagnosis, ...]]] = {
+        # Where a search adds an effect, the gains are others, and so are the numbers in a text.
+        "residual": lambda: close_loop(fit(logs, holdout=holdout, keep_rows=True), 0).diagnoses,
+        "fit_logs": lambda: fit_logs(logs, holdout=holdout, effects=False, created=WHEN).diagnoses,
+    }
+    try:
+        fitted = fit(logs, holdout=holdout)
+    except IdentificationError as error:
+        assert type(error).__name__ == expected
+        for verb in verbs.values():
+            with pytest.raises(type(error), match=re.escape(str(error))):
+                verb()
+        return
+    assert said(fitted.diagnoses) == ({expected} if expected else set())
+    assert texts(verbs["fit_logs"]()) == texts(fitted.diagnoses)
+    assert said(verbs["residual"]()) == said(fitted.diagnoses)
+    calibration = decode(encode(calibration_of(fitted, WHEN)), "calibration.yaml")
+    assert texts(calibration.diagnoses) == texts(fitted.diagnoses)
+    for given in (logs, holdout, [*logs, *holdout]):
+        assert texts(cross_validate({"one": calibration}, given).diagnoses) == texts(fitted.diagnoses)
+    page = certificate_page(certify(calibration, without_controller(calibration, "Not read.", WHEN)))
+    shown = unescape(re.sub(r"<[^>]*>|`", "", page))
+    for one in fitted.diagnoses:
+        assert f"CHECK {one.text}.".replace("`", "") in shown

@@ -1,0 +1,106 @@
+"""Currents without their sign are refused by axis; a current that has one sign by its nature is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ident.data.run import Run
+from ident.data.unsigned_current import unsigned_currents
+from ident.errors import CurrentUnsigned
+from ident.estimators.identify import identify
+from tests.ident.mistaken import AXES, SMALL, small_recordings
+from tests.ident.recordings import FloatArray, Truth
+
+
+@pytest.fixture(scope="module")
+def runs(small_truth: Truth) -> list[Run]:
+    return small_recordings(small_truth, 0, count=2)
+
+
+def sized(run: Run, axes: list[int], sign: float = 1.0) -> Run:
+    """The run with the sizes of these currents alone."""
+    current = run.current_a.copy()
+    current[:, axes] = sign * np.abs(current[:, axes])
+    return replace(run, current_a=current)
+
+
+def shifted(current: FloatArray, least: float) -> FloatArray:
+    """Currents shifted so far that the least of each is this share of its largest."""
+    positive = current - current.min(axis=0)
+    return np.asarray(positive + least * positive.max(axis=0))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["never negative", "never positive"])
+@pytest.mark.parametrize("axes", [[0, 1, 2], [0], [1], [2]], ids=str)
+def test_sizes_are_refused_and_the_axes_named(
+    small_truth: Truth, runs: list[Run], axes: list[int], sign: float
+) -> None:
+    names = ", ".join(AXES[axis] for axis in axes)
+    other = "negative" if sign > 0.0 else "positive"
+    with pytest.raises(CurrentUnsigned, match=f"axis {names}: found currents that are never {other} .* both ways"):
+        identify(small_truth.model, [sized(run, axes, sign) for run in runs], SMALL, axes=AXES)
+
+
+def test_sizes_in_a_held_out_run_are_refused(small_truth: Truth, runs: list[Run]) -> None:
+    unseen = replace(sized(small_recordings(small_truth, 1, count=1)[0], [1]), name="unseen")
+    with pytest.raises(CurrentUnsigned, match="run 'unseen': axis J2"):
+        identify(small_truth.model, runs[:1], SMALL, holdout=[unseen], fixed_gains=small_truth.gains, axes=AXES)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_currents_with_a_sign_are_taken(small_truth: Truth, seed: int) -> None:
+    for run in small_recordings(small_truth, seed, count=2, noise_a=(0.0, 0.02, 0.15)[seed % 3]):
+        assert not unsigned_currents(run, small_truth.model.drive_train.ratio).any()
+
+
+@settings(deadline=None)
+@given(least=st.floats(0.0, 0.05), upwards=st.booleans(), steps=st.sampled_from([0, 10, 100]))
+def test_a_current_that_has_one_sign_by_its_nature_is_taken(
+    small_truth: Truth, runs: list[Run], least: float, upwards: bool, steps: int
+) -> None:
+    """A shoulder that always lifts, however near to zero its current comes, and however coarse its counts are."""
+    current = shifted(runs[0].current_a if upwards else -runs[0].current_a, least)
+    if steps:
+        count = current.max(axis=0) / steps
+        current = np.rint(current / count) * count
+    lifting = replace(runs[0], current_a=current if upwards else -current)
+    assert not unsigned_currents(lifting, small_truth.model.drive_train.ratio).any()
+
+
+def test_a_brake_that_takes_the_load_at_each_stop_is_no_size(small_truth: Truth, runs: list[Run]) -> None:
+    """The current of an axis that always lifts is zero while its brake is on."""
+    current = shifted(runs[0].current_a, 0.3)
+    stops = np.arange(len(current)) % 220 < 40  # 0.2 s of 1.1
+    current[stops] = 0.0
+    braked = replace(runs[0], current_a=current)
+    assert not unsigned_currents(braked, small_truth.model.drive_train.ratio).any()
+
+
+def test_an_axis_that_moves_one_way_alone_is_not_judged(small_truth: Truth, runs: list[Run]) -> None:
+    turning = replace(runs[0], position_rad=np.cumsum(np.abs(runs[0].position_rad), axis=0))
+    assert not unsigned_currents(sized(turning, [0, 1, 2]), np.eye(3)).any()
+    assert unsigned_currents(sized(runs[0], [0, 1, 2]), small_truth.model.drive_train.ratio).all()
+
+
+def test_sizes_that_are_reported_slowly_or_coarsely_are_found(small_truth: Truth, runs: list[Run]) -> None:
+    """A drive reports every third sample anew, in counts of 2 % of the largest current."""
+    slow = np.repeat(np.abs(runs[1].current_a[::3]), 3, axis=0)[: len(runs[1].time_s)]
+    count = 0.02 * slow.max(axis=0)
+    coarse = replace(runs[1], current_a=np.rint(slow / count) * count)
+    assert unsigned_currents(coarse, small_truth.model.drive_train.ratio).all()
+
+
+def test_samples_that_are_no_use_do_not_hide_a_size(small_truth: Truth, runs: list[Run]) -> None:
+    """Where no frame came, the log has an old value or a zero."""
+    size = sized(runs[0], [0, 1, 2])
+    valid = np.ones(size.current_a.shape, dtype=np.bool_)
+    valid[100:110] = False
+    current = size.current_a.copy()
+    current[100:110] = -5.0
+    found = replace(size, current_a=current, valid=valid)
+    assert unsigned_currents(found, small_truth.model.drive_train.ratio).all()
