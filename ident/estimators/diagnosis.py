@@ -232,6 +232,15 @@ def current_scale(measured_nm: FloatArray, predicted_nm: FloatArray) -> CurrentS
     return CurrentScale(product / square, std, left)
 
 
+_OF_LEAST_SQUARES = "use --method ml: noise in the currents makes the gains of least squares too small"
+REMEDIES_OF_DISAGREEMENT = {
+    Method.LS: _OF_LEAST_SQUARES,
+    Method.WLS: _OF_LEAST_SQUARES,
+    Method.TLS: "use --method ml: an effect that the model lacks bends tls more; `drivegain residual` looks for it",
+}
+"""What to do where an estimator's gain is far from that of ml; iv need not agree with it (`diagnose`)."""
+
+
 def estimator_diagnoses(estimate: Estimate, likeliest: Estimate, axes: Sequence[str]) -> Iterator[Diagnosis]:
     """Compare the gains of another estimator with those of ml on the same equations."""
     if estimate.gains_fixed or estimate is likeliest:
@@ -247,7 +256,7 @@ def estimator_diagnoses(estimate: Estimate, likeliest: Estimate, axes: Sequence[
             f"a gain of {estimate.gains[axis]:.4g} by {estimate.method.value}, {percent:.0f} % from "
             f"{likeliest.gains[axis]:.4g} ± {likeliest.gains_std[axis]:.2g} by ml on the same rows",
             f"at most {100.0 * GAIN_DIFFERENCE:.0f} %, or {GAIN_SIGMAS:g} σ",
-            "use --method ml: noise in the currents biases this estimator",
+            REMEDIES_OF_DISAGREEMENT[estimate.method],
         )
 
 
