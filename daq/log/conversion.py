@@ -16,8 +16,8 @@ from daq.config.cell import DEGREE, Cell
 from daq.config.cell_file import cell_from_bundle
 from daq.config.same_cell import Correction, correction_of
 from daq.errors import CurrentSaturated, LogIncomplete, PositionImplausible, RunInvalid
+from daq.log.impossible import motion_fault
 from daq.log.metadata import Readback, reports_only_losses
-from daq.log.plausibility import motion_fault
 from daq.log.reader import Log, LossyLogs, SampleChecks, read_log
 from drivers.stream.sample import CellEvent, EventKind, Quantity
 from ident.arrays import BoolArray, FloatArray

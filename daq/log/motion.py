@@ -1,6 +1,6 @@
 """Judge the motion in a log wherever a log is called valid: at the end of its recording, by `info`, by the exports.
 
-A fit refuses a log that no robot moves by (`daq.log.plausibility.motion_fault`); what is said of a log before agrees.
+A fit refuses a log that no robot moves by (`daq.log.impossible.motion_fault`); what is said of a log before agrees.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from daq.config.cell import Cell
 from daq.errors import DataError
 from daq.log.conversion import answers, continuous_counts, scaling
+from daq.log.impossible import LARGEST_OUTLIER, SPEED_MARGIN, motion_fault
 from daq.log.metadata import Readback, RunStatistics
-from daq.log.plausibility import LARGEST_OUTLIER, SPEED_MARGIN, motion_fault
 from daq.log.reader import LogHead, SampleBlock, SampleChecks, joined
 from drivers.stream.sample import Sample
 

@@ -1,23 +1,23 @@
-"""Refuse numbers that no robot moves by: a glitch of an encoder, a wrong unit, rate or column, a counter that wraps.
+"""Refuse numbers of a foreign recording that no robot moves by: a wrong unit, rate or column, a counter that wraps.
 
-The functions `impossible_*` judge samples, of an import as of a recording of our own, and return what they found. The
-checks of an import name the file, the column or axis, and the setting of the import description to correct.
+Each check names the file, the column or axis, what was found, and the setting of the import description to correct. A
+step, a speed or a current is judged as in a recording of our own (`daq.log.impossible`).
 """
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 from math import pi
 
 import numpy as np
 
-from daq.config.cell import Axis, Cell
+from daq.config.cell import Cell
 from daq.config.import_description import ImportDescription, ScaledColumns, Side, TemperatureColumns, VelocityUnit
-from daq.errors import CurrentImplausible, DataError, PositionImplausible, TableUnfit
+from daq.errors import PositionImplausible, TableUnfit
+from daq.log.impossible import fastest_speeds, impossible_current, impossible_speed, impossible_step
 from daq.log.resampling import Clock, on_clock
 from daq.log.table import Table
-from ident.arrays import BoolArray, FloatArray
+from ident.arrays import FloatArray
 from ident.data.run import Run
 from ident.data.unsigned_current import require_signed_currents
 from ident.errors import CurrentUnsigned
@@ -25,26 +25,11 @@ from ident.errors import CurrentUnsigned
 _LOG = logging.getLogger("drivegain")
 LARGEST_RAW = 2**31 - 1
 SMALLEST_MOTION = 0.02  #: Smallest motion of at least one joint, as a share of its range
-LARGEST_OUTLIER = 1000.0
-"""Largest current, in multiples of the 99th percentile of its column; a real peak is some ten times that."""
-SPEED_MARGIN = 3.0
-"""Largest speed, in multiples of the joint's velocity limit, which is often a guess; a wrong rate is off by more."""
-SPEED_PERCENTILE = 99.9
-"""Percentile of a run's speeds that is compared with the limit: a few outliers do not mean a wrong rate."""
 SLOW_SHARE = 0.1
 """Share of the velocity limits; if no joint is ever faster, the real rate may be ten times the declared one."""
 LARGEST_NUMBER = 1e12  #: Of a position, speed, current or torque in any unit
 TEMPERATURES_C = (-60.0, 250.0)  #: Of a drive or a motor; kelvin above -23 °C are more
 VELOCITY_WINDOW_S = 0.1  #: Time over which the ways by velocities and by positions are compared
-STEP_NOISE, STEP_PERCENTILE, STEP_OUTLIER = 10.0, 95.0, 5.0
-"""A step between two samples is refused beyond SPEED_MARGIN, by this multiple of the typical change of a step (noise,
-coarse encoders), if it is this multiple of that percentile of all steps: a wrong rate makes all of them larger."""
-NOISE_SHARE, NOISE_CHANGES, SPARSE_NOISE = 0.01, 20, 0.005
-"""Where fewer samples than this share, or than this number, change their step at all, as of an axis at rest, the
-changes may be the glitch itself: as noise they then count up to this share of the joint's range."""
-GLITCH_SAMPLES, ABSURD = 10, 1e6
-"""An outlier has at most so many samples above a tenth of it, where a short motion has more; or it is so many times the
-99th percentile, which no current is."""
 COUNTER_BITS = range(12, 32)  #: Counters whose wraps are found; those of 32 bits are followed
 COUNTER_SHARE = 0.75  #: Least share of its range that a counter which wraps was seen in
 STILL = 1e-3  #: Difference of speed that is no contradiction, as a share of the velocity limit
@@ -164,182 +149,6 @@ def check_current(current: FloatArray, wanted: ImportDescription, file: Table) -
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Impossible:
-    """A number among the samples that no robot moves by."""
-
-    axis: int  #: index of the axis
-    row: int  #: index of the sample
-    found: str
-    expected: str
-
-
-def impossible_current(current: FloatArray) -> Impossible | None:
-    """Return the first current that is an outlier, None without one.
-
-    Args:
-        current: of the motors, in any unit, shape (k, n).
-    """
-    size = np.abs(current)
-    usual = np.percentile(size, 99.0, axis=0)
-    others = usual[usual > 0.0]
-    # An axis whose current is almost always zero is compared with the other one of the smallest current.
-    least = float(others.min()) if others.size else 0.0
-    for axis, own in enumerate(usual.tolist()):
-        column = size[:, axis]
-        row = int(np.argmax(column))
-        peak = float(column[row])
-        compared = own if own > 0.0 else least
-        is_rare = np.count_nonzero(column > 0.1 * peak) <= GLITCH_SAMPLES
-        times = LARGEST_OUTLIER if is_rare else ABSURD
-        if peak > times * max(compared, 1e-200):
-            found = f"{current[row, axis]:.6g}, while 99 % of the column are within {own:.3g}"
-            return Impossible(axis, row, found, "a current")
-    return None
-
-
-def impossible_speed(joint_rad: FloatArray, rate_hz: float, cell: Cell) -> Impossible | None:
-    """Return the first axis that is too fast over many samples, far above the noise; None without one.
-
-    Args:
-        joint_rad: positions of the joints [rad; m of a prismatic joint], shape (k, n).
-        rate_hz: rate of the samples.
-        cell: with the velocity limits.
-    """
-    step = _speed_samples(joint_rad, rate_hz)
-    fastest = _fastest(joint_rad, rate_hz)
-    for index, axis in enumerate(cell.axes):
-        limit = axis.limits.velocity
-        if fastest[index] > SPEED_MARGIN * limit:
-            found = f"{axis.unit.spell(float(fastest[index]))}/s over {step} samples at {rate_hz:g} Hz"
-            return Impossible(index, 0, found, _speed_limit(axis))
-    return None
-
-
-def impossible_step(joint_rad: FloatArray, rate_hz: float, cell: Cell) -> Impossible | None:
-    """Return the first step between two samples that no motor makes, None without one.
-
-    Args:
-        joint_rad: positions of the joints [rad; m of a prismatic joint], shape (k, n).
-        rate_hz: rate of the samples.
-        cell: with the velocity limits.
-    """
-    steps = np.diff(joint_rad, axis=0)
-    if not len(steps):
-        return None
-    changes = np.abs(np.diff(steps, axis=0))
-    for index, axis in enumerate(cell.axes):
-        sizes = np.abs(steps[:, index])
-        step = int(np.argmax(sizes))
-        size = float(sizes[step])
-        usual = float(np.percentile(sizes, STEP_PERCENTILE))
-        lower, upper = axis.limits.position
-        noise = _step_noise(changes[:, index], upper - lower)
-        largest = SPEED_MARGIN * axis.limits.velocity / rate_hz + noise
-        if size > max(largest, STEP_OUTLIER * usual):
-            found = f"a step of {axis.unit.spell(size)} in one sample, {axis.unit.spell(size * rate_hz)}/s"
-            return Impossible(index, step + 1, found, _speed_limit(axis))
-    return None
-
-
-def _step_noise(changes: FloatArray, range_rad: float) -> float:
-    """Largest step that noise or a coarse encoder makes [rad or m], from the changes of an axis's steps, shape (k,)."""
-    typical = changes[changes > 0.0]
-    if not typical.size:
-        return 0.0
-    noise = STEP_NOISE * float(np.median(typical))
-    if typical.size < max(NOISE_SHARE * len(changes), NOISE_CHANGES):
-        return min(noise, SPARSE_NOISE * range_rad)
-    return noise
-
-
-def _speed_limit(axis: Axis) -> str:
-    limit = axis.unit.spell(axis.limits.velocity)
-    largest = axis.unit.spell(SPEED_MARGIN * axis.limits.velocity)
-    return f"at most {largest}/s, {SPEED_MARGIN:g} times {limit}/s, the limit in the cell configuration"
-
-
-def _speed_samples(joint_rad: FloatArray, rate_hz: float) -> int:
-    """Samples over which a speed is measured: a tenth of a second, and at most a tenth of the run."""
-    return max(1, min(round(0.1 * rate_hz), len(joint_rad) // 10))
-
-
-def _fastest(joint_rad: FloatArray, rate_hz: float) -> FloatArray:
-    """Speed of each axis that a few outliers do not raise [rad/s or m/s], shape (n,)."""
-    step = _speed_samples(joint_rad, rate_hz)
-    speeds = np.abs(joint_rad[step:] - joint_rad[:-step]) * rate_hz / step
-    if not len(speeds):
-        return np.zeros(joint_rad.shape[1])
-    return np.asarray(np.percentile(speeds, SPEED_PERCENTILE, axis=0), dtype=np.float64)
-
-
-def between_answers(joint_rad: FloatArray, answered: BoolArray) -> FloatArray:
-    """Return positions with straight lines in the place of samples without an answer, shape (k, n).
-
-    An unanswered sample says nothing of the position, and must not count as a step.
-
-    Args:
-        joint_rad: positions of the joints [rad; m of a prismatic joint], shape (k, n).
-        answered: whether every motor that moves the joint answered, shape (k, n).
-    """
-    if answered.all():
-        return joint_rad
-    filled = joint_rad.copy()
-    every = np.arange(len(joint_rad))
-    for axis in np.flatnonzero(~answered.all(axis=0) & answered.any(axis=0)).tolist():
-        known = answered[:, axis]
-        filled[:, axis] = np.interp(every, every[known], joint_rad[known, axis])
-    filled[:, ~answered.any(axis=0)] = 0.0
-    return filled
-
-
-_GLITCH = (
-    "record again, and check the encoder, its cable and the object that the drive sends; a counter of fewer than 32 "
-    "bits that wraps is read as a step"
-)
-
-
-def motion_fault(
-    name: str, cell: Cell, rate_hz: float, position_rad: FloatArray, current: FloatArray, answered: BoolArray
-) -> DataError | None:
-    """Return the error for a recording of our own that no robot moves by, None for a plausible one.
-
-    Args:
-        name: of the recording in the message.
-        cell: with the limits.
-        rate_hz: rate of the samples.
-        position_rad: joint positions [rad; m of a prismatic joint], shape (k, n).
-        current: of the motors, shape (k, n).
-        answered: whether every motor that moves the joint answered, shape (k, n).
-    """
-    known_rad = between_answers(position_rad, answered)
-    found = impossible_step(known_rad, rate_hz, cell)
-    if found is not None:
-        return PositionImplausible(
-            f"{name}, axis {cell.axes[found.axis].name}",
-            found=f"{found.found}, at {found.row / rate_hz:.6g} s",
-            expected=found.expected,
-            remedy=_GLITCH,
-        )
-    found = impossible_speed(known_rad, rate_hz, cell)
-    if found is not None:
-        return PositionImplausible(
-            f"{name}, axis {cell.axes[found.axis].name}",
-            found=found.found,
-            expected=found.expected,
-            remedy="check `drive_train.ratio`, `counts_per_revolution` and the velocity limit in the cell file",
-        )
-    found = impossible_current(current)
-    if found is not None:
-        return CurrentImplausible(
-            f"{name}, axis {cell.axes[found.axis].name}",
-            found=f"a current of {found.found}, at {found.row / rate_hz:.6g} s",
-            expected=found.expected,
-            remedy="record again, and check the object that the drive sends as its current",
-        )
-    return None
-
-
 def check_speed(name: str, joint_rad: FloatArray, rate_hz: float, cell: Cell) -> None:
     """Refuse implausible speeds. A wrong rate scales them all; over many samples they are far above the noise."""
     found = impossible_speed(joint_rad, rate_hz, cell)
@@ -351,7 +160,7 @@ def check_speed(name: str, joint_rad: FloatArray, rate_hz: float, cell: Cell) ->
             remedy="most likely rate_hz is too high, or the unit of the time column or of the positions is another",
         )
     limits = np.array([axis.limits.velocity for axis in cell.axes])
-    share = float((_fastest(joint_rad, rate_hz) / limits).max())
+    share = float((fastest_speeds(joint_rad, rate_hz) / limits).max())
     if share < SLOW_SHARE:
         _LOG.warning(
             "warning: %s: at %g Hz no joint is faster than %.2g %% of its velocity limit; is the rate of the recording "

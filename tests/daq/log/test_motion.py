@@ -17,9 +17,9 @@ from daq.errors import CurrentImplausible, DataError, ExitCode, PositionImplausi
 from daq.log.bag_writer import export_bag
 from daq.log.conversion import load_run
 from daq.log.export import TableFormat, export_log
+from daq.log.impossible import impossible_current, impossible_step
 from daq.log.metadata import AxisReadback, Readback
 from daq.log.motion import RecordedMotion
-from daq.log.plausibility import impossible_current, impossible_step
 from daq.log.reader import LossyLogs
 from daq.log.salvage import salvage
 from daq.report.log import describe_log
@@ -207,7 +207,7 @@ def test_an_import_and_a_recording_are_judged_by_one_function(monkeypatch: pytes
     def refuse(*_: Any) -> Any:
         raise DataError("the one function", found="", expected="", remedy="")
 
-    monkeypatch.setattr("daq.log.plausibility.impossible_step", refuse)
+    monkeypatch.setattr("daq.log.impossible.impossible_step", refuse)
     with pytest.raises(DataError, match="the one function"):
         load_run(log)
 
