@@ -25,6 +25,7 @@ from ident.discovery.evidence import Evidence, without_effects
 from ident.effects.effect import PlacedEffect
 from ident.estimators.comparison import Comparison, EstimatorTrial
 from ident.estimators.estimate import Estimate, RelativeError
+from ident.estimators.least_squares import misjudged_joints
 from ident.estimators.method import Method
 from ident.planning.verdict import GOOD_PERCENT, GainVerdict
 
@@ -49,7 +50,7 @@ def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | 
         yield torque_table(fitted.torque_slopes, calibration.gains)
         yield from map(printable, torque_sentences(fitted.torque_slopes, calibration.gains))
     if fitted.paper is not None:
-        apart = paper_note(axes, estimate, fitted.paper)
+        apart = paper_note(axes, estimate, fitted.paper, misjudged_joints(fitted.final.system))
         if apart is not None:
             yield apart
     yield ""
@@ -71,18 +72,20 @@ def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | 
         yield f"{len(found.essential.system.columns)} essential parameters; removed: {removed}"
 
 
-def paper_note(axes: Sequence[str], estimate: Estimate, paper: Estimate) -> str | None:
-    """Gains that the paper's total least squares finds elsewhere; None where both agree, or ml did not find them.
+def paper_note(axes: Sequence[str], estimate: Estimate, paper: Estimate, misjudged: Sequence[int] = ()) -> str | None:
+    """Gains that the paper's total least squares finds elsewhere; None where that says nothing about the model.
 
     With noise in the currents alone the two differ by less than σ (`make tls-study`), so a difference says something
-    about the model. Beside another estimator it would not: that one may be biased by noise.
+    about the model. It does not beside another estimator than ml, which noise may bias, nor where the weights of tls
+    are wrong.
 
     Args:
         axes: their names.
         estimate: of the fit.
         paper: of ``tls`` on the same equations.
+        misjudged: of `misjudged_joints`.
     """
-    if estimate.method is not Method.ML:
+    if estimate.method is not Method.ML or misjudged:
         return None
     change = paper.gains - estimate.gains
     sigmas = np.abs(change) / estimate.gains_std
@@ -103,7 +106,14 @@ def fit_document(found: CaseFit, calibration: Calibration, comparison: Compariso
     axes, paper = fitted.cell.axis_names, fitted.paper
     compared = {}
     if paper is not None:
-        compared = {"tls": {"gains": _gains(axes, paper.gains, paper.gains_std), "condition": paper.condition}}
+        misjudged = misjudged_joints(fitted.final.system)
+        compared = {
+            "tls": {
+                "gains": _gains(axes, paper.gains, paper.gains_std),
+                "condition": paper.condition,
+                "misjudged": [axes[joint] for joint in misjudged],
+            }
+        }
     return {
         **as_document(calibration),
         "compared": compared,

@@ -36,6 +36,8 @@ class ComparedFit(StrictModel):
 
     gains: list[ComparedGain]
     condition: Figure
+    #: Axes for which σ_W^j (eq. 22) is not the noise of a current, so that these gains are bent.
+    misjudged: list[str]
 
 
 class OwnTorque(StrictModel):

@@ -236,7 +236,8 @@ _OF_LEAST_SQUARES = "use --method ml: noise in the currents makes the gains of l
 REMEDIES_OF_DISAGREEMENT = {
     Method.LS: _OF_LEAST_SQUARES,
     Method.WLS: _OF_LEAST_SQUARES,
-    Method.TLS: "use --method ml: an effect that the model lacks bends tls more; `drivegain residual` looks for it",
+    Method.TLS: "use --method ml: an effect that the model lacks, or a parameter that these moves hardly show, bends "
+    "tls more; `drivegain residual` looks for effects",
 }
 """What to do where an estimator's gain is far from that of ml; iv need not agree with it (`diagnose`)."""
 

@@ -13,6 +13,8 @@ from ident.estimators.estimate import Estimate
 from ident.estimators.method import Method
 from ident.model.base import independent_columns
 
+MISJUDGED_RATIO = 1.5
+"""Least ratio of the smallest singular values without and with the currents of a joint, where the latter is noise."""
 NO_COLUMN = 1e-8
 """Norm of a column, relative to the largest of the same joint, below which the joint does not have this column."""
 
@@ -171,6 +173,31 @@ def joint_data_std(triangles: Triangles) -> FloatArray:
         smallest = float(singular_values(own).min(initial=np.inf))
         deviations.append(_deviation(smallest, factor, rows - own.shape[1]))
     return np.array(deviations)
+
+
+def misjudged_joints(system: System) -> tuple[int, ...]:
+    """Joints whose σ_W^j is not the noise of a current, by their index; none of a redundant robot.
+
+    Eq. (22) takes the smallest singular value of the joint's equations for noise. Where the moves hardly show one of
+    the joint's parameters, a combination of columns of W, which have no noise, has one as small. σ_W^j is then too
+    small, the rows of this joint count for too much, and ``tls`` bends the gains. The smallest singular value of a
+    joint's equations without its currents shows it: noise makes that of all columns smaller by MISJUDGED_RATIO at
+    least where it is well below everything that the moves show.
+
+    Args:
+        system: of the fit.
+    """
+    if system.model.is_redundant:
+        return ()
+    found = []
+    for joint, factor in enumerate(system.joints.factors):
+        own = independent_columns(factor, smallest=NO_COLUMN)
+        parameters = [column for column in own if column >= system.axis_count]
+        smallest = singular_values(factor[:, own]).min(initial=np.inf)
+        of_parameters = singular_values(factor[:, parameters]).min(initial=np.inf)
+        if of_parameters < MISJUDGED_RATIO * smallest:
+            found.append(joint)
+    return tuple(found)
 
 
 def _row_std(system: System, scaling: Scaling) -> FloatArray:

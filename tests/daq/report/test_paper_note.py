@@ -48,3 +48,8 @@ def test_paper_note_with_gains_alike_is_not_printed(tls_gain: float, std: float)
 def test_paper_note_of_another_method_than_ml_is_not_printed(method: Method) -> None:
     estimate = _estimate(method, (7.352, -6.838))
     assert paper_note(AXES, estimate, _estimate(Method.TLS, (7.314, -8.113))) is None
+
+
+def test_paper_note_with_wrong_weights_of_tls_is_not_printed() -> None:
+    estimate = _estimate(Method.ML, (7.352, -6.838))
+    assert paper_note(AXES, estimate, _estimate(Method.TLS, (7.314, -8.113)), misjudged=(0,)) is None

@@ -14,7 +14,7 @@ from ident.equations.reduction import reduce_runs
 from ident.equations.system import System
 from ident.equations.triangles import Triangles, triangle
 from ident.estimators.identify import Identification
-from ident.estimators.least_squares import Scaling, joint_data_std, joint_error_std, ls, tls, wls
+from ident.estimators.least_squares import Scaling, joint_data_std, joint_error_std, ls, misjudged_joints, tls, wls
 from ident.estimators.maximum_likelihood import ml
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, Truth, record
 
@@ -157,3 +157,46 @@ def test_tls_of_runs_in_another_order_is_the_same(truth: Truth, noisy_runs: tupl
         return tls(reduction.system(reduction.base(), reduction.payload_columns())).gains
 
     assert gains(noisy_runs[::-1]) == pytest.approx(gains(noisy_runs), rel=1e-9)
+
+
+def _with_twin_column(system: System, difference: float) -> System:
+    """J1 has one column twice, but for a share of its norm; the parameter of the second one is zero."""
+    count = system.axis_count
+    factors = []
+    for joint, factor in enumerate(system.joints.factors):
+        twin = np.zeros((len(factor), 1))
+        own_row = np.zeros((1, factor.shape[1] + 1))
+        if joint == 0:
+            norms = np.linalg.norm(factor, axis=0)
+            largest = count + int(np.argmax(norms[count:-1]))
+            twin = factor[:, [largest]]
+            own_row[0, -2] = difference * norms[largest]
+        wider = np.concatenate((factor[:, :-1], twin, factor[:, -1:]), axis=1)
+        factors.append(np.concatenate((wider, own_row)))
+    return replace(system, joints=replace(system.joints, factors=tuple(factors)))
+
+
+@pytest.mark.parametrize(("difference", "expected"), [(1e-2, ()), (1e-4, (0,))])
+def test_misjudged_joints_with_a_parameter_that_hardly_shows_names_its_joint(
+    small_truth: Truth, difference: float, expected: tuple[int, ...]
+) -> None:
+    system = _with_twin_column(_small_system(small_truth, 1, NOISE_A), difference)
+    assert misjudged_joints(system) == expected
+
+
+def test_misjudged_joints_of_usual_recordings_is_empty(small_truth: Truth, noisy_found: Identification) -> None:
+    assert misjudged_joints(_small_system(small_truth, 1, NOISE_A)) == ()
+    assert misjudged_joints(noisy_found.system) == ()
+
+
+def test_misjudged_joints_with_currents_in_milliampere_names_a_joint_whose_gain_is_bent(small_truth: Truth) -> None:
+    """Eq. (21) takes the noise for one of every column, and parameters are then larger numbers than gains."""
+    system = _small_system(small_truth, 1, NOISE_A)
+    scale = np.ones(system.joints.factors[0].shape[1])
+    scale[: system.axis_count] = 1000.0
+    factors = tuple(factor * scale for factor in system.joints.factors)
+    in_milliampere = replace(system, joints=replace(system.joints, factors=factors))
+    assert 0 in misjudged_joints(in_milliampere)
+    assert _mean_error(1000.0 * tls(in_milliampere).gains, small_truth) > 3.0 * _mean_error(
+        tls(system).gains, small_truth
+    )
