@@ -45,6 +45,7 @@ from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import PairedChange, compare_by_move
 from ident.discovery.loop import Step
 from ident.discovery.noise_floor import NoiseFloor, noise_floors
+from ident.discovery.time_skew import Skew, time_skew
 from ident.drift.change import FALSE_ALARM
 from ident.effects.effect import PlacedEffect
 from ident.equations.currents import whitening_transform
@@ -296,6 +297,8 @@ class Account:
     turns: tuple[BeforeAfter | None, ...]  #: change by each turn of the loop, None where it added nothing
     total: BeforeAfter  #: change from the declared model to the last one
     holdout_change: PairedChange | None  #: of the squared error on held-out rows, None without any
+    #: Delay of the currents after the positions, beside the effects of the last model; None where no instruments exist.
+    skew: Skew | None = None
 
 
 def account(
@@ -334,6 +337,8 @@ def account(
     if end.choice_std is not None:
         last = replace(last, gains_std=end.after.estimate.gains_std, choice_std=end.choice_std)
     left_a = left_on(end.after.training, end.after.estimate)
+    progress("time skew by instruments from the demanded motion")
+    skew = time_skew(end.after)
     known: list[NoiseFloor | None] = []
     least: list[NoiseFloor | None] = []
     for floor, left in zip(floors, left_a, strict=True):
@@ -366,6 +371,7 @@ def account(
         turns=tuple(turns),
         total=before_after(first, last),
         holdout_change=holdout_change(start, end.after),
+        skew=skew,
     )
 
 
