@@ -26,7 +26,7 @@ from daq.workflow.declared_effects import (
     with_declared_again,
     with_effects_of_cell,
 )
-from ident.calibration import Calibration, Source
+from ident.calibration import Calibration, PayloadMass, Source
 from ident.calibration import calibration_of as identified_calibration
 from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
@@ -446,7 +446,14 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
         nameplate_holdout_error_percent=_nameplate_error(fitted),
         recording_configuration_sha256=cell.recording_digest,
         diagnoses=fitted.diagnoses,
+        payload_mass=_with_tolerances(found.payload_mass, cell),
     )
+
+
+def _with_tolerances(influences: Sequence[PayloadMass], cell: Cell) -> tuple[PayloadMass, ...]:
+    """Add the tolerance of each weighing, from the cell."""
+    declared = {payload.name: payload.mass_tolerance_kg for payload in cell.payloads}
+    return tuple(one.weighed_to(declared.get(one.payload, 0.0)) for one in influences)
 
 
 def _nameplate_error(fitted: Fit) -> RelativeError | None:
