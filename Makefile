@@ -40,7 +40,7 @@ help:
 	@echo "make console-study  60 minutes on SocketCAN with the console alternately open and closed: losses, jitter, processor, memory"
 	@echo "make drift-study  detection delay and false alarms of a drifting gain (docs/evidence/drift.md); a minute"
 	@echo "make holdout-study  which wrong gains the hold-out gate detects (docs/evidence/hold-out.md); a minute"
-	@echo "make diagnosis-study  false alarms of the diagnoses on clean recordings, and planted mistakes that are named; a minute"
+	@echo "make diagnosis-study  false alarms of the diagnoses on clean recordings, and planted mistakes that are named; time skews that are printed; ten minutes"
 	@echo "make robot-study  gains and a second payload of every shipped robot (docs/evidence/robots.md); resumable, half an hour"
 	@echo "make effects-study  undeclared effects of every family: named, error before and after (docs/evidence/effects-study.md); hours, resumable"
 	@echo "make tx40-study  the loop closed on a real robot, scored on blocks that were left out (docs/evidence/tx40.md); minutes"
@@ -173,6 +173,7 @@ effects-study: setup
 
 diagnosis-study: setup
 	$(BIN)/python -m tests.studies.diagnosis_study
+	$(BIN)/python -m tests.studies.skew_study
 
 holdout-study: setup
 	$(BIN)/python -m tests.studies.holdout_study

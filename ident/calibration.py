@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -78,6 +78,40 @@ class AcceptedEffect:
 
 
 @dataclass(frozen=True, slots=True)
+class MassInfluence:
+    """What the mass of a payload does to one gain, to first order; no residual shows a wrong mass."""
+
+    axis: str  #: name of the axis
+    per_kg: float  #: dg/dm [unit of the gain per kg]
+    percent_per_percent: float  #: d ln g/d ln m: change of the gain [%] with a mass that is wrong by 1 %
+    tolerance_std: float  #: |dg/dm| times the tolerance of the mass [unit of the gain]; it is not in the gain's σ
+
+
+@dataclass(frozen=True, slots=True)
+class PayloadMass:
+    """A payload of which the mass is known, which gives the gains their scale."""
+
+    payload: str  #: name of the body
+    mass_kg: float  #: as the fit took it for known
+    tolerance_kg: float  #: declared tolerance of the weighing, 0 where none is declared
+    gains: tuple[MassInfluence, ...]  #: one an axis
+
+    @classmethod
+    def of(cls, payload: str, mass_kg: float, gain_per_kg: Sequence[float], gains: Sequence[Gain]) -> PayloadMass:
+        """Influence on gains, without a tolerance, from the derivative of each."""
+        influences = tuple(
+            MassInfluence(gain.axis, float(slope), float(slope * mass_kg / gain.value), 0.0)
+            for slope, gain in zip(gain_per_kg, gains, strict=True)
+        )
+        return cls(payload, mass_kg, 0.0, influences)
+
+    def weighed_to(self, tolerance_kg: float) -> PayloadMass:
+        """Return the same with the tolerance of the weighing."""
+        influences = tuple(replace(one, tolerance_std=abs(one.per_kg) * tolerance_kg) for one in self.gains)
+        return replace(self, tolerance_kg=tolerance_kg, gains=influences)
+
+
+@dataclass(frozen=True, slots=True)
 class Source:
     """One log that the calibration rests on."""
 
@@ -127,6 +161,9 @@ class Calibration:
     #: unit of the gains' current]; of the fit for a motor that did not move there. None in earlier versions.
     current_residual: tuple[float, ...] | None = None
     passive_joints: tuple[str, ...] = ()  #: joints of a closed chain without a motor, on which effects can act, too
+    #: How the gains depend on the mass of each payload whose mass is known; empty for fixed gains, and in calibrations
+    #: of earlier versions.
+    payload_mass: tuple[PayloadMass, ...] = ()
 
     @property
     def places(self) -> tuple[str, ...]:
@@ -183,7 +220,9 @@ def calibration_of(
     Raises:
         ModelError: there is not one name, nameplate gain and unit for each axis, or the effects come without steps.
     """
-    from ident.effects.signals import session_began_s  # noqa: PLC0415 - reading a calibration needs no effects
+    # Reading a calibration needs no effects and no estimator.
+    from ident.effects.signals import session_began_s  # noqa: PLC0415
+    from ident.estimators.payload_mass import mass_responses  # noqa: PLC0415
 
     last = steps[-1].after if steps else None
     start, found = found, found if last is None else last.identification
@@ -201,13 +240,15 @@ def calibration_of(
         Parameter(column.name, float(value), float(std), column.unit)
         for column, value, std in zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
     )
-    gains = zip(axes, estimate.gains, estimate.gains_std, units, nameplate, strict=True)
+    identified = zip(axes, estimate.gains, estimate.gains_std, units, nameplate, strict=True)
+    gains = tuple(Gain(axis, float(g), float(std), unit, float(entered)) for axis, g, std, unit, entered in identified)
+    responses = mass_responses(found.system, estimate)
     passive = found.model.robot.passive_names
     places = (*axes, *passive)
     return Calibration(
         cell=robot,
         method=estimate.method.value,
-        gains=tuple(Gain(axis, float(g), float(std), unit, float(entered)) for axis, g, std, unit, entered in gains),
+        gains=gains,
         parameters=parameters,
         effects=() if last is None else tuple(_accepted(start, steps, one, places, parameters) for one in last.effects),
         relative_error_percent=found.training_error,
@@ -226,6 +267,9 @@ def calibration_of(
         covariance_factor=factor_of(estimate.covariance),
         current_residual=found.current_residual,
         passive_joints=passive,
+        payload_mass=tuple(
+            PayloadMass.of(one.payload, one.mass_kg, one.gain_per_kg.tolist(), gains) for one in responses
+        ),
     )
 
 

@@ -200,6 +200,10 @@ def residual_verb(
             help="Write effects that raise the error of held-out logs by more than its noise, too.",
         ),
     ] = False,
+    verbose: Annotated[
+        bool,
+        typer.Option("--verbose", help="Also print the search, all errors and what these data cannot show."),
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Fit, then detect the effect that explains the residual, add it, refit everything, and repeat."""
@@ -240,7 +244,7 @@ def residual_verb(
         if json:
             print_json(residual_document(closed, changed, calibration))
         else:
-            print_view(residual_view(closed, changed, calibration), *written)
+            print_view(residual_view(closed, changed, calibration, verbose=verbose), *written)
 
     try:
         if report is not None:
@@ -252,9 +256,18 @@ def residual_verb(
         show()  # what took minutes to find is not lost with the disk
         raise
     show(out, report, pictures)
-    if out is not None and not json:
-        same = [] if cell is None else ["--cell", cell]
+    if json:
+        return
+    same: list[object] = [] if cell is None else ["--cell", cell]
+    if out is not None:
         say_next("drivegain", "validate", out, *(holdout or logs), *same)
+        return
+    same += [word for log in holdout or () for word in ("--holdout", log)]
+    same += ["--gains", gains.value] if gains is Gains.FIXED else []
+    same += ["--seed", str(seed)] if seed else []
+    same += ["--accept-losses"] if accept_losses else []
+    same += ["--accept-worse-holdout"] if accept_worse_holdout else []
+    say_next("drivegain", "residual", *logs, *same, "--out", "calibration.yaml", "--report", report or "report")
 
 
 def check_report(folder: Path | None) -> None:

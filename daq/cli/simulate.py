@@ -241,6 +241,7 @@ def demo_view(outcome: Outcome) -> Iterator[RenderableType]:
     from daq.report.bus import scan_rows, scan_table
     from daq.report.gains import gain_table
     from daq.report.residual import before_after_table, summary, turns_view
+    from daq.report.text import Sentence
 
     fitted, truth = outcome.fitted, outcome.truth
     yield scan_table(scan_rows(outcome.cell, outcome.nodes, outcome.cell.buses[0].name))
@@ -248,7 +249,7 @@ def demo_view(outcome: Outcome) -> Iterator[RenderableType]:
     yield from turns_view(fitted)
     yield before_after_table(outcome.changed, fitted.cell.axis_names)
     yield ""
-    yield from summary(fitted, outcome.changed, outcome.calibration.effects)
+    yield from map(Sentence, summary(fitted, outcome.changed, outcome.calibration.effects))
     yield ""
     yield gain_table(outcome.calibration.gains, truth, title="Drive gains beside the truth of the simulated cell")
     if fitted.paper is not None:

@@ -257,12 +257,15 @@ def progress_bar(title: str) -> Iterator[ProgressCallback]:
 
 @contextmanager
 def status(title: str) -> Iterator[Callable[[str], None]]:
-    """Show a spinner on stderr for work of unknown length; each reported step is a line."""
+    """Show work of unknown length on stderr: in a terminal a spinner with the step, elsewhere a line for each step."""
     console = Console(stderr=True, highlight=False)
-    with console.status(title):
+    with console.status(title) as spinner:
 
         def show_step(step: str) -> None:
-            console.print(f"  {step}", style="dim")
+            if console.is_terminal:
+                spinner.update(terminal_text(step))
+            else:
+                console.print(f"  {step}", style="dim")
 
         yield show_step
 

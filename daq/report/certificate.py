@@ -7,7 +7,7 @@ controller was not read, the nameplate takes its place, and the limit of a chang
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from enum import Enum
 from typing import Any
@@ -19,6 +19,7 @@ from daq.errors import CalibrationRefused, DaqError
 from daq.ledger.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, judge, noise_note, query_history
 from daq.report.effect_names import accepted_text, size_text
 from daq.report.fit import error_document
+from daq.report.gains import mass_texts
 from daq.report.proposal import refusal_document
 from daq.report.text import picked
 from daq.writeback.file_target import FileEdit, FileTarget
@@ -290,7 +291,10 @@ def identity(calibration: Calibration) -> tuple[tuple[str, str], ...]:
     between = days[0] if len(days) == 1 else f"{days[0]} to {days[-1][11 if same_day else 0 :]}" if days else ""
     payloads = "; ".join(payload_texts(calibration))
     # No residual shows a wrong mass: it must be on the sheet that a person signs.
-    weighed = f"{payloads}; with a mass wrong by 1 % every gain is wrong by 1 %" if payloads else ""
+    influences = "; ".join(mass_texts(calibration.payload_mass))
+    # Calibrations of earlier versions do not say more.
+    influences = influences or "a wrong mass changes every gain, by the same share where nothing else of it is known"
+    weighed = f"{payloads}; {influences}" if payloads and not calibration.gains_fixed else payloads
     return (
         ("Serial numbers", _serials(calibration)),
         ("Operator", ", ".join(operators) or "not known: the recordings name none"),
@@ -357,6 +361,7 @@ def certificate_document(certificate: Certificate) -> dict[str, Any]:
         "holdout_error_percent": error_document(calibration.holdout_error_percent),
         "nameplate_holdout_error_percent": error_document(calibration.nameplate_holdout_error_percent),
         "relative_error_percent": error_document(calibration.relative_error_percent),
+        "payload_mass": [asdict(one) for one in calibration.payload_mass],
         "effects": [
             {
                 "axis": effect.axis,

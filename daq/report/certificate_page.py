@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from daq.report.certificate import EARLIER, AxisRow, Certificate, Verdict, identity
 from daq.report.effect_names import WORDS, accepted_text, curve_of, size_text
-from daq.report.gains import diagnosis_texts, partial_note, with_deviation
+from daq.report.gains import MASS_HEADINGS, diagnosis_texts, mass_rows, partial_note, with_deviation
 from daq.report.html import element, figure, folded, listed, page, pair, paragraph, section, table, terms
 from daq.report.picture import QUANTITY
 from daq.report.svg import Interval, Line, before_after, chart, intervals
@@ -289,6 +289,15 @@ def _evidence(calibration: Calibration) -> Iterator[str]:
         yield folded(
             "Effects that these data cannot distinguish",
             table("", ("axis", "effect", "not distinguishable from"), rivals, "words"),
+        )
+    if calibration.payload_mass:
+        yield folded(
+            "Dependence of the gains on the payload's mass",
+            paragraph(
+                "To first order. A wrong mass is in every gain; where the mass is all that is known of the payload, no "
+                "residual shows it. The part of σ that the tolerance of the weighing makes is not in σ of the gains."
+            ),
+            table("", MASS_HEADINGS, mass_rows(calibration), "names"),
         )
     of_effects = {one.name for effect in calibration.effects for one in effect.coefficients}
     yield folded(

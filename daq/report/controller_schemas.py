@@ -8,6 +8,7 @@ from pydantic import Field
 
 from daq.config.yaml_file import StrictModel
 from daq.report.fit_schemas import Errors, Figure
+from ident.calibration import PayloadMass
 
 
 class Refused(StrictModel):
@@ -161,6 +162,7 @@ class CertificateReport(StrictModel):
     holdout_error_percent: Errors | None
     nameplate_holdout_error_percent: Errors | None
     relative_error_percent: Errors
+    payload_mass: tuple[PayloadMass, ...] = ()
     effects: list[CertifiedEffect]
     beside: EarlierCalibration | None
 

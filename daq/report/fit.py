@@ -8,19 +8,26 @@ from typing import Any
 import numpy as np
 from rich.console import RenderableType
 from rich.table import Table
-from rich.text import Text
 
 from daq.report import paper_tables
 from daq.report.effect_names import size_text
-from daq.report.gains import diagnosis_texts, gain_table, partial_note, torque_document, torque_sentences, torque_table
-from daq.report.text import percent_text, picked, plain_table, printable
+from daq.report.gains import (
+    diagnosis_texts,
+    gain_table,
+    mass_texts,
+    partial_note,
+    torque_document,
+    torque_sentences,
+    torque_table,
+)
+from daq.report.text import Sentence, percent_text, picked, plain_table
 from daq.workflow.calibration_file import as_document
 from daq.workflow.cases import CASES, CaseFit
 from daq.workflow.fit import DOUBTFUL_PERCENT, Fit
 from daq.workflow.nameplates import actual_current_note
 from daq.workflow.verdicts import needed_verdicts
 from ident.arrays import FloatArray
-from ident.calibration import Calibration, Parameter
+from ident.calibration import Calibration, Parameter, PayloadMass
 from ident.discovery.evidence import Evidence, without_effects
 from ident.effects.effect import PlacedEffect
 from ident.estimators.comparison import Comparison, EstimatorTrial
@@ -40,29 +47,30 @@ def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | 
     axes, estimate = fitted.cell.axis_names, fitted.estimate
     yield gain_table(calibration.gains, title=f"Drive gains of {calibration.cell} by {calibration.method}")
     if (note := partial_note(calibration)) is not None:
-        yield Text(note, style="bold")
-    yield from (Text(printable(text), style="bold") for text in diagnosis_texts(calibration.diagnoses))
+        yield Sentence(note, "bold")
+    yield from (Sentence(text, "bold") for text in diagnosis_texts(calibration.diagnoses))
     for effect in calibration.effects:
-        yield f"{effect.axis}: {effect.name}, declared in the cell file: {size_text(effect, calibration)}"
+        yield Sentence(f"{effect.axis}: {effect.name}, declared in the cell file: {size_text(effect, calibration)}")
     if (note := actual_current_note(fitted.cell)) is not None:
-        yield note
+        yield Sentence(note)
     if fitted.torque_slopes:
         yield torque_table(fitted.torque_slopes, calibration.gains)
-        yield from map(printable, torque_sentences(fitted.torque_slopes, calibration.gains))
+        yield from map(Sentence, torque_sentences(fitted.torque_slopes, calibration.gains))
     if fitted.paper is not None:
         apart = paper_note(axes, estimate, fitted.paper, misjudged_joints(fitted.final.system))
         if apart is not None:
-            yield apart
+            yield Sentence(apart)
     yield ""
     errors = {"fit": calibration.relative_error_percent, "held out": calibration.holdout_error_percent}
     yield error_table("Relative error ‖ρ‖/‖Y‖ [%]", axes, errors)
     filter_ = fitted.identification.conditioning
-    yield (
+    yield Sentence(
         f"{estimate.rows} rows, {len(fitted.final.system.columns)} base parameters and effects, condition "
         f"{estimate.condition:.0f}; position filter {filter_.position_cutoff_hz:g} Hz, decimation "
         f"{filter_.decimation_cutoff_hz:g} Hz. Compare relative errors only under the same filters."
     )
-    yield from (*identifiability_notes(fitted), *advice(fitted, needed_verdicts(fitted)))
+    yield from map(Sentence, identifiability_notes(fitted, calibration.payload_mass))
+    yield from map(Sentence, advice(fitted, needed_verdicts(fitted)))
     if comparison is not None:
         for table in comparison_tables(comparison, axes):
             yield ""
@@ -166,7 +174,7 @@ def cases_view(fits: Mapping[str, CaseFit], tables: tuple[paper_tables.PaperTabl
     for name, found in fits.items():
         left = found.fitted.identification.training_error.total
         if left > DOUBTFUL_PERCENT:
-            yield Text(f"{name} failed: its relative error is {left:.3g} %.", style="bold")
+            yield Sentence(f"{name} failed: its relative error is {left:.3g} %.", "bold")
     for table in tables:
         yield from table.view()
         yield ""
@@ -209,18 +217,17 @@ def coefficients(evidence: Evidence, placed: PlacedEffect) -> tuple[Parameter, .
     )
 
 
-def identifiability_notes(fitted: Fit) -> tuple[str, ...]:
-    """Describe errors that leave no residual in these data."""
+def identifiability_notes(fitted: Fit, influences: Sequence[PayloadMass]) -> tuple[str, ...]:
+    """Describe errors that leave no residual in these data.
+
+    Args:
+        fitted: the fit.
+        influences: of each payload's mass on its gains, as in its calibration.
+    """
     if fitted.estimate.gains_fixed:
         return ()
-    mounted = {payload.mounting for payload in fitted.identification.system.payloads}
-    known = [payload for payload in fitted.cell.payloads if payload.payload.mounting in mounted]
-    scales = [
-        f"{payload.name} was weighed to {payload.mass_kg:g} kg ± {payload.mass_tolerance_kg:g} kg, which is "
-        f"± {100.0 * payload.mass_tolerance_kg / payload.mass_kg:.2g} % of every gain, not in σ"
-        for payload in known
-        if payload.mass_tolerance_kg > 0.0
-    ]
+    texts = mass_texts(influences)
+    masses = f" ({'; '.join(texts)})" if texts else ""
     drawn = [payload.name for payload in fitted.identification.system.payloads if len(payload.known) > 1]
     return (
         *(
@@ -232,9 +239,8 @@ def identifiability_notes(fitted: Fit) -> tuple[str, ...]:
             else ()
         ),
         "Not identifiable from these data: a wrong payload mass scales all gains alike and leaves no residual"
-        + (f" ({'; '.join(scales)}); " if scales else "; ")
-        + "so does a wrong value of gravity; a gear efficiency that is the same in "
-        "both directions is part of its gain.",
+        f"{masses}; so does a wrong value of gravity; a gear efficiency that is the same in both directions is part of "
+        "its gain.",
     )
 
 

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from daq.config.yaml_file import StrictModel
 from daq.workflow.calibration_file import CalibrationBody
+from ident.calibration import PayloadMass
 from ident.errors import Diagnosis
 
 Figure = float | None  #: null where it is not known
@@ -109,10 +110,11 @@ class CasesReport(StrictModel):
 
 
 class MotorNoise(StrictModel):
-    """Noise floor of one motor."""
+    """Noise of one motor at rest or between repeated moves."""
 
     axis: str
-    noise: float = Field(description="in the unit of the current reference")
+    noise: float = Field(description="estimate, in the unit of the current reference")
+    least: float = Field(description="its lower limit: no model's error in motion is smaller")
     source: str
     std_percent: Figure
     dwells: int | None
@@ -123,18 +125,30 @@ class MotorNoise(StrictModel):
 
 
 class NoiseFloor(StrictModel):
-    """Error that noise alone would leave."""
+    """Error that noise alone would leave: estimates, and their lower limits."""
 
     motors: list[MotorNoise | None]
     relative_error_percent: Errors
     holdout_error_percent: Errors | None
+    least_error_percent: Errors
+    least_holdout_error_percent: Errors | None
+    confidence: float
 
 
 class Skew(StrictModel):
-    """Delay of currents against positions [s]."""
+    """Delay of currents against positions that instruments confirm [s]."""
 
     seconds: float
     std: float
+
+
+class SkewByInstruments(Skew):
+    """The same whether or not they confirm it, beside the estimate of the fit [s]."""
+
+    fit_seconds: float
+    fit_std: float
+    confirmed: bool
+    is_in_model: bool
 
 
 class GearLossEntry(StrictModel):
@@ -262,6 +276,7 @@ class ResidualReport(CalibrationBody):
     metric: str
     noise_floor: NoiseFloor
     time_skew: Skew | None
+    time_skew_by_instruments: SkewByInstruments | None = None
     gear_loss: list[GearLossEntry]
     before: ModelErrors
     after: ModelErrors
@@ -328,6 +343,7 @@ class ValidateReport(StrictModel):
     axes: list[str]
     filter: dict[str, int | float | list[float]]
     fit_relative_error_percent: Errors
+    payload_mass: tuple[PayloadMass, ...] = ()
     logs: list[ValidatedLog]
     together: Together | None
     calibrations: list[str]

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from daq.report.picture import BLUE, GREEN, GREY, legend_below, render, single
 from daq.report.text import SHOWN_SIGMAS, plain_table, terminal_text
-from ident.calibration import Calibration, Gain
+from ident.calibration import Calibration, Gain, PayloadMass
 from ident.data.torque_channel import TorqueSlope
 from ident.errors import Diagnosis
 
@@ -134,6 +134,53 @@ def partial_note(calibration: Calibration) -> str | None:
 def diagnosis_texts(diagnoses: Iterable[Diagnosis]) -> tuple[str, ...]:
     """One sentence for each diagnosis, for a view or a page."""
     return tuple(f"CHECK {one.text}." for one in diagnoses)
+
+
+def mass_texts(influences: Iterable[PayloadMass]) -> tuple[str, ...]:
+    """Say of each payload how a wrong mass changes the gains, and what its declared tolerance makes of them."""
+    return tuple(f"{_mass_influence(one)}{_mass_tolerance(one)}" for one in influences)
+
+
+def _is_proportional(one: PayloadMass) -> bool:
+    """Whether every gain is proportional to the mass, to a hundredth."""
+    return all(round(gain.percent_per_percent, 2) == 1.0 for gain in one.gains)
+
+
+def _mass_influence(one: PayloadMass) -> str:
+    if _is_proportional(one):
+        return f"with a mass of {one.payload} that is wrong by 1 %, every gain is wrong by 1 %"
+    listed = ", ".join(f"{gain.axis} {gain.percent_per_percent:.2f} %" for gain in one.gains)
+    return f"with a mass of {one.payload} that is wrong by 1 %, the gains are wrong by: {listed}"
+
+
+def _mass_tolerance(one: PayloadMass) -> str:
+    if not one.tolerance_kg > 0.0:
+        return ""
+    largest = max(abs(gain.percent_per_percent) for gain in one.gains)
+    share_percent = 100.0 * one.tolerance_kg / one.mass_kg * largest
+    at_most = "" if _is_proportional(one) else "at most "
+    return (
+        f"; {one.payload} was weighed to {one.mass_kg:g} kg ± {one.tolerance_kg:g} kg, which is {at_most}"
+        f"± {share_percent:.2g} % of every gain, not in σ"
+    )
+
+
+MASS_HEADINGS = ("payload", "axis", "gain per kg", "gain % per % of mass", "σ by the tolerance", "unit")
+
+
+def mass_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
+    """Yield the dependence of each gain on the mass of each payload, under MASS_HEADINGS."""
+    units = {gain.axis: gain.unit for gain in calibration.gains}
+    for one in calibration.payload_mass:
+        for gain in one.gains:
+            yield (
+                one.payload,
+                gain.axis,
+                f"{gain.per_kg:.4g}",
+                f"{gain.percent_per_percent:.3f}",
+                f"{gain.tolerance_std:.2g}" if one.tolerance_kg > 0.0 else "-",
+                units.get(gain.axis, ""),
+            )
 
 
 def with_deviation(value: float, std: float) -> str:

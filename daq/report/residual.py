@@ -11,12 +11,11 @@ from typing import Any
 
 from rich.console import RenderableType
 from rich.table import Table
-from rich.text import Text
 
 from daq.report.effect_names import effect_text, size_text, variable_text
 from daq.report.fit import coefficients, error_document, error_table, identifiability_notes
 from daq.report.gains import diagnosis_texts, gain_table, partial_note
-from daq.report.text import picked, plain_table
+from daq.report.text import Sentence, picked, plain_table
 from daq.workflow.calibration_file import as_document
 from daq.workflow.fit import Fit
 from ident.calibration import AcceptedEffect, Calibration
@@ -24,11 +23,11 @@ from ident.discovery.before_after import Account, BeforeAfter, Errors
 from ident.discovery.gates import runs_to_leave_out
 from ident.discovery.gear_loss import CERTAIN, GearLoss, gear_losses, is_gear_loss
 from ident.discovery.loop import MAX_EFFECTS, Step
-from ident.discovery.noise_floor import FloorSource
+from ident.discovery.noise_floor import CONFIDENCE, FloorSource
 from ident.discovery.search import Finding
+from ident.discovery.time_skew import Skew
 from ident.drift.change import FALSE_ALARM
 from ident.effects.effect import PlacedEffect, Side
-from ident.effects.electrical import TimeSkew
 from ident.effects.signals import session_began_s
 from ident.effects.unnamed import is_unnamed
 from ident.estimators.estimate import RelativeError
@@ -53,66 +52,125 @@ ErrorRow = tuple[str, RelativeError]  #: Name of the error and of the data it is
 WHEN = ("before", "after")
 
 
-def residual_view(fitted: Fit, account: Account, calibration: Calibration) -> Iterator[RenderableType]:
-    """Turns of the loop, the effects with their coefficients, the summary, errors, gains, and what σ lacks."""
-    yield from turns_view(fitted)
+def residual_view(
+    fitted: Fit, account: Account, calibration: Calibration, *, verbose: bool = False
+) -> Iterator[RenderableType]:
+    """One screen: what was found, and the gains; if verbose, all that the report says of the search, too."""
+    if (note := partial_note(calibration)) is not None:
+        yield Sentence(note, "bold")
+    if verbose:
+        yield from turns_view(fitted)
+        yield from map(Sentence, effect_sizes(calibration))
+    diagnosed = len(fitted.diagnoses)
+    for number, text in enumerate(headline(fitted, account, calibration.effects)):
+        yield Sentence(text, "bold" if number < diagnosed else "")
+    statistics = (*statistical_sentences(fitted, account), *identifiability_notes(fitted, calibration.payload_mass))
+    if verbose:
+        yield from map(Sentence, statistics)
+        yield ""
+        yield before_after_table(account, fitted.cell.axis_names)
+    yield ""
+    yield gain_table(calibration.gains, title="Drive gains with the effects; change % is from the a priori gain")
+    if not verbose:
+        yield Sentence(
+            f"The report (`--report FOLDER`) and `--verbose` have the search, the errors, and {len(statistics)} "
+            "sentences on what these data can and cannot show."
+        )
+
+
+def effect_sizes(calibration: Calibration) -> Iterator[str]:
+    """Name of each effect as in files and commands, its size ± σ, and what these data cannot distinguish from it."""
     for effect in calibration.effects:
         more = len(effect.ambiguity) - _SHOWN_RIVALS
         rivals = ", ".join(effect.ambiguity[:_SHOWN_RIVALS]) + (f" and {more} more" if more > 0 else "")
         rivals = f"; not distinguishable from {rivals}" if rivals else ""
         yield f"{effect.axis}: {effect.name}: {size_text(effect, calibration)}{rivals}"
-    yield from summary(fitted, account, calibration.effects)
-    yield ""
-    yield before_after_table(account, fitted.cell.axis_names)
-    yield ""
-    yield gain_table(calibration.gains, title="Drive gains with the effects; change % is from the a priori gain")
-    yield from identifiability_notes(fitted)
-    if (note := partial_note(calibration)) is not None:
-        yield Text(note, style="bold")
 
 
 def turns_view(fitted: Fit) -> Iterator[RenderableType]:
     """Candidates of each turn of the loop, and the one that was added."""
-    for declared in (step.accepted for step in fitted.steps if step.declared):
-        if declared is not None:
-            placed = PlacedEffect(declared.effect, declared.axis)
-            yield f"Declared in the cell file: {placed.name_among(fitted.cell.place_names)}.\n"
-    for number, step in enumerate((step for step in fitted.steps if not step.declared), start=1):
-        headings = ("effect", "axis", "p", "folds", "explains", "left-out error", "gates")
-        table = plain_table(headings, title=f"Turn {number}: best candidates on left-out moves, before the refit")
-        for finding in step.ranked(_SHOWN):
-            table.add_row(
-                finding.effect.name,
-                fitted.cell.place_names[finding.axis],
-                f"{finding.probability:.3f}",
-                f"{100 * finding.folds_better:.0f} %",
-                f"{100 * finding.explained:.1f} %",
-                f"{finding.error_before_percent:.2f} → {finding.error_after_percent:.2f} %",
-                "pass" if finding.passed else "no",
-            )
+    declared = declared_sentences(fitted)
+    yield from map(Sentence, declared)
+    for number, step in enumerate(searched_steps(fitted), start=1):
+        if number > 1 or declared:
+            yield ""
+        title = f"Turn {number}: {CANDIDATES}"
+        table = plain_table(CANDIDATE_HEADINGS, title=title)
+        for row in candidate_rows(fitted, step, _SHOWN):
+            table.add_row(*row)
         yield table
-        for aside in step.set_aside:
-            placed = PlacedEffect(aside.finding.effect, aside.finding.axis)
-            yield f"Not added: {placed.name_among(fitted.cell.place_names)}: {aside.reason(fitted.cell.place_names)}."
-        if step.accepted is None:
-            yield "No candidate passes every gate; nothing is added.\n"
-        else:
+        yield from map(Sentence, turn_sentences(fitted, step))
+    yield ""
+
+
+CANDIDATES = "best candidates on left-out moves, before the refit"
+CANDIDATE_HEADINGS = ("effect", "axis", "p", "folds", "explains", "left-out error", "gates")
+
+
+def searched_steps(fitted: Fit) -> tuple[Step, ...]:
+    """Turns of the search, without the steps of effects that the cell declares."""
+    return tuple(step for step in fitted.steps if not step.declared)
+
+
+def candidate_rows(fitted: Fit, step: Step, count: int) -> Iterator[tuple[str, ...]]:
+    """Yield the best named candidates of a turn under CANDIDATE_HEADINGS, the added one among them."""
+    for finding in step.ranked(count):
+        yield (
+            finding.effect.name,
+            fitted.cell.place_names[finding.axis],
+            f"{finding.probability:.3f}",
+            f"{100 * finding.folds_better:.0f} %",
+            f"{100 * finding.explained:.1f} %",
+            f"{finding.error_before_percent:.2f} → {finding.error_after_percent:.2f} %",
+            "pass" if finding.passed else "no",
+        )
+
+
+def declared_sentences(fitted: Fit) -> list[str]:
+    """Name the effects that the cell file declares."""
+    sentences: list[str] = []
+    for step in fitted.steps:
+        if step.declared and step.accepted is not None:
             placed = PlacedEffect(step.accepted.effect, step.accepted.axis)
-            yield f"Added: {placed.name_among(fitted.cell.place_names)}.\n"
+            sentences.append(f"Declared in the cell file: {placed.name_among(fitted.cell.place_names)}.")
+    return sentences
+
+
+def turn_sentences(fitted: Fit, step: Step) -> list[str]:
+    """Say what a turn of the search added, and what it refused and why."""
+    places = fitted.cell.place_names
+    sentences: list[str] = []
+    for aside in step.set_aside:
+        placed = PlacedEffect(aside.finding.effect, aside.finding.axis)
+        sentences.append(f"Not added: {placed.name_among(places)}: {aside.reason(places)}.")
+    if step.accepted is None:
+        sentences.append("No candidate passes every gate; nothing is added.")
+    else:
+        placed = PlacedEffect(step.accepted.effect, step.accepted.axis)
+        sentences.append(f"Added: {placed.name_among(places)}.")
+    return sentences
 
 
 def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
-    """Relative error of each axis before and after, and the share that noise alone would leave."""
+    """Relative error of each axis before and after, and the least that noise alone would leave."""
     return error_table("Relative error ‖e‖/‖v‖ of the motor currents by ml [%]", axes, dict(error_rows(account)))
 
 
 def summary(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -> tuple[str, ...]:
-    """Summarise in sentences: what to check first, each accepted effect, the whole, the gains, the limit.
+    """Summarise in sentences: what `residual` prints, then what it prints with `--verbose`.
 
     Args:
         fitted: with the turns of the loop.
         account: of these turns.
         effects: of the calibration, with the errors that the gate of an effect compares.
+    """
+    return (*headline(fitted, account, effects), *statistical_sentences(fitted, account))
+
+
+def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -> tuple[str, ...]:
+    """What to check first, each accepted effect, all axes together, the gains, and what held-out runs refute.
+
+    The arguments are those of `summary`. The diagnoses come first, a sentence each.
     """
     kept = fitted.steps[-1].after.effects
     first = diagnosis_texts(fitted.diagnoses)
@@ -125,31 +183,31 @@ def summary(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) ->
     )
     (before, _), (after, where) = _strictest_error(account.total.before), _strictest_error(account.total.after)
     floor = _floor(account).total
-    noise = f" (noise floor {floor:.1f} %)" if math.isfinite(floor) else ""
-    ending = [*_choice_sentence(fitted, account), _silence(fitted)]
-    if (skew := time_skew(fitted)) is not None and abs(skew[0]) > CERTAIN * skew[1]:
-        beside = " (beside the effects above; it was not added)" if kept else ""
-        ending.append(
-            f"Currents were sampled {1e3 * abs(skew[0]):.2f} ± {1e3 * skew[1]:.2f} ms "
-            f"{'after' if skew[0] > 0 else 'before'} the positions on all axes alike{beside}. Tenths of a "
-            "millisecond are a filter of the drive, several milliseconds a fault of the recording: check its stamps."
-        )
-    ending += _refused(fitted)
-    ending += gear_sentences(fitted)
-    ending += floor_sentences(account, fitted.cell.axis_names)
-    ending += _holdout_verdict(fitted, account)
-    if kept and not runs_to_leave_out(fitted.steps[-1].after.training):
-        ending.append(
-            "The effects were tested on moves of the same recordings only, kept out of the fit in turn. Record two "
-            "runs without load and two with each payload: whole runs can then be kept out, which is a stricter test."
-        )
-    ending[:0] = [sentence for step in fitted.steps for sentence in _set_aside(fitted, step)]
+    noise = f" ({_floor_text(floor)})" if math.isfinite(floor) else ""
+    ending = (*_skew_sentence(account.skew), *_holdout_verdict(fitted, account))
     if not found:
         return (*first, f"No structure found: the error {where} is {after.total:.1f} %{noise}.", *ending)
     change = error_change_text(before.total, after.total)
     whole = f"All axes together: the error {where} {change}{noise}{_unconfirmed(account)}."
     gains = gains_sentence(fitted, account)
     return (*first, *found, whole, *_to_be_refused(effects), *((gains,) if gains else ()), *ending)
+
+
+def statistical_sentences(fitted: Fit, account: Account) -> tuple[str, ...]:
+    """What was not added and why, what would have been detected, and what the noise and the gears hide."""
+    last = fitted.steps[-1]
+    sentences = [sentence for step in fitted.steps for sentence in _set_aside(fitted, step)]
+    sentences += [*_choice_sentence(fitted, account), _silence(fitted)]
+    sentences += _unconfirmed_skew(account.skew)
+    sentences += _refused(fitted)
+    sentences += gear_sentences(fitted)
+    sentences += floor_sentences(account, fitted.cell.axis_names)
+    if last.after.effects and not runs_to_leave_out(last.after.training):
+        sentences.append(
+            "The effects were tested on moves of the same recordings only, kept out of the fit in turn. Record two "
+            "runs without load and two with each payload: whole runs can then be kept out, which is a stricter test."
+        )
+    return tuple(sentences)
 
 
 def _unconfirmed(account: Account) -> str:
@@ -163,13 +221,19 @@ def _unconfirmed(account: Account) -> str:
 
 def _to_be_refused(effects: Sequence[AcceptedEffect]) -> Iterator[str]:
     """Name the effects with which `apply` refuses a calibration (`daq.writeback.gates.fit.effect`)."""
-    for one in effects:
-        if not one.is_confirmed:
-            yield (
-                f"`apply` refuses a calibration with {one.name} on {one.axis}: on data that the fit did not use, the "
-                f"torque error is {one.error_after_percent:.2f} % with it, {one.error_before_percent:.2f} % without. "
-                "Record more runs for the fit, or take `drivegain fit`, which adds no effects."
-            )
+    refused = [one for one in effects if not one.is_confirmed]
+    if not refused:
+        return
+    first, *others = refused
+    more = "".join(
+        f"; {one.name} on {one.axis}: {one.error_after_percent:.2f} % with it, {one.error_before_percent:.2f} % without"
+        for one in others
+    )
+    yield (
+        f"`apply` refuses a calibration with {first.name} on {first.axis}: on data that the fit did not use, the "
+        f"torque error is {first.error_after_percent:.2f} % with it, {first.error_before_percent:.2f} % without{more}. "
+        "Record more runs for the fit, or take `drivegain fit`, which adds no effects."
+    )
 
 
 def gains_sentence(fitted: Fit, account: Account) -> str:
@@ -241,7 +305,7 @@ def _refused(fitted: Fit) -> Iterator[str]:
 
 
 def floor_sentences(account: Account, axes: Sequence[str]) -> list[str]:
-    """Name the axes whose noise floor lies above what the model leaves, and possible causes."""
+    """Name the axes whose noise estimate is far above what the model leaves, and possible causes."""
     causes = {
         FloorSource.STANDSTILL: (
             "at standstill",
@@ -268,16 +332,40 @@ def _holdout_verdict(fitted: Fit, account: Account) -> list[str]:
     return ["The effects raise the error of the held-out runs by more than its noise: no calibration was written."]
 
 
-def time_skew(fitted: Fit) -> tuple[float, float] | None:
-    """Delay of current samples after position samples, equal on all axes, and its σ [s]; None where unknown.
+def _skew_sentence(skew: Skew | None) -> Iterator[str]:
+    """State a time skew that instruments confirm; nothing where they do not, or do not exist."""
+    if skew is None or not skew.confirmed:
+        return
+    side = "after" if skew.seconds > 0.0 else "before"
+    beside = "it is among the effects" if skew.is_in_model else "it was not added to the model"
+    yield (
+        f"Currents were sampled {1e3 * abs(skew.seconds):.2f} ± {1e3 * skew.std:.2f} ms {side} the positions, the same "
+        f"on every axis ({beside}). Tenths of a millisecond are a filter of the drive, several milliseconds a fault of "
+        "the recording: check its stamps."
+    )
 
-    It is taken from the last turn, where no accepted effect accounts for it.
-    """
-    last = fitted.steps[-1]
-    if any(isinstance(placed.effect, TimeSkew) for placed in last.after.effects):
-        return None
-    skews = [finding for finding in last.findings if isinstance(finding.effect, TimeSkew)]
-    return None if not skews else (float(skews[0].coefficients[0]), float(skews[0].deviations[0]))
+
+def _unconfirmed_skew(skew: Skew | None) -> Iterator[str]:
+    """Say why no time skew is stated."""
+    if skew is None:
+        yield (
+            "A time skew between currents and positions is not known: these data give no instruments, which need "
+            "point-to-point moves and one motor for each degree of freedom."
+        )
+    elif not skew.confirmed:
+        yield (
+            "A time skew between currents and positions is not confirmed: by instruments from the demanded motion it "
+            f"is {1e3 * skew.seconds:.2f} ± {1e3 * skew.std:.2f} ms, which may be zero."
+        )
+
+
+def skew_document(skew: Skew | None) -> dict[str, Any]:
+    """Return the keys `time_skew`, null unless instruments confirm it, and `time_skew_by_instruments`."""
+    if skew is None:
+        return {"time_skew": None, "time_skew_by_instruments": None}
+    stated = {"seconds": skew.seconds, "std": skew.std} if skew.confirmed else None
+    figures = ("seconds", "std", "fit_seconds", "fit_std", "confirmed", "is_in_model")
+    return {"time_skew": stated, "time_skew_by_instruments": picked(skew, *figures)}
 
 
 def gear_sentences(fitted: Fit) -> list[str]:
@@ -322,7 +410,7 @@ def error_rows(account: Account) -> tuple[ErrorRow, ...]:
         ("runs left out", first, second),
         ("held out", before.holdout, after.holdout),
     )
-    floors = (("noise floor", account.floor), ("noise floor, held out", account.holdout_floor))
+    floors = (("noise, at least", account.least_floor), ("noise, at least, held out", account.least_holdout_floor))
     named = [(f"{name}, {when}", error) for name, *both in pairs for when, error in zip(WHEN, both, strict=True)]
     return tuple(
         (name, error) for name, error in (*named, *floors) if error is not None and any(map(math.isfinite, error.axes))
@@ -356,10 +444,10 @@ def _effect_sentence(
     name = axes[placed.axis]
     (before, _), (after, where) = _strictest_error(turn.before), _strictest_error(turn.after)
     floor = _floor(account).at(placed.axis)
-    floor_text = f"noise floor {floor:.1f} %" if math.isfinite(floor) else "noise floor not known"
+    floor_text = _floor_text(floor)
     excess = ""
     if is_unnamed(placed.effect) and share_of_excess is not None:
-        excess = f" ({100.0 * share_of_excess:.0f} % of the residual beyond noise)"
+        excess = f" (at least {100.0 * share_of_excess:.0f} % of the residual beyond noise)"
     if placed.effect.side is Side.ALL_MOTORS:
         before_all, after_all = (_strictest_error(errors)[0].total for errors in (turn.before, turn.after))
         change = error_change_text(before_all, after_all)
@@ -374,8 +462,13 @@ def _effect_sentence(
 
 
 def _floor(account: Account) -> RelativeError:
-    """Noise floor of the rows that `_strictest_error` is measured on."""
-    return account.floor if account.holdout_floor is None else account.holdout_floor
+    """Lower limit of the error by noise, on the rows that `_strictest_error` is measured on."""
+    return account.least_floor if account.least_holdout_floor is None else account.least_holdout_floor
+
+
+def _floor_text(floor_percent: float) -> str:
+    """Say how much of an error noise leaves, to stand in brackets."""
+    return f"noise leaves at least {floor_percent:.1f} %" if math.isfinite(floor_percent) else "noise floor not known"
 
 
 def _silence(fitted: Fit) -> str:
@@ -407,7 +500,7 @@ _METRIC = (
 
 def residual_document(fitted: Fit, account: Account, calibration: Calibration) -> dict[str, Any]:
     """Build the object of `residual --json`, which is also the body of `residual.json`."""
-    axes, skew = fitted.cell.axis_names, time_skew(fitted)
+    axes = fitted.cell.axis_names
     return {
         **as_document(calibration),
         "summary": list(summary(fitted, account, calibration.effects)),
@@ -420,6 +513,7 @@ def residual_document(fitted: Fit, account: Account, calibration: Calibration) -
                 else {
                     "axis": axis,
                     "noise": floor.noise_a,
+                    "least": floor.least_a,
                     "source": floor.source.value,
                     "std_percent": floor.std_percent,
                     "dwells": floor.parts if floor.source is FloorSource.STANDSTILL else None,
@@ -432,8 +526,11 @@ def residual_document(fitted: Fit, account: Account, calibration: Calibration) -
             ],
             "relative_error_percent": error_document(account.floor),
             "holdout_error_percent": error_document(account.holdout_floor),
+            "least_error_percent": error_document(account.least_floor),
+            "least_holdout_error_percent": error_document(account.least_holdout_floor),
+            "confidence": CONFIDENCE,
         },
-        "time_skew": None if skew is None else {"seconds": skew[0], "std": skew[1]},
+        **skew_document(account.skew),
         "gear_loss": [
             {"axis": axis, **picked(gear, *_OF_A_GEAR)}
             for axis, gear in zip(axes, gear_losses(fitted.steps[-1]), strict=True)

@@ -15,13 +15,27 @@ from daq.report.fit import coefficients, identifiability_notes, start_of
 from daq.report.gains import with_deviation
 from daq.report.html import MARK, figure, folded, listed, pair, paragraph, table
 from daq.report.plots import draw_effect, draw_torques, drawn_axis, plot_ranking
-from daq.report.residual import WHEN, error_rows, gains_sentence, residual_document, summary
+from daq.report.residual import (
+    CANDIDATE_HEADINGS,
+    CANDIDATES,
+    WHEN,
+    candidate_rows,
+    declared_sentences,
+    effect_sizes,
+    error_rows,
+    gains_sentence,
+    residual_document,
+    searched_steps,
+    summary,
+    turn_sentences,
+)
 from daq.report.svg import Interval, intervals
 from daq.report.text import json_text, percent_text
 from daq.workflow.fit import Fit
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account, BeforeAfter
 from ident.discovery.evidence import Evidence
+from ident.discovery.joining import SetAside
 from ident.discovery.loop import Step
 from ident.effects.effect import PlacedEffect
 from ident.effects.unnamed import is_unnamed
@@ -64,16 +78,18 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration, compa
         if turn is not None:
             sections += [_effect(fitted, before, step, turn, placed) for placed in turn.added]
         before = step.after
+    sentences = (*declared_sentences(fitted), *summary(fitted, account, calibration.effects))
     details = (
-        folded("What was found, in sentences", listed(summary(fitted, account, calibration.effects))),
+        folded("What was found, in sentences", listed(sentences)),
         folded(
             "Errors without and with the effects",
             table("Relative error ‖e‖/‖v‖ [%]", ("", *axes, "total"), errors, "names"),
             paragraph(
                 "Error: the share of each motor's current that the model leaves, ‖e‖/‖v‖, over the rows in motion; "
                 "in total with each current weighted by its gain. Compare errors only under the same filters (end "
-                "of this page). Noise floor: the share that the current's noise would leave, as measured at "
-                "standstill or between repeated moves, whichever is smaller."
+                "of this page). Noise, at least: what the current's noise alone leaves, no less at 95 % confidence, as "
+                "measured at standstill or between repeated moves, whichever is smaller. No model's error is smaller; "
+                "it may be several times as large where the noise in motion is larger."
             ),
         ),
         *sections,
@@ -83,8 +99,9 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration, compa
             pair(map(figure, draw_torques(before, fitted.cell))),
         ),
         _gains(fitted, account),
-        *(_turn(fitted, number, step) for number, step in enumerate(fitted.steps, start=1)),
-        _limits(fitted),
+        folded("Effects by their names in files and commands", listed(effect_sizes(calibration))),
+        *(_turn(fitted, number, step) for number, step in enumerate(searched_steps(fitted), start=1)),
+        _limits(fitted, calibration),
     )
     return certificate_page(certify(calibration, comparison), gains_sentence(fitted, account), details)
 
@@ -167,9 +184,6 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
     named = step.ranked(_SHOWN)
     own = [(one.effect, one.axis) for one in named]
     shown = (*named, *(o for o in step.structures[:_SHOWN] if o.passed and (o.effect, o.axis) not in own))
-    outcome = "Nothing passed every check and nothing was added."
-    if added is not None:
-        outcome = f"Added to {axes[added.axis]}: {effect_text(added.effect, axes)}."
     ranking = paragraph("No candidate could be tried.")
     if shown:
         ranked = sorted(shown, key=lambda finding: -finding.held_out_fall)
@@ -178,23 +192,34 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
             "Candidates by how much they reduce the error of left-out moves. Full: passed every check. Pale: these "
             "data cannot distinguish it from the added one. Hollow: failed a check.",
         )
-    refused = [
-        f"Not added to {axes[aside.finding.axis]}: {effect_text(aside.finding.effect, axes)}: {aside.reason(axes)}."
-        for aside in step.set_aside
-    ]
-    return folded(f"Search, round {number}: what was tried", paragraph(" ".join((outcome, *refused))), ranking)
+    told = [_in_words(fitted, aside) for aside in step.set_aside]
+    if added is not None:
+        told.append(f"Added to {axes[added.axis]}: {effect_text(added.effect, axes)}.")
+    return folded(
+        f"Search, round {number}: what was tried",
+        listed((*turn_sentences(fitted, step), *told)),
+        ranking,
+        table(f"Turn {number}: {CANDIDATES}", CANDIDATE_HEADINGS, candidate_rows(fitted, step, _SHOWN), "names"),
+    )
 
 
-def _limits(fitted: Fit) -> str:
+def _in_words(fitted: Fit, aside: SetAside) -> str:
+    axes = fitted.cell.place_names
+    words = effect_text(aside.finding.effect, axes)
+    return f"Not added to {axes[aside.finding.axis]}: {words}: {aside.reason(axes)}."
+
+
+def _limits(fitted: Fit, calibration: Calibration) -> str:
     held = fitted.estimate.gains_fixed
     limits = (
-        *identifiability_notes(fitted),
+        *identifiability_notes(fitted, calibration.payload_mass),
         "A torque constant that is wrong by a constant factor is part of the gain, and an effect that is the same at "
         "every speed, load and position is part of the parameters: neither leaves a residual.",
         *(("The gains were held: an error in them is hidden in the parameters.",) if held else ()),
         "Backlash or elasticity behind an encoder on the motor may leave no trace in these signals.",
         "An effect is named after the variable it depends on and the shape of that dependence; another cause with the "
         "same dependence would get the same name. Indistinguishable effects are listed with each effect.",
-        "The noise floor is a lower bound: an error above it need not be an effect.",
+        "The noise floor is a lower bound (95 % confidence), and often a loose one: noise that acts in motion only is "
+        "not in it. An error above it need not be an effect.",
     )
     return folded("What these data can and cannot show", listed(limits))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from textwrap import wrap
 from typing import Any
 
@@ -38,6 +39,25 @@ def terminal_lines(text: str) -> str:
     """Lines of a diff: control characters except tabs spelled out, line ends as \\n."""
     lines = text.splitlines()
     return "\n".join("".join(c if c.isprintable() or c == "\t" else _spelled(c) for c in line) for line in lines)
+
+
+@dataclass(frozen=True, slots=True)
+class Sentence:
+    """A sentence of a view: a terminal breaks it at spaces alone, a pipe gets one line."""
+
+    text: str
+    style: str = ""  #: of rich
+
+    def __str__(self) -> str:
+        return self.text
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Render as lines that fit the terminal."""
+        text = printable(self.text)
+        if console.is_terminal:
+            lines = wrap(text, options.max_width, break_long_words=False, break_on_hyphens=False)
+            text = "\n".join(lines)
+        yield Text(text, style=self.style)
 
 
 class WholeTable(Table):

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import RenderableType
-from rich.text import Text
 
 from daq.files import replace_file
 from daq.report import paper_tables
@@ -18,7 +17,7 @@ from daq.report.fit import error_document
 from daq.report.gains import diagnosis_texts
 from daq.report.plots import plot_torques
 from daq.report.svg import sheet
-from daq.report.text import percent_text, picked, plain_table, printable, terminal_text
+from daq.report.text import Sentence, percent_text, picked, plain_table, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
 from daq.workflow.validate import CrossValidation, DataUse, Validation, WeighedRun, conditioning_of, together
 from ident.calibration import Calibration
@@ -35,7 +34,7 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
         table.add_row(terminal_text(name), *map(percent_text, (*error.axes, error.total)), use)
     yield table
     filter_ = conditioning_of(calibration)
-    yield (
+    yield Sentence(
         f"Position filter {filter_.position_cutoff_hz:g} Hz, decimation {filter_.decimation_cutoff_hz:g} Hz, as in the "
         "fit. Compare relative errors only under the same filters."
     )
@@ -52,7 +51,7 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
         if validation.error.total > DOUBTFUL_PERCENT
     ]
     doubts += [f"{run.run}: {run.left_out}" for run in found.runs if run.left_out]
-    yield from (Text(printable(doubt), style="bold") for doubt in doubts)
+    yield from (Sentence(doubt, "bold") for doubt in doubts)
     for paper_table in validation_tables(found, complete=False):
         yield ""
         yield from paper_table.view(numbered=False)
@@ -102,6 +101,7 @@ def validation_document(
         "axes": [gain.axis for gain in calibration.gains],
         "filter": calibration.filter,
         "fit_relative_error_percent": error_document(calibration.relative_error_percent),
+        "payload_mass": [asdict(one) for one in calibration.payload_mass],
         "logs": [
             {
                 "log": str(validation.log),

@@ -1,7 +1,7 @@
 """`calibration.yaml`, the result of a fit: written whole, read strictly, and every edit by hand is detected.
 
 The file adds percentages for people and writes NaN as null. Sections without such a difference (`Source`, `Recording`,
-`Diagnosis`) are read as the classes of `ident`.
+`Diagnosis`, `PayloadMass`) are read as the classes of `ident`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from daq.config.cell_schema import CUTOFF_HZ, FILTER_ORDER
 from daq.config.yaml_file import MAX_BYTES, StrictModel, parse_yaml, read_model
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, SchemaMismatch, YamlInvalid
 from daq.files import read_regular, replace_file
-from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
+from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, PayloadMass, Source
 from ident.errors import Diagnosis
 from ident.estimators.estimate import RelativeError
 
@@ -112,6 +112,7 @@ class CalibrationBody(StrictModel):
     diagnoses: tuple[Diagnosis, ...] = ()
     current_residual: tuple[_Positive, ...] | None = None
     passive_joints: tuple[str, ...] = ()
+    payload_mass: tuple[PayloadMass, ...] = ()
 
 
 class CalibrationDocument(CalibrationBody):

@@ -27,7 +27,7 @@ from daq.workflow.declared_effects import (
 )
 from daq.workflow.diagnoses import currents_as_cause, diagnose_fit
 from daq.workflow.validate import diagnose_log
-from ident.calibration import Calibration, Source
+from ident.calibration import Calibration, PayloadMass, Source
 from ident.calibration import calibration_of as identified_calibration
 from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
@@ -373,8 +373,10 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
         fitted: with or without effects.
         created: when, with its time zone.
     """
+    predicting = _calibration(fitted)
     return replace(
-        _calibration(fitted),
+        predicting,
+        payload_mass=_with_tolerances(predicting.payload_mass, fitted.cell),
         created=created.isoformat(timespec="seconds"),
         software=software(),
         nameplate_holdout_error_percent=_nameplate_error(fitted),
@@ -399,6 +401,12 @@ def _calibration(fitted: Fit) -> Calibration:
         configuration_sha256=cell.digest,
         recording_configuration_sha256=cell.recording_digest,
     )
+
+
+def _with_tolerances(influences: Sequence[PayloadMass], cell: Cell) -> tuple[PayloadMass, ...]:
+    """Add the tolerance of each weighing, from the cell."""
+    declared = {payload.name: payload.mass_tolerance_kg for payload in cell.payloads}
+    return tuple(one.weighed_to(declared.get(one.payload, 0.0)) for one in influences)
 
 
 def _nameplate_error(fitted: Fit) -> RelativeError | None:

@@ -45,6 +45,7 @@ from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import PairedChange, compare_by_move
 from ident.discovery.loop import Step
 from ident.discovery.noise_floor import NoiseFloor, noise_floors
+from ident.discovery.time_skew import Skew, time_skew
 from ident.drift.change import FALSE_ALARM
 from ident.effects.effect import PlacedEffect
 from ident.equations.currents import whitening_transform
@@ -286,13 +287,18 @@ class Account:
 
     floors: tuple[NoiseFloor | None, ...]  #: noise of each motor's current, None where it is not known
     left_a: FloatArray  #: `left_on` the rows of the fit after the last turn [A]
-    #: Error that this noise alone would leave on the rows of the fit [%], at most that of either model; NaN where it
-    #: is not known or refuted.
+    #: Error that this noise alone would leave on the rows of the fit [%]: an estimate, at most the error of either
+    #: model; NaN where it is not known or refuted.
     floor: RelativeError
     holdout_floor: RelativeError | None  #: the same on held-out rows, None without any
+    #: The same of the lower limit of the noise (`NoiseFloor.least_a`): no model's error is smaller.
+    least_floor: RelativeError
+    least_holdout_floor: RelativeError | None  #: the same on held-out rows, None without any
     turns: tuple[BeforeAfter | None, ...]  #: change by each turn of the loop, None where it added nothing
     total: BeforeAfter  #: change from the declared model to the last one
     holdout_change: PairedChange | None  #: of the squared error on held-out rows, None without any
+    #: Delay of the currents after the positions, beside the effects of the last model; None where no instruments exist.
+    skew: Skew | None = None
 
 
 def account(
@@ -331,23 +337,41 @@ def account(
     if end.choice_std is not None:
         last = replace(last, gains_std=end.after.estimate.gains_std, choice_std=end.choice_std)
     left_a = left_on(end.after.training, end.after.estimate)
-    bounds = tuple(
-        None if floor is None or floor.is_refuted(left) else floor for floor, left in zip(floors, left_a, strict=True)
-    )
+    progress("time skew by instruments from the demanded motion")
+    skew = time_skew(end.after)
+    known: list[NoiseFloor | None] = []
+    least: list[NoiseFloor | None] = []
+    for floor, left in zip(floors, left_a, strict=True):
+        if floor is None or floor.is_refuted(left):
+            known.append(None)
+            least.append(None)
+        else:
+            known.append(floor)
+            least.append(replace(floor, noise_a=floor.least_a))
 
-    def floor_below(before: Observation, after: Observation) -> RelativeError:
-        """Floor of some rows: where a model leaves less, within the floor's own σ, the model is at the floor."""
+    def error_of(noises: Sequence[NoiseFloor | None], before: Observation, after: Observation) -> RelativeError:
+        """Error by noise alone on some rows; a model that leaves less by chance is at the floor."""
         left = np.fmin(left_on(before, start.estimate), left_on(after, end.after.estimate))
-        return floor_on(before, start.estimate, capped(bounds, left)).relative(weights_nm_a)
+        return floor_on(before, start.estimate, capped(noises, left)).relative(weights_nm_a)
 
+    training = start.training, end.after.training
+    holdout_floor: RelativeError | None = None
+    least_holdout_floor: RelativeError | None = None
+    if start.holdout is not None:
+        holdout = start.holdout, end.after.holdout or start.holdout
+        holdout_floor = error_of(known, *holdout)
+        least_holdout_floor = error_of(least, *holdout)
     return Account(
         floors=floors,
         left_a=left_a,
-        floor=floor_below(start.training, end.after.training),
-        holdout_floor=None if start.holdout is None else floor_below(start.holdout, end.after.holdout or start.holdout),
+        floor=error_of(known, *training),
+        holdout_floor=holdout_floor,
+        least_floor=error_of(least, *training),
+        least_holdout_floor=least_holdout_floor,
         turns=tuple(turns),
         total=before_after(first, last),
         holdout_change=holdout_change(start, end.after),
+        skew=skew,
     )
 
 

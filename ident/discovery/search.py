@@ -66,7 +66,8 @@ class Finding:
     fold_errors: FloatArray  #: ‖e‖² of the whole on each fold, shape (folds,), for paired comparisons
     #: Other effects that cannot be distinguished from this one by their score on held-out moves.
     ambiguity: tuple[PlacedEffect, ...] = ()
-    #: Of the motor's squared residual beyond its noise floor; None where the floor is not known.
+    #: Least share of the motor's squared residual beyond noise: the floor is a lower bound. None where the floor is not
+    #: known, or nothing is left beyond it.
     share_of_excess: float | None = None
     refusals: tuple[str, ...] = ()  #: gates that it did not pass, in words
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
+from contextlib import redirect_stderr
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from rich.console import Console, RenderableType
 
 from daq.cli.app import main
 from daq.config.cell import model_of
@@ -18,6 +22,7 @@ from daq.report.schemas import DemoReport
 from ident.errors import RolesExchanged
 from ident.estimators.identify import identify
 from ident.estimators.refusals import require_roles
+from tests.pipeline.next_step import next_step
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +129,47 @@ def test_exchanged_roles_turn_all_signs_and_are_named(demonstration: Path) -> No
     require_roles(estimate.gains, nameplate)
     with pytest.raises(RolesExchanged, match="exchanged"):
         require_roles(-estimate.gains, nameplate)
+
+
+@pytest.mark.parametrize("columns", [80, 120])
+def test_residual_prints_one_screen(
+    demonstration: Path,
+    searched: tuple[str, list[RenderableType]],
+    columns: int,
+) -> None:
+    """Standard output and standard error together, as a terminal or a log shows them."""
+    progress, parts = searched
+    out = StringIO()
+    console = Console(file=out, width=columns, soft_wrap=True, highlight=False, markup=False, force_terminal=True)
+    for part in parts:
+        console.print(part)
+    lines = out.getvalue().splitlines() + progress.splitlines()
+    assert len(lines) <= 40
+    text = " ".join(out.getvalue().split())
+    assert "J3 has friction that grows with the load: the error of J3 on held-out runs falls from" in text
+    assert "Drive gains with the effects" in text
+    assert f"Written: {demonstration / 'again.yaml'}" in text
+    assert next_step(progress.splitlines()[-1]) == "validate"
+
+
+@pytest.fixture(scope="module")
+def searched(demonstration: Path) -> tuple[str, list[RenderableType]]:
+    """What `residual` says on standard error, and the parts of what it prints on standard output."""
+    names = ("bare-1", "loaded-1", "bare-2", "loaded-2")
+    logs = [str(demonstration / f"{name}.mcap") for name in names]
+    out = demonstration / "again.yaml"
+    said = StringIO()
+    parts: list[RenderableType] = []
+
+    def keep(view: Iterable[RenderableType], *written: Path | None) -> None:
+        parts.extend(view)
+        parts.extend(f"Written: {path}" for path in written if path is not None)
+
+    with pytest.MonkeyPatch.context() as patch, redirect_stderr(said):
+        patch.setattr("daq.cli.terminal.print_view", keep)
+        holdout = str(demonstration / "held-out.mcap")
+        assert main(["residual", *logs, "--holdout", holdout, "--out", str(out)]) == ExitCode.OK
+    return said.getvalue(), parts
 
 
 def test_validate_measures_the_calibration_on_the_holdout_run(

@@ -15,11 +15,13 @@ from daq.cli.app import main
 from daq.errors import CalibrationRefused, ExitCode
 from daq.report.certificate import Verdict, certificate_document, certify, without_controller
 from daq.report.certificate_page import certificate_page
+from daq.report.controller_schemas import CertificateReport
 from daq.report.effect_names import curve_of, size_text
 from daq.report.gains import with_deviation
+from daq.report.text import json_text
 from daq.workflow.calibration_file import save_calibration
 from daq.writeback.gates.gate import Gate
-from ident.calibration import AcceptedEffect, Calibration, Parameter
+from ident.calibration import AcceptedEffect, Calibration, Parameter, PayloadMass
 from ident.effects.effect import PlacedEffect
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Smooth
@@ -91,13 +93,41 @@ def test_the_mass_is_shown_as_it_was_entered_twice_and_what_is_missing_is_said()
     calibration = with_recordings(demo_calibration(), operator="Ada")
     texts = Reader(_page(calibration)).texts
     entered = "disc: 4.59 kg in the cell file, 4.592 and 4.588 kg on the scale"
-    assert f"{entered}; with a mass wrong by 1 % every gain is wrong by 1 %" in texts
+    assert f"{entered}; a wrong mass changes every gain, by the same share where nothing else of it is known" in texts
     assert "Ada" in texts
     bare = replace(calibration, sources=(), holdout_error_percent=None, effects=())
     texts = Reader(_page(bare)).texts
     assert "not known: the recordings name none" in texts
     assert any("No run was held out" in text for text in texts)
     assert "The calibration holds no effect beyond the declared model." in texts
+
+
+def test_the_dependence_of_the_gains_on_the_mass_is_on_the_sheet_and_in_the_details() -> None:
+    calibration = with_recordings(demo_calibration(), operator="Ada")
+    gains = calibration.gains
+    alike = PayloadMass.of("disc", 4.59, [gain.value / 4.59 for gain in gains], gains).weighed_to(0.0459)
+    texts = Reader(_page(replace(calibration, payload_mass=(alike,)))).texts
+    sheet = next(text for text in texts if text.startswith("disc: 4.59 kg in the cell file"))
+    assert "with a mass of disc that is wrong by 1 %, every gain is wrong by 1 %" in sheet
+    assert "4.59 kg ± 0.0459 kg, which is ± 1 % of every gain, not in σ" in sheet
+    assert "Dependence of the gains on the payload's mass" in texts
+    assert f"{gains[0].value / 4.59:.4g}" in texts
+    # With the drawing known too, each gain has a number.
+    shares = np.linspace(0.1, 0.6, len(gains))
+    slopes = [share * gain.value / 4.59 for share, gain in zip(shares, gains, strict=True)]
+    drawn = replace(calibration, payload_mass=(PayloadMass.of("disc", 4.59, slopes, gains).weighed_to(0.0459),))
+    sheet = next(text for text in Reader(_page(drawn)).texts if text.startswith("disc: 4.59 kg in the cell file"))
+    assert f"the gains are wrong by: {gains[0].axis} 0.10 %, " in sheet
+    assert "which is at most ± 0.6 % of every gain, not in σ" in sheet
+    document = certificate_document(certify(drawn, without_controller(drawn, "", NOW)))
+    CertificateReport.model_validate_json(json_text(document))
+    (found,) = document["payload_mass"]
+    assert (found["payload"], found["mass_kg"], found["tolerance_kg"]) == ("disc", 4.59, 0.0459)
+    for one, gain, share in zip(found["gains"], gains, shares, strict=True):
+        assert one["axis"] == gain.axis
+        assert one["percent_per_percent"] == pytest.approx(share)
+        assert one["per_kg"] == pytest.approx(share * gain.value / 4.59)
+        assert one["tolerance_std"] == pytest.approx(0.01 * share * abs(gain.value))
 
 
 def test_what_files_say_is_escaped() -> None:

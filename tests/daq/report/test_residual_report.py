@@ -6,15 +6,19 @@ import errno
 import json
 import math
 import os
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from html.parser import HTMLParser
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
+from rich.cells import cell_len
+from rich.console import Console, RenderableType
 from rich.table import Table
 
 from daq.cli.app import main
@@ -27,12 +31,22 @@ from daq.report.effect_names import WORDS, effect_text, other_axis
 from daq.report.fit_schemas import ResidualReport
 from daq.report.html import page, paragraph, table
 from daq.report.plots import draw_fit
-from daq.report.residual import _gear_sentence, error_change_text, residual_document, summary, turns_view
+from daq.report.residual import (
+    _gear_sentence,
+    error_change_text,
+    headline,
+    residual_document,
+    residual_view,
+    statistical_sentences,
+    summary,
+    turns_view,
+)
 from daq.report.residual_page import DOCUMENT, PAGE, residual_page, save_report
-from daq.report.text import json_text
+from daq.report.text import Sentence, json_text
 from daq.workflow import fit as fit_module
+from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.fit import Fit, calibration_of, fit
-from ident.calibration import AcceptedEffect
+from ident.calibration import AcceptedEffect, Calibration
 from ident.discovery import before_after as before_after_module
 from ident.discovery.before_after import Account, account
 from ident.discovery.evidence import with_effects
@@ -42,9 +56,9 @@ from ident.discovery.joining import SetAside
 from ident.discovery.loop import Step
 from ident.discovery.noise_floor import FloorSource, NoiseFloor
 from ident.discovery.search import Finding
+from ident.discovery.time_skew import Skew
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect
-from ident.effects.electrical import TimeSkew
 from ident.effects.friction import Coupling, LoadFriction
 from ident.effects.position import Spring
 from ident.effects.signals import Abscissa
@@ -342,21 +356,152 @@ def test_a_noise_floor_above_the_error_of_the_model_is_reported_with_its_cause(c
     assert motors[2]["left"] == pytest.approx(left_a[2])
 
 
-def test_a_skew_of_time_within_its_noise_is_not_said(closed: Closed) -> None:
+def test_a_time_skew_is_stated_only_where_instruments_confirm_it(closed: Closed) -> None:
+    """Least squares are certain of −3 ms in each of these."""
+    biased = Skew(4e-5, 6e-5, fit_seconds=-3e-3, fit_std=4e-4, confirmed=False, is_in_model=False)
+    confirmed = replace(biased, seconds=-2e-3, confirmed=True)
+    sentence = "Currents were sampled 2.00 ± 0.06 ms before the positions, the same on every axis"
+    for skew, stated in ((None, False), (biased, False), (confirmed, True)):
+        made = Closed(closed.fitted, replace(closed.account, skew=skew))
+        sentences = summary(made.fitted, made.account, ())
+        assert any(text.startswith(sentence) for text in sentences) is stated
+        assert any("Currents were sampled" in text for text in sentences) is stated
+        assert any("3.0" in text and " ms" in text for text in sentences) is False
+        shown = headline(made.fitted, made.account, ())
+        assert any("skew" in text or "sampled" in text for text in shown) is stated
+        document = made.document()
+        assert document["time_skew"] == ({"seconds": -2e-3, "std": 6e-5} if stated else None)
+        tested = document["time_skew_by_instruments"]
+        assert (tested is None) == (skew is None)
+        if skew is not None:
+            assert tested == asdict(skew)
+        ResidualReport.model_validate_json(json_text(document))
+    unknown, unconfirmed = (
+        statistical_sentences(closed.fitted, replace(closed.account, skew=skew)) for skew in (None, biased)
+    )
+    assert any(text.startswith("A time skew between currents and positions is not known") for text in unknown)
+    assert any("0.04 ± 0.06 ms, which may be zero" in text for text in unconfirmed)
+
+
+@dataclass(frozen=True)
+class Screen:
+    """Lines of a terminal."""
+
+    text: str
+
+    @property
+    def lines(self) -> list[str]:
+        return self.text.splitlines()
+
+
+def _on_screen(parts: Iterable[RenderableType], columns: int) -> Screen:
+    out = StringIO()
+    console = Console(
+        file=out, width=columns, soft_wrap=True, highlight=False, markup=False, force_terminal=True, color_system=None
+    )
+    for part in parts:
+        console.print(part)
+    return Screen(out.getvalue())
+
+
+def _with_three_effects(closed: Closed) -> Closed:
+    """Two more effects with every kind of sentence: diagnoses, a skew, a refutation, findings that did not join."""
     first, last = closed.fitted.steps
-    for seconds, said in ((4e-5, False), (-4e-4, True)):
-        skew = replace(
-            _finding(PlacedEffect(TimeSkew(), 0), passed=False),
-            coefficients=np.array([seconds]),
-            deviations=np.array([6e-5]),
-        )
-        skewed = replace(closed.fitted, steps=(first, replace(last, findings=(skew,))))
-        sentence = "Currents were sampled 0.40 ± 0.06 ms before the positions"
-        assert any(text.startswith(sentence) for text in summary(skewed, closed.account, ())) is said
-        assert residual_document(skewed, closed.account, calibration_of(skewed, CREATED))["time_skew"] == {
-            "seconds": seconds,
-            "std": 6e-5,
-        }
+    places = (PlacedEffect(LoadFriction(0), 1), PlacedEffect(Smooth(Abscissa.POSITION), 4))
+    after = replace(first.after, effects=(SPRING, *places))
+    (turn, _) = closed.account.turns
+    assert turn is not None
+    found = [_finding(place, rivals=(SPRING, places[0])) for place in places]
+    asides = tuple(SetAside(_finding(PlacedEffect(LoadFriction(0), axis)), moved=((3, 2.91),)) for axis in range(6))
+    refused = replace(_finding(PlacedEffect(LoadFriction(0), 3), passed=False), refusals=("coefficient is -1 ± 0.1",))
+    steps = (
+        replace(first, after=after),
+        *(replace(first, accepted=one, findings=(one,), after=after) for one in found),
+        replace(last, after=after, set_aside=asides, findings=(refused,)),
+    )
+    turns = (turn, *(replace(turn, added=(place,)) for place in places), None)
+    gains = tuple(replace(gain, significant=True) for gain in closed.account.total.gains)
+    account = replace(
+        closed.account,
+        turns=turns,
+        total=replace(closed.account.total, gains=gains),
+        holdout_change=PairedChange(1.3, 1.0, 20),
+        skew=Skew(-2e-3, 6e-5, fit_seconds=-3e-3, fit_std=4e-4, confirmed=True, is_in_model=False),
+    )
+    odd = Diagnosis("payload-differs", ("loaded-2",), (), "a body", "another", "was it turned?")
+    return Closed(replace(closed.fitted, steps=steps, diagnoses=(odd,)), account)
+
+
+def _calibrated(made: Closed, effects: int) -> Calibration:
+    calibration = calibration_of(replace(made.fitted, steps=()), CREATED)
+    worse = AcceptedEffect("spring", "J3", {}, (), 2.98, 3.11, ("load-friction on J2",) * 5)
+    return replace(calibration, effects=(worse,) * effects, diagnoses=made.fitted.diagnoses)
+
+
+@pytest.mark.parametrize("columns", [80, 120])
+def test_what_is_printed_fits_one_screen_and_breaks_no_word(closed: Closed, columns: int) -> None:
+    made = _with_three_effects(closed)
+    calibration = _calibrated(made, 3)
+    screen = _on_screen(residual_view(made.fitted, made.account, calibration), columns)
+    # Calibration, report and the next command follow, a line each.
+    assert len(screen.lines) <= 40 - 3
+    assert all(cell_len(line) <= columns for line in screen.lines)
+    whole = _on_screen(residual_view(made.fitted, made.account, calibration), 10_000)
+    assert screen.text.split() == whole.text.split()
+    for words in ("CHECK loaded-2", "J3 has a spring", "J2 has friction", "J5 has a torque", "Currents were sampled"):
+        assert words in whole.text
+    for gain in calibration.gains:
+        assert f"{gain.std_percent:.2f}" in screen.text
+        assert f"{gain.change_percent:+.1f}" in screen.text
+    for statistics in ("Turn 1", "would have been detected", "Not added", "failed a check", "may have", "scales all"):
+        assert statistics not in screen.text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_the_report_has_every_sentence_and_number_of_the_verbose_output(closed: Closed) -> None:
+    made = _with_three_effects(closed)
+    calibration = _calibrated(made, 3)
+    page = Reader(residual_page(made.fitted, made.account, calibration))
+    text = " ".join(page.text.split())
+    listed = {" ".join(one.split()) for one in page.texts}
+    parts = [*residual_view(made.fitted, made.account, calibration, verbose=True)]
+    sentences = [" ".join(part.text.replace("`", "").split()) for part in parts if isinstance(part, Sentence)]
+    assert len(sentences) > 15
+    # A command in a sentence is an element of its own on the page.
+    joined = " ".join(text.replace(" .", ".").replace(" ,", ",").split())
+    assert [one for one in sentences if one not in joined and one not in text] == []
+    tables = [part for part in parts if isinstance(part, Table)]
+    assert len(tables) == len(made.fitted.steps) + 2
+    for table_ in tables[:-1]:
+        cells = [str(cell) for column in table_.columns for cell in (column.header, *column.cells)]
+        assert [cell for cell in cells if cell and cell not in listed] == []
+    # The verbose output has what the screen has.
+    shown = residual_view(made.fitted, made.account, calibration)
+    short = [part.text for part in shown if isinstance(part, Sentence)][:-1]
+    assert set(short) <= {part.text for part in parts if isinstance(part, Sentence)}
+
+
+def test_the_dependence_on_the_mass_is_in_the_documents_and_in_a_sentence(closed: Closed, tmp_path: Path) -> None:
+    payloads = tuple(replace(one, mass_tolerance_kg=0.0459) for one in closed.fitted.cell.payloads)
+    weighed = replace(closed.fitted, cell=replace(closed.fitted.cell, payloads=payloads))
+    calibration = calibration_of(weighed, CREATED)
+    (document,) = residual_document(weighed, closed.account, calibration)["payload_mass"]
+    assert document["tolerance_kg"] == 0.0459
+    for one, gain in zip(document["gains"], calibration.gains, strict=True):
+        assert one["percent_per_percent"] == pytest.approx(1.0, abs=0.01)
+        assert one["per_kg"] == pytest.approx(gain.value / document["mass_kg"], rel=0.01)
+        assert one["tolerance_std"] == pytest.approx(abs(one["per_kg"]) * 0.0459)
+    verbose = residual_view(weighed, closed.account, calibration, verbose=True)
+    sentences = [part.text for part in verbose if isinstance(part, Sentence)]
+    assert any("which is ± 1 % of every gain, not in σ" in one for one in sentences)
+    # The file has it, and one of an earlier version is read without.
+    path = tmp_path / "calibration.yaml"
+    save_calibration(calibration, path)
+    assert load_calibration(path).payload_mass == calibration.payload_mass
+    earlier = yaml.safe_load(path.read_text(encoding="utf-8"))
+    del earlier["payload_mass"], earlier["digests"]["payload_mass"]
+    path.write_text(yaml.safe_dump(earlier, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    assert load_calibration(path).payload_mass == ()
 
 
 def test_the_summary_says_what_the_effects_change(closed: Closed) -> None:
@@ -628,7 +773,7 @@ def test_the_verb_writes_the_report_and_says_the_same(
     shelved: Shelf, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "report"
-    command = ["residual", *NAMES[:3], "--holdout", NAMES[3], "--report", str(folder)]
+    command = ["residual", *NAMES[:3], "--holdout", NAMES[3], "--report", str(folder), "--verbose"]
     assert main(command) == ExitCode.OK
     text, progress = capsys.readouterr()
     assert "adding spring on J3" in progress

@@ -268,6 +268,11 @@ def test_no_floor_exceeds_the_error_on_the_same_rows(
             assert np.all(np.array((*floor.axes, floor.total)) <= np.array((*error.axes, error.total)) * (1.0 + 1e-9))
     assert made.floor.axes[2] == pytest.approx(last.in_sample.axes[2])
     assert made.floors == floors  # as measured
+    # The lower limit of such a floor, a seventh below it, is below the error.
+    expected = np.array([floor.least_a for floor in floors]) / left_a
+    assert np.all(expected < 1.0)
+    ratio = np.array(made.least_floor.axes) / last.in_sample.axes
+    assert ratio == pytest.approx(expected)
 
 
 def test_fixed_gains_do_not_change(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:

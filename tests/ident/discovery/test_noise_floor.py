@@ -101,6 +101,22 @@ def test_the_estimates_scatter_as_they_say_and_are_not_biased(resting: tuple[Dat
     assert relative.std() == pytest.approx(reported, rel=0.25)
 
 
+def test_the_lower_limit_is_below_the_noise_as_often_as_it_says(resting: tuple[Dataset, ...]) -> None:
+    """The estimate itself is no bound: half of the draws are above the noise."""
+    above: list[bool] = []
+    above_limit: list[bool] = []
+    for seed in range(40):
+        floors = _all(noise_floors(_noisy(resting, seed), CONDITIONING))
+        for floor, expected in zip(floors, _expected_a(resting[0]), strict=True):
+            above.append(floor.noise_a > expected)
+            above_limit.append(floor.least_a > expected)
+            assert 0.7 * floor.noise_a < floor.least_a < floor.noise_a
+    draws = len(above)
+    assert 0.35 * draws < sum(above) < 0.65 * draws
+    # Of 240 draws, 12 are expected above a limit of 95 %; 23 and more come in one of a thousand such tests.
+    assert 1 <= sum(above_limit) <= 22
+
+
 def test_slips_in_some_dwells_do_not_become_the_noise(resting: tuple[Dataset, ...]) -> None:
     """A quarter of the dwells spoilt moves the median to a higher quantile; a mean would follow the steps' size."""
     slipping = []
