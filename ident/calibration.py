@@ -79,7 +79,7 @@ class AcceptedEffect:
 
 @dataclass(frozen=True, slots=True)
 class MassInfluence:
-    """What the mass of a payload does to one gain, to first order; no residual shows a wrong mass."""
+    """What the mass of a payload does to one gain, to first order."""
 
     axis: str  #: name of the axis
     per_kg: float  #: dg/dm [unit of the gain per kg]

@@ -1,9 +1,9 @@
 """Bus lock: one program of drivegain at a time sends to the drives of a bus.
 
-Whatever sends to the drives takes the lock of their bus first: recordings, jobs, scans, writes to drives. `monitor`
-sends nothing while another program has it. It is the lock of flock(2) on a file in a folder of the system, and ends
-with its process. It excludes other programs of drivegain on this computer; a foreign master, or a recorder on another
-computer, is detected on the bus itself (BusBusy).
+Every verb and job that moves, scans or writes to drives takes the lock of their bus first. `monitor` takes none, and
+sends nothing while another program has it; a call of the library takes none. It is the lock of flock(2) on a file in a
+folder of the system, and ends with its process. It excludes other programs of drivegain on this computer; a foreign
+master, or a recorder on another computer, is detected on the bus itself (BusBusy).
 """
 
 from __future__ import annotations

@@ -62,11 +62,12 @@ def diagnose_fit(found: Identification, cell: Cell, logs: Sequence[Path], read: 
     Args:
         found: with all effects.
         cell: description of its cell.
-        logs: of the fit; read again where exchanged currents are looked for.
+        logs: of the fit; read again where exchanged currents, or currents without a sign, are looked for.
         read: reads a log as the fit did.
 
     Raises:
         PayloadUnseen, ModelContradicted: a mistake leaves no usable number.
+        CurrentUnsigned: drives report the size of their currents only.
     """
     nameplate = np.array([axis.nameplate_gain for axis in cell.axes])
     effort_limit = read_urdf(cell.urdf).effort_limit[list(robot_of(cell).axis_joints)]

@@ -145,6 +145,6 @@ def _held(subject: str, found: str, expected: str) -> NotReleased:
         subject,
         found=found,
         expected=expected,
-        remedy="nothing moves: close the cell, let everyone leave it and set automatic mode, then record again; the "
-        "next job resumes one that ended here",
+        remedy="nothing moves: close the cell, let everyone leave it and set automatic mode, then start again; a job "
+        "goes on where it ended",
     )

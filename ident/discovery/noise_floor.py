@@ -34,7 +34,7 @@ the load over in most dwells, repeated moves where the robot warms up or the pat
 What it is. The estimate is of the noise at rest or between repetitions, which is a part of the noise in motion: neither
 shows all ripple, commutation error and differentiated noise of the encoder; noise slower than a part is subtracted with
 the parabola. Where all noise is in the current, it is the noise in motion, and half of the estimates are above it, by
-their own σ. So no estimate is a bound, and `NoiseFloor.least_a`, its lower 95 % limit, is one: none of 96 limits on
+their own σ. So the estimate is not a bound. Its lower 95 % limit, `NoiseFloor.least_a`, is: none of 96 limits on
 axes of clean simulated cells is above the error of a fit of the right model. It is not tight: with noise in the current
 alone it is 0.68 to 1 of that error, where a torque disturbs the arm 0.2 to 0.9 (`tests/studies/floor_study.py`).
 

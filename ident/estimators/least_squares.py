@@ -14,7 +14,7 @@ from ident.estimators.method import Method
 from ident.model.base import independent_columns
 
 MISJUDGED_RATIO = 1.5
-"""Least ratio of the smallest singular values without and with the currents of a joint, where the latter is noise."""
+"""Of `parameters_over_noise`: below it the smallest singular value is not the noise of a current."""
 NO_COLUMN = 1e-8
 """Norm of a column, relative to the largest of the same joint, below which the joint does not have this column."""
 
@@ -35,17 +35,24 @@ def ls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
 def wls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
     """Weighted least squares: rows of a joint are divided by the standard deviation of their error.
 
-    With fixed gains it is that of §2.2, `joint_error_std`. With free gains §2.2 has none to offer: where a known mass
-    exerts no torque on a joint, as on every wrist, the right-hand side of this joint's own equations (eq. 15) is zero.
-    So are their solution and its error. The error of the global ``ls`` is taken there.
+    Arguments and errors as for ``ls``.
+    """
+    return _solve(system, 1.0 / wls_row_std(system, fixed_gains), Method.WLS, fixed_gains)
+
+
+def wls_row_std(system: System, fixed_gains: FloatArray | None = None) -> FloatArray:
+    """Standard deviation by which ``wls`` divides the rows of each joint, shape (n,) [Nm].
+
+    With fixed gains it is that of §2.2, `joint_error_std`. Where gains are free, or the robot is redundant, it is that
+    of the global ``ls`` solution for all joints. §2.2 has none to offer there: where a known mass exerts no torque on a
+    joint, as on every wrist, the right-hand side of this joint's own equations (eq. 15) is zero, and so are their
+    solution and its error. A joint of a redundant robot has no equations of its own.
 
     Arguments and errors as for ``ls``.
     """
     if fixed_gains is not None and not system.model.is_redundant:
-        row_std = joint_error_std(system.joints, fixed_gains)
-    else:
-        row_std = ls(system, fixed_gains).axis_noise
-    return _solve(system, 1.0 / row_std, Method.WLS, fixed_gains)
+        return joint_error_std(system.joints, fixed_gains)
+    return ls(system, fixed_gains).axis_noise
 
 
 def joint_error_std(triangles: Triangles, gains: FloatArray) -> FloatArray:
@@ -138,7 +145,7 @@ def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
     """
     require_known_payload(system)
     triangles = system.joints
-    row_std = _row_std(system, scaling)
+    row_std = tls_row_std(system, scaling)
     vector, covariance, singular = _smallest(triangles, 1.0 / row_std, scaling.has_unit_columns)
     count = system.axis_count
     weighted = system.weighted_singular_values(vector, len(vector) - 1, gains=True)
@@ -159,10 +166,11 @@ def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
 def joint_data_std(triangles: Triangles) -> FloatArray:
     """Standard deviation σ_W^j of the data in the equations of each joint (eq. 22 and §3.3), shape (n,).
 
-    It is the smallest singular value of these equations over √(r − c). Eq. (22) expects full rank c, which W_tot has
-    and a single joint has not: most parameters are absent from its torque, and some of those that are present cannot be
-    told apart in it. Columns below NO_COLUMN of the largest norm, and columns that depend on those before them, are
-    left out. c is the number of the others. A joint without any column has an infinite deviation, so no weight.
+    It is the smallest singular value of these equations over √(r − c). In eq. (22) c is the number of columns, which
+    must be independent. In the equations of one joint they are not: most parameters are absent from its torque, and
+    some of those that are present cannot be distinguished in it. Columns below NO_COLUMN of the largest norm, and
+    columns that depend on those before them, are left out; c is the number of the others. A joint without any column
+    has an infinite deviation, so no weight.
 
     Args:
         triangles: of each joint's rows of W_tot.
@@ -180,28 +188,34 @@ def misjudged_joints(system: System) -> tuple[int, ...]:
 
     Eq. (22) takes the smallest singular value of the joint's equations for noise. Where the moves hardly show one of
     the joint's parameters, a combination of columns of W, which have no noise, has one as small. σ_W^j is then too
-    small, the rows of this joint count for too much, and ``tls`` bends the gains. The smallest singular value of a
-    joint's equations without its currents shows it: noise makes that of all columns smaller by MISJUDGED_RATIO at
-    least where it is well below everything that the moves show.
+    small, the rows of this joint count for too much, and ``tls`` bends the gains.
 
     Args:
         system: of the fit.
     """
     if system.model.is_redundant:
         return ()
-    found = []
-    for joint, factor in enumerate(system.joints.factors):
+    ratios = parameters_over_noise(system)
+    return tuple(np.flatnonzero(ratios < MISJUDGED_RATIO).tolist())
+
+
+def parameters_over_noise(system: System) -> FloatArray:
+    """Smallest singular value of each joint's equations without its currents, relative to that with them, shape (n,).
+
+    Where noise of the currents determines σ_W^j, everything that the moves show of the parameters is well above it.
+    """
+    ratios = []
+    for factor in system.joints.factors:
         own = independent_columns(factor, smallest=NO_COLUMN)
         parameters = [column for column in own if column >= system.axis_count]
-        smallest = singular_values(factor[:, own]).min(initial=np.inf)
+        of_all = singular_values(factor[:, own]).min(initial=np.inf)
         of_parameters = singular_values(factor[:, parameters]).min(initial=np.inf)
-        if of_parameters < MISJUDGED_RATIO * smallest:
-            found.append(joint)
-    return tuple(found)
+        ratios.append(of_parameters / of_all if np.isfinite(of_all) else np.inf)
+    return np.array(ratios)
 
 
-def _row_std(system: System, scaling: Scaling) -> FloatArray:
-    """Divisor of the rows of each joint, shape (n,)."""
+def tls_row_std(system: System, scaling: Scaling = Scaling.ROWS) -> FloatArray:
+    """Standard deviation by which ``tls`` divides the rows of each joint, shape (n,); arguments as for ``tls``."""
     triangles = system.joints
     even = np.ones(len(triangles.factors))
     if scaling in (Scaling.NONE, Scaling.COLUMNS):

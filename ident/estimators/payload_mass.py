@@ -24,6 +24,7 @@ from ident.arrays import FloatArray
 from ident.equations.system import System
 from ident.equations.triangles import Triangles, triangle
 from ident.estimators.estimate import Estimate
+from ident.estimators.least_squares import tls_row_std, wls_row_std
 from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS
 
@@ -78,16 +79,16 @@ def mass_responses(system: System, estimate: Estimate) -> tuple[MassResponse, ..
     )
 
 
-Column = list[tuple[FloatArray, ...]]
+MotorColumns = list[tuple[FloatArray, ...]]
 """A column of W on the rows of each motor, cluster by cluster; on the rows of the demanded motion likewise."""
 
 
 @dataclass(frozen=True, slots=True)
 class _MassColumn:
-    """Column of a mass on the motors' rows."""
+    """MotorColumns of a mass on the motors' rows."""
 
-    clusters: Column
-    instruments: Column  #: empty without instruments
+    clusters: MotorColumns
+    instruments: MotorColumns  #: empty without instruments
 
 
 def _mass_column(system: System, mountings: Sequence[int]) -> _MassColumn | None:
@@ -97,8 +98,8 @@ def _mass_column(system: System, mountings: Sequence[int]) -> _MassColumn | None
     if weights is None and not mass_alone:
         return None
 
-    def on(parts: Sequence[tuple[FloatArray, ...]], leading: int) -> Column:
-        made: Column = []
+    def on(parts: Sequence[tuple[FloatArray, ...]], leading: int) -> MotorColumns:
+        made: MotorColumns = []
         for (_, mounting), rows in zip(system.cluster_runs, parts, strict=True):
             own: list[FloatArray] = []
             for motor in rows:
@@ -125,8 +126,8 @@ def _weights(system: System) -> FloatArray | None:
 def _with_columns(system: System, added: Sequence[_MassColumn]) -> System:
     """Put columns before the last one, that of what is known, on the motors' rows."""
 
-    def widened(parts: Sequence[tuple[FloatArray, ...]], columns: Sequence[Column]) -> Column:
-        made: Column = []
+    def widened(parts: Sequence[tuple[FloatArray, ...]], columns: Sequence[MotorColumns]) -> MotorColumns:
+        made: MotorColumns = []
         for cluster, rows in enumerate(parts):
             own: list[FloatArray] = []
             for motor, matrix in enumerate(rows):
@@ -159,8 +160,10 @@ def _responses(extended: System, estimate: Estimate, count: int) -> FloatArray:
         noise = extended.currents.noise(gains, values)
     elif estimate.method is Method.LS:
         noise = 1.0 / np.abs(gains)
+    elif estimate.method is Method.WLS:
+        noise = wls_row_std(extended) / np.abs(gains)
     else:
-        noise = estimate.axis_noise / np.abs(gains)
+        noise = tls_row_std(extended) / np.abs(gains)
     currents = extended.currents
     whitened = currents.whitened(gains, noise)
     drive = whitened.drive

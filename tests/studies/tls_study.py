@@ -24,7 +24,7 @@ from ident.arrays import FloatArray
 from ident.equations.reduction import reduce_runs
 from ident.equations.system import System
 from ident.estimators.estimate import Estimate
-from ident.estimators.least_squares import Scaling, tls, wls
+from ident.estimators.least_squares import Scaling, parameters_over_noise, tls, wls
 from ident.estimators.maximum_likelihood import ml
 from tests.studies.coverage_cases import EFFECTS, OUT, CaseTask, make_runs
 from tests.studies.direct_cell import run_of
@@ -37,8 +37,8 @@ from tests.studies.study_plans import CELL
 TABLE = Path("docs/evidence/data/tls-model-errors.csv")
 CLEAN_CELLS = 12
 CROWDED_CELLS = 6
-EFFECT_NUMBERS = (2, 0, 6, 26, 19, 21)
-"""Of EFFECTS, one on each of J1 to J6: drag, Stribeck, load friction, coupling, friction by position, cogging."""
+ON_EVERY_AXIS = ("nonlinear-viscous", "stribeck", "load-friction", "coupling", "position-friction", "cogging")
+"""Effects of J1 to J6 in the cells that have one on every axis."""
 WORLD = "measurement"
 ESTIMATORS: dict[str, Callable[[System], Estimate]] = {
     "ml": ml,
@@ -54,7 +54,8 @@ class CrowdedTask(CaseTask):
     @property
     def effects(self) -> tuple[UndeclaredEffect, ...]:
         """One effect for each axis."""
-        return tuple(EFFECTS[number] for number in EFFECT_NUMBERS)
+        by_place = {(effect.name, effect.axis): effect for effect in EFFECTS}
+        return tuple(by_place[name, axis] for axis, name in enumerate(ON_EVERY_AXIS))
 
     @property
     def path(self) -> Path:
@@ -73,6 +74,7 @@ class CellErrors:
         tls_shift_sigmas: |tls − ml| of each gain, in σ of ml.
         tls_shift_percent: the same, in per cent of ml.
         scores: error of each gain over its σ, by estimator; eqs. (10) and (23) for wls and tls.
+        parameters_over_noise: of each joint.
     """
 
     title: str
@@ -81,6 +83,7 @@ class CellErrors:
     tls_shift_sigmas: FloatArray
     tls_shift_percent: FloatArray
     scores: dict[str, FloatArray]
+    parameters_over_noise: FloatArray
 
 
 def errors_of(task: CaseTask) -> CellErrors:
@@ -103,6 +106,7 @@ def errors_of(task: CaseTask) -> CellErrors:
         tls_shift_sigmas=shift / estimates["ml"].gains_std,
         tls_shift_percent=100.0 * shift / np.abs(estimates["ml"].gains),
         scores={name: (estimate.gains - true_gains) / estimate.gains_std for name, estimate in estimates.items()},
+        parameters_over_noise=parameters_over_noise(system),
     )
 
 
@@ -147,6 +151,10 @@ def main(arguments: list[str] | None = None) -> int:
     for name in ("ml", "tls"):
         scores = np.concatenate([cell.scores[name] for cell in clean])
         print_line(f"clean cells: error / σ of {name}, root mean square {np.sqrt(np.mean(scores**2)):.2f}")
+    ratios = np.concatenate([cell.parameters_over_noise for cell in found])
+    print_line(
+        f"smallest singular values without and with the currents: ratio {ratios.min():.1f} to {ratios.max():.1f}"
+    )
     options.table.write_text(as_csv(text), encoding="utf-8")
     return 0
 
