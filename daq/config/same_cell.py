@@ -21,7 +21,7 @@ from ident.model.urdf import read_urdf
 
 _REMEDY = (
     "another robot's description gives wrong gains: give the description of this cell, or none, since the log has its "
-    "own; `cell`, `axes`, joints and drives have to be as in the log, and everything else may be corrected"
+    "own; `name`, `axes`, joints and drives have to be as in the log, and everything else may be corrected"
 )
 
 
@@ -57,18 +57,21 @@ def correction_of(
         ConfigurationError: the log has no description that can be compared.
     """
     name = f"{log}, {CELL}"
+    own: Cell | None
     try:
         own = cell_from_bundle(files, names={CELL: name})
     except (ConfigurationInconsistent, SchemaMismatch):
         # A description that this version refuses may be what the given one corrects: its names are compared.
+        own = None
         found = _mismatch_of_names(files, given, name) or _mismatch_of_drives(None, given, serials)
-        correction = Correction("", (CELL,))
     else:
         found = mismatch(own, given) or _mismatch_of_drives(own, given, serials)
-        correction = Correction(own.digest, differing_sections(own, given))
     if found is not None:
         raise LogsDiffer(log, found=found.found, expected=found.expected, remedy=_REMEDY)
-    return correction if correction.sections else None
+    if own is None:
+        return Correction("", (CELL,))
+    sections = differing_sections(own, given)
+    return Correction(own.digest, sections) if sections else None
 
 
 def mismatch(own: Cell, given: Cell) -> Mismatch | None:
@@ -100,7 +103,10 @@ def mismatch_of_calibration(calibration: Calibration, cell: Cell) -> Mismatch | 
 
 
 def differing_sections(own: Cell, given: Cell) -> tuple[str, ...]:
-    """Name the sections in which two descriptions of one cell differ, as far as a recording or its fit needs them."""
+    """Name the sections in which two descriptions of one cell differ, as far as a recording or its fit needs them.
+
+    Both have the same axes (`mismatch`).
+    """
     of_robot = (
         ("robot.urdf", own.urdf == given.urdf),
         ("robot.gravity_m_s2", own.gravity_m_s2 == given.gravity_m_s2),

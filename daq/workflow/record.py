@@ -398,7 +398,7 @@ def _permission(granted_by: str | None) -> str:
     if granted_by is None:
         raise MotionRefused(
             "a recording without permission to move",
-            expected="an operator who permits motion",
+            expected="an operator who permits motion; `policy: {motion: allowed}` is for `recalibrate` alone",
             remedy="pass --enable-motion",
         )
     return granted_by

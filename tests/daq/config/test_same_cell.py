@@ -75,6 +75,18 @@ def test_another_cell_is_refused_with_what_shows_it(kind: str, checkout: Path, t
         load_run(log, other)
 
 
+@pytest.mark.parametrize("name", ["gantry", "dualv", "five-bar", "seven-axis"])
+def test_a_robot_with_another_number_of_axes_is_another_one(name: str, checkout: Path, log: Path) -> None:
+    with pytest.raises(LogsDiffer, match=f"a log of cell 'demo'; expected one of cell '{name}'"):
+        load_run(log, load_cell(checkout / f"configs/cells/{name}.yaml"))
+
+
+def test_a_robot_with_another_number_of_axes_and_the_same_name_is_another_one(checkout: Path, log: Path) -> None:
+    gantry = load_cell(checkout / "configs/cells/gantry.yaml")
+    with pytest.raises(LogsDiffer, match="axes J1, J2"):
+        load_run(log, replace(gantry, name="demo"))
+
+
 def test_a_robot_with_other_joints_is_another_one(checkout: Path) -> None:
     demo = load_cell(checkout / "configs/cells/demo.yaml")
     for old, new in (('<joint name="J2"', '<joint name="elbow"'), ('type="revolute"', 'type="prismatic"')):

@@ -57,7 +57,7 @@ def test_an_interlock_that_says_no_holds_a_person_too(
         assert cell.cycles == 0
         failure = json.loads(capsys.readouterr().err.splitlines()[-1])
         assert (failure["kind"], failure["exit_code"]) == ("NotReleased", ExitCode.NOT_RELEASED)
-        assert "record again" in failure["do"]
+        assert "start again" in failure["do"]
         assert not list(rig.folder.glob("*.mcap*"))
         rig.closed.touch()
         assert record_by_hand(rig, one_move, "--enable-motion") == ExitCode.OK
