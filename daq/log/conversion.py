@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.config.cell import DEGREE, Cell
+from daq.config.cell import DEGREE, Cell, model_of
 from daq.config.cell_file import cell_from_bundle
 from daq.config.same_cell import Correction, correction_of
-from daq.errors import CurrentSaturated, LogIncomplete, PositionImplausible, RunInvalid
+from daq.errors import CurrentSaturated, LogIncomplete, LogsDiffer, PositionImplausible, RunInvalid
 from daq.log.impossible import motion_fault
 from daq.log.metadata import Readback, reports_only_losses
 from daq.log.reader import Log, LossyLogs, SampleChecks, read_log
@@ -23,7 +23,7 @@ from drivers.stream.sample import CellEvent, EventKind, Quantity
 from ident.arrays import BoolArray, FloatArray
 from ident.data.run import Recording, Run
 from ident.data.torque_channel import TorqueChannel
-from ident.data.unsigned_current import require_signed_currents
+from ident.data.unsigned_current import unsigned_currents
 from ident.model.model import DriveTrain
 
 _LOG = logging.getLogger("drivegain")
@@ -127,12 +127,25 @@ def load_run(path: Path | str, cell: Cell | None = None, lossy: LossyLogs = Loss
 
 
 def _corrected(run: Run, cell: Cell, correction: Correction | None) -> Run:
-    """Return a run with the payload's mass of a given description, and the record of what that corrects."""
+    """Return a run with the payload's mass of a given description, and the record of what that corrects.
+
+    Raises:
+        LogsDiffer: the description lacks the payload of the run.
+    """
     payload = run.payload
     if payload is not None and "m" in payload.known:
-        for weighed in cell.payloads:
-            if (weighed.name, weighed.mounting) == (payload.name, payload.mounting):
-                run = replace(run, payload=replace(payload, known={**payload.known, "m": weighed.mass_kg}))
+        declared = {(one.name, one.mounting): one.mass_kg for one in cell.payloads}
+        mass_kg = declared.get((payload.name, payload.mounting))
+        if mass_kg is not None:
+            run = replace(run, payload=replace(payload, known={**payload.known, "m": mass_kg}))
+        elif correction is not None:
+            names = ", ".join(f"{name} on {mounting}" for name, mounting in declared)
+            raise LogsDiffer(
+                run.name,
+                found=f"payload {payload.name} on {payload.mounting}, which the given description does not have",
+                expected=f"one of its payloads: {names or 'it has none'}",
+                remedy="keep name and mounting of the payload; its mass and tolerance may be corrected",
+            )
     if correction is None or run.recording is None:
         return run
     recording = replace(
@@ -222,7 +235,10 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
             operator=run.operator or None,
         ),
     )
-    require_signed_currents(converted, cell.ratio, cell.axis_names)
+    if unsigned_currents(converted, cell.ratio).any():
+        from ident.estimators.diagnosis import require_explained_currents  # noqa: PLC0415 - needs scipy, seldom
+
+        require_explained_currents(converted, model_of(cell), cell.conditioning, cell.axis_names)
     return converted
 
 

@@ -214,7 +214,7 @@ def check_motion(name: str, joint_rad: FloatArray, cell: Cell) -> None:
 
 
 def warn_of_unsigned(name: str, joint_rad: FloatArray, current_a: FloatArray, rate_hz: float, cell: Cell) -> None:
-    """Warn of currents without their sign: the log can be read, but no fit takes it.
+    """Warn of currents without their sign: the log can be read; a fit takes it only if the motion explains them.
 
     Args:
         name: of the recording.
@@ -226,4 +226,4 @@ def warn_of_unsigned(name: str, joint_rad: FloatArray, current_a: FloatArray, ra
     try:
         require_signed_currents(run, cell.ratio, cell.axis_names)
     except CurrentUnsigned as error:
-        _LOG.warning("warning: %s; no fit takes this log", error)
+        _LOG.warning("warning: %s; a fit refuses this log unless the motion explains the current", error)

@@ -13,16 +13,16 @@ import re
 from collections.abc import Mapping
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import yaml
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from daq.config.cell_schema import CUTOFF_HZ, FILTER_ORDER
 from daq.config.yaml_file import MAX_BYTES, StrictModel, parse_yaml, read_model
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, SchemaMismatch, YamlInvalid
 from daq.files import read_regular, replace_file
-from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, PayloadMass, Source
+from ident.calibration import AcceptedEffect, Calibration, Gain, MassInfluence, Parameter, PayloadMass, Source
 from ident.errors import Diagnosis
 from ident.estimators.estimate import RelativeError
 
@@ -87,6 +87,24 @@ class EffectEntry(StrictModel):
     ambiguity: tuple[str, ...]
 
 
+class MassInfluenceEntry(StrictModel):
+    """What the mass of a payload does to one gain."""
+
+    axis: str
+    per_kg: _Number
+    percent_per_percent: _Number
+    tolerance_std: _Positive
+
+
+class PayloadMassEntry(StrictModel):
+    """One payload of which the mass is known."""
+
+    payload: str
+    mass_kg: Annotated[float, Field(gt=0.0, le=_LARGEST)]
+    tolerance_kg: _Positive
+    gains: tuple[MassInfluenceEntry, ...]
+
+
 class CalibrationBody(StrictModel):
     """Schema of a calibration, without the envelope of a file."""
 
@@ -112,7 +130,15 @@ class CalibrationBody(StrictModel):
     diagnoses: tuple[Diagnosis, ...] = ()
     current_residual: tuple[_Positive, ...] | None = None
     passive_joints: tuple[str, ...] = ()
-    payload_mass: tuple[PayloadMass, ...] = ()
+    payload_mass: tuple[PayloadMassEntry, ...] = ()
+
+    @model_validator(mode="after")
+    def _check_axes_of_payload_mass(self) -> Self:
+        axes = [gain.axis for gain in self.gains]
+        for one in self.payload_mass:
+            if [influence.axis for influence in one.gains] != axes:
+                raise ValueError(f"payload_mass of {one.payload} with an entry for each of the axes {', '.join(axes)}")
+        return self
 
 
 class CalibrationDocument(CalibrationBody):
@@ -128,6 +154,8 @@ _CLASSES: dict[type, type] = {
     GainEntry: Gain,
     ParameterEntry: Parameter,
     EffectEntry: AcceptedEffect,
+    MassInfluenceEntry: MassInfluence,
+    PayloadMassEntry: PayloadMass,
 }
 
 

@@ -22,12 +22,12 @@ from ident.arrays import BoolArray, FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
-from ident.data.unsigned_current import missing_sign, one_sided_currents
+from ident.data.unsigned_current import missing_sign, one_sided_currents, unsigned_currents
 from ident.equations.reduction import layout
 from ident.equations.rows import rows_of
 from ident.equations.system import System
 from ident.equations.triangles import qr_update
-from ident.errors import CurrentUnsigned, Diagnosis, IdentificationError
+from ident.errors import CurrentUnsigned, DataUnfit, Diagnosis, IdentificationError
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import wls
 from ident.estimators.maximum_likelihood import ml
@@ -374,6 +374,33 @@ def exchanged_channels(
         "each current to follow from the motion of its own axis",
         "exchange these currents: the drives' node numbers in the cell, or the columns of the import",
     )
+
+
+def require_explained_currents(run: Run, model: Model, conditioning: Conditioning, axes: Sequence[str]) -> None:
+    """Refuse a recording with currents that look like sizes, unless the equations of their motors explain them.
+
+    A load that is always carried may come down to zero again and again, with little friction to take its current below.
+    Its motor's equation explains it then, and does not explain a size.
+
+    Args:
+        run: a recording.
+        model, conditioning: of the fit.
+        axes: name of each axis.
+
+    Raises:
+        CurrentUnsigned: drives report the size of the current only.
+    """
+    unsigned = unsigned_currents(run, model.drive_train.ratio)
+    if not unsigned.any():
+        return
+    # A redundant robot has no equation for one motor, and a run that is too short has too few: the shape decides.
+    if not model.is_redundant:
+        with suppress(DataUnfit):
+            own_errors = np.diag(channel_errors(model, (run,), conditioning))
+            unsigned &= ~(100.0 * own_errors <= LARGEST_AXIS_ERROR_PERCENT)
+    if unsigned.any():
+        names = tuple(axis for axis, found in zip(axes, unsigned, strict=True) if found)
+        raise CurrentUnsigned(run.name, names, missing_sign(run.current_a[:, unsigned]))
 
 
 def unsigned_channels(

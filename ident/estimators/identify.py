@@ -12,11 +12,11 @@ from ident.arrays import FloatArray, as_array, require_kind
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.data.run import Run
-from ident.data.unsigned_current import require_signed_currents
 from ident.equations.reduction import reduce_runs
 from ident.equations.rows import Observation, observe
 from ident.equations.system import System, require_distinct
 from ident.errors import DataUnfit, IdentificationError, ModelError
+from ident.estimators.diagnosis import require_explained_currents
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import ls, tls, wls
 from ident.estimators.maximum_likelihood import iv, ml
@@ -110,7 +110,7 @@ def identify(
         if not fixed_gains.all():
             raise ModelError(f"fixed_gains is {fixed_gains.tolist()}; expected no zero: such a motor moves nothing")
     axes = axes or [joint.name for joint in model.robot.axes]
-    used = with_signed_currents(each_run(runs), model, axes)
+    used = with_signed_currents(each_run(runs), model, conditioning, axes)
     reduction = reduce_runs(model, used, conditioning, instruments=method is Method.IV, keep_rows=keep_rows)
     if not reduction.runs:
         raise DataUnfit("", "no run was given; expected one without load and one with a weighed payload")
@@ -130,7 +130,7 @@ def identify(
     if judge:
         idle = idle_joints(model, *joint_torques(system, estimate))
         require_plausible(jackknifed, estimate.relative_error(system), axes, idle)
-    unused = with_signed_currents(each_run(holdout, system.payloads), model, axes)
+    unused = with_signed_currents(each_run(holdout, system.payloads), model, conditioning, axes)
     rest = reduce_runs(model, unused, conditioning, payloads=system.payloads, keep_rows=keep_rows)
     unseen = rest.system(system.base, system.payload_columns) if rest.runs else None
     found = Identification(model, conditioning, system, unseen, estimate)
@@ -153,13 +153,15 @@ def each_run(runs: Iterable[Run], payloads: tuple[Payload, ...] | None = None) -
         yield run
 
 
-def with_signed_currents(runs: Iterable[Run], model: Model, axes: Sequence[str]) -> Iterator[Run]:
+def with_signed_currents(
+    runs: Iterable[Run], model: Model, conditioning: Conditioning, axes: Sequence[str]
+) -> Iterator[Run]:
     """Yield runs, and refuse one in which drives report the size of the current only."""
     for run in runs:
         # What is of another shape is refused where the run is differentiated.
         shape = (len(run.time_s), len(axes))
         if np.shape(run.current_a) == shape and np.shape(run.position_rad) == shape:
-            require_signed_currents(run, model.drive_train.ratio, axes)
+            require_explained_currents(run, model, conditioning, axes)
         yield run
 
 

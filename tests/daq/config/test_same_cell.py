@@ -87,6 +87,13 @@ def test_a_robot_with_another_number_of_axes_and_the_same_name_is_another_one(ch
         load_run(log, replace(gantry, name="demo"))
 
 
+def test_a_correction_without_the_payload_of_the_log_is_refused(checkout: Path, tmp_path: Path) -> None:
+    loaded = write(tmp_path / "loaded.mcap", demo_content(checkout, payload=DISC), ROWS)
+    renamed = load_cell(_copy(checkout, tmp_path, _replaced("name: disc", "name: cube")))
+    with pytest.raises(LogsDiffer, match="payload disc on flange-a, which the given description does not have"):
+        load_run(loaded, renamed)
+
+
 def test_a_robot_with_other_joints_is_another_one(checkout: Path) -> None:
     demo = load_cell(checkout / "configs/cells/demo.yaml")
     for old, new in (('<joint name="J2"', '<joint name="elbow"'), ('type="revolute"', 'type="prismatic"')):

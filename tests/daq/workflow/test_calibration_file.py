@@ -7,6 +7,7 @@ import json
 import os
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -14,7 +15,7 @@ from hypothesis import given, settings
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, exit_code
 from daq.workflow import calibration_file
 from daq.workflow.calibration_file import as_document, decode, encode, load_calibration, save_calibration
-from ident.calibration import Calibration
+from ident.calibration import Calibration, PayloadMass
 from tests.daq.calibrations import calibrations, demo_calibration
 
 
@@ -166,3 +167,19 @@ def test_a_failing_disk_leaves_the_old_calibration(path: Path, call: str, monkey
     monkeypatch.undo()
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("mass_kg", 0.0), ("mass_kg", -1.0), ("tolerance_kg", -0.1), ("gains", ())],
+)
+def test_an_impossible_payload_mass_is_refused(key: str, value: Any) -> None:
+    calibration = demo_calibration()
+    slopes = [gain.value / 4.59 for gain in calibration.gains]
+    disc = PayloadMass.of("disc", 4.59, slopes, calibration.gains)
+    content = encode(dataclasses.replace(calibration, payload_mass=(disc,)))
+    assert decode(content, "calibration.yaml").payload_mass == (disc,)
+    impossible = dataclasses.replace(disc, **{key: value})
+    content = encode(dataclasses.replace(calibration, payload_mass=(impossible,)))
+    with pytest.raises(CalibrationUnreadable, match="payload_mass"):
+        decode(content, "calibration.yaml")

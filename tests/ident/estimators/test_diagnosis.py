@@ -11,15 +11,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.data.unsigned_current import unsigned_currents
 from ident.discovery.evidence import gather
-from ident.errors import CurrentReversed, ModelContradicted, PayloadDiffers, UnitsMistaken
+from ident.errors import CurrentReversed, CurrentUnsigned, ModelContradicted, PayloadDiffers, UnitsMistaken
 from ident.estimators.diagnosis import (
     axis_error_diagnoses,
     diagnose,
     exchanged_channels,
     gain_diagnoses,
+    require_explained_currents,
     scale_diagnoses,
     unsigned_channels,
 )
@@ -29,7 +31,8 @@ from ident.estimators.least_squares import wls
 from ident.estimators.method import Method
 from ident.estimators.payload_diagnosis import payload_differences
 from ident.estimators.refusals import idle_joints, require_plausible, require_units
-from ident.model.model import Column
+from ident.model.model import Column, DriveTrain, Model
+from ident.model.robot import Joint, JointKind, Robot
 from ident.plausible import UNIT_RATIO, WEIGHT_RATIO
 from tests.ident.mistaken import AXES, BODY, SMALL, diagnosed, small_recordings, turned, with_currents
 from tests.ident.recordings import MOUNTED, FloatArray, Truth, record
@@ -330,6 +333,45 @@ def test_the_axis_whose_friction_jumps_through_zero_is_found_by_its_equation(sma
     offset = np.array([0.0, 0.0, 2.0 * float(size.max())])
     lifting = [replace(run, current_a=run.current_a + offset) for run in runs]
     assert unsigned_channels(small_truth.model, lifting, SMALL, AXES) is None
+
+
+def _pendulum_run() -> Run:
+    """An arm that hangs, is lifted and let down again, with hardly any friction: its current has one sign, almost.
+
+    From rest at zero torque the current rises as a line, as the size of a current does where it turns.
+    """
+    rate_hz = 500.0
+    ramp = np.clip(np.arange(0.0, 0.6, 1.0 / rate_hz) / 0.6, 0.0, 1.0)
+    way = ramp**2 * (3.0 - 2.0 * ramp)
+    pause = np.zeros(25)
+    lifts = []
+    for lift in range(20):
+        height_rad = 1.2 if lift % 2 else 0.84
+        lifts += [height_rad * way, height_rad + pause, height_rad * way[::-1], pause]
+    position = np.concatenate(lifts)
+    time_s = np.arange(len(position)) / rate_hz
+    velocity = np.gradient(position, time_s)
+    acceleration = np.gradient(velocity, time_s)
+    current = np.sin(position) + 0.005 * acceleration + 0.02 * np.sign(np.round(velocity, 3))
+    current = current + 1e-3 * np.random.default_rng(1).standard_normal(len(current))
+    return Run("lifts", time_s, position[:, None], current[:, None])
+
+
+def test_a_load_that_is_always_carried_is_explained_by_the_equation_of_its_motor() -> None:
+    link = Joint("J1", JointKind.REVOLUTE, -1, np.eye(3), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    pendulum = Model(Robot((link,), np.array([0.0, -9.81, 0.0])), DriveTrain(np.eye(1)))
+    conditioning = Conditioning(standstill_rad_s=(0.03,))
+    run = _pendulum_run()
+    assert unsigned_currents(run, np.eye(1)).all()  # by its shape alone it would be called a size
+    require_explained_currents(run, pendulum, conditioning, ("J1",))
+
+
+def test_a_size_is_refused_whatever_its_load(small_truth: Truth) -> None:
+    """The sizes of the currents of an arm, which its equations do not explain."""
+    (run,) = small_recordings(small_truth, 3, count=1)
+    sizes = replace(run, current_a=np.abs(run.current_a))
+    with pytest.raises(CurrentUnsigned, match="J1, J2, J3"):
+        require_explained_currents(sizes, small_truth.model, SMALL, AXES)
 
 
 @pytest.mark.parametrize("method", [Method.LS, Method.WLS, Method.TLS, Method.ML])
