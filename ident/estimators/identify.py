@@ -156,13 +156,20 @@ def each_run(runs: Iterable[Run], payloads: tuple[Payload, ...] | None = None) -
 def with_signed_currents(
     runs: Iterable[Run], model: Model, conditioning: Conditioning, axes: Sequence[str]
 ) -> Iterator[Run]:
-    """Yield runs, and refuse one in which drives report the size of the current only."""
+    """Yield runs, and refuse one in which drives report the size of the current only.
+
+    A run is judged when the next one is asked for: it has been differentiated then, which refuses what is no recording.
+    """
     for run in runs:
-        # What is of another shape is refused where the run is differentiated.
-        shape = (len(run.time_s), len(axes))
-        if np.shape(run.current_a) == shape and np.shape(run.position_rad) == shape:
-            require_explained_currents(run, model, conditioning, axes)
         yield run
+        arrays = replace(
+            run,
+            time_s=np.asarray(run.time_s, dtype=np.float64),
+            position_rad=np.asarray(run.position_rad, dtype=np.float64),
+            current_a=np.asarray(run.current_a, dtype=np.float64),
+            valid=None if run.valid is None else np.asarray(run.valid, dtype=np.bool_),
+        )
+        require_explained_currents(arrays, model, conditioning, axes)
 
 
 def estimate_with(method: Method, system: System, fixed_gains: FloatArray | None = None) -> Estimate:
