@@ -272,4 +272,5 @@ def moved_gains(shifts: FloatArray, gains_std: FloatArray) -> tuple[tuple[int, f
 def _factor(hessian: FloatArray) -> tuple[FloatArray, bool]:
     """Cholesky factor of JᵀJ; directions that the rows do not show stay where they are."""
     regular = hessian + _RIDGE * np.diag(np.diag(hessian))
-    return linalg.cho_factor(regular, lower=True)
+    factor, _ = linalg.cho_factor(regular, lower=True)
+    return factor, True

@@ -473,7 +473,7 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
         moves=moves,
         blocks=blocks,
         motors=tuple(by_motor),
-        full_factor=linalg.cho_factor(hessian, lower=True),
+        full_factor=(linalg.cho_factor(hessian, lower=True)[0], True),
         factors=tuple(factors),
         scores=np.stack(scores_without),
         cluster_hessian=cluster_hessian,

@@ -130,8 +130,8 @@ def identify(
     if judge:
         idle = idle_joints(model, *joint_torques(system, estimate))
         require_plausible(jackknifed, estimate.relative_error(system), axes, idle)
-    unused = with_signed_currents(each_run(holdout, system.payloads), model, conditioning, axes)
-    rest = reduce_runs(model, unused, conditioning, payloads=system.payloads, keep_rows=keep_rows)
+    left_out = with_signed_currents(each_run(holdout, system.payloads), model, conditioning, axes)
+    rest = reduce_runs(model, left_out, conditioning, payloads=system.payloads, keep_rows=keep_rows)
     unseen = rest.system(system.base, system.payload_columns) if rest.runs else None
     found = Identification(model, conditioning, system, unseen, estimate)
     if not keep_rows:

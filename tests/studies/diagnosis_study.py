@@ -73,12 +73,12 @@ def named(
 
 
 def scaled(truth: Truth, seed: int, fixed: bool, factors: FloatArray | float) -> list[str]:
-    """What is said of currents that are recorded too large or too small."""
+    """Diagnoses of currents that are recorded too large or too small."""
     return named(truth, with_currents(small_recordings(truth, seed), factors), fixed=fixed)
 
 
 def sized(truth: Truth, seed: int, fixed: bool, axes: list[int], sign: float = 1.0) -> list[str]:
-    """What is said where drives report the size of their current."""
+    """Diagnoses where drives report the size of their current."""
     runs = []
     for run in small_recordings(truth, seed, noise_a=NOISES_A[seed % len(NOISES_A)]):
         current = run.current_a.copy()
@@ -88,12 +88,12 @@ def sized(truth: Truth, seed: int, fixed: bool, axes: list[int], sign: float = 1
 
 
 def carried(truth: Truth, seed: int, fixed: bool, body: FloatArray) -> list[str]:
-    """What is said where run r3 carries another body than it declares."""
+    """Diagnoses where run r3 carries another body than it declares."""
     return named(truth, small_recordings(truth, seed, count=6, bodies={3: body}), fixed=fixed)
 
 
 def lifted(truth: Truth, seed: int) -> list[str]:
-    """What the sign of a current is called where a load is always carried: shifted so far that it is never negative."""
+    """Refusals of currents that are shifted so far that they are never negative, as where a load is always carried."""
     names = []
     for run in small_recordings(truth, seed, count=2, noise_a=NOISES_A[seed % len(NOISES_A)]):
         least = run.current_a.min(axis=0)

@@ -200,7 +200,7 @@ def _any_tree(seed: int, count: int) -> str:
     elements = [f'<link name="base">{_inertial(rng)}</link>']
     for number, (name, kind) in enumerate(zip(names, kinds, strict=True)):
         parent = "base" if number == 0 or rng.random() < 0.1 else f"l{rng.integers(max(0, number - 3), number)}"
-        axis = "" if rng.random() < 0.2 else f'<axis xyz="{_three(rng.choice([-1.0, 0.3, 1.0, 2.0], 3))}"/>'
+        axis = "" if rng.random() < 0.2 else f'<axis xyz="{_three(rng.choice(np.array([-1.0, 0.3, 1.0, 2.0]), 3))}"/>'
         limit = (
             "" if kind in ("continuous", "fixed") and rng.random() < 0.5 else f'<limit velocity="1" effort="{number}"/>'
         )
@@ -219,7 +219,7 @@ def _three(numbers: FloatArray) -> str:
 
 def _origin(rng: np.random.Generator) -> str:
     xyz = f'xyz="{_three(rng.uniform(-2, 2, 3))}"' if rng.random() < 0.8 else ""
-    turned = rng.choice([0.0, np.pi / 2, np.pi, -1.2, 0.3], 3)
+    turned = rng.choice(np.array([0.0, np.pi / 2, np.pi, -1.2, 0.3]), 3)
     rpy = f'rpy="{_three(turned)}"' if rng.random() < 0.8 else ""
     return f"<origin {xyz} {rpy}/>" if rng.random() < 0.9 else ""
 
