@@ -38,7 +38,7 @@ axes of clean simulated cells, 2 are above the error of a fit of the right model
 disturbs the arm, it is 0.8 to 0.9 of that error, and less where standstill shows less.
 
 Standstill alone bounds nothing. The load of an axis that stands still changes while others move, and its integrator
-follows: in recordings of 40 s, 9 of 23 limits from standstill are above the error of the right model, by up to 58 %.
+follows: in recordings of 40 s, 12 of 47 limits from standstill are above the error of the right model, by up to 58 %.
 Elsewhere it is a fraction of that error, 0.1 to 0.7 with a disturbance (`tests/studies/floor_study.py`). Such an
 estimate is shown as one, and is no noise floor (`NoiseFloor.is_bound`).
 
