@@ -114,7 +114,7 @@ class MotorNoise(StrictModel):
 
     axis: str
     noise: float = Field(description="estimate, in the unit of the current reference")
-    least: float = Field(description="its lower limit: no model's error in motion is smaller")
+    least: Figure = Field(description="its lower limit where that bounds any model's error: known from repeated moves")
     source: str
     std_percent: Figure
     dwells: int | None

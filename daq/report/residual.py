@@ -152,7 +152,7 @@ def turn_sentences(fitted: Fit, step: Step) -> list[str]:
 
 
 def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
-    """Relative error of each axis before and after, and the least that noise alone would leave."""
+    """Relative error of each axis before and after, and what noise alone would leave."""
     return error_table("Relative error ‖e‖/‖v‖ of the motor currents by ml [%]", axes, dict(error_rows(account)))
 
 
@@ -410,7 +410,12 @@ def error_rows(account: Account) -> tuple[ErrorRow, ...]:
         ("runs left out", first, second),
         ("held out", before.holdout, after.holdout),
     )
-    floors = (("noise, at least", account.least_floor), ("noise, at least, held out", account.least_holdout_floor))
+    floors = (
+        ("noise, estimate", account.floor),
+        ("noise, estimate, held out", account.holdout_floor),
+        ("noise, at least", account.least_floor),
+        ("noise, at least, held out", account.least_holdout_floor),
+    )
     named = [(f"{name}, {when}", error) for name, *both in pairs for when, error in zip(WHEN, both, strict=True)]
     return tuple(
         (name, error) for name, error in (*named, *floors) if error is not None and any(map(math.isfinite, error.axes))
@@ -447,7 +452,7 @@ def _effect_sentence(
     floor_text = _floor_text(floor)
     excess = ""
     if is_unnamed(placed.effect) and share_of_excess is not None:
-        excess = f" (at least {100.0 * share_of_excess:.0f} % of the residual beyond noise)"
+        excess = f" (about {100.0 * share_of_excess:.0f} % of the residual beyond noise)"
     if placed.effect.side is Side.ALL_MOTORS:
         before_all, after_all = (_strictest_error(errors)[0].total for errors in (turn.before, turn.after))
         change = error_change_text(before_all, after_all)
@@ -513,7 +518,7 @@ def residual_document(fitted: Fit, account: Account, calibration: Calibration) -
                 else {
                     "axis": axis,
                     "noise": floor.noise_a,
-                    "least": floor.least_a,
+                    "least": floor.least_a if floor.is_bound else None,
                     "source": floor.source.value,
                     "std_percent": floor.std_percent,
                     "dwells": floor.parts if floor.source is FloorSource.STANDSTILL else None,

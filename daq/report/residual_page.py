@@ -87,9 +87,9 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration, compa
             paragraph(
                 "Error: the share of each motor's current that the model leaves, ‖e‖/‖v‖, over the rows in motion; "
                 "in total with each current weighted by its gain. Compare errors only under the same filters (end "
-                "of this page). Noise, at least: what the current's noise alone leaves, no less at 95 % confidence, as "
-                "measured at standstill or between repeated moves, whichever is smaller. No model's error is smaller; "
-                "it may be several times as large where the noise in motion is larger."
+                "of this page). Noise, estimate: what the current's noise alone would leave, as measured at standstill "
+                "or between repeated moves, whichever is smaller, and at most the error. Noise, at least: its lower "
+                "limit at 95 % confidence, where moves were repeated; no model's error is smaller."
             ),
         ),
         *sections,
@@ -219,7 +219,8 @@ def _limits(fitted: Fit, calibration: Calibration) -> str:
         "Backlash or elasticity behind an encoder on the motor may leave no trace in these signals.",
         "An effect is named after the variable it depends on and the shape of that dependence; another cause with the "
         "same dependence would get the same name. Indistinguishable effects are listed with each effect.",
-        "The noise floor is a lower bound (95 % confidence), and often a loose one: noise that acts in motion only is "
-        "not in it. An error above it need not be an effect.",
+        "Noise that was measured at standstill alone bounds nothing: in motion it may be smaller or larger. Between "
+        "repeated moves its lower limit bounds any model's error (95 % confidence), often loosely: an error above it "
+        "need not be an effect.",
     )
     return folded("What these data can and cannot show", listed(limits))

@@ -291,7 +291,7 @@ class Account:
     #: model; NaN where it is not known or refuted.
     floor: RelativeError
     holdout_floor: RelativeError | None  #: the same on held-out rows, None without any
-    #: The same of the lower limit of the noise (`NoiseFloor.least_a`): no model's error is smaller.
+    #: The same of the lower limit of the noise where it is a bound (`NoiseFloor.least_a`): no model's error is smaller.
     least_floor: RelativeError
     least_holdout_floor: RelativeError | None  #: the same on held-out rows, None without any
     turns: tuple[BeforeAfter | None, ...]  #: change by each turn of the loop, None where it added nothing
@@ -347,7 +347,7 @@ def account(
             least.append(None)
         else:
             known.append(floor)
-            least.append(replace(floor, noise_a=floor.least_a))
+            least.append(replace(floor, noise_a=floor.least_a) if floor.is_bound else None)
 
     def error_of(noises: Sequence[NoiseFloor | None], before: Observation, after: Observation) -> RelativeError:
         """Error by noise alone on some rows; a model that leaves less by chance is at the floor."""

@@ -46,7 +46,7 @@ class SearchProblem:
     runs: tuple[Signals, ...]  #: predicted signals of each run, at full rate
     rows: tuple[Signals, ...]  #: the same at the observation's rows, without inertia
     folds: Folds  #: the problem around the estimate, in folds of moves
-    #: Lower limit of each motor's noise in a row, which no model of motion explains [A]; None where not known.
+    #: Estimate of each motor's noise in a row, which no model of motion explains [A]; None where not known.
     floors_a: tuple[float | None, ...]
     #: Columns of motion and time alone, which stay the same from turn to turn, before they are placed at joints.
     cache: ColumnCache = field(default_factory=dict)
@@ -174,7 +174,7 @@ def prepare_search(
         runs=runs,
         rows=tuple(rows),
         folds=cut_into_folds(problem, move_of=move_of),
-        floors_a=tuple(None if floor is None else floor.least_a for floor in floors),
+        floors_a=tuple(None if floor is None else floor.noise_a for floor in floors),
         cache={} if cache is None else cache,
     )
 

@@ -66,8 +66,8 @@ class Finding:
     fold_errors: FloatArray  #: ‖e‖² of the whole on each fold, shape (folds,), for paired comparisons
     #: Other effects that cannot be distinguished from this one by their score on held-out moves.
     ambiguity: tuple[PlacedEffect, ...] = ()
-    #: Least share of the motor's squared residual beyond noise: the floor is a lower bound. None where the floor is not
-    #: known, or nothing is left beyond it.
+    #: Of the motor's squared residual beyond noise, roughly: the noise is an estimate, often from standstill. None
+    #: where it is not known, or nothing is left beyond it. No gate uses it.
     share_of_excess: float | None = None
     refusals: tuple[str, ...] = ()  #: gates that it did not pass, in words
 

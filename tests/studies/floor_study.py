@@ -1,10 +1,11 @@
 """Noise floors beside the error of a fit on the same rows: which part of it they are, and whether they bound it.
 
 `python -m tests.studies.floor_study --seeds 1 2` prints a line a recording and source: the noise of each axis by that
-source relative to what the fit leaves, ± σ, or "-" where there is none; and a line with the lower limit of the smaller
-one, which a report states as the noise floor. Then, for each noise world, how many limits are above the error of the
-fit, which is of the right model: at most one in twenty, if the limit is what it says. Simulated cells repeat one plan,
-twice without and twice with load; the real KR300 and TX-40, from ../shared/data or $DRIVEGAIN_DATA, repeat nothing.
+source relative to what the fit leaves, ± σ, or "-" where there is none. Then, for each noise world and source, how
+many lower limits are above the error of the fit, which is of the right model: one in twenty, if the limit is a bound.
+Simulated cells repeat one plan, twice without and twice with load, or with `--apart` have a plan for each run, so that
+standstill is the only source; `--worlds quiet --apart --duration 40` is like the demonstration. The real KR300 and
+TX-40, from ../shared/data or $DRIVEGAIN_DATA, repeat nothing.
 """
 
 from __future__ import annotations
@@ -26,7 +27,6 @@ from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.log.conversion import load_run
 from daq.workflow.plan import plan
-from ident.arrays import FloatArray
 from ident.data.run import Run
 from ident.discovery.before_after import left_on
 from ident.discovery.evidence import gather
@@ -35,17 +35,20 @@ from ident.estimators.identify import identify
 from ident.estimators.method import Method
 from tests.studies.direct_cell import run_of, simulate_run
 from tests.studies.output import print_line
-from tests.studies.study_cells import WORLDS, declared_payload, spec_of, world_cell
+from tests.studies.study_cells import WORLDS, declared_payload, spec_of, study_cell, world_cell
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 
 
+QUIET = "quiet"  #: World of the clean cell itself, with noise in the currents alone
+
+
 @dataclass(frozen=True, slots=True)
 class FloorScore:
-    """Noise of each axis relative to what the fit leaves, NaN where it is not known."""
+    """Noise of each axis relative to what the fit leaves."""
 
     lines: tuple[str, ...]  #: of the table
-    least: FloatArray  #: lower limit of the smaller source, where it is not refuted, shape (m,)
+    least: dict[FloorSource, list[float]]  #: lower limits by each source, of the axes where it is known
 
 
 def measure(name: str, cell: Cell, runs: Sequence[Run], *, fixed: bool) -> FloorScore:
@@ -55,6 +58,7 @@ def measure(name: str, cell: Cell, runs: Sequence[Run], *, fixed: bool) -> Floor
     start = gather(found, runs)
     left_a = left_on(start.training, start.estimate)
     lines: list[str] = []
+    least: dict[FloorSource, list[float]] = {}
     for source in FloorSource:
         floors = noise_floors(start.fit_runs, start.conditioning, (source,))
         ratios = [
@@ -64,21 +68,20 @@ def measure(name: str, cell: Cell, runs: Sequence[Run], *, fixed: bool) -> Floor
             for floor, left in zip(floors, left_a, strict=True)
         ]
         lines.append(f"| {name} | {source.value} | {' | '.join(ratios)} |")
-    least = np.full(len(left_a), np.nan)
-    for axis, floor in enumerate(noise_floors(start.fit_runs, start.conditioning)):
-        if floor is not None and not floor.is_refuted(float(left_a[axis])):
-            least[axis] = floor.least_a / left_a[axis]
-    limits = [f"{ratio:.2f}" if np.isfinite(ratio) else "-" for ratio in least]
-    lines.append(f"| {name} | at least | {' | '.join(limits)} |")
+        known = zip(floors, left_a, strict=True)
+        least[source] = [floor.least_a / float(left) for floor, left in known if floor is not None]
     return FloorScore(tuple(lines), least)
 
 
-def simulated(world: str, seed: int, duration_s: float) -> tuple[Cell, list[Run]]:
-    """Four runs of one plan."""
-    cell, truth = load_cell(shipped_configurations() / "cells" / "demo.yaml"), world_cell(seed, world)
-    moves, runs = plan(cell, seed=10 * seed, duration_s=duration_s), []
+def simulated(world: str, seed: int, duration_s: float, *, apart: bool) -> tuple[Cell, list[Run]]:
+    """Four runs of one plan, or of one plan each."""
+    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    truth = study_cell(seed) if world == QUIET else world_cell(seed, world)
+    plans = [plan(cell, seed=10 * seed + number, duration_s=duration_s) for number in range(4 if apart else 1)]
+    runs: list[Run] = []
     for number, payload in enumerate((None, "disc", None, "disc")):
         declared = None if payload is None else declared_payload(payload)
+        moves = plans[number % len(plans)]
         raw = simulate_run(cell, spec_of(truth, payload, number), moves, f"run-{number}", declared)
         runs.append(run_of(raw, cell))
     return cell, runs
@@ -104,8 +107,9 @@ def main(arguments: list[str] | None = None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.floor_study", description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--worlds", choices=tuple(WORLDS), nargs="+", default=list(WORLDS))
+    parser.add_argument("--worlds", choices=(*WORLDS, QUIET), nargs="+", default=list(WORLDS))
     parser.add_argument("--duration", type=float, default=20.0, help="of each simulated run [s]")
+    parser.add_argument("--apart", action="store_true", help="a plan for each run: no move is repeated")
     options = parser.parse_args(arguments)
     print_line("| recording | source | J1 | J2 | J3 | J4 | J5 | J6 |\n|---|---|---|---|---|---|---|---|")
     data = Path(os.environ.get("DRIVEGAIN_DATA", SHARED))
@@ -114,17 +118,19 @@ def main(arguments: list[str] | None = None) -> int:
             for line in measure(name, *read(data / name), fixed=True).lines:
                 print_line(line)
     for world in options.worlds:
-        known: list[FloatArray] = []
+        scores: list[FloorScore] = []
         for seed in options.seeds:
-            score = measure(f"{world}, {seed}", *simulated(world, seed, options.duration), fixed=False)
-            for line in score.lines:
+            recordings = simulated(world, seed, options.duration, apart=options.apart)
+            scores.append(measure(f"{world}, {seed}", *recordings, fixed=False))
+            for line in scores[-1].lines:
                 print_line(line)
-            known.append(score.least[np.isfinite(score.least)])
-        ratios = np.concatenate(known)
-        print_line(
-            f"{world}: {len(ratios)} lower limits, {np.sum(ratios > 1.0)} above the error of the fit; they are "
-            f"{ratios.min():.2f} to {ratios.max():.2f} of it, median {np.median(ratios):.2f}"
-        )
+        for source in FloorSource:
+            ratios = np.array([ratio for score in scores for ratio in score.least[source]])
+            if len(ratios):
+                print_line(
+                    f"{world}, {source.value}: {np.sum(ratios > 1.0)} of {len(ratios)} lower limits above the error of "
+                    f"the fit; they are {ratios.min():.2f} to {ratios.max():.2f} of it, median {np.median(ratios):.2f}"
+                )
     return 0
 
 

@@ -342,15 +342,18 @@ def test_a_noise_floor_above_the_error_of_the_model_is_reported_with_its_cause(c
     floors = (
         NoiseFloor(4.0 * float(left_a[0]), FloorSource.STANDSTILL, 20, 100.0),
         NoiseFloor(2.0 * float(left_a[1]), FloorSource.REPEATED_MOVES, 20, 100.0),
-        NoiseFloor(0.9 * float(left_a[2]), FloorSource.REPEATED_MOVES, 12, 100.0),
-        *(None,) * 3,
+        NoiseFloor(0.9 * float(left_a[2]), FloorSource.REPEATED_MOVES, 12, 100.0, is_bound=True),
+        NoiseFloor(0.9 * float(left_a[3]), FloorSource.STANDSTILL, 12, 100.0),
+        *(None,) * 2,
     )
     refuted = Closed(closed.fitted, replace(closed.account, floors=floors))
     first, second = (line for line in summary(refuted.fitted, refuted.account, ()) if "no noise floor" in line)
     assert first.startswith("J1 has no noise floor: its current at standstill scatters 4.0 times as much as")
     assert second.startswith("J2 has no noise floor: its current between repeated moves scatters 2.0 times")
     motors = refuted.document()["noise_floor"]["motors"]
-    assert [motor and motor["refuted"] for motor in motors] == [True, True, False, None, None, None]
+    assert [motor and motor["refuted"] for motor in motors] == [True, True, False, False, None, None]
+    assert motors[2]["least"] == floors[2].least_a
+    assert motors[3]["least"] is None
     assert [motor["dwells"] for motor in motors[:3]] == [20, None, None]
     assert (motors[2]["source"], motors[2]["pairs"]) == ("repeated moves", 12)
     assert motors[2]["left"] == pytest.approx(left_a[2])

@@ -256,7 +256,9 @@ def test_no_floor_exceeds_the_error_on_the_same_rows(
 ) -> None:
     """The floors are a tenth above what the model leaves, and known to 9 %: the model is at the floor."""
     left_a = left_on(after.training, after.estimate)
-    floors = tuple(NoiseFloor(1.1 * float(left), FloorSource.STANDSTILL, 20, 100.0) for left in left_a)
+    floors = tuple(
+        NoiseFloor(1.1 * float(left), FloorSource.REPEATED_MOVES, 20, 100.0, is_bound=True) for left in left_a
+    )
     monkeypatch.setattr(before_after_module, "noise_floors", lambda *_: floors)
     made = account(start, [Step((), (), np.zeros(6), None, after)])
     before, last = made.total.before, made.total.after
@@ -273,6 +275,12 @@ def test_no_floor_exceeds_the_error_on_the_same_rows(
     assert np.all(expected < 1.0)
     ratio = np.array(made.least_floor.axes) / last.in_sample.axes
     assert ratio == pytest.approx(expected)
+    # Standstill alone bounds nothing.
+    at_rest = tuple(replace(floor, source=FloorSource.STANDSTILL, is_bound=False) for floor in floors)
+    monkeypatch.setattr(before_after_module, "noise_floors", lambda *_: at_rest)
+    unbound = account(start, [Step((), (), np.zeros(6), None, after)])
+    assert np.isnan(unbound.least_floor.axes).all()
+    assert unbound.floor == made.floor
 
 
 def test_fixed_gains_do_not_change(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:

@@ -181,6 +181,15 @@ def test_it_has_the_unit_of_the_current_and_no_offset(
         assert (other.parts, other.freedom) == (one.parts, one.freedom)
 
 
+def test_standstill_alone_is_no_bound(resting: tuple[Dataset, ...], repeated: tuple[Dataset, ...]) -> None:
+    at_rest = _all(noise_floors(_noisy(resting), CONDITIONING, (FloorSource.STANDSTILL,)))
+    assert not any(floor.is_bound for floor in at_rest)
+    in_motion = _all(noise_floors(_noisy(repeated), SMALL, MOVES))
+    assert all(floor.is_bound for floor in in_motion)
+    # Where standstill shows less than repeated moves, it is below the noise in motion as well.
+    assert all(floor.is_bound for floor in _all(noise_floors(_noisy(repeated), SMALL)))
+
+
 def test_repeated_moves_recover_a_known_noise(repeated: tuple[Dataset, ...]) -> None:
     """Torques of the motion cancel, ten times larger than the noise in a row; the start of a move is no sample."""
     drawn = [_all(noise_floors(_noisy(repeated, seed), SMALL, MOVES)) for seed in range(20)]
