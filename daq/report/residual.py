@@ -349,8 +349,8 @@ def _unconfirmed_skew(skew: Skew | None) -> Iterator[str]:
     """Say why no time skew is stated."""
     if skew is None:
         yield (
-            "A time skew between currents and positions is not known: these data give no instruments, which need "
-            "point-to-point moves and one motor for each degree of freedom."
+            "A time skew between currents and positions is not known: it needs instruments, so point-to-point "
+            "moves and one motor for each degree of freedom, and data that show it beside the model."
         )
     elif not skew.confirmed:
         yield (

@@ -5,7 +5,7 @@ one that is validated. A calibration keeps what was said of its fit, so its repo
 
 The order of the judgements, causes before their traces:
 
-1. Each log as it is read: currents without a sign (`ident.data.unsigned_current`).
+1. Each log as it is read: currents without a sign (`ident.estimators.diagnosis.require_explained_currents`).
 2. What leaves no usable number (`ident.estimators.refusals.refuse_mistakes`): a payload that does not show; with fixed
    gains its weight and the signs of the currents; errors; exchanged roles; units. Where one of these refuses, or the
    estimator does not converge, its causes are looked for in the logs: currents without a sign, exchanged currents.
@@ -134,9 +134,12 @@ def _payload_diagnoses(
 
 def not_repeated(stored: Iterable[Diagnosis], fresh: Iterable[Diagnosis]) -> Iterator[Diagnosis]:
     """Yield stored diagnoses, less those that were made again of each of their runs."""
-    again = {(one.name, run, one.axes) for one in fresh for run in one.runs}
+    again: set[tuple[str, str, tuple[str, ...]]] = set()
+    for one in fresh:
+        again.update((one.name, run, one.axes) for run in one.runs)
     for one in stored:
-        if not one.runs or any((one.name, run, one.axes) not in again for run in one.runs):
+        of_runs = {(one.name, run, one.axes) for run in one.runs}
+        if not of_runs or not of_runs <= again:
             yield one
 
 

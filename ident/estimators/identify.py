@@ -99,7 +99,7 @@ def identify(
         ModelError: an argument is of another type, there is no such method, or no gain for each motor.
         RolesExchanged, ModelContradicted: see `require_plausible`. A reversed current only reverses its gain's sign.
         UnitsMistaken, CurrentReversed: with fixed gains.
-        CurrentUnsigned: see `ident.data.unsigned_current`.
+        CurrentUnsigned: see `ident.estimators.diagnosis.require_explained_currents`.
         DataUnfit, RankDeficient, TooFewMoves, PayloadUnseen, NotConverged: see reduction and estimators.
     """
     require_kind("model", model, Model, "write Model(robot, drive_train)")
