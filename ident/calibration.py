@@ -237,7 +237,7 @@ def calibration_of(
             f"{len(estimate.gains)} identified gains; expected one of each for each axis"
         )
     parameters = tuple(
-        Parameter(column.name, float(value), float(std), column.unit)
+        Parameter(column.name, float(value + column.about), float(std), column.unit)
         for column, value, std in zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
     )
     identified = zip(axes, estimate.gains, estimate.gains_std, units, nameplate, strict=True)

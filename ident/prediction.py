@@ -9,8 +9,9 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.data.dataset import Dataset
-from ident.effects.dictionary import EFFECTS, UNNAMED
-from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, Side, at_joints, check_settings, columns_at
+from ident.effects.dictionary import EFFECTS, GEOMETRY, UNNAMED
+from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, at_joints, check_settings, columns_at
+from ident.effects.geometry import GeometryEffect, corrected_dataset, corrected_model, is_correction
 from ident.effects.signals import declared_signals, payload_parameters
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload
@@ -37,18 +38,37 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
         EffectRefused: it holds an effect that does not exist.
     """
     gains = _gains(calibration, model)
+    corrections = corrections_of(calibration)
+    model = corrected_model(model, corrections)
+    data = corrected_dataset(data, corrections)
     standard = standard_parameters(calibration, model)
     standard[model.flange] += _payload(calibration, data)
     run = declared_signals(model, data, standard, gains, calibration.session_began_s)
     torque = model.drive_train.direction.T @ run.motor_torque_nm
     for accepted in calibration.effects:
         placed, coefficients = placed_effect(accepted, calibration)
+        if is_correction(placed):
+            continue  # in the model already
         columns = columns_at(placed.effect, run, placed.axis)
         at_all = at_joints(placed.effect, placed.axis, columns, model.drive_train)
         torque += np.einsum("p,npk->nk", coefficients, at_all)
     if calibration.effects and model.is_redundant:
         torque = without_preload(model.follow(data.motion()), torque)
     return np.asarray(torque.T)
+
+
+def corrections_of(calibration: Calibration) -> tuple[PlacedEffect, ...]:
+    """The corrections of the robot's description that a calibration holds, applied as a whole.
+
+    Raises:
+        EffectRefused: it holds an effect that does not exist.
+    """
+    found: list[PlacedEffect] = []
+    for accepted in calibration.effects:
+        placed, coefficients = placed_effect(accepted, calibration)
+        if isinstance(placed.effect, GeometryEffect):
+            found.append(replace(placed, effect=placed.effect.with_applied(coefficients.tolist())))
+    return tuple(found)
 
 
 def predict_current(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
@@ -161,15 +181,15 @@ def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[P
         EffectRefused: no such effect, setting, axis or coefficient exists.
     """
     places = calibration.places
-    families = {known.name: known for known in (*(family[0] for family in EFFECTS), *UNNAMED)}
+    families = {known.name: known for known in (*(family[0] for family in (*EFFECTS, *GEOMETRY)), *UNNAMED)}
     if accepted.name not in families:
         raise EffectRefused(f"there is no effect {accepted.name!r}; there are {', '.join(sorted(families))}")
     known = families[accepted.name]
-    everywhere = known.side is Side.ALL_MOTORS and accepted.axis == ALL_AXES
+    everywhere = not known.has_axis and accepted.axis == ALL_AXES
     if not everywhere and accepted.axis not in places:
         raise EffectRefused(f"effect {accepted.name!r} acts on axis {accepted.axis!r}; there are {', '.join(places)}")
     axis = 0 if everywhere else places.index(accepted.axis)
-    if known.side is Side.ALL_MOTORS and axis:
+    if not known.has_axis and axis:
         raise EffectRefused(f"effect {accepted.name!r} acts on axis {accepted.axis!r}; it acts on {ALL_AXES}")
     added = {name: 0.0 for name in known.settings if name in ADDED and name not in accepted.settings}
     own, accepted = accepted.settings, replace(accepted, settings={**accepted.settings, **added})

@@ -208,7 +208,7 @@ def coefficients(evidence: Evidence, placed: PlacedEffect) -> tuple[Parameter, .
     return tuple(
         Parameter(
             short.name,
-            float(estimate.parameters[index[whole.name]]),
+            float(estimate.parameters[index[whole.name]] + whole.about),
             float(estimate.parameters_std[index[whole.name]]),
             whole.unit,
         )

@@ -46,6 +46,7 @@ class Dataset:
     demanded: Motion | None = None
     #: Temperature of each motor or its drive [°C], NaN for one without; None where none was recorded.
     temperature_c: FloatArray | None = None
+    is_planned: bool = False  #: a motion that was asked for: nothing of a recording can be wrong with it
 
     def motion(self, part: slice = slice(None)) -> Motion:
         """Motion of the joints over some of the samples."""
@@ -181,6 +182,7 @@ def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> D
         valid=everywhere,
         move=np.zeros(shape[0], dtype=np.int64),
         payload=payload,
+        is_planned=True,
     )
 
 

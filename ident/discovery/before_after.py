@@ -41,7 +41,7 @@ import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
 
 from ident.arrays import FloatArray, IntArray
-from ident.discovery.evidence import Evidence, with_effects
+from ident.discovery.evidence import Evidence, Uncorrected, with_effects
 from ident.discovery.gates import PairedChange, compare_by_move
 from ident.discovery.loop import Step
 from ident.discovery.noise_floor import NoiseFloor, noise_floors
@@ -190,12 +190,20 @@ def _error_without(evidence: Evidence, left_out: int) -> CurrentError:
         training=training,
         holdout=held,
         effects=(),
+        uncorrected=_datasets_in_order(evidence.uncorrected, order),
         estimate=estimate_with(evidence.estimate.method, training.system(), fixed),
     )
     if not evidence.effects:
         return error_on(held, bare.estimate)
     refitted = with_effects(bare, evidence.effects)
     return error_on(refitted.holdout or held, refitted.estimate)
+
+
+def _datasets_in_order(uncorrected: Uncorrected | None, order: Sequence[int]) -> Uncorrected | None:
+    """Put recordings in this order, as they were before corrections."""
+    if uncorrected is None:
+        return None
+    return replace(uncorrected, datasets=tuple(uncorrected.datasets[index] for index in order))
 
 
 def _in_order(bare: Observation, order: Sequence[int]) -> Observation:

@@ -18,11 +18,13 @@ from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.dataset import Dataset
 from ident.discovery.noise_floor import noise_floors
 from ident.effects.effect import Effect, at_joints, columns_at, effect_columns, is_placeable
+from ident.effects.geometry import GeometryEffect
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.linearisation import Folds, MotorRows, cut_into_folds, linearise
 from ident.equations.rows import Observation, decimate_rows
 from ident.estimators.estimate import Estimate
 from ident.model.model import Model
+from ident.model.robot import Motion
 
 ColumnCache = dict[tuple[Effect, int], npt.NDArray[np.float32]]
 """Columns of candidates by effect and axis. There are hundreds, and single precision is enough for their trials."""
@@ -84,6 +86,8 @@ class SearchProblem:
 
     def torque(self, effect: Effect, axis: int) -> FloatArray:
         """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (m, p, r)."""
+        if isinstance(effect, GeometryEffect):
+            return self.torque_at_rows(effect, axis)  # the torque of the whole arm, once more, and it is smooth
         kept = self.cache.get((effect, axis))
         if kept is None:
             columns = effect_columns(effect, axis, self.runs, self.datasets, self.observation.conditioning)
@@ -161,12 +165,19 @@ def prepare_search(
     rows: list[Signals] = []
     for run, data in zip(runs, datasets, strict=True):
         at_rate = {array.name: getattr(run, array.name) for array in fields(run) if array.name != "rate_hz"}
+        del at_rate["arm"]
         sampled = {name: array for name, array in at_rate.items() if array is not None and array.shape[-1]}
         known = {name: array for name, array in sampled.items() if name != "inertia_kg_m2"}
         arrays = {name: decimate_rows(data, observation.conditioning, array) for name, array in known.items()}
         time_s, none = arrays["time_s"], run.inertia_kg_m2[..., :0]
         rate_hz = float((len(time_s) - 1) / (time_s[-1] - time_s[0]))
-        rows.append(Signals(rate_hz=rate_hz, inertia_kg_m2=none, **arrays))
+        # The arm of a closed chain moves joints that are not axes: it is followed from the axes again.
+        states = (
+            decimate_rows(data, observation.conditioning, state.T).T
+            for state in (data.position_rad, data.velocity_rad_s, data.acceleration_rad_s2)
+        )
+        arm = None if run.arm is None else replace(run.arm, motion=Motion(*states))
+        rows.append(Signals(rate_hz=rate_hz, inertia_kg_m2=none, arm=arm, **arrays))
     return SearchProblem(
         model=model,
         datasets=datasets,

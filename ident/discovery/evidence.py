@@ -15,9 +15,12 @@ from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.demand import as_demanded, with_demand
 from ident.data.run import Run
-from ident.effects.effect import PlacedEffect, Side, effect_torque
+from ident.discovery.gates import own_unknowns, values_of
+from ident.effects.effect import PlacedEffect, effect_torque
 from ident.effects.signals import Signals, fitted_signals, session_began_s
-from ident.equations.rows import Observation, observe, on_demanded_motion
+from ident.effects.geometry import GeometryEffect, corrected_dataset, corrected_model, is_correction
+from ident.equations.reduction import reduce_runs
+from ident.equations.rows import Observation, RunRows, observe, on_demanded_motion, rows_of
 from ident.equations.system import System
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.identify import Identification, estimate_with
@@ -25,11 +28,23 @@ from ident.estimators.method import Method
 from ident.model.model import Model
 
 
+RELINEARISATIONS = 4  #: Corrections of the geometry in one refit; a zero that is wrong by 2° settles in two
+SETTLED = 0.1  #: Share of σ below which a further correction is not worth its time
+
+
+@dataclass(frozen=True, slots=True)
+class Uncorrected:
+    """The description and the recordings as they were given."""
+
+    model: Model  #: as declared
+    datasets: tuple[Dataset, ...]  #: all runs, held-out runs last
+
+
 @dataclass(frozen=True, slots=True)
 class Evidence:
     """An estimate with its rows at hand, for searches and plots."""
 
-    model: Model  #: the declared model
+    model: Model  #: the declared model, with the corrections
     conditioning: Conditioning  #: the filters
     datasets: tuple[Dataset, ...]  #: all runs, held-out runs last
     held_out: int  #: number of held-out runs
@@ -39,6 +54,9 @@ class Evidence:
     effects: tuple[PlacedEffect, ...]  #: in the model, in the order of their columns
     estimate: Estimate  #: of the training rows
     declared: int = 0  #: how many of the effects, the first ones, the cell declares: no search takes them out
+    #: Effects whose applied part has corrected model, runs and rows (`ident.effects.geometry`).
+    corrections: tuple[PlacedEffect, ...] = ()
+    uncorrected: Uncorrected | None = None  #: as they were before; None where nothing was corrected
     _identification: list[Identification] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
@@ -81,15 +99,99 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequ
     """Refit the same data with these effects in the model, gains included.
 
     Load and current are the model's predictions, so columns of them are built twice: with the estimate before, and
-    with the estimate that they led to.
+    with the estimate that they led to. Where an effect corrects the geometry, its column is that of a small change:
+    what it finds is applied to the description, and everything is built again, until nothing is left to apply.
 
     Args:
         before: the same data.
-        effects: of the model.
+        effects: of the model. Those of the result may hold another applied part.
         runs: signals of the runs of the fit around the estimate before, where they are at hand.
     """
+    corrections = tuple(placed for placed in effects if is_correction(placed))
+    is_same = _is_same_geometry(before.corrections, corrections)
+    found = _refitted(before if is_same else with_corrections(before, corrections), effects, runs if is_same else ())
+    for _ in range(RELINEARISATIONS):
+        moved = _relinearised(found)
+        if moved is None:
+            break
+        corrections = tuple(placed for placed in moved if is_correction(placed))
+        found = _refitted(with_corrections(found, corrections), moved, ())
+    return found
+
+
+def with_corrections(before: Evidence, corrections: tuple[PlacedEffect, ...]) -> Evidence:
+    """The same data under the declared model with other corrections, refitted without any effect.
+
+    Rows and base parameters are built anew: where gravity is turned, other parameters can be seen.
+    """
+    given = before.uncorrected or Uncorrected(before.model, before.datasets)
+    model = corrected_model(given.model, corrections)
+    datasets = tuple(corrected_dataset(data, corrections) for data in given.datasets)
+    conditioning = before.conditioning
+    rows = [RunRows(data, tuple(rows_of(model, data, conditioning))) for data in datasets]
+    fitted = len(datasets) - before.held_out
+    reduction = reduce_runs(model, rows[:fitted], conditioning, payloads=before.training.payloads)
+    system = reduction.system(reduction.base(), reduction.payload_columns())
+    observation = observe(model, rows, conditioning, system)
+    training, holdout = _split_holdout(observation, before.held_out)
+    return replace(
+        before,
+        model=model,
+        datasets=datasets,
+        rows_without_effects=observation,
+        training=training,
+        holdout=holdout,
+        effects=(),
+        estimate=estimate_with(before.estimate.method, training.system(), _fixed_gains(before)),
+        corrections=corrections,
+        uncorrected=given if corrections else None,
+    )
+
+
+def coefficients_of(estimate: Estimate, placed: PlacedEffect) -> tuple[FloatArray, FloatArray]:
+    """Coefficients of an effect in an estimate, what was applied to the description included, and σ; shape (p,) each."""
+    own = own_unknowns(estimate, (placed,))
+    return values_of(estimate, own), estimate.parameters_std[own]
+
+
+def _is_same_geometry(one: Sequence[PlacedEffect], other: Sequence[PlacedEffect]) -> bool:
+    """Whether two sets of corrections have corrected a description alike."""
+    return _applied(one) == _applied(other)
+
+
+def _applied(corrections: Sequence[PlacedEffect]) -> dict[PlacedEffect, tuple[float, ...]]:
+    """The applied part of each correction that has one."""
+    found: dict[PlacedEffect, tuple[float, ...]] = {}
+    for placed in corrections:
+        if isinstance(placed.effect, GeometryEffect) and any(placed.effect.applied):
+            found[placed] = placed.effect.applied
+    return found
+
+
+def _relinearised(found: Evidence) -> tuple[PlacedEffect, ...] | None:
+    """The effects of a fit with what their corrections have found applied; None where nothing is left to apply."""
+    effects: list[PlacedEffect] = []
+    is_moved = False
+    for placed in found.effects:
+        if isinstance(placed.effect, GeometryEffect):
+            values, std = coefficients_of(found.estimate, placed)
+            left = np.abs(values - np.array(placed.effect.applied))
+            if np.any(left > SETTLED * std):
+                is_moved = True
+                placed = replace(placed, effect=placed.effect.with_applied(values.tolist()))
+        effects.append(placed)
+    return tuple(effects) if is_moved else None
+
+
+def _fixed_gains(evidence: Evidence) -> FloatArray | None:
+    """Gains that the fit holds; None where it finds them."""
+    return evidence.estimate.gains if evidence.estimate.gains_fixed else None
+
+
+def _refitted(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals]) -> Evidence:
+    """Refit with effects; the description has their corrections already."""
     around, current, began_s = before, before, session_began_s(before.fit_runs)  # held-out runs must not affect the fit
-    fixed = before.estimate.gains if before.estimate.gains_fixed else None
+    fixed = _fixed_gains(before)
     joints = before.model.robot.places
     columns = tuple(column.at(joints[placed.axis].kind) for placed in effects for column in placed.columns)
     bare, unseen = _split_holdout(before.rows_without_effects, before.held_out)
@@ -141,7 +243,7 @@ def _torques(
     runs: Sequence[Signals] = (),
 ) -> FloatArray:
     """Columns of effects on the rows of runs, load and current predicted by an estimate, shape (m, p, r)."""
-    parts, through_links = [], any(placed.effect.side is Side.ALL_JOINTS for placed in effects)
+    parts, through_links = [], any(placed.effect.needs_inertia for placed in effects)
     for index, data in enumerate(datasets):  # one by one: signals at full rate are the largest arrays of a search
         if runs:
             run = runs[index]
@@ -155,6 +257,8 @@ def _torques(
 
 def without_effects(evidence: Evidence, estimate: Estimate) -> Evidence:
     """Return the same data under the declared model alone, with its estimate by ``ml``."""
+    if evidence.corrections:
+        evidence = with_corrections(evidence, ())
     training, rest = _split_holdout(evidence.rows_without_effects, evidence.held_out)
     return replace(evidence, training=training, holdout=rest, effects=(), estimate=estimate, declared=0)
 

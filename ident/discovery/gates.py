@@ -208,6 +208,11 @@ def own_unknowns(estimate: Estimate, effects: Sequence[PlacedEffect]) -> IntArra
     return np.array([index for index, column in enumerate(estimate.unknowns) if column.name in names])
 
 
+def values_of(estimate: Estimate, own: IntArray) -> FloatArray:
+    """Values of some parameters, what was applied to the description of the robot included, shape (p,)."""
+    return estimate.parameters[own] + np.array([estimate.unknowns[index].about for index in own])
+
+
 def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effects: Sequence[PlacedEffect]) -> Reduced:
     """Take effects out of a joint fit, to first order, without a refit.
 
@@ -220,7 +225,7 @@ def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effect
     problem = search_problem.folds.linearisation
     taken = np.isin(problem.free, len(estimate.gains) + own)
     columns = problem.jacobian.columns(np.flatnonzero(taken)) / problem.scale[taken]
-    torque = columns @ estimate.parameters[own]
+    torque = columns @ values_of(estimate, own)
     rest = problem.jacobian.only(np.flatnonzero(~taken))
     for place, motor in enumerate(problem.free[problem.free < len(estimate.gains)]):
         # ∂(γ τ)/∂g = −γ² τ, and τ loses these effects; with preload ∂e/∂g_i = (T_D)_i (v_i − σ_i e_i), in all rows.

@@ -24,6 +24,7 @@ from ident.discovery.gates import (
     moved_gains,
     own_unknowns,
     runs_to_leave_out,
+    values_of,
     whitened_columns,
     without_effects_of,
 )
@@ -74,6 +75,12 @@ def linearised(evidence: Evidence, cache: ColumnCache) -> JointFit:
     """Linearise the problem around a joint fit."""
     problem = prepare_search(evidence.model, evidence.fit_runs, evidence.training, evidence.estimate, cache)
     return JointFit(evidence, problem)
+
+
+def _linearised_after(evidence: Evidence, before: JointFit) -> JointFit:
+    """Linearise around a refit; columns of motion are kept unless a correction has changed the motion."""
+    is_same = all(one is other for one, other in zip(evidence.datasets, before.evidence.datasets, strict=True))
+    return linearised(evidence, before.search_problem.cache if is_same else ColumnCache())
 
 
 def keys_of(evidence: Evidence) -> frozenset[EffectKey]:
@@ -141,7 +148,7 @@ def _refit(model: JointFit, accepted: Finding) -> JointFit | SetAside:
         # Asked here: after it, the linearised problem would take memory beside the instruments.
         if why := _refuted_by_instruments(refitted, last):
             return SetAside(accepted, why)
-        joined = resettled(linearised(refitted, problem.cache))
+        joined = resettled(_linearised_after(refitted, model))
     except UNFITTED as error:
         # The linearised problem distinguished the effect from the model, the whole one does not.
         return SetAside(accepted, f"it cannot be fitted: {error}")
@@ -175,7 +182,7 @@ def resettled(model: JointFit) -> JointFit:
             break
         others = evidence.effects[:-1]
         refitted = with_effects(evidence, (*others, PlacedEffect(effect, last.axis)), model.search_problem.runs)
-        model = linearised(refitted, model.search_problem.cache)
+        model = _linearised_after(refitted, model)
     return model
 
 
@@ -201,7 +208,9 @@ def _refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
     if estimate is None:
         return ""
     own = own_unknowns(estimate, (placed,))
-    place, values, fitted = len(estimate.gains) + own, estimate.parameters[own], evidence.estimate.parameters[own]
+    place = len(estimate.gains) + own
+    values = values_of(estimate, own)
+    fitted = values_of(evidence.estimate, own)
     covariance = estimate.covariance[np.ix_(place, place)]
     if not (why := in_noise(values, covariance, SHOWN)):
         return ""
@@ -233,7 +242,7 @@ def _pruned(model: JointFit, accepted: Finding, rng: np.random.Generator, gates:
         try:
             kept = tuple(placed for placed in evidence.effects if placed != worst)
             rest = with_effects(evidence, kept, model.search_problem.runs)
-            model = linearised(rest, model.search_problem.cache)
+            model = _linearised_after(rest, model)
         except UNFITTED:
             needed.add(worst)  # the data cannot be fitted without it
 
@@ -250,7 +259,8 @@ def _beside_others(model: JointFit, placed: PlacedEffect, rng: np.random.Generat
         return 0.0, "the model contains it already"
     (finding,) = rank_families(problem, (FamilyTrials(placed.axis, members),), rng, gates)
     own = own_unknowns(estimate, (placed,))
-    values, place = estimate.parameters[own], len(estimate.gains) + own
+    values = values_of(estimate, own)
+    place = len(estimate.gains) + own
     joint = in_noise(values, estimate.covariance[np.ix_(place, place)])
     physics = impossible(placed.effect.coefficients, values, estimate.parameters_std[own])
     reasons = (*finding.refusals, joint, physics, RunsLeftOut.of(problem).refusal(columns))

@@ -20,6 +20,7 @@ from ident.discovery.gates import (
     RunsLeftOut,
     impossible,
     own_unknowns,
+    values_of,
     whitened_columns,
     without_effects_of,
 )
@@ -45,7 +46,7 @@ from ident.discovery.search import (
     refine_setting,
 )
 from ident.discovery.structure import MIN_MOVES_FOR_STRUCTURE, detection_limits_nm, find_structure, is_inadequate
-from ident.effects.dictionary import EFFECTS
+from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.position import Counterbalance
 from ident.effects.transmission import Ripple
@@ -88,6 +89,7 @@ def find_effects(
     families: tuple[tuple[Effect, ...], ...] = EFFECTS,
     progress: Callable[[str], None] = lambda _: None,
     axes: Sequence[str] = (),
+    geometry: tuple[tuple[Effect, ...], ...] = GEOMETRY,
 ) -> tuple[Step, ...]:
     """Find effects that the model lacks, add them one by one, and refit everything after each.
 
@@ -124,6 +126,7 @@ def find_effects(
         families: the dictionary.
         progress: called with a description of each step.
         axes: their names in it; those of the robot's joints when empty.
+        geometry: the part of the dictionary that corrects the description of the robot.
 
     Returns:
         the turns taken; the last one has accepted nothing, unless MAX_EFFECTS was reached.
@@ -134,7 +137,7 @@ def find_effects(
     steps: list[Step] = []
     seen = {keys_of(start)}
     for _ in range(MAX_EFFECTS):
-        step, joined = _turn(model, rng, gates, families, seen, progress, names)
+        step, joined = _turn(model, rng, gates, (*geometry, *families), seen, progress, names)
         if steps:
             steps[-1] = _settled(steps[-1], model.search_problem, (*step.findings, *step.structures), rng, gates)
         steps.append(step)
@@ -182,7 +185,7 @@ def with_declared(
         problem, columns = reduced.search_problem, reduced.columns
         (trial,) = score_candidates(problem.folds, columns, (slice(0, columns.shape[1]),))
         own = own_unknowns(estimate, (last,))
-        wrong = impossible(last.effect.coefficients, estimate.parameters[own], estimate.parameters_std[own])
+        wrong = impossible(last.effect.coefficients, values_of(estimate, own), estimate.parameters_std[own])
         if trial is None or wrong:
             raise EffectRefused(f"the declared {name}: {wrong or 'the model contains it already'}")
         (finding,) = rank_families(problem, (FamilyTrials(last.axis, ((last.effect, trial),)),), rng, gates)

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident.effects import electrical, friction, position, transmission
+from ident.effects import electrical, friction, geometry, position, transmission
 from ident.effects.effect import Effect
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Periodic, Smooth
@@ -65,6 +65,13 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
     ),  # and what fits the residual best (ident.discovery.balancer)
 )
 """One family a row, with the values of its searched parameters that the search tries."""
+
+GEOMETRY: tuple[tuple[Effect, ...], ...] = (
+    (geometry.ZeroOffset(),),
+    (geometry.GravityDirection(),),
+    (geometry.LatePosition(),),
+)
+"""What the description may have wrong: such an effect corrects it (`ident.effects.geometry`)."""
 
 UNNAMED: tuple[Effect, ...] = (Periodic(), *(Smooth(variable) for variable in Abscissa))
 """Terms that fit anything: what a calibration holds where structure was found that no name explains."""

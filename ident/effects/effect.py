@@ -53,6 +53,7 @@ class Property(Enum):
     RATE_OF_TORQUE = "is zero where the torque has not changed for a while"
     SMOOTH = "changes little where its variable does"
     RATE_OF_LOAD = "is zero where the load does not change"
+    TURNS_THE_ARM = "is the change of the whole arm's torque by another geometry"
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +103,23 @@ class Effect(ABC):
         return Side.JOINT
 
     @property
+    def has_axis(self) -> bool:
+        """Whether it is on an axis; what acts on all alike is placed on the first one for order only."""
+        return self.side is not Side.ALL_MOTORS
+
+    @property
+    def needs_inertia(self) -> bool:
+        """Whether it needs the mass matrix."""
+        return self.side is Side.ALL_JOINTS
+
+    @property
     def needs_revolute(self) -> bool:
         """Whether the effect exists only where the joint's position is an angle."""
+        return False
+
+    @property
+    def needs_tree(self) -> bool:
+        """Whether it exists only where no loop is closed."""
         return False
 
     @property
@@ -208,8 +224,8 @@ class PlacedEffect:
     axis: int
 
     def axis_name(self, axes: Sequence[str]) -> str:
-        """Name of its axis; what acts on every motor alike is placed on the first axis for order only: ALL_AXES."""
-        return ALL_AXES if self.effect.side is Side.ALL_MOTORS else axes[self.axis]
+        """Name of its axis; what acts on every axis alike is placed on the first one for order only: ALL_AXES."""
+        return axes[self.axis] if self.effect.has_axis else ALL_AXES
 
     def name_among(self, axes: Sequence[str]) -> str:
         """Name of effect and place: `load-friction on J3`, `coupling on J4 with J5`."""
@@ -281,6 +297,8 @@ def is_placeable(effect: Effect, axis: int, robot: Robot) -> bool:
         return False
     if effect.needs_revolute and robot.places[axis].kind is JointKind.PRISMATIC:
         return False
-    if effect.side is Side.ALL_MOTORS:
+    if effect.needs_tree and robot.closures:
+        return False
+    if not effect.has_axis:
         return axis == 0
     return effect.side is not Side.TWO_JOINTS or axis + 1 < int(effect.settings["other_axis"]) <= robot.axis_count

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import pairwise
 
@@ -14,7 +14,8 @@ from ident.data.dataset import Dataset
 from ident.equations.rows import Observation
 from ident.estimators.estimate import Estimate
 from ident.model.bodies import LINK_PARAMETERS, Payload
-from ident.model.model import Model
+from ident.model.model import JOINT_COLUMNS, Model
+from ident.model.robot import Motion
 
 STICKING_RAD_S = 0.005  #: Below this speed the noise of the filtered encoder decides the sign
 UNIX_S = 1e9  #: Times from here on, September 2001, are since 1970; earlier ones since some start
@@ -46,6 +47,33 @@ class Abscissa(Enum):
         return self not in {Abscissa.LOAD, Abscissa.CURRENT, Abscissa.TORQUE_RATE, Abscissa.LOAD_CURVATURE}
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Arm:
+    """The arm behind a run's signals, for the torques of a changed geometry."""
+
+    model: Model  #: the model, with the corrections that were applied to it
+    standard: FloatArray  #: standard parameters, those of the mounted payload on the flange, shape (c,)
+    motion: Motion  #: of the axes over k samples
+
+    def load(self, motion: Motion) -> FloatArray:
+        """Torque for links and payload of another motion [Nm or N], shape (m, k)."""
+        return self.model.torques(motion, self.standard)[0]
+
+    def smooth_torque(self, motion: Motion) -> FloatArray:
+        """Whole torque of another motion without dry friction, in joint units [Nm or N], shape (m, k)."""
+        smooth = self.standard.copy()
+        smooth[self.model.dry_friction_columns] = 0.0
+        smooth[JOINT_COLUMNS * self.model.robot.joint_count + 2 :: 3] = 0.0
+        return self.model.torques(motion, smooth)[2]
+
+    def weight(self, gravity_m_s2: FloatArray) -> FloatArray:
+        """Torque that carries links and payload in some gravity, at rest [Nm or N], shape (m, k)."""
+        robot = replace(self.model.robot, gravity_m_s2=gravity_m_s2)
+        still = np.zeros_like(self.motion.position_rad)
+        at_rest = Motion(self.motion.position_rad, still, still)
+        return Model(robot, self.model.drive_train).torques(at_rest, self.standard)[0]
+
+
 @dataclass(frozen=True, slots=True)
 class Signals:
     """One run as an effect sees it; arrays are axis-first, shape (n, k).
@@ -74,6 +102,8 @@ class Signals:
     temperature_c: FloatArray | None = None
     #: Torque at each axis per unit of torque on each joint without a motor, shape (n − m, m, k); empty without any.
     leverage: FloatArray = field(default_factory=lambda: np.empty((0, 0, 0)))
+    #: What made the torques; None where they were not made of a model. Effects that change the geometry need it.
+    arm: Arm | None = None
 
     def temperature(self, axis: int) -> FloatArray:
         """Temperature of an axis [°C], shape (k,); REFERENCE_C where it was not recorded."""
@@ -188,6 +218,7 @@ def declared_signals(
         current_a=motor / gains[:, None],
         temperature_c=None if data.temperature_c is None else data.temperature_c.T,
         leverage=leverage,
+        arm=Arm(model, standard, motion),
     )
 
 

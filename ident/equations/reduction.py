@@ -173,7 +173,7 @@ def layout(model: Model) -> Layout:
 
 def reduce_runs(
     model: Model,
-    runs: Iterable[Run],
+    runs: Iterable[Run | RunRows],
     conditioning: Conditioning,
     *,
     payloads: Sequence[Payload] = (),
@@ -185,7 +185,8 @@ def reduce_runs(
 
     Args:
         model: the declared model.
-        runs: read while they are reduced; a mounting that several share has one set of unknowns.
+        runs: read while they are reduced, or the rows already built of them; a mounting that several share has one set
+            of unknowns.
         conditioning: the filters.
         payloads: known beforehand; others are added as runs bring them.
         instruments: keep those of the demanded motion beside the rows; where it is not known, the recorded one serves.
@@ -206,14 +207,20 @@ def reduce_runs(
     kept: list[RunRows] = []
     known = False
     for run in runs:
-        mounting = mounting_index(run.payload, seen_payloads, run.name)
+        built: Iterable[Rows] = ()
+        if isinstance(run, RunRows):
+            data = run.data
+            built = run.pieces
+        else:
+            data = differentiate(run, model.drive_train, conditioning)
+        mounting = mounting_index(data.payload, seen_payloads, data.name)
         joints += [[np.zeros((c, c)) for c in width] for _ in range(len(seen_payloads) + 1 - len(joints))]
-        data = differentiate(run, model.drive_train, conditioning)
         if instruments:
             data = with_demand(data, model.drive_train, conditioning)
             known |= data.demanded is not None
         moves: dict[int, list[tuple[list[FloatArray], FloatArray]]] = {}
-        built: Iterable[Rows] = rows_of(model, data, conditioning, chunk_rows)
+        if not isinstance(run, RunRows):
+            built = rows_of(model, data, conditioning, chunk_rows)
         if keep_rows:
             kept.append(RunRows(data, tuple(built)))
             built = kept[-1].pieces
@@ -235,7 +242,7 @@ def reduce_runs(
             clusters.append(_cluster(mounting, len(names), pieces))
             if len(clusters) > 2 * MAX_CLUSTERS:
                 clusters = _joined(clusters)
-        names.append(run.name)
+        names.append(data.name)
     if len(clusters) > MAX_CLUSTERS:
         clusters = _joined(clusters)
     return Reduction(

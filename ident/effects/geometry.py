@@ -1,0 +1,324 @@
+"""What the description of a robot has wrong: zeros of joints, the mounting, and positions that come late.
+
+Such a mistake changes the torques of the whole arm. Its column is the derivative of all joint torques with respect to
+it, at the parameters of an estimate; friction of one axis, which may look like it there, explains nothing on the
+others. One column is right for small mistakes alone. So a search corrects the description by what it has found
+(`corrected_robot`, `corrected_dataset`), builds everything anew around it, and fits what is left: the value of a
+coefficient is the whole correction, what was applied and what is left, and its σ is that of the fit.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ident.arrays import BoolArray, FloatArray
+from ident.data.dataset import Dataset
+from ident.effects.effect import Effect, PlacedEffect, Property, Side
+from ident.effects.signals import Abscissa, Arm, Signals
+from ident.model.model import Column, Model
+from ident.model.robot import JointKind, Motion, Robot, skew
+
+POSITION_STEP = 1e-5  #: Of a difference quotient, rad or m: torques change by 1e-5 of themselves, far above rounding
+TIME_STEP_S = 1e-5  #: The same of a delay
+LARGEST_ZERO = 0.35  #: Largest zero offset, rad or m: 20°; a larger one is another robot
+LARGEST_TILT_RAD = 0.35  #: Largest turn of gravity that two columns can find
+LONGEST_DELAY_S = 0.02  #: Longest delay of one encoder
+ROUNDS = 30  #: Of `declared_gravity`; each leaves a third of the difference for the largest turn
+
+
+@dataclass(frozen=True, slots=True)
+class GeometryEffect(Effect):
+    """An effect that corrects the description of the robot, or of its recordings.
+
+    The applied part does not take part in comparisons: an effect is the same one after each correction.
+    """
+
+    side = Side.ALL_JOINTS
+    needs_inertia = False
+
+    @property
+    @abstractmethod
+    def applied(self) -> tuple[float, ...]:
+        """Value of each coefficient that the description has been corrected by already, shape (p,)."""
+
+    @abstractmethod
+    def with_applied(self, values: Sequence[float]) -> GeometryEffect:
+        """The same effect, with the description corrected by these values of the coefficients."""
+
+    def correct_robot(self, robot: Robot, axis: int) -> Robot:
+        """The robot with the applied part of the correction."""
+        del axis
+        return robot
+
+    def correct_dataset(self, data: Dataset, axis: int) -> Dataset:
+        """A run with the applied part of the correction."""
+        del axis
+        return data
+
+
+@dataclass(frozen=True, slots=True)
+class ZeroOffset(GeometryEffect):
+    """τ = c ∂τ/∂q_j, on all joints;  c > 0: joint j stands further than its position says, by c.
+
+    Source: calibration of joint offsets; Hollerbach, Khalil & Gautier, "Model identification", Springer Handbook of
+    Robotics (2016), by torques in the place of poses. Signature: gravity and inertia of the arm behind the joint act in
+    directions that are turned, on the joint and on all those before it.
+    """
+
+    name = "zero-offset"
+    needs_tree = True
+    declares = Property.TURNS_THE_ARM
+    abscissa = Abscissa.LOAD
+
+    applied_rad: float = field(default=0.0, compare=False)  #: correction of the joint's zero in the description
+
+    @property
+    def coefficients(self) -> tuple[Column, ...]:
+        """The offset."""
+        return (Column("offset", "rad", least=-LARGEST_ZERO, largest=LARGEST_ZERO, about=self.applied_rad),)
+
+    @property
+    def applied(self) -> tuple[float, ...]:
+        """The offset in the description."""
+        return (self.applied_rad,)
+
+    def with_applied(self, values: Sequence[float]) -> ZeroOffset:
+        """The same with another zero in the description."""
+        (offset,) = values
+        return ZeroOffset(applied_rad=float(offset))
+
+    def correct_robot(self, robot: Robot, axis: int) -> Robot:
+        """Turn or shift the frame of the joint, so that its recorded position means what it should."""
+        number = robot.axis_joints[axis]
+        joint = robot.joints[number]
+        if joint.kind is JointKind.REVOLUTE:
+            moved = replace(joint, rotation=joint.rotation @ rotation_by(self.applied_rad * joint.axis))
+        else:
+            moved = replace(joint, translation_m=joint.translation_m + self.applied_rad * joint.rotation @ joint.axis)
+        joints = (*robot.joints[:number], moved, *robot.joints[number + 1 :])
+        return replace(robot, joints=joints)
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Columns, shape (n, 1, k)."""
+        arm = require_arm(signals)
+        position = arm.motion.position_rad.copy()
+        position[:, axis] += POSITION_STEP
+        # Not the load of the signals: filtered, it is not quite that of a filtered motion.
+        change = arm.load(replace(arm.motion, position_rad=position)) - arm.load(arm.motion)
+        return change[:, None] / POSITION_STEP
+
+
+@dataclass(frozen=True, slots=True)
+class GravityDirection(GeometryEffect):
+    """τ = a ∂τ/∂α + b ∂τ/∂β on all joints: gravity is turned about two axes across the declared one.
+
+    Source: torque is linear in the vector of gravity. Its length is known; two angles are its direction, so a mounting
+    that is tilted shows in two columns. Signature: torque at rest on many joints at once, also about a vertical axis.
+    """
+
+    name = "gravity-direction"
+    declares = Property.TURNS_THE_ARM
+    abscissa = Abscissa.LOAD
+    has_axis = False
+
+    applied_1_rad: float = field(default=0.0, compare=False)  #: applied turn about the first axis (`across`)
+    applied_2_rad: float = field(default=0.0, compare=False)  #: applied turn about the second axis
+
+    @property
+    def coefficients(self) -> tuple[Column, ...]:
+        """The components of the turn."""
+        return tuple(
+            Column(f"turn {number}", "rad", least=-LARGEST_TILT_RAD, largest=LARGEST_TILT_RAD, about=applied)
+            for number, applied in enumerate(self.applied, start=1)
+        )
+
+    @property
+    def applied(self) -> tuple[float, ...]:
+        """The turn in the description."""
+        return self.applied_1_rad, self.applied_2_rad
+
+    def with_applied(self, values: Sequence[float]) -> GravityDirection:
+        """The same with another direction in the description."""
+        first, second = values
+        return GravityDirection(applied_1_rad=float(first), applied_2_rad=float(second))
+
+    def correct_robot(self, robot: Robot, axis: int) -> Robot:
+        """Turn gravity."""
+        del axis
+        return replace(robot, gravity_m_s2=turned_gravity(robot.gravity_m_s2, self.applied))
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Columns, shape (n, 2, k); the axis does not matter."""
+        del axis
+        arm = require_arm(signals)
+        found = arm.model.robot.gravity_m_s2
+        declared = declared_gravity(found, self.applied)
+        columns: list[FloatArray] = []
+        for number in range(2):
+            turn = list(self.applied)
+            turn[number] += POSITION_STEP
+            change = (turned_gravity(declared, turn) - found) / POSITION_STEP
+            columns.append(arm.weight(change))
+        return np.stack(columns, axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class LatePosition(GeometryEffect):
+    """τ = c (∂τ/∂q_j q̇_j + ∂τ/∂q̇_j q̈_j + ∂τ/∂q̈_j d³q_j/dt³), on all joints;  c > 0: the position of j is late by c.
+
+    Source: Taylor expansion of the torque of the whole arm with one joint later than the others. Signature: in motion
+    alone, on the joint itself and on all joints that its acceleration acts on; a late current shows on its own alone.
+    """
+
+    name = "late-position"
+    needs_tree = True
+    declares = Property.TURNS_THE_ARM
+    abscissa = Abscissa.TORQUE_RATE
+
+    applied_s: float = field(default=0.0, compare=False)  #: by which the recorded position was advanced
+
+    @property
+    def coefficients(self) -> tuple[Column, ...]:
+        """The delay."""
+        return (Column("time", "s", least=-LONGEST_DELAY_S, largest=LONGEST_DELAY_S, about=self.applied_s),)
+
+    @property
+    def applied(self) -> tuple[float, ...]:
+        """The delay that the recording was corrected by."""
+        return (self.applied_s,)
+
+    def with_applied(self, values: Sequence[float]) -> LatePosition:
+        """The same with the recording corrected by another delay."""
+        (delay_s,) = values
+        return LatePosition(applied_s=float(delay_s))
+
+    def correct_dataset(self, data: Dataset, axis: int) -> Dataset:
+        """Advance one joint's position and its derivatives; what the filter has smoothed is interpolated."""
+        steps = self.applied_s * data.rate_hz
+
+        def advanced(values: FloatArray) -> FloatArray:
+            moved = values.copy()
+            moved[:, axis] = shifted(values[:, axis], steps)
+            return moved
+
+        def advanced_mask(mask: BoolArray) -> BoolArray:
+            source = np.clip(np.arange(len(mask)) + round(steps), 0, len(mask) - 1)
+            moved = mask.copy()
+            moved[:, axis] = mask[source, axis]
+            return moved
+
+        return replace(
+            data,
+            position_rad=advanced(data.position_rad),
+            velocity_rad_s=advanced(data.velocity_rad_s),
+            acceleration_rad_s2=advanced(data.acceleration_rad_s2),
+            moving=advanced_mask(data.moving),
+            motor_moving=advanced_mask(data.motor_moving),
+        )
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Columns, shape (n, 1, k)."""
+        arm = require_arm(signals)
+        motion = arm.motion
+        jerk = np.gradient(motion.acceleration_rad_s2[:, axis]) * signals.rate_hz
+        position, velocity, acceleration = (
+            state.copy() for state in (motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2)
+        )
+        position[:, axis] += TIME_STEP_S * motion.velocity_rad_s[:, axis]
+        velocity[:, axis] += TIME_STEP_S * motion.acceleration_rad_s2[:, axis]
+        acceleration[:, axis] += TIME_STEP_S * jerk
+        # Dry friction jumps where the joint turns back; there the joint rests, and rows at rest do not count.
+        change = arm.smooth_torque(Motion(position, velocity, acceleration)) - arm.smooth_torque(motion)
+        return change[:, None] / TIME_STEP_S
+
+
+def is_correction(placed: PlacedEffect) -> bool:
+    """Whether an effect corrects the description of the robot or of its recordings."""
+    return isinstance(placed.effect, GeometryEffect)
+
+
+def corrected_model(model: Model, effects: Iterable[PlacedEffect]) -> Model:
+    """The declared model with the applied part of all corrections among these effects."""
+    robot = model.robot
+    for placed in effects:
+        if isinstance(placed.effect, GeometryEffect):
+            robot = placed.effect.correct_robot(robot, placed.axis)
+    return model if robot is model.robot else Model(robot, model.drive_train)
+
+
+def corrected_dataset(data: Dataset, effects: Iterable[PlacedEffect]) -> Dataset:
+    """A run with the applied part of all corrections among these effects; one that was planned has nothing wrong."""
+    if data.is_planned:
+        return data
+    for placed in effects:
+        if isinstance(placed.effect, GeometryEffect):
+            data = placed.effect.correct_dataset(data, placed.axis)
+    return data
+
+
+def require_arm(signals: Signals) -> Arm:
+    """The arm behind signals.
+
+    Raises:
+        ValueError: they were made without one.
+    """
+    if signals.arm is None:
+        raise ValueError("signals without an arm; expected those that fitted_signals or declared_signals returns")
+    return signals.arm
+
+
+def across(gravity_m_s2: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors across gravity and each other, shape (3,) each; x and y of the base where gravity is along z."""
+    along = gravity_m_s2 / np.linalg.norm(gravity_m_s2)
+    other = np.eye(3)[int(np.argmin(np.abs(along)))]
+    first = other - along * float(along @ other)
+    first /= np.linalg.norm(first)
+    return first, np.cross(first, along)
+
+
+def turned_gravity(declared_m_s2: FloatArray, turn_rad: Sequence[float]) -> FloatArray:
+    """Gravity turned by the two components of a turn about the axes of `across` [m/s²], shape (3,)."""
+    first, second = across(declared_m_s2)
+    return rotation_by(turn_rad[0] * first + turn_rad[1] * second) @ declared_m_s2
+
+
+def declared_gravity(found_m_s2: FloatArray, turn_rad: Sequence[float]) -> FloatArray:
+    """Gravity before a turn: what `turned_gravity` made this of [m/s²], shape (3,).
+
+    The axes of the turn are those across the answer; a few rounds settle both, as the turn is small.
+    """
+    declared = found_m_s2
+    for _ in range(ROUNDS):
+        first, second = across(declared)
+        declared = rotation_by(turn_rad[0] * first + turn_rad[1] * second).T @ found_m_s2
+    return declared
+
+
+def rotation_by(vector_rad: FloatArray) -> FloatArray:
+    """Rotation about a vector by its length (Rodrigues), shape (3, 3)."""
+    angle = float(np.linalg.norm(vector_rad))
+    if angle == 0.0:
+        return np.eye(3)
+    cross = skew(vector_rad / angle)
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)
+
+
+def shifted(values: FloatArray, steps: float) -> FloatArray:
+    """Values so many samples later, by Lagrange's cubic between four neighbours, shape (k,); the ends stay constant."""
+    whole = int(np.floor(steps))
+    part = steps - whole
+    weights = (
+        -part * (part - 1.0) * (part - 2.0) / 6.0,
+        (part + 1.0) * (part - 1.0) * (part - 2.0) / 2.0,
+        -(part + 1.0) * part * (part - 2.0) / 2.0,
+        (part + 1.0) * part * (part - 1.0) / 6.0,
+    )
+    at = np.arange(len(values)) + whole
+    out = np.zeros_like(values)
+    for offset, weight in enumerate(weights, start=-1):
+        out += weight * values[np.clip(at + offset, 0, len(values) - 1)]
+    return out
