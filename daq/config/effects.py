@@ -48,7 +48,7 @@ def _places(effect: Effect, place: int, robot: Robot) -> str:
     """Describe where an effect that is elsewhere can be."""
     if effect.with_motor != (place < robot.axis_count):
         return "an axis: it acts on a motor" if effect.with_motor else "a joint of a closed chain without a motor"
-    if effect.side is Side.ALL_MOTORS:
+    if not effect.has_axis:
         return "the first axis: it acts on all motors alike"
     if effect.side is Side.TWO_JOINTS:
         return "the pair the other way: on the axis of the lower number, with `other_axis` the higher"

@@ -43,6 +43,9 @@ WORDS = {
     "counterbalance": "a balancer between two links",
     "passive-friction": "friction in a joint without a motor",
     "passive-spring": "a spring in a joint without a motor",
+    "zero-offset": "a zero that is off",
+    "gravity-direction": "another direction of gravity than the cell file says",
+    "late-position": "a position that is later than the others",
 }
 """Words by family; an effect that is not listed is called by its name."""
 

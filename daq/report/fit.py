@@ -24,11 +24,13 @@ from daq.report.text import Sentence, percent_text, picked, plain_table
 from daq.workflow.calibration_file import as_document
 from daq.workflow.cases import CASES, CaseFit
 from daq.workflow.fit import DOUBTFUL_PERCENT, Fit
+from daq.workflow.geometry import hidden_zeros_text
 from daq.workflow.nameplates import actual_current_note
 from daq.workflow.verdicts import needed_verdicts
 from ident.arrays import FloatArray
 from ident.calibration import Calibration, Parameter, PayloadMass
 from ident.discovery.evidence import Evidence, without_effects
+from ident.discovery.geometry_check import GeometryCheck
 from ident.effects.effect import PlacedEffect
 from ident.estimators.comparison import Comparison, EstimatorTrial
 from ident.estimators.estimate import Estimate, RelativeError
@@ -69,6 +71,7 @@ def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | 
         f"{estimate.condition:.0f}; position filter {filter_.position_cutoff_hz:g} Hz, decimation "
         f"{filter_.decimation_cutoff_hz:g} Hz. Compare relative errors only under the same filters."
     )
+    yield from map(Sentence, geometry_notes(fitted.geometry, axes))
     yield from map(Sentence, identifiability_notes(fitted, calibration.payload_mass))
     yield from map(Sentence, advice(fitted, needed_verdicts(fitted)))
     if comparison is not None:
@@ -125,6 +128,7 @@ def fit_document(found: CaseFit, calibration: Calibration, comparison: Compariso
     return {
         **as_document(calibration),
         "compared": compared,
+        "geometry": geometry_document(fitted.geometry, axes),
         **(
             {"torque_channel": torque_document(fitted.torque_slopes, calibration.gains)} if fitted.torque_slopes else {}
         ),
@@ -241,6 +245,41 @@ def identifiability_notes(fitted: Fit, influences: Sequence[PayloadMass]) -> tup
         f"Not identifiable from these data: {_mass_mistake(drawn)}{masses}; so does a wrong value of gravity. A gear "
         "efficiency that is the same in both directions is part of its gain.",
     )
+
+
+def geometry_notes(check: GeometryCheck | None, axes: Sequence[str]) -> tuple[str, ...]:
+    """Sentences on the direction of gravity and on the zeros that the data do not show; none where nothing was tested.
+
+    Args:
+        check: beside the fit.
+        axes: their names.
+    """
+    if check is None:
+        return ()
+    texts: list[str] = []
+    if check.gravity is not None:
+        turn = np.degrees(check.gravity.turn_rad)
+        std = np.degrees(check.gravity.turn_std_rad)
+        texts.append(f"Gravity, by the torques: {turn:.2f} ± {std:.2f}° from the direction in the cell file.")
+    hidden = hidden_zeros_text(check, axes)
+    if hidden:
+        texts.append(hidden)
+    return tuple(texts)
+
+
+def geometry_document(check: GeometryCheck | None, axes: Sequence[str]) -> dict[str, Any] | None:
+    """Build the part `geometry` of `fit --json`; None where nothing was tested."""
+    if check is None:
+        return None
+    gravity = None
+    if check.gravity is not None:
+        gravity = {
+            "declared_m_s2": check.gravity.declared_m_s2.tolist(),
+            "found_m_s2": check.gravity.found_m_s2.tolist(),
+            "turn_deg": float(np.degrees(check.gravity.turn_rad)),
+            "turn_std_deg": float(np.degrees(check.gravity.turn_std_rad)),
+        }
+    return {"gravity": gravity, "hidden_zeros": [axes[axis] for axis in check.hidden_zeros]}
 
 
 def _mass_mistake(drawn: Sequence[str]) -> str:

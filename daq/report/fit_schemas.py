@@ -85,10 +85,27 @@ class Trial(StrictModel):
     reason: str = ""
 
 
+class FoundGravity(StrictModel):
+    """Direction of gravity by the torques, beside the declared one."""
+
+    declared_m_s2: list[Figure]
+    found_m_s2: list[Figure]
+    turn_deg: Figure
+    turn_std_deg: Figure
+
+
+class CheckedGeometry(StrictModel):
+    """What the torques say of the description of the robot."""
+
+    gravity: FoundGravity | None
+    hidden_zeros: list[str]
+
+
 class FitReport(CalibrationBody):
     """`fit`."""
 
     compared: dict[Literal["tls"], ComparedFit]
+    geometry: CheckedGeometry | None = None
     torque_channel: tuple[OwnTorque, ...] = ()
     removed: list[RemovedParameter]
     verdicts: list[GainWords]

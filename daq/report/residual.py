@@ -27,7 +27,7 @@ from ident.discovery.noise_floor import CONFIDENCE, FloorSource
 from ident.discovery.search import Finding
 from ident.discovery.time_skew import Skew
 from ident.drift.change import FALSE_ALARM
-from ident.effects.effect import PlacedEffect, Side
+from ident.effects.effect import PlacedEffect
 from ident.effects.signals import session_began_s
 from ident.effects.unnamed import is_unnamed
 from ident.estimators.estimate import RelativeError
@@ -453,7 +453,7 @@ def _effect_sentence(
     excess = ""
     if is_unnamed(placed.effect) and share_of_excess is not None:
         excess = f" (about {100.0 * share_of_excess:.0f} % of the residual beyond noise)"
-    if placed.effect.side is Side.ALL_MOTORS:
+    if not placed.effect.has_axis:
         before_all, after_all = (_strictest_error(errors)[0].total for errors in (turn.before, turn.after))
         change = error_change_text(before_all, after_all)
         return f"The recording has {effect_text(placed.effect, axes)}: the error {where} {change}."

@@ -26,6 +26,7 @@ from daq.workflow.declared_effects import (
     with_effects_of_cell,
 )
 from daq.workflow.diagnoses import currents_as_cause, diagnose_fit
+from daq.workflow.geometry import check_diagnoses, correction_diagnoses, geometry_beside, is_checked
 from daq.workflow.validate import diagnose_log
 from ident.calibration import Calibration, PayloadMass, Source
 from ident.calibration import calibration_of as identified_calibration
@@ -33,6 +34,7 @@ from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
 from ident.discovery.before_after import error_on, holdout_change
 from ident.discovery.evidence import Evidence, gather, without_effects
+from ident.discovery.geometry_check import GeometryCheck
 from ident.discovery.loop import Step, find_effects
 from ident.effects.friction import TemperatureFriction
 from ident.errors import Diagnosis, IdentificationError, PayloadUnseen
@@ -62,6 +64,7 @@ class Fit:
     torque_slopes: tuple[TorqueSlope | None, ...] = ()
     #: The operator takes effects that held-out runs refute: these have then taken part in the choice.
     accept_worse_holdout: bool = False
+    geometry: GeometryCheck | None = None  #: of the declared geometry; None where it was not tested
 
     @property
     def estimate(self) -> Estimate:
@@ -221,7 +224,7 @@ def fit(
             holdout=reading.runs(unseen, "holdout"),
             method=method,
             fixed_gains=nameplate if gains_fixed else None,
-            keep_rows=keep_rows or bool(effects),
+            keep_rows=keep_rows or bool(effects) or is_checked((*used, *unseen)),
             judge=not effects,
             axes=declared.axis_names,
         )
@@ -268,13 +271,35 @@ def judged(fitted: Fit) -> Fit:
     Raises:
         IdentificationError: a mistake leaves no number that can be used.
     """
-    of_fit = diagnose_fit(fitted.final, fitted.cell, fitted.logs, fitted.read)
+    fitted = with_geometry(fitted)
+    of_fit = (
+        *geometry_diagnoses(fitted),
+        *diagnose_fit(fitted.final, fitted.cell, fitted.logs, fitted.read),
+    )
     calibration = _calibration(fitted)
     of_holdout: list[Diagnosis] = []
     for log in fitted.holdout:
         run, described = fitted.read(log)
         of_holdout += diagnose_log(calibration, log, run, described)
     return replace(fitted, diagnoses=(*of_fit, *of_holdout))
+
+
+def with_geometry(fitted: Fit) -> Fit:
+    """Test the declared geometry beside a fit that has kept its rows; a search has tested it itself."""
+    if fitted.geometry is not None or fitted.identification.gathered is None:
+        return fitted
+    evidence = fitted.steps[-1].after if fitted.steps else fitted.evidence()
+    return replace(fitted, geometry=geometry_beside(evidence, BOOTSTRAP_SEED))
+
+
+def geometry_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
+    """What a fit says of the declared geometry: the corrections of its search, or else what the test beside it found."""
+    runs = fitted.identification.system.runs
+    if fitted.steps:
+        return correction_diagnoses(fitted.steps[-1].after, fitted.cell, runs)
+    if fitted.geometry is None:
+        return ()
+    return check_diagnoses(fitted.geometry, fitted.cell, fitted.identification.model, runs)
 
 
 def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: None) -> Comparison:

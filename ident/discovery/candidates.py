@@ -151,7 +151,7 @@ def prepare_search(
     Raises:
         TooFewMoves: there are too few moves to leave some out.
     """
-    pieces, move_of = _pieces(observation)
+    pieces, move_of = pieces_of(observation)
     began_s = session_began_s(datasets)
     runs = tuple(fitted_signals(model, data, observation, estimate, began_s) for data in datasets)
     problem = linearise(
@@ -190,7 +190,7 @@ def prepare_search(
     )
 
 
-def _pieces(observation: Observation) -> tuple[IntArray, IntArray]:
+def pieces_of(observation: Observation) -> tuple[IntArray, IntArray]:
     """Piece of a move that each row belongs to, shape (r,), and the move that each piece with rows belongs to.
 
     The scatter of moves is known well only from many: moves of a short recording are cut into pieces of many

@@ -27,7 +27,6 @@ TIME_STEP_S = 1e-5  #: The same of a delay
 LARGEST_ZERO = 0.35  #: Largest zero offset, rad or m: 20°; a larger one is another robot
 LARGEST_TILT_RAD = 0.35  #: Largest turn of gravity that two columns can find
 LONGEST_DELAY_S = 0.02  #: Longest delay of one encoder
-ROUNDS = 30  #: Of `declared_gravity`; each leaves a third of the difference for the largest turn
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,14 +148,16 @@ class GravityDirection(GeometryEffect):
     def correct_robot(self, robot: Robot, axis: int) -> Robot:
         """Turn gravity."""
         del axis
-        return replace(robot, gravity_m_s2=turned_gravity(robot.gravity_m_s2, self.applied))
+        declared = robot.gravity_m_s2
+        return replace(robot, gravity_m_s2=turned_gravity(declared, self.applied), declared_gravity_m_s2=declared)
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (n, 2, k); the axis does not matter."""
         del axis
         arm = require_arm(signals)
-        found = arm.model.robot.gravity_m_s2
-        declared = declared_gravity(found, self.applied)
+        robot = arm.model.robot
+        found = robot.gravity_m_s2
+        declared = found if robot.declared_gravity_m_s2 is None else robot.declared_gravity_m_s2
         columns: list[FloatArray] = []
         for number in range(2):
             turn = list(self.applied)
@@ -284,18 +285,6 @@ def turned_gravity(declared_m_s2: FloatArray, turn_rad: Sequence[float]) -> Floa
     """Gravity turned by the two components of a turn about the axes of `across` [m/s²], shape (3,)."""
     first, second = across(declared_m_s2)
     return rotation_by(turn_rad[0] * first + turn_rad[1] * second) @ declared_m_s2
-
-
-def declared_gravity(found_m_s2: FloatArray, turn_rad: Sequence[float]) -> FloatArray:
-    """Gravity before a turn: what `turned_gravity` made this of [m/s²], shape (3,).
-
-    The axes of the turn are those across the answer; a few rounds settle both, as the turn is small.
-    """
-    declared = found_m_s2
-    for _ in range(ROUNDS):
-        first, second = across(declared)
-        declared = rotation_by(turn_rad[0] * first + turn_rad[1] * second).T @ found_m_s2
-    return declared
 
 
 def rotation_by(vector_rad: FloatArray) -> FloatArray:

@@ -66,6 +66,8 @@ class Robot:
     #: Positions of all joints at which the closures hold: which of several ways of assembly is meant. Shape (n,).
     assembly_rad: FloatArray | None = None
     platform: Place | None = None  #: frame of the link that carries the payload; None: that of the last joint
+    #: Gravity before its direction was corrected, shape (3,); None where it was not.
+    declared_gravity_m_s2: FloatArray | None = None
 
     @property
     def joint_count(self) -> int:

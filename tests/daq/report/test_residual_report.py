@@ -57,7 +57,7 @@ from ident.discovery.loop import Step
 from ident.discovery.noise_floor import FloorSource, NoiseFloor
 from ident.discovery.search import Finding
 from ident.discovery.time_skew import Skew
-from ident.effects.dictionary import EFFECTS
+from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import Coupling, LoadFriction
 from ident.effects.position import Spring
@@ -677,7 +677,7 @@ def test_effects_are_called_by_words_and_axes_by_names() -> None:
     term = Smooth(Abscissa.OTHER_VELOCITY, other_axis=2)
     assert effect_text(term, axes) == "a torque that depends on the velocity of arm and that no named effect explains"
     assert other_axis(Spring()) is None
-    assert set(WORDS) <= {family[0].name for family in EFFECTS}
+    assert set(WORDS) <= {family[0].name for family in (*EFFECTS, *GEOMETRY)}
 
 
 def test_a_folder_that_holds_something_else_is_refused_before_any_work(

@@ -1,0 +1,157 @@
+"""What a fit says of the description of its robot: zeros, mounting and late positions, as diagnoses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from daq.config.cell import Cell
+from ident.arrays import FloatArray
+from ident.discovery.evidence import Evidence, coefficients_of
+from ident.discovery.geometry_check import GeometryCheck, check_geometry
+from ident.effects.effect import PlacedEffect
+from ident.effects.geometry import GravityDirection, LatePosition, ZeroOffset, is_correction, turned_gravity
+from ident.errors import Diagnosis, TooFewMoves
+from ident.estimators.identify import estimate_with
+from ident.estimators.method import Method
+from ident.model.model import Model
+from ident.model.robot import JointKind
+
+CHECKED_BYTES = 150_000_000
+"""Largest size of all logs of a fit whose rows are kept for the test: some ten minutes of six axes at 1 kHz."""
+
+
+def is_checked(logs: Sequence[Path]) -> bool:
+    """Whether logs are small enough to keep their rows."""
+    return sum(log.stat().st_size for log in logs) <= CHECKED_BYTES
+
+
+def geometry_beside(evidence: Evidence, seed: int) -> GeometryCheck | None:
+    """Test the geometry beside a fit by any estimator; None with too few moves.
+
+    Args:
+        evidence: the rows behind the fit.
+        seed: of the bootstrap.
+    """
+    if evidence.estimate.method is not Method.ML:
+        fixed = evidence.estimate.gains if evidence.estimate.gains_fixed else None
+        by_ml = estimate_with(Method.ML, evidence.training.system(), fixed)
+        evidence = replace(evidence, estimate=by_ml)
+    try:
+        return check_geometry(evidence, np.random.default_rng(seed))
+    except TooFewMoves:
+        return None
+
+
+def check_diagnoses(check: GeometryCheck, cell: Cell, model: Model, runs: Sequence[str]) -> tuple[Diagnosis, ...]:
+    """Diagnoses of a check beside a fit.
+
+    Args:
+        check: of the fit.
+        cell: whose description it is.
+        model: as declared.
+        runs: names of the runs of the fit.
+    """
+    found = check.mistake
+    if found is None:
+        return ()
+    placed = PlacedEffect(found.effect, found.axis)
+    return tuple(_diagnosis(placed, found.coefficients, found.deviations, cell, model, runs))
+
+
+def correction_diagnoses(evidence: Evidence, cell: Cell, runs: Sequence[str]) -> tuple[Diagnosis, ...]:
+    """Diagnoses of the corrections that a search has made.
+
+    Args:
+        evidence: with its effects.
+        cell: whose description it is.
+        runs: names of the runs of the fit.
+    """
+    if evidence.uncorrected is None:
+        return ()
+    found: list[Diagnosis] = []
+    for placed in evidence.effects:
+        if is_correction(placed):
+            values, deviations = coefficients_of(evidence.estimate, placed)
+            found += _diagnosis(placed, values, deviations, cell, evidence.uncorrected.model, runs)
+    return tuple(found)
+
+
+def _diagnosis(
+    placed: PlacedEffect, values: FloatArray, deviations: FloatArray, cell: Cell, model: Model, runs: Sequence[str]
+) -> list[Diagnosis]:
+    """The diagnosis of one correction; none of an effect that is no correction."""
+    name = cell.place_names[placed.axis]
+    match placed.effect:
+        case ZeroOffset():
+            unit, scale, key = _zero_unit(model, placed.axis)
+            offset = f"{scale * values[0]:+.2f} ± {scale * deviations[0]:.2f} {unit}"
+            entered = scale * (cell.axes[placed.axis].zero_offset_rad + values[0])
+            return [
+                Diagnosis(
+                    name="zero-off",
+                    runs=tuple(runs),
+                    axes=(name,),
+                    found=f"the zero of {name} off by {offset}",
+                    expected="positions whose zero is that of the URDF",
+                    remedy=f"correct `{key}` of {name} in the cell file to {entered:.2f}, or the zero in the "
+                    "controller, and fit again",
+                )
+            ]
+        case GravityDirection():
+            declared = model.robot.gravity_m_s2
+            turned = turned_gravity(declared, values.tolist())
+            angle = np.degrees(np.linalg.norm(values))
+            std = np.degrees(np.linalg.norm(values * deviations) / max(float(np.linalg.norm(values)), 1e-12))
+            return [
+                Diagnosis(
+                    name="gravity-turned",
+                    runs=tuple(runs),
+                    axes=(),
+                    found=f"gravity along {vector_text(turned)}, turned by {angle:.2f} ± {std:.2f}°",
+                    expected=f"{vector_text(declared)}, as the cell file says",
+                    remedy=f"level the base, or write `gravity_m_s2: {vector_text(turned)}`, and fit again",
+                )
+            ]
+        case LatePosition():
+            delay = f"{1e3 * abs(values[0]):.2f} ± {1e3 * deviations[0]:.2f} ms"
+            late = "late" if values[0] > 0.0 else "early"
+            return [
+                Diagnosis(
+                    name="position-late",
+                    runs=tuple(runs),
+                    axes=(name,),
+                    found=f"the position of {name} {late} by {delay}",
+                    expected="positions and currents of one moment",
+                    remedy=f"look for what delays this encoder alone: a filter, a slower channel, another time stamp "
+                    f"than that of the other axes",
+                )
+            ]
+        case _:
+            return []
+
+
+def _zero_unit(model: Model, axis: int) -> tuple[str, float, str]:
+    """Unit of an axis' zero, how many of it are in a radian or metre, and the key of the cell file."""
+    if model.robot.axes[axis].kind is JointKind.PRISMATIC:
+        return "mm", 1e3, "zero_offset_mm"
+    return "°", float(np.degrees(1.0)), "zero_offset_deg"
+
+
+def vector_text(vector: FloatArray) -> str:
+    """A vector as a cell file has it: `[0.00, 0.34, -9.80]`."""
+    return f"[{', '.join(f'{entry:.2f}' for entry in vector)}]"
+
+
+def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str]) -> str:
+    """Which zeros the data cannot show; empty where they show all, or were not asked."""
+    if check is None or not check.hidden_zeros:
+        return ""
+    names = [axes[axis] for axis in check.hidden_zeros]
+    return (
+        f"The zero of {' and '.join(names)} cannot be seen here: about a vertical axis, or behind the last joint, "
+        "another zero makes the same torques."
+    )

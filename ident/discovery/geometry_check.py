@@ -1,0 +1,159 @@
+"""Whether the description of a robot is wrong, beside a fit: without a search, and without correcting anything.
+
+Zeros of joints, the direction of gravity and late positions are tested on the rows of a fit
+(`ident.effects.geometry`). Where one of them passes, it must also explain more of what is left out than each named
+effect of one axis does: a spring that nobody declared looks like a wrong zero if nothing else is asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ident.arrays import FloatArray
+from ident.data.conditioning import Conditioning
+from ident.data.dataset import Dataset
+from ident.discovery.candidates import FamilyTrials, SearchProblem, pieces_of
+from ident.discovery.evidence import Evidence
+from ident.discovery.gates import Gates
+from ident.discovery.search import Finding, rank_families
+from ident.effects.dictionary import EFFECTS, GEOMETRY
+from ident.effects.effect import Effect, is_placeable
+from ident.effects.geometry import GravityDirection, ZeroOffset, turned_gravity
+from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
+from ident.equations.linearisation import cut_into_folds, linearise
+from ident.equations.rows import decimate_rows
+
+AT_ROWS = frozenset(
+    {Abscissa.VELOCITY, Abscissa.POSITION, Abscissa.LOAD, Abscissa.TIME, Abscissa.SESSION, Abscissa.CURRENT}
+)
+"""Variables of the effects that a correction competes with: they change slowly enough to be built at the rows."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gravity:
+    """Direction of gravity as the torques show it, beside the declared one."""
+
+    declared_m_s2: FloatArray  #: in the base frame, shape (3,)
+    found_m_s2: FloatArray  #: of the same length, shape (3,)
+    turn_rad: float  #: angle between both
+    turn_std_rad: float  #: its σ
+
+
+@dataclass(frozen=True, slots=True)
+class GeometryCheck:
+    """What a fit says of the description of its robot."""
+
+    gravity: Gravity | None  #: None where the data do not show it, as in a plane that is level
+    mistake: Finding | None  #: the correction that the data ask for; None where they ask for none
+    hidden_zeros: tuple[int, ...]  #: axes whose zero the data cannot show: another one makes the same torques
+
+
+def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | None = None) -> GeometryCheck:
+    """Test the geometry beside a fit.
+
+    Args:
+        evidence: identified by ``ml``, from `gather`.
+        rng: of the bootstrap.
+        gates: limits for a correction, those of a search.
+
+    Raises:
+        TooFewMoves: there are too few moves to leave some out.
+    """
+    gates = gates or Gates()
+    problem = _problem_at_rows(evidence)
+    tested = _tested(problem, GEOMETRY)
+    findings = rank_families(problem, tested, rng, gates)
+    passed = [found for found in findings if found.passed]
+    mistake = passed[0] if passed else None
+    if mistake is not None:
+        rivals = rank_families(problem, (*tested, *_tested(problem, _slow(EFFECTS))), rng, gates)
+        best = max(rivals, key=lambda found: found.held_out_fall)
+        if (best.effect, best.axis) != (mistake.effect, mistake.axis):
+            mistake = None
+    shown = {found.axis for found in findings if isinstance(found.effect, ZeroOffset)}
+    robot = evidence.model.robot
+    can_be_wrong = [axis for axis in range(robot.axis_count) if is_placeable(ZeroOffset(), axis, robot)]
+    return GeometryCheck(
+        gravity=_gravity(findings, robot.gravity_m_s2),
+        mistake=mistake,
+        hidden_zeros=tuple(axis for axis in can_be_wrong if axis not in shown),
+    )
+
+
+def _gravity(findings: Sequence[Finding], declared_m_s2: FloatArray) -> Gravity | None:
+    """The direction of gravity among findings."""
+    for found in findings:
+        if isinstance(found.effect, GravityDirection):
+            turn = found.coefficients
+            angle = float(np.linalg.norm(turn))
+            # σ along the turn that was found; of no turn at all, the larger one.
+            along = turn / angle if angle > 0.0 else np.ones(2)
+            return Gravity(
+                declared_m_s2=declared_m_s2,
+                found_m_s2=turned_gravity(declared_m_s2, turn.tolist()),
+                turn_rad=angle,
+                turn_std_rad=float(np.linalg.norm(along * found.deviations)),
+            )
+    return None
+
+
+def _tested(problem: SearchProblem, families: Sequence[Sequence[Effect]]) -> tuple[FamilyTrials, ...]:
+    """Trials of families on all axes, built at the rows."""
+    tested: list[FamilyTrials] = []
+    for axis in range(len(problem.model.robot.places)):
+        fitting: list[tuple[Effect, ...]] = []
+        for family in families:
+            members = tuple(one for one in family if is_placeable(one, axis, problem.model.robot))
+            fitting.append(tuple(one for one in members if one.fits_in(problem.rows, axis)))
+        tested += problem.test([family for family in fitting if family], axis, at_rows=True)
+    return tuple(tested)
+
+
+def _slow(families: Sequence[Sequence[Effect]]) -> tuple[Sequence[Effect], ...]:
+    """Families whose columns can be built at the rows."""
+    return tuple(family for family in families if family[0].abscissa in AT_ROWS and not family[0].needs_inertia)
+
+
+def _problem_at_rows(evidence: Evidence) -> SearchProblem:
+    """The residual of a fit with signals of the decimated motion: a twentieth of the samples."""
+    observation, estimate = evidence.training, evidence.estimate
+    pieces, move_of = pieces_of(observation)
+    began_s = session_began_s(evidence.fit_runs)
+    rows: list[Signals] = []
+    for data in evidence.fit_runs:
+        slow = _decimated(data, evidence.conditioning)
+        rows.append(fitted_signals(evidence.model, slow, observation, estimate, began_s, inertia=False))
+    problem = linearise(
+        replace(observation, move=pieces),
+        estimate.gains,
+        estimate.parameters,
+        estimate.axis_noise,
+        gains_fixed=estimate.gains_fixed,
+    )
+    return SearchProblem(
+        model=evidence.model,
+        datasets=evidence.fit_runs,
+        observation=observation,
+        runs=tuple(rows),
+        rows=tuple(rows),
+        folds=cut_into_folds(problem, move_of=move_of),
+        floors_a=(None,) * observation.axis_count,
+    )
+
+
+def _decimated(data: Dataset, conditioning: Conditioning) -> Dataset:
+    """A run at its rows: motion and clock; what a search does not ask of it is left out."""
+    time_s = decimate_rows(data, conditioning, data.time_s)
+    temperature_c = None if data.temperature_c is None else decimate_rows(data, conditioning, data.temperature_c.T).T
+    return replace(
+        data,
+        rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])),
+        time_s=time_s,
+        position_rad=decimate_rows(data, conditioning, data.position_rad.T).T,
+        velocity_rad_s=decimate_rows(data, conditioning, data.velocity_rad_s.T).T,
+        acceleration_rad_s2=decimate_rows(data, conditioning, data.acceleration_rad_s2.T).T,
+        temperature_c=temperature_c,
+    )

@@ -1,0 +1,188 @@
+"""Mistakes of the description, planted into recordings: found as what they are, and gains as if they were not there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ident.calibration import calibration_of
+from ident.data.run import Run
+from ident.discovery.before_after import account, left_out_runs
+from ident.discovery.evidence import Evidence, coefficients_of, with_effects, without_effects
+from ident.discovery.gates import Gates
+from ident.discovery.geometry_check import GeometryCheck, check_geometry
+from ident.discovery.loop import Step, find_effects
+from ident.effects.effect import PlacedEffect
+from ident.effects.geometry import GravityDirection, LatePosition, ZeroOffset, rotation_by
+from ident.model.model import Model
+from ident.prediction import predict_current
+from tests.ident.recordings import MOUNTED, Truth, gathered, record, three_axes_truth
+
+FloatArray = NDArray[np.float64]
+
+GATES = Gates(draws=199)
+NOISE_A = 0.03
+ZERO_RAD = np.radians(2.0)
+TILT_RAD = np.radians(2.0)
+LATE_S = 0.003
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """What is wrong with a description, with the name, axis and values that must be found."""
+
+    name: str
+    axis: int
+    values: tuple[float, ...]
+    zero_rad: float = 0.0
+    late_s: float = 0.0
+    tilt_rad: float = 0.0
+
+
+MISTAKES = (
+    Mistake("zero-offset", 1, (-ZERO_RAD,), zero_rad=ZERO_RAD),
+    Mistake("late-position", 2, (LATE_S,), late_s=LATE_S),
+    Mistake("gravity-direction", 0, (-TILT_RAD, 0.0), tilt_rad=TILT_RAD),
+)
+CLEAN = Mistake("nothing", 0, ())
+
+
+def _declared(mistake: Mistake) -> Truth:
+    truth = three_axes_truth()
+    robot = truth.model.robot
+    turned = rotation_by(np.array([mistake.tilt_rad, 0.0, 0.0])) @ robot.gravity_m_s2
+    return replace(truth, model=Model(replace(robot, gravity_m_s2=turned), truth.model.drive_train))
+
+
+def _with_mistake(run: Run, mistake: Mistake) -> Run:
+    position = run.position_rad.copy()
+    axis = mistake.axis
+    position[:, axis] += mistake.zero_rad
+    position[:, axis] = np.interp(run.time_s - mistake.late_s, run.time_s, position[:, axis])
+    return replace(run, position_rad=position)
+
+
+@cache
+def _runs() -> tuple[Run, ...]:
+    truth = three_axes_truth()
+    rng = np.random.default_rng(8)
+    return tuple(
+        record(truth, f"run {number}", rng, seconds=15.0, rate_hz=500.0, noise_a=NOISE_A, payload=payload)
+        for number, payload in enumerate((None, MOUNTED, None, MOUNTED, MOUNTED))
+    )
+
+
+@cache
+def _fitted(mistake: Mistake) -> Evidence:
+    runs = tuple(_with_mistake(run, mistake) for run in _runs())
+    return gathered(_declared(mistake), runs[:4], runs[4:])
+
+
+@cache
+def _searched(mistake: Mistake) -> tuple[Step, ...]:
+    return find_effects(_fitted(mistake), np.random.default_rng(0), GATES)
+
+
+def _checked(mistake: Mistake) -> GeometryCheck:
+    return check_geometry(_fitted(mistake), np.random.default_rng(0), GATES)
+
+
+@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.name)
+def test_a_mistake_is_named_alone_with_its_size_and_bends_no_gain(mistake: Mistake) -> None:
+    start, last = _fitted(mistake), _searched(mistake)[-1].after
+    (placed,) = last.effects
+    assert (placed.effect.name, placed.axis) == (mistake.name, mistake.axis)
+    values, deviations = coefficients_of(last.estimate, placed)
+    assert np.all(np.abs(values - mistake.values) < 3.0 * deviations)
+    assert np.all(deviations < 0.15 * abs(mistake.values[0]))
+    truth = three_axes_truth()
+    off = np.abs(last.estimate.gains - truth.gains)
+    assert np.all(off < 3.0 * last.estimate.gains_std)
+    clean = _fitted(CLEAN)
+    assert last.identification.training_error.total < 1.02 * clean.identification.training_error.total
+    # The description is what it was without the correction, to the last bit.
+    again = without_effects(last, start.estimate)
+    assert np.array_equal(again.training.regressor, start.training.regressor)
+    assert again.datasets == start.datasets
+    assert again.corrections == ()
+
+
+@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.name)
+def test_the_check_beside_a_fit_names_it_too(mistake: Mistake) -> None:
+    found = _checked(mistake).mistake
+    assert found is not None
+    assert (found.effect.name, found.axis) == (mistake.name, mistake.axis)
+
+
+def test_a_clean_recording_names_nothing_and_shows_the_direction_of_gravity() -> None:
+    assert _searched(CLEAN)[-1].after.effects == ()
+    check = _checked(CLEAN)
+    assert check.mistake is None
+    assert check.hidden_zeros == (0, 2)  # about the vertical, and behind the last joint
+    assert check.gravity is not None
+    assert check.gravity.turn_rad < 4.0 * check.gravity.turn_std_rad < np.radians(0.5)
+
+
+def test_a_spring_that_nobody_declared_is_no_wrong_zero() -> None:
+    """A wrong zero explains a part of what it leaves; the spring explains all of it."""
+    truth = three_axes_truth()
+    runs: list[Run] = []
+    for run in _runs()[:4]:
+        current = run.current_a.copy()
+        current[:, 1] += 6.0 * run.position_rad[:, 1] / truth.gains[1]
+        runs.append(replace(run, current_a=current))
+    found = check_geometry(gathered(truth, tuple(runs)), np.random.default_rng(0), GATES)
+    assert found.mistake is None
+
+
+def test_the_correction_is_in_the_prediction_of_a_calibration() -> None:
+    mistake = MISTAKES[0]
+    start, steps = _fitted(mistake), _searched(mistake)
+    calibration = calibration_of(start.identification, ("J1", "J2", "J3"), (33.0, 33.0, -24.0), steps=steps)
+    (accepted,) = calibration.effects
+    assert (accepted.name, accepted.axis, accepted.settings) == ("zero-offset", "J2", {})
+    assert accepted.coefficients[0].value == pytest.approx(-ZERO_RAD, abs=0.002)
+    last = steps[-1].after
+    data = start.datasets[-1]
+    predicted = predict_current(calibration, start.model, data)
+    moving = data.motor_moving.all(axis=1)
+    left = (predicted - data.current_a)[moving]
+    assert np.sqrt(np.mean(left**2)) < 1.1 * NOISE_A
+    # The corrected model predicts the same; the declared one does not.
+    declared = tuple(one for one in calibration.parameters if not one.name.startswith("zero-offset"))
+    without = replace(calibration, effects=(), parameters=declared)
+    bad = (predict_current(without, start.model, data) - data.current_a)[moving]
+    assert np.sqrt(np.mean(bad**2)) > 1.5 * NOISE_A
+    assert last.model is not start.model
+
+
+def test_before_and_after_are_of_the_same_rows() -> None:
+    mistake = MISTAKES[1]
+    start, steps = _fitted(mistake), _searched(mistake)
+    whole = account(start, steps)
+    assert whole.holdout_change is not None
+    assert whole.holdout_change.rise < -2.0 * whole.holdout_change.std
+    assert [placed.effect.name for placed in whole.total.added] == ["late-position"]
+    left_out = left_out_runs(steps[-1].after, start.estimate.gains)
+    assert left_out.together is not None
+    assert left_out.together.total < 1.1 * whole.total.after.in_sample.total
+
+
+def test_a_correction_that_leaves_is_taken_back() -> None:
+    start = _fitted(MISTAKES[0])
+    offset, late = PlacedEffect(ZeroOffset(), 1), PlacedEffect(LatePosition(), 2)
+    both = with_effects(start, (offset, late))
+    assert set(both.corrections) == {offset, late}
+    alone = with_effects(both, (late,))
+    directly = with_effects(start, (late,))
+    assert alone.estimate.gains == pytest.approx(directly.estimate.gains, rel=1e-6)
+    assert alone.corrections == (late,)
+
+
+def test_a_declared_turn_of_gravity_is_within_twenty_degrees() -> None:
+    columns = GravityDirection().coefficients
+    assert [np.degrees(column.largest) for column in columns] == pytest.approx([20.05, 20.05], abs=0.1)
