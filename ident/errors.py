@@ -166,7 +166,8 @@ class Diagnosis:
     """Something wrong with a recording or fit that leaves usable numbers, and where to look."""
 
     #: One of axis-error, axis-idle, channels-exchanged, current-off-scale, current-reversed, estimators-disagree,
-    #: gain-off-nameplate, gravity-turned, ill-conditioned, payload-differs, position-late, torque-above-limit, zero-off.
+    #: gain-off-nameplate, gravity-turned, ill-conditioned, payload-differs, position-late, torque-above-limit,
+    #: zero-off.
     name: str
     runs: tuple[str, ...]  #: those it points at
     axes: tuple[str, ...]  #: likewise

@@ -71,6 +71,14 @@ def corrections_of(calibration: Calibration) -> tuple[PlacedEffect, ...]:
     return tuple(found)
 
 
+def left_of(placed: PlacedEffect, coefficients: FloatArray) -> tuple[PlacedEffect, FloatArray]:
+    """An effect and its coefficients beside a corrected model: of a correction nothing is left, but its σ."""
+    if not isinstance(placed.effect, GeometryEffect):
+        return placed, coefficients
+    applied = replace(placed, effect=placed.effect.with_applied(coefficients.tolist()))
+    return applied, np.zeros_like(coefficients)
+
+
 def predict_current(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
     """Predict the current references of a motion, v = (T τ)/g.
 

@@ -26,7 +26,8 @@ from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
-from ident.effects.effect import effect_torque
+from ident.effects.effect import PlacedEffect, effect_torque
+from ident.effects.geometry import corrected_dataset, corrected_model
 from ident.effects.signals import Signals, declared_signals
 from ident.equations.linearisation import jackknife_covariance
 from ident.equations.rows import Observation, observe
@@ -40,7 +41,7 @@ from ident.model.model import Column, Model
 from ident.model.robot import Place
 from ident.planning.excitation import UNSEEN, side_of_cube
 from ident.planning.verdict import ExtraMoves
-from ident.prediction import placed_effect, standard_parameters
+from ident.prediction import corrections_of, left_of, placed_effect, standard_parameters
 
 MAX_PASSES = 8  #: Of the effects' columns; load friction of a tenth of the load needs three
 STAYS = 1e-3  #: Largest change of the body in the last pass, as a share of its size; each is some 3 % of the one before
@@ -204,22 +205,36 @@ def rows_to_weigh(
     without, mounted = prepared(bare), prepared(loaded)
     if not mounted:
         raise DataUnfit("", "no run with the body to weigh was given; expected at least one")
-    datasets = (*without, *mounted)
+    return _rows_of(model, (*without, *mounted), len(without), conditioning)
+
+
+def _rows_of(model: Model, datasets: tuple[Dataset, ...], bare: int, conditioning: Conditioning) -> RowsToWeigh:
+    """Build the rows of runs, those without the body first."""
     names = tuple(column.name for column in model.columns)
     every = BaseParameters(tuple(range(len(names))), np.eye(len(names)), names)
     runs = tuple(data.name for data in datasets)
     standard = Equations(model, every, model.columns, (), (), runs)
     rows = observe(model, datasets, conditioning, standard)
     body = tuple(Column(f"{name}:body", unit) for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True))
-    rows = rows.extended(body, rows.flange * (rows.run >= len(without)))
-    return RowsToWeigh(model, datasets, len(without), rows)
+    rows = rows.extended(body, rows.flange * (rows.run >= bare))
+    return RowsToWeigh(model, datasets, bare, rows)
+
+
+def _corrected(given: RowsToWeigh, corrections: tuple[PlacedEffect, ...]) -> RowsToWeigh:
+    """The rows of the robot as a calibration has corrected its description."""
+    if not corrections:
+        return given
+    model = corrected_model(given.model, corrections)
+    datasets = tuple(corrected_dataset(data, corrections) for data in given.datasets)
+    return _rows_of(model, datasets, given.bare, given.rows.conditioning)
 
 
 def weigh_rows(calibration: Calibration, given: RowsToWeigh) -> WeighedBody:
     """Weigh the body with rows that are at hand; errors are those of `weigh`."""
+    given = _corrected(given, corrections_of(calibration))
     model, standard = given.model, standard_parameters(calibration, given.model)
     gains = np.array([gain.value for gain in calibration.gains])
-    effects = [placed_effect(accepted, calibration) for accepted in calibration.effects]
+    effects = [left_of(*placed_effect(accepted, calibration)) for accepted in calibration.effects]
     known = np.concatenate((standard, np.zeros(10), *(coefficients for _, coefficients in effects)))
     ten = np.arange(len(standard), len(standard) + 10)
     depends = not all(placed.effect.abscissa.is_independent_of_model for placed, _ in effects)

@@ -293,7 +293,7 @@ def with_geometry(fitted: Fit) -> Fit:
 
 
 def geometry_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
-    """What a fit says of the declared geometry: the corrections of its search, or else what the test beside it found."""
+    """What a fit says of the declared geometry: corrections of its search, or else what the test beside it found."""
     runs = fitted.identification.system.runs
     if fitted.steps:
         return correction_diagnoses(fitted.steps[-1].after, fitted.cell, runs)

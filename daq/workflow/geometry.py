@@ -126,8 +126,8 @@ def _diagnosis(
                     axes=(name,),
                     found=f"the position of {name} {late} by {delay}",
                     expected="positions and currents of one moment",
-                    remedy=f"look for what delays this encoder alone: a filter, a slower channel, another time stamp "
-                    f"than that of the other axes",
+                    remedy="look for what delays this encoder alone: a filter, a slower channel, another time stamp "
+                    "than that of the other axes",
                 )
             ]
         case _:

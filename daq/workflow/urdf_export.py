@@ -15,6 +15,7 @@ from daq.writeback.formats.xml_document import Element, parse
 from ident.arrays import FloatArray
 from ident.calibration import Calibration
 from ident.effects.effect import Property
+from ident.effects.geometry import corrected_model
 from ident.model.bodies import Body
 from ident.model.model import Model
 from ident.physical.physical import (
@@ -25,7 +26,7 @@ from ident.physical.physical import (
     random_motion,
     regroup,
 )
-from ident.prediction import placed_effect
+from ident.prediction import corrections_of, placed_effect
 
 SAMPLES = 400
 """Random states on which torques are compared: some ten times as many equations as a six-axis arm has parameters."""
@@ -83,6 +84,7 @@ def physical_robot(calibration: Calibration, model: Model, limits: FloatArray, u
         ModelError: the calibration is of another robot.
         NotPhysical: no set was found.
     """
+    model = corrected_model(model, corrections_of(calibration))
     columns = model.regressor(random_motion(limits, SAMPLES, SEED))
     of_effects = {coefficient.name for effect in calibration.effects for coefficient in effect.coefficients}
     known = {p.name: p for p in calibration.parameters if p.name not in of_effects and ":" not in p.name}

@@ -27,6 +27,7 @@ from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.effects.friction import TemperatureFriction
+from ident.effects.geometry import corrected_model
 from ident.effects.signals import REFERENCE_C
 from ident.equations.reduction import reduce_runs
 from ident.equations.rows import row_filter, row_masks
@@ -37,6 +38,7 @@ from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
 from ident.prediction import (
     as_calibrated,
+    corrections_of,
     measured_torque,
     mounted_parameters,
     predict_torque,
@@ -319,7 +321,8 @@ def cross_validate(
             validations.append(found[first])
         condition, reduction = None, None
         with suppress(IdentificationError):
-            reduction = reduce_runs(model, (run,), conditioning)
+            corrected = corrected_model(model, corrections_of(calibrations[first]))
+            reduction = reduce_runs(corrected, (run,), conditioning)
             # A payload without columns of its own is part of the link that carries it.
             system = reduction.system(reduction.base(), ((),) * len(reduction.payloads))
             condition = wls(system, _gains(calibrations[first])).condition
@@ -380,7 +383,8 @@ def diagnose_log(calibration: Calibration, log: Path, run: Run, described: Cell)
     conditioning = conditioning_of(calibration)
     validation = predicted(calibration, conditioning, model, log, run, described.digest)
     with suppress(IdentificationError):
-        return diagnose_run(calibration, validation, model, run, reduce_runs(model, (run,), conditioning))
+        corrected = corrected_model(model, corrections_of(calibration))
+        return diagnose_run(calibration, validation, model, run, reduce_runs(corrected, (run,), conditioning))
     return ()
 
 

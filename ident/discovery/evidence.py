@@ -17,8 +17,8 @@ from ident.data.demand import as_demanded, with_demand
 from ident.data.run import Run
 from ident.discovery.gates import own_unknowns, values_of
 from ident.effects.effect import PlacedEffect, effect_torque
-from ident.effects.signals import Signals, fitted_signals, session_began_s
 from ident.effects.geometry import GeometryEffect, corrected_dataset, corrected_model, is_correction
+from ident.effects.signals import Signals, fitted_signals, session_began_s
 from ident.equations.reduction import reduce_runs
 from ident.equations.rows import Observation, RunRows, observe, on_demanded_motion, rows_of
 from ident.equations.system import System
@@ -26,7 +26,6 @@ from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.identify import Identification, estimate_with
 from ident.estimators.method import Method
 from ident.model.model import Model
-
 
 RELINEARISATIONS = 4  #: Corrections of the geometry in one refit; a zero that is wrong by 2° settles in two
 SETTLED = 0.1  #: Share of σ below which a further correction is not worth its time
@@ -149,7 +148,7 @@ def with_corrections(before: Evidence, corrections: tuple[PlacedEffect, ...]) ->
 
 
 def coefficients_of(estimate: Estimate, placed: PlacedEffect) -> tuple[FloatArray, FloatArray]:
-    """Coefficients of an effect in an estimate, what was applied to the description included, and σ; shape (p,) each."""
+    """Coefficients of an effect in an estimate, with what was applied to the description, and σ; shape (p,) each."""
     own = own_unknowns(estimate, (placed,))
     return values_of(estimate, own), estimate.parameters_std[own]
 
@@ -173,13 +172,14 @@ def _relinearised(found: Evidence) -> tuple[PlacedEffect, ...] | None:
     effects: list[PlacedEffect] = []
     is_moved = False
     for placed in found.effects:
+        kept = placed
         if isinstance(placed.effect, GeometryEffect):
             values, std = coefficients_of(found.estimate, placed)
             left = np.abs(values - np.array(placed.effect.applied))
             if np.any(left > SETTLED * std):
                 is_moved = True
-                placed = replace(placed, effect=placed.effect.with_applied(values.tolist()))
-        effects.append(placed)
+                kept = replace(placed, effect=placed.effect.with_applied(values.tolist()))
+        effects.append(kept)
     return tuple(effects) if is_moved else None
 
 

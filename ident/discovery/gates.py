@@ -210,7 +210,8 @@ def own_unknowns(estimate: Estimate, effects: Sequence[PlacedEffect]) -> IntArra
 
 def values_of(estimate: Estimate, own: IntArray) -> FloatArray:
     """Values of some parameters, what was applied to the description of the robot included, shape (p,)."""
-    return estimate.parameters[own] + np.array([estimate.unknowns[index].about for index in own])
+    applied = np.array([estimate.unknowns[index].about for index in own])
+    return np.asarray(estimate.parameters[own] + applied)
 
 
 def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effects: Sequence[PlacedEffect]) -> Reduced:

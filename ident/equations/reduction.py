@@ -207,20 +207,16 @@ def reduce_runs(
     kept: list[RunRows] = []
     known = False
     for run in runs:
-        built: Iterable[Rows] = ()
-        if isinstance(run, RunRows):
-            data = run.data
-            built = run.pieces
-        else:
-            data = differentiate(run, model.drive_train, conditioning)
+        data = run.data if isinstance(run, RunRows) else differentiate(run, model.drive_train, conditioning)
         mounting = mounting_index(data.payload, seen_payloads, data.name)
         joints += [[np.zeros((c, c)) for c in width] for _ in range(len(seen_payloads) + 1 - len(joints))]
         if instruments:
             data = with_demand(data, model.drive_train, conditioning)
             known |= data.demanded is not None
         moves: dict[int, list[tuple[list[FloatArray], FloatArray]]] = {}
-        if not isinstance(run, RunRows):
-            built = rows_of(model, data, conditioning, chunk_rows)
+        built: Iterable[Rows] = (
+            run.pieces if isinstance(run, RunRows) else rows_of(model, data, conditioning, chunk_rows)
+        )
         if keep_rows:
             kept.append(RunRows(data, tuple(built)))
             built = kept[-1].pieces
