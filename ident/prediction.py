@@ -42,7 +42,7 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
     model = corrected_model(model, corrections)
     data = corrected_dataset(data, corrections)
     standard = standard_parameters(calibration, model)
-    standard[model.flange] += _payload(calibration, data)
+    standard[model.flange] += payload_of(calibration, data)
     run = declared_signals(model, data, standard, gains, calibration.session_began_s)
     torque = model.drive_train.direction.T @ run.motor_torque_nm
     for accepted in calibration.effects:
@@ -225,7 +225,12 @@ def _gains(calibration: Calibration, model: Model) -> FloatArray:
     return np.array([gain.value for gain in calibration.gains])
 
 
-def _payload(calibration: Calibration, data: Dataset) -> FloatArray:
+def payload_of(calibration: Calibration, data: Dataset) -> FloatArray:
+    """χ_L of what a run carries: from the run, and what the calibration has identified of its mounting, shape (10,).
+
+    Raises:
+        DataUnfit: the calibration does not know the mounting, or knows the payload with another mass.
+    """
     payload = data.payload
     if payload is None:
         return np.zeros(len(LINK_PARAMETERS))

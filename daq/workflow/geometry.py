@@ -26,7 +26,7 @@ CHECKED_BYTES = 150_000_000
 
 def is_checked(logs: Sequence[Path]) -> bool:
     """Whether logs are small enough to keep their rows."""
-    return sum(log.stat().st_size for log in logs) <= CHECKED_BYTES
+    return sum(log.stat().st_size for log in logs if log.is_file()) <= CHECKED_BYTES
 
 
 def geometry_beside(evidence: Evidence, seed: int) -> GeometryCheck | None:

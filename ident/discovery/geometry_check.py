@@ -13,18 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.data.conditioning import Conditioning
-from ident.data.dataset import Dataset
 from ident.discovery.candidates import FamilyTrials, SearchProblem, pieces_of
 from ident.discovery.evidence import Evidence
 from ident.discovery.gates import Gates
 from ident.discovery.search import Finding, rank_families
 from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import Effect, is_placeable
-from ident.effects.geometry import GravityDirection, ZeroOffset, turned_gravity
+from ident.effects.geometry import LARGEST_ZERO, GravityDirection, ZeroOffset, turned_gravity
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.linearisation import cut_into_folds, linearise
-from ident.equations.rows import decimate_rows
+from ident.equations.rows import at_rows
 
 AT_ROWS = frozenset(
     {Abscissa.VELOCITY, Abscissa.POSITION, Abscissa.LOAD, Abscissa.TIME, Abscissa.SESSION, Abscissa.CURRENT}
@@ -73,7 +71,8 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
         best = max(rivals, key=lambda found: found.held_out_fall)
         if (best.effect, best.axis) != (mistake.effect, mistake.axis):
             mistake = None
-    shown = {found.axis for found in findings if isinstance(found.effect, ZeroOffset)}
+    zeros = [found for found in findings if isinstance(found.effect, ZeroOffset)]
+    shown = {found.axis for found in zeros if found.deviations[0] < LARGEST_ZERO}
     robot = evidence.model.robot
     can_be_wrong = [axis for axis in range(robot.axis_count) if is_placeable(ZeroOffset(), axis, robot)]
     return GeometryCheck(
@@ -124,7 +123,7 @@ def _problem_at_rows(evidence: Evidence) -> SearchProblem:
     began_s = session_began_s(evidence.fit_runs)
     rows: list[Signals] = []
     for data in evidence.fit_runs:
-        slow = _decimated(data, evidence.conditioning)
+        slow = at_rows(data, evidence.conditioning)
         rows.append(fitted_signals(evidence.model, slow, observation, estimate, began_s, inertia=False))
     problem = linearise(
         replace(observation, move=pieces),
@@ -141,19 +140,4 @@ def _problem_at_rows(evidence: Evidence) -> SearchProblem:
         rows=tuple(rows),
         folds=cut_into_folds(problem, move_of=move_of),
         floors_a=(None,) * observation.axis_count,
-    )
-
-
-def _decimated(data: Dataset, conditioning: Conditioning) -> Dataset:
-    """A run at its rows: motion and clock; what a search does not ask of it is left out."""
-    time_s = decimate_rows(data, conditioning, data.time_s)
-    temperature_c = None if data.temperature_c is None else decimate_rows(data, conditioning, data.temperature_c.T).T
-    return replace(
-        data,
-        rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])),
-        time_s=time_s,
-        position_rad=decimate_rows(data, conditioning, data.position_rad.T).T,
-        velocity_rad_s=decimate_rows(data, conditioning, data.velocity_rad_s.T).T,
-        acceleration_rad_s2=decimate_rows(data, conditioning, data.acceleration_rad_s2.T).T,
-        temperature_c=temperature_c,
     )

@@ -43,6 +43,21 @@ def decimate_rows(data: Dataset, conditioning: Conditioning, columns: FloatArray
     return decimator(data.rate_hz, conditioning.decimation_cutoff_hz)(columns)
 
 
+def at_rows(data: Dataset, conditioning: Conditioning) -> Dataset:
+    """A run at the rows of the equations: motion and clock, and nothing else of it."""
+    time_s = decimate_rows(data, conditioning, data.time_s)
+    temperature_c = None if data.temperature_c is None else decimate_rows(data, conditioning, data.temperature_c.T).T
+    return replace(
+        data,
+        rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])),
+        time_s=time_s,
+        position_rad=decimate_rows(data, conditioning, data.position_rad.T).T,
+        velocity_rad_s=decimate_rows(data, conditioning, data.velocity_rad_s.T).T,
+        acceleration_rad_s2=decimate_rows(data, conditioning, data.acceleration_rad_s2.T).T,
+        temperature_c=temperature_c,
+    )
+
+
 def row_masks(model: Model, data: Dataset, conditioning: Conditioning) -> tuple[BoolArray, BoolArray]:
     """Rows of each axis, and of each motor, that count (Observation.use, .motor_use), both of shape (m, r).
 

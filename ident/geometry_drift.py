@@ -1,0 +1,130 @@
+"""Whether the geometry of a robot has changed since its calibration, by one run that the fit has not seen.
+
+An encoder that lost its zero, or a base that was moved, leaves a part of the prediction's error that is the derivative
+of the whole arm's torque (`ident.effects.geometry`). Friction and gains change with temperature and wear, so what they
+explain is left out of the comparison: on each axis the predicted torque, its speed, the direction of motion and a
+constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.calibration import Calibration
+from ident.data.conditioning import Conditioning
+from ident.data.dataset import Dataset
+from ident.effects.dictionary import GEOMETRY
+from ident.effects.effect import PlacedEffect, is_placeable
+from ident.effects.geometry import corrected_dataset, corrected_model
+from ident.effects.signals import declared_signals
+from ident.equations.rows import at_rows
+from ident.model.model import Model
+from ident.prediction import corrections_of, payload_of, standard_parameters
+
+LEAST_SHARE = 0.3  #: Of the squared error, beyond friction and gains, that a change of the geometry must explain
+CERTAIN_SIGMAS = 6.0  #: By which it must differ from zero: several are tried
+FEWEST_MOVES = 8  #: Of the scatter that σ comes from
+
+
+@dataclass(frozen=True, slots=True)
+class GeometryDrift:
+    """A change of the geometry since the calibration."""
+
+    placed: PlacedEffect  #: the correction, on its axis
+    values: FloatArray  #: of its coefficients, shape (p,)
+    deviations: FloatArray  #: their σ by the scatter of moves, shape (p,)
+    share: float  #: of the squared error beyond friction and gains that it explains
+
+
+def geometry_drift(
+    calibration: Calibration,
+    model: Model,
+    data: Dataset,
+    conditioning: Conditioning,
+    left_nm: FloatArray,
+    use: BoolArray,
+) -> GeometryDrift | None:
+    """Name the change of the geometry that explains the error of a prediction; None where none does.
+
+    Args:
+        calibration: that predicts.
+        model: the declared model.
+        data: the run, differentiated.
+        conditioning: the filters of the rows.
+        left_nm: measured less predicted torque at the rows [Nm or N], shape (m, r).
+        use: rows of each axis that count, shape (m, r).
+    """
+    corrections = corrections_of(calibration)
+    model = corrected_model(model, corrections)
+    slow = at_rows(corrected_dataset(data, corrections), conditioning)
+    move = data.move[np.searchsorted(data.time_s, slow.time_s).clip(0, len(data.move) - 1)]
+    standard = standard_parameters(calibration, model)
+    standard[model.flange] += payload_of(calibration, data)
+    gains = np.array([gain.value for gain in calibration.gains])
+    signals = declared_signals(model, slow, standard, gains, calibration.session_began_s, inertia=False)
+    scale = np.array([_rms(row[used]) for row, used in zip(left_nm, use, strict=True)])
+    weight = np.where(use, 1.0 / np.maximum(scale, np.finfo(np.float64).tiny)[:, None], 0.0)
+    nuisance = _nuisance(signals.geared_torque_nm, signals.velocity_rad_s)
+    left = _beyond(nuisance, left_nm[:, None], weight)[:, 0]
+    best: GeometryDrift | None = None
+    for placed in _candidates(model):
+        columns = _beyond(nuisance, placed.effect.columns(signals, placed.axis), weight)
+        found = _fitted(placed, columns, left, move)
+        if found is not None and (best is None or found.share > best.share):
+            best = found
+    return best
+
+
+def _candidates(model: Model) -> Iterator[PlacedEffect]:
+    for (effect,) in GEOMETRY:
+        for axis in range(model.robot.axis_count):
+            if is_placeable(effect, axis, model.robot):
+                yield PlacedEffect(effect, axis)
+
+
+def _nuisance(torque_nm: FloatArray, velocity: FloatArray) -> FloatArray:
+    """What may have changed on each axis without a change of the geometry, shape (m, 4, r)."""
+    return np.stack((torque_nm, velocity, np.sign(velocity), np.ones_like(velocity)), axis=1)
+
+
+def _beyond(nuisance: FloatArray, columns: FloatArray, weight: FloatArray) -> FloatArray:
+    """Weighted columns, shape (m, p, r), less what the nuisance of each axis explains of them."""
+    out = columns * weight[:, None]
+    for axis, own in enumerate(nuisance * weight[:, None]):
+        solution = np.linalg.lstsq(own.T, out[axis].T, rcond=None)[0]
+        out[axis] -= (own.T @ solution).T
+    return np.asarray(out)
+
+
+def _fitted(placed: PlacedEffect, columns: FloatArray, left: FloatArray, move: IntArray) -> GeometryDrift | None:
+    """Least squares of one correction, with σ by moves; None where it is not certain enough."""
+    gram = np.einsum("mpr,mqr->pq", columns, columns)
+    score = np.einsum("mpr,mr->pr", columns, left)
+    if np.linalg.cond(gram) > 1e10 or not np.diag(gram).all():
+        return None
+    inverse = np.linalg.inv(gram)
+    values = inverse @ score.sum(axis=1)
+    rest = left - np.einsum("mpr,p->mr", columns, values)
+    by_row = np.einsum("mpr,mr->pr", columns, rest)
+    clusters = np.unique(move, return_inverse=True)[1]
+    by_move = np.stack([np.bincount(clusters, weights=row) for row in by_row], axis=1)
+    if len(by_move) < FEWEST_MOVES:
+        return None
+    spread = by_move @ inverse
+    covariance = spread.T @ spread
+    wald = float(values @ np.linalg.pinv(covariance) @ values)
+    share = 1.0 - float(np.sum(rest**2) / np.sum(left**2))
+    if share < LEAST_SHARE or wald < CERTAIN_SIGMAS**2:
+        return None
+    bounds = zip(values, placed.effect.coefficients, strict=True)
+    if any(not column.least <= value <= column.largest for value, column in bounds):
+        return None
+    return GeometryDrift(placed, values, np.sqrt(np.diag(covariance)), share)
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0

@@ -1,0 +1,79 @@
+"""A zero that is lost, a base that is moved, after the calibration: named by one run that the fit has not seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ident.calibration import Calibration, calibration_of
+from ident.data.dataset import differentiate
+from ident.data.run import Run
+from ident.discovery.evidence import Evidence
+from ident.effects.geometry import rotation_by
+from ident.equations.rows import decimate_rows, row_masks
+from ident.geometry_drift import GeometryDrift, geometry_drift
+from ident.model.model import Model
+from ident.prediction import measured_torque, predict_torque
+from tests.ident.recordings import MOUNTED, gathered, record, tx40_truth
+
+FloatArray = NDArray[np.float64]
+
+AXES = tuple(f"J{number}" for number in range(1, 7))
+NOISE_A = 0.05
+
+
+@cache
+def _new_run() -> Run:
+    return record(tx40_truth(), "new", np.random.default_rng(77), seconds=30.0, rate_hz=500.0, noise_a=NOISE_A)
+
+
+@cache
+def _fitted() -> tuple[Evidence, Calibration]:
+    rng = np.random.default_rng(5)
+    runs = tuple(
+        record(tx40_truth(), f"run {number}", rng, payload, seconds=15.0, rate_hz=500.0, noise_a=NOISE_A)
+        for number, payload in enumerate((None, MOUNTED))
+    )
+    evidence = gathered(tx40_truth(), runs)
+    return evidence, calibration_of(evidence.identification, AXES, (1.0,) * 6)
+
+
+def _drift(run: Run, model: Model) -> GeometryDrift | None:
+    evidence, calibration = _fitted()
+    data = differentiate(run, model.drive_train, evidence.conditioning)
+    use, _ = row_masks(model, data, evidence.conditioning)
+    left = measured_torque(calibration, model, data.current_a) - predict_torque(calibration, model, data)
+    left_nm = decimate_rows(data, evidence.conditioning, left.T)
+    return geometry_drift(calibration, model, data, evidence.conditioning, left_nm, use)
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+def test_a_lost_zero_is_named_with_its_size(axis: int) -> None:
+    position = _new_run().position_rad.copy()
+    position[:, axis] += np.radians(3.0)
+    found = _drift(replace(_new_run(), position_rad=position), tx40_truth().model)
+    assert found is not None
+    assert (found.placed.effect.name, found.placed.axis) == ("zero-offset", axis)
+    assert np.degrees(found.values[0]) == pytest.approx(-3.0, abs=0.5)
+
+
+def test_a_moved_base_is_named() -> None:
+    truth = tx40_truth().model
+    turned = rotation_by(np.array([0.0, np.radians(4.0), 0.0])) @ truth.robot.gravity_m_s2
+    found = _drift(_new_run(), Model(replace(truth.robot, gravity_m_s2=turned), truth.drive_train))
+    assert found is not None
+    assert found.placed.effect.name == "gravity-direction"
+    assert np.degrees(np.linalg.norm(found.values)) == pytest.approx(4.0, abs=0.5)
+
+
+def test_nothing_is_named_where_friction_or_a_gain_has_changed() -> None:
+    run, truth = _new_run(), tx40_truth()
+    assert _drift(run, truth.model) is None
+    current = run.current_a.copy()
+    current[:, 1] += 4.0 * np.sign(np.gradient(run.position_rad[:, 1])) / truth.gains[1]
+    current[:, 2] *= 1.2
+    assert _drift(replace(run, current_a=current), truth.model) is None
