@@ -61,6 +61,8 @@ _WHERE = {
     "counterbalance": "with a lever of {ratio:.2g} of its foot's distance",
 }
 """Where or how fast an effect acts, by family, from its searched parameters; other families need no such words."""
+_ANGLES = frozenset({"offset", "turn 1", "turn 2"})
+"""Coefficients of the geometry that a technician reads in degrees."""
 _POINTS = 61
 
 
@@ -185,6 +187,8 @@ def _in_order(accepted: AcceptedEffect, placed: PlacedEffect) -> list[Parameter]
 
 
 def _sized(name: str, one: Parameter) -> str:
+    if one.unit == "rad" and name in _ANGLES:
+        return f"{name} {with_deviation(math.degrees(one.value), math.degrees(one.std))}°"
     if one.unit == "Nm/Nm":
         return f"{with_deviation(100.0 * one.value, 100.0 * one.std)} % of the load torque"
     if one.unit == "s":

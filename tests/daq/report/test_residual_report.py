@@ -27,7 +27,7 @@ from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import EffectsRefuted, ExitCode, OutputFailed, UsageError
 from daq.report import residual_page as residual_page_module
-from daq.report.effect_names import WORDS, effect_text, other_axis
+from daq.report.effect_names import WORDS, effect_text, named_size, other_axis
 from daq.report.fit_schemas import ResidualReport
 from daq.report.html import page, paragraph, table
 from daq.report.plots import draw_fit
@@ -46,7 +46,7 @@ from daq.report.text import Sentence, json_text
 from daq.workflow import fit as fit_module
 from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.fit import Fit, calibration_of, fit
-from ident.calibration import AcceptedEffect, Calibration
+from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.discovery import before_after as before_after_module
 from ident.discovery.before_after import Account, account
 from ident.discovery.evidence import with_effects
@@ -60,6 +60,7 @@ from ident.discovery.time_skew import Skew
 from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import Coupling, LoadFriction
+from ident.effects.geometry import ZeroOffset
 from ident.effects.position import Spring
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Periodic, Smooth
@@ -668,6 +669,13 @@ def test_what_rises_is_not_said_to_fall() -> None:
     assert error_change_text(2.34, 2.39) == "rises from 2.3 to 2.4 %"
     assert error_change_text(2.4, 2.1) == "falls from 2.4 to 2.1 %"
     assert error_change_text(2.81, 2.79) == "stays at 2.8 %"
+
+
+def test_a_zero_is_read_in_degrees_and_a_slide_in_metres() -> None:
+    turned = Parameter("zero-offset offset 3", -math.radians(2.0), math.radians(0.04), "rad")
+    assert named_size(ZeroOffset(), (turned,)) == "offset -2.000 ± 0.040°"
+    moved = Parameter("zero-offset offset 1", 0.003, 0.0001, "m")
+    assert named_size(ZeroOffset(), (moved,)) == "offset 0.00300 ± 0.00010 m"
 
 
 def test_effects_are_called_by_words_and_axes_by_names() -> None:
