@@ -35,6 +35,7 @@ from ident.discovery.joining import (
 )
 from ident.discovery.resonance import propose_resonances
 from ident.discovery.ripple import propose_orders
+from ident.discovery.rotor import propose_rotors
 from ident.discovery.search import (
     EffectKey,
     Finding,
@@ -289,7 +290,8 @@ def _proposals(
     balanced = [placed.axis for placed in effects if isinstance(placed.effect, Counterbalance)]
     balancers = propose_balancers(search_problem, gates, families, balanced)
     found = (ripples, resonances, balancers)
-    return {axis: tuple(f for one in found for f in one.get(axis, ())) for axis in {a for one in found for a in one}}
+    own = {axis: tuple(f for one in found for f in one.get(axis, ())) for axis in {a for one in found for a in one}}
+    return propose_rotors(search_problem, gates, families, own)
 
 
 def _first_of_axis(aside: Sequence[SetAside], new: SetAside) -> tuple[SetAside, ...]:

@@ -1,0 +1,107 @@
+"""Propose what the rotor takes of the load, for losses at the gear of an axis whose load contains the rotor.
+
+Which axes these are follows from the base parameters: the column of the rotor's inertia depends on columns of links.
+There `load-friction` and `efficiency` are proposed in a second form, with the rotor's inertia as a setting and the
+rest of it as a coefficient (`ident.effects.rotor`). It is tried only where the plain form explains what the gates
+require, so a search without such a loss costs a few trials.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ident.arrays import FloatArray
+from ident.discovery.candidates import SearchProblem, shares_explained
+from ident.discovery.gates import Gates
+from ident.effects.effect import Effect
+from ident.effects.rotor import largest_inertia, next_inertia
+from ident.equations.rows import Observation
+
+Families = tuple[tuple[Effect, ...], ...]
+
+MOST_STEPS = 6  #: Of a rotor's inertia; each is a fraction of the one before
+CLOSE_ENOUGH = 0.1  #: Standard deviations of the inertia below which a step no longer matters
+
+
+def has_rotor_form(effect: Effect) -> bool:
+    """Whether an effect is a loss that grows with the load."""
+    return "with_rotor" in effect.settings
+
+
+def axes_with_rotor_in_load(observation: Observation) -> tuple[int, ...]:
+    """Indices of the axes whose predicted load contains the rotor's torque, because links move the same way."""
+    model, base = observation.model, observation.base
+    links = set(model.link_columns.ravel().tolist())
+    of_links = np.array([column in links for column in base.independent])
+    found = []
+    for axis, column in enumerate(model.rotor_columns.tolist()):
+        weights = base.grouping[:, column]
+        if column not in base.independent and weights[of_links].any():
+            found.append(axis)
+    return tuple(found)
+
+
+def propose_rotors(
+    search_problem: SearchProblem, gates: Gates, families: Families, proposed: Mapping[int, Families]
+) -> dict[int, Families]:
+    """Return each family of losses with the form that leaves the rotor out, for each axis that needs it.
+
+    Args:
+        search_problem: around the model.
+        gates: the plain form must explain their least share of a motor's squared residual.
+        families: the dictionary.
+        proposed: what is proposed for each axis already; it is kept.
+    """
+    losses = [family for family in families if has_rotor_form(family[0])]
+    found = dict(proposed)
+    for axis in axes_with_rotor_in_load(search_problem.observation) if losses else ():
+        for family in losses:
+            (tested,) = search_problem.test((family,), axis, at_rows=True) or (None,)
+            if tested is None:
+                continue
+            shares = shares_explained(search_problem, [trial for _, trial in tested.members])
+            if max(shares) < gates.smallest_share:
+                continue
+            refined = [without_rotor(search_problem, effect, axis) for effect in family]
+            forms = tuple(effect for effect in refined if effect is not None)
+            if forms:
+                found[axis] = (*found.get(axis, ()), (*family, *forms))
+    return found
+
+
+def without_rotor(search_problem: SearchProblem, effect: Effect, axis: int) -> Effect | None:
+    """Return the form of a loss that leaves the rotor out, with the inertia that fits best; None where none does."""
+    largest_kg_m2 = largest_inertia(search_problem.runs, axis)
+    inertia_kg_m2 = effect.settings["rotor_inertia_kg_m2"]
+    for _ in range(MOST_STEPS):
+        effect = effect.with_settings({"with_rotor": 1, "rotor_inertia_kg_m2": inertia_kg_m2})
+        (trial,) = search_problem.trials([search_problem.torque_at_rows(effect, axis)])
+        if trial is None or not trial.coefficients[0] > 0.0:
+            return None
+        before_kg_m2 = inertia_kg_m2
+        inertia_kg_m2 = next_inertia(before_kg_m2, trial.coefficients, largest_kg_m2)
+        if abs(inertia_kg_m2 - before_kg_m2) <= 0.01 * largest_kg_m2:
+            break
+    return effect.with_settings({"rotor_inertia_kg_m2": inertia_kg_m2})
+
+
+def refined_rotor(
+    search_problem: SearchProblem, effect: Effect, axis: int, coefficients: FloatArray, deviations: FloatArray
+) -> Effect:
+    """Return a loss with the rotor's inertia that its fit calls for, or the same effect where that is close enough.
+
+    Args:
+        search_problem: around the fit.
+        effect: the loss, with the inertia as a setting.
+        axis: index of its joint.
+        coefficients: of the fit, c and d, shape (2,).
+        deviations: their σ, shape (2,).
+    """
+    before_kg_m2 = effect.settings["rotor_inertia_kg_m2"]
+    largest_kg_m2 = largest_inertia(search_problem.runs, axis)
+    inertia_kg_m2 = next_inertia(before_kg_m2, coefficients, largest_kg_m2)
+    if abs(inertia_kg_m2 - before_kg_m2) * abs(coefficients[0]) <= CLOSE_ENOUGH * deviations[1]:
+        return effect
+    return effect.with_settings({"rotor_inertia_kg_m2": inertia_kg_m2})
