@@ -11,6 +11,7 @@ from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import EFFECTS, UNNAMED
 from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, Side, at_joints, check_settings, columns_at
+from ident.effects.rotor import beside_rotors
 from ident.effects.signals import declared_signals, payload_parameters
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload
@@ -41,8 +42,9 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
     standard[model.flange] += _payload(calibration, data)
     run = declared_signals(model, data, standard, gains, calibration.session_began_s)
     torque = model.drive_train.direction.T @ run.motor_torque_nm
-    for accepted in calibration.effects:
-        placed, coefficients = placed_effect(accepted, calibration)
+    effects = [placed_effect(accepted, calibration) for accepted in calibration.effects]
+    run = beside_rotors(run, (placed for placed, _ in effects))
+    for placed, coefficients in effects:
         columns = columns_at(placed.effect, run, placed.axis)
         at_all = at_joints(placed.effect, placed.axis, columns, model.drive_train)
         torque += np.einsum("p,npk->nk", coefficients, at_all)

@@ -16,6 +16,7 @@ from ident.data.dataset import Dataset, differentiate
 from ident.data.demand import as_demanded, with_demand
 from ident.data.run import Run
 from ident.effects.effect import PlacedEffect, Side, effect_torque
+from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Signals, fitted_signals, session_began_s
 from ident.equations.rows import Observation, observe, on_demanded_motion
 from ident.equations.system import System
@@ -148,6 +149,7 @@ def _torques(
         else:
             model, rows, estimate = around.model, around.training, around.estimate
             run = fitted_signals(model, data, rows, estimate, began_s, inertia=through_links)
+        run = beside_rotors(run, effects)
         given = (run,), (data,), around.conditioning, around.model
         parts.append(np.concatenate([effect_torque(placed.effect, placed.axis, *given) for placed in effects], axis=1))
     return np.concatenate(parts, axis=2)

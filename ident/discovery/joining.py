@@ -73,7 +73,8 @@ class JointFit:
 
 def linearised(evidence: Evidence, cache: ColumnCache) -> JointFit:
     """Linearise the problem around a joint fit."""
-    problem = prepare_search(evidence.model, evidence.fit_runs, evidence.training, evidence.estimate, cache)
+    model, estimate = evidence.model, evidence.estimate
+    problem = prepare_search(model, evidence.fit_runs, evidence.training, estimate, cache, evidence.effects)
     return JointFit(evidence, problem)
 
 

@@ -16,12 +16,14 @@ from ident.arrays import FloatArray
 from ident.discovery.candidates import SearchProblem, shares_explained
 from ident.discovery.gates import Gates
 from ident.effects.effect import Effect
-from ident.effects.rotor import largest_inertia, next_inertia
+from ident.effects.rotor import next_inertia
 from ident.equations.rows import Observation
 
 Families = tuple[tuple[Effect, ...], ...]
 
+SMALLEST_EIGENVALUE = 1e-6  #: Of the mass matrix of a redundant drive, in parts of the largest, that is not zero
 MOST_STEPS = 6  #: Of a rotor's inertia; each is a fraction of the one before
+SETTLED_SHARE = 0.01  #: Of the largest inertia, a step after which the joint fit does the rest
 CLOSE_ENOUGH = 0.1  #: Standard deviations of the inertia below which a step no longer matters
 
 
@@ -73,8 +75,8 @@ def propose_rotors(
 
 def without_rotor(search_problem: SearchProblem, effect: Effect, axis: int) -> Effect | None:
     """Return the form of a loss that leaves the rotor out, with the inertia that fits best; None where none does."""
-    largest_kg_m2 = largest_inertia(search_problem.runs, axis)
-    inertia_kg_m2 = effect.settings["rotor_inertia_kg_m2"]
+    largest_kg_m2 = largest_inertia(search_problem, axis)
+    inertia_kg_m2 = search_problem.runs[0].rotor_inertia(axis)
     for _ in range(MOST_STEPS):
         effect = effect.with_settings({"with_rotor": 1, "rotor_inertia_kg_m2": inertia_kg_m2})
         (trial,) = search_problem.trials([search_problem.torque_at_rows(effect, axis)])
@@ -82,7 +84,7 @@ def without_rotor(search_problem: SearchProblem, effect: Effect, axis: int) -> E
             return None
         before_kg_m2 = inertia_kg_m2
         inertia_kg_m2 = next_inertia(before_kg_m2, trial.coefficients, largest_kg_m2)
-        if abs(inertia_kg_m2 - before_kg_m2) <= 0.01 * largest_kg_m2:
+        if abs(inertia_kg_m2 - before_kg_m2) <= SETTLED_SHARE * largest_kg_m2:
             break
     return effect.with_settings({"rotor_inertia_kg_m2": inertia_kg_m2})
 
@@ -100,8 +102,26 @@ def refined_rotor(
         deviations: their σ, shape (2,).
     """
     before_kg_m2 = effect.settings["rotor_inertia_kg_m2"]
-    largest_kg_m2 = largest_inertia(search_problem.runs, axis)
+    largest_kg_m2 = largest_inertia(search_problem, axis)
     inertia_kg_m2 = next_inertia(before_kg_m2, coefficients, largest_kg_m2)
     if abs(inertia_kg_m2 - before_kg_m2) * abs(coefficients[0]) <= CLOSE_ENOUGH * deviations[1]:
         return effect
     return effect.with_settings({"rotor_inertia_kg_m2": inertia_kg_m2})
+
+
+def largest_inertia(search_problem: SearchProblem, axis: int) -> float:
+    """Return the largest inertia that the rotor of an axis can have [kg m²]: links have no negative one.
+
+    With M the mass matrix that contains it, M − J e eᵀ has no negative eigenvalue for J ≤ 1/(eᵀ M⁺ e). M_jj, which is
+    larger, is used where M is invertible: it needs no other estimate than its own. The least of all postures counts;
+    zero where the model has none.
+    """
+    least = np.inf
+    for run in search_problem.runs:
+        inertia_kg_m2 = run.inertia_kg_m2[axis, axis]
+        if search_problem.model.is_redundant:
+            by_posture = np.moveaxis(run.inertia_kg_m2, -1, 0)
+            mobility = np.linalg.pinv(by_posture, rcond=SMALLEST_EIGENVALUE, hermitian=True)[:, axis, axis]
+            inertia_kg_m2 = 1.0 / mobility
+        least = min(least, float(np.min(inertia_kg_m2)))
+    return max(0.0, least)

@@ -13,16 +13,18 @@ with d = c (Ia − J),
 
 Both columns are linear, so c and d are fitted together with everything else, and the σ of c, and that of the gains,
 contains what the data leave open about the rotor. J + d/c is the next guess; at the last one d is zero within its σ
-(Gauss-Newton).
+(Gauss-Newton). Effects that speak of the load or the inertia behind the gear, as `elasticity`, then leave J out, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
 from ident.arrays import FloatArray
+from ident.effects.effect import PlacedEffect
 from ident.effects.signals import Signals
 
 DIGITS = 4  #: Of a rotor's inertia, as a calibration shows it
@@ -56,7 +58,7 @@ def next_inertia(inertia_kg_m2: float, coefficients: FloatArray, largest_kg_m2: 
     Args:
         inertia_kg_m2: J.
         coefficients: c and d, shape (2,).
-        largest_kg_m2: of `largest_inertia`.
+        largest_kg_m2: largest inertia that the rotor can have.
     """
     loss, remainder = coefficients
     if not loss > 0.0:
@@ -65,10 +67,24 @@ def next_inertia(inertia_kg_m2: float, coefficients: FloatArray, largest_kg_m2: 
     return float(f"{guess:.{DIGITS}g}")
 
 
-def largest_inertia(runs: Sequence[Signals], axis: int) -> float:
-    """Return the largest inertia that the rotor of an axis can have [kg m²]: links have no negative one.
+def known_rotors(effects: Iterable[PlacedEffect], axes: int) -> tuple[float, ...]:
+    """Return the inertia of each axis' rotor that losses of a model show [kg m²], 0 where none does; empty without any.
 
-    It is the least apparent inertia of the axis in any posture of any run; zero where the model has none.
+    Args:
+        effects: of the model; the first loss on an axis counts.
+        axes: number of axes.
     """
-    least = min(float(np.min(run.inertia_kg_m2[axis, axis])) for run in runs)
-    return max(0.0, least)
+    known: dict[int, float] = {}
+    for placed in effects:
+        inertia_kg_m2 = placed.effect.settings.get("rotor_inertia_kg_m2", 0.0)
+        if inertia_kg_m2:
+            known.setdefault(placed.axis, inertia_kg_m2)
+    if not known:
+        return ()
+    return tuple(known.get(axis, 0.0) for axis in range(axes))
+
+
+def beside_rotors(signals: Signals, effects: Iterable[PlacedEffect]) -> Signals:
+    """Return signals of a run that know the rotors which losses of the model show."""
+    known = known_rotors(effects, len(signals.current_a))
+    return replace(signals, rotor_inertia_kg_m2=known) if known else signals

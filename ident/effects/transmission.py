@@ -48,7 +48,8 @@ class Backlash(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (n, 1, k)."""
-        torque, inertia = signals.geared_torque_nm[axis], signals.inertia(slice(None), axis)
+        torque = signals.gear_torque(axis)
+        inertia = signals.inertia(slice(None), axis)
         if self.half_gap_rad > 0.0 and self.resonant_rad_nm > 0.0:
             gap = (np.array([self.half_gap_rad]), np.array([self.resonant_rad_nm]), self.damping_ratio)
             crossing = twist_acceleration(torque, inertia[axis], signals.rate_hz, *gap)[0] / self.half_gap_rad
@@ -146,7 +147,8 @@ class Elasticity(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (n, 1, k)."""
-        inertia, torque = signals.inertia(slice(None), axis), signals.load_torque_nm[axis]
+        inertia = signals.inertia(slice(None), axis)
+        torque = signals.link_torque(axis)
         passed = spring_torque(torque, inertia[axis], signals.rate_hz, self.resonant_rad_nm, self.damping_ratio)
         return np.asarray(-inertia * curvature(passed, signals.rate_hz))[:, None]
 
