@@ -8,16 +8,18 @@ require, so a search without such a loss costs a few trials.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ident.arrays import FloatArray
 from ident.discovery.candidates import SearchProblem, shares_explained
 from ident.discovery.gates import Gates
-from ident.effects.effect import Effect
+from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.rotor import next_inertia
 from ident.equations.rows import Observation
+from ident.errors import EffectRefused
 
 Families = tuple[tuple[Effect, ...], ...]
 
@@ -71,6 +73,36 @@ def propose_rotors(
             if forms:
                 found[axis] = (*found.get(axis, ()), (*family, *forms))
     return found
+
+
+def declared_forms(placed: PlacedEffect, observation: Observation, axes: Sequence[str]) -> tuple[PlacedEffect, ...]:
+    """Return the forms in which a declared effect may be fitted, the best first.
+
+    A loss leaves the rotor out where the load contains it and no inertia is declared; a declared one, as from a data
+    sheet, is kept.
+
+    Args:
+        placed: the declared effect.
+        observation: rows of the fit.
+        axes: names of the axes, for the error.
+
+    Raises:
+        EffectRefused: a rotor's inertia is declared where the load does not contain the rotor.
+    """
+    effect = placed.effect
+    if not has_rotor_form(effect):
+        return (placed,)
+    given = effect.settings["rotor_inertia_kg_m2"] > 0.0 or effect.settings["with_rotor"]
+    contains_rotor = placed.axis in axes_with_rotor_in_load(observation)
+    if given and not contains_rotor:
+        raise EffectRefused(
+            f"the declared {placed.name_among(axes)} is given a rotor; the load of that axis does not contain its "
+            "rotor's inertia, which is a parameter of its own: leave rotor_inertia_kg_m2 and with_rotor out"
+        )
+    if given or not contains_rotor:
+        return (placed,)
+    fitted = effect.with_settings({"with_rotor": 1})
+    return (replace(placed, effect=fitted), placed)
 
 
 def without_rotor(search_problem: SearchProblem, effect: Effect, axis: int) -> Effect | None:
