@@ -12,6 +12,7 @@ from ident.data.dataset import Dataset
 from ident.effects.dictionary import EFFECTS, GEOMETRY, UNNAMED
 from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, at_joints, check_settings, columns_at
 from ident.effects.geometry import GeometryEffect, corrected_dataset, corrected_model, is_correction
+from ident.effects.rotor import beside_rotors
 from ident.effects.signals import declared_signals, payload_parameters
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload
@@ -45,8 +46,9 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
     standard[model.flange] += payload_of(calibration, data)
     run = declared_signals(model, data, standard, gains, calibration.session_began_s)
     torque = model.drive_train.direction.T @ run.motor_torque_nm
-    for accepted in calibration.effects:
-        placed, coefficients = placed_effect(accepted, calibration)
+    effects = [placed_effect(accepted, calibration) for accepted in calibration.effects]
+    run = beside_rotors(run, (placed for placed, _ in effects))
+    for placed, coefficients in effects:
         if is_correction(placed):
             continue  # in the model already
         columns = columns_at(placed.effect, run, placed.axis)

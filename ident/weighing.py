@@ -28,6 +28,7 @@ from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.effects.effect import PlacedEffect, effect_torque
 from ident.effects.geometry import corrected_dataset, corrected_model
+from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Signals, declared_signals
 from ident.equations.linearisation import jackknife_covariance
 from ident.equations.rows import Observation, observe
@@ -244,7 +245,10 @@ def weigh_rows(calibration: Calibration, given: RowsToWeigh) -> WeighedBody:
         whole = standard.copy()
         whole[model.flange] += body
         began_s = calibration.session_began_s
-        return [declared_signals(model, data, whole, gains, began_s) for data in datasets] if effects else []
+        if not effects:
+            return []
+        placed = [effect for effect, _ in effects]
+        return [beside_rotors(declared_signals(model, data, whole, gains, began_s), placed) for data in datasets]
 
     bare, body = signals(without, np.zeros(10)), np.zeros(10)
     for _ in range(MAX_PASSES if depends else 1):

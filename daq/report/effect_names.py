@@ -142,6 +142,12 @@ def named_size(effect: Effect, found: Sequence[Parameter]) -> str:
         amplitude = math.hypot(cosine.value, sine.value)
         std = math.hypot(cosine.value * cosine.std, sine.value * sine.std) / (amplitude or 1.0)
         sizes = f"amplitude {with_deviation(amplitude, std)} {cosine.unit}"
+    elif effect.settings.get("with_rotor"):
+        loss, rest = found
+        inertia = effect.settings["rotor_inertia_kg_m2"] + rest.value / (loss.value or math.inf)
+        std = rest.std / (abs(loss.value) or math.inf)
+        rotor = f"beside a rotor of {with_deviation(inertia, std)} kg m²"
+        sizes = f"{_sized(names[0], loss)}, {rotor}"
     else:
         sizes = ", ".join(_sized(name, one) for name, one in zip(names, found, strict=True))
     return f"{sizes}, {where}" if where else sizes

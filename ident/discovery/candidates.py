@@ -17,8 +17,9 @@ from scipy import linalg
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.dataset import Dataset
 from ident.discovery.noise_floor import noise_floors
-from ident.effects.effect import Effect, at_joints, columns_at, effect_columns, is_placeable
+from ident.effects.effect import Effect, PlacedEffect, at_joints, columns_at, effect_columns, is_placeable
 from ident.effects.geometry import GeometryEffect
+from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.linearisation import Folds, MotorRows, cut_into_folds, linearise
 from ident.equations.rows import Observation, decimate_rows
@@ -35,6 +36,7 @@ MOVES_WANTED = 60
 SHORTEST_PIECE_S = 0.25
 REDUNDANT_SHARE = 1e-6  #: Share of a column that must be left when all declared directions are projected out of it
 UNSEEN = 1e-9  #: Share of a direction, squared, below which the folds of a fit do not show it
+NO_SERIES = frozenset({"rate_hz", "rotor_inertia_kg_m2", "arm"})  #: Fields of `Signals` that do not change in a run
 FAST = frozenset({Abscissa.MOTOR_ANGLE})  #: Variables that turn within a decimated row
 
 
@@ -143,17 +145,20 @@ def prepare_search(
     observation: Observation,
     estimate: Estimate,
     cache: ColumnCache | None = None,
+    effects: Sequence[PlacedEffect] = (),
 ) -> SearchProblem:
     """Linearise around an estimate by ``ml``, cut into folds, and predict the signals of every run.
 
-    The caller may keep a cache from turn to turn, for these datasets alone.
+    The caller may keep a cache from turn to turn, for these datasets alone. Of the effects in the estimate, the signals
+    know the rotors that they show.
 
     Raises:
         TooFewMoves: there are too few moves to leave some out.
     """
     pieces, move_of = pieces_of(observation)
     began_s = session_began_s(datasets)
-    runs = tuple(fitted_signals(model, data, observation, estimate, began_s) for data in datasets)
+    fitted = (fitted_signals(model, data, observation, estimate, began_s) for data in datasets)
+    runs = tuple(beside_rotors(run, effects) for run in fitted)
     problem = linearise(
         replace(observation, move=pieces),
         estimate.gains,
@@ -164,8 +169,7 @@ def prepare_search(
     floors = noise_floors(datasets, observation.conditioning)
     rows: list[Signals] = []
     for run, data in zip(runs, datasets, strict=True):
-        at_rate = {array.name: getattr(run, array.name) for array in fields(run) if array.name != "rate_hz"}
-        del at_rate["arm"]
+        at_rate = {array.name: getattr(run, array.name) for array in fields(run) if array.name not in NO_SERIES}
         sampled = {name: array for name, array in at_rate.items() if array is not None and array.shape[-1]}
         known = {name: array for name, array in sampled.items() if name != "inertia_kg_m2"}
         arrays = {name: decimate_rows(data, observation.conditioning, array) for name, array in known.items()}
@@ -177,7 +181,15 @@ def prepare_search(
             for state in (data.position_rad, data.velocity_rad_s, data.acceleration_rad_s2)
         )
         arm = None if run.arm is None else replace(run.arm, motion=Motion(*states))
-        rows.append(Signals(rate_hz=rate_hz, inertia_kg_m2=none, arm=arm, **arrays))
+        rows.append(
+            Signals(
+                rate_hz=rate_hz,
+                inertia_kg_m2=none,
+                arm=arm,
+                rotor_inertia_kg_m2=run.rotor_inertia_kg_m2,
+                **arrays,
+            )
+        )
     return SearchProblem(
         model=model,
         datasets=datasets,

@@ -18,6 +18,7 @@ from ident.data.run import Run
 from ident.discovery.gates import own_unknowns, values_of
 from ident.effects.effect import PlacedEffect, effect_torque
 from ident.effects.geometry import GeometryEffect, corrected_dataset, corrected_model, is_correction
+from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Signals, fitted_signals, session_began_s
 from ident.equations.reduction import reduce_runs
 from ident.equations.rows import Observation, RunRows, observe, on_demanded_motion, rows_of
@@ -250,6 +251,7 @@ def _torques(
         else:
             model, rows, estimate = around.model, around.training, around.estimate
             run = fitted_signals(model, data, rows, estimate, began_s, inertia=through_links)
+        run = beside_rotors(run, effects)
         given = (run,), (data,), around.conditioning, around.model
         parts.append(np.concatenate([effect_torque(placed.effect, placed.axis, *given) for placed in effects], axis=1))
     return np.concatenate(parts, axis=2)

@@ -112,4 +112,4 @@ def _loss(step: Step, axis: int) -> tuple[float | None, float | None]:
 
 def is_gear_loss(effect: Effect) -> bool:
     """Whether an effect is the contrast of the two sides, c."""
-    return isinstance(effect, Efficiency) or effect == LoadFriction(0)
+    return isinstance(effect, Efficiency) or (isinstance(effect, LoadFriction) and effect.speed_exponent == 0)

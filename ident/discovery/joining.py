@@ -29,9 +29,10 @@ from ident.discovery.gates import (
     without_effects_of,
 )
 from ident.discovery.refinement import refine_together
+from ident.discovery.rotor import refined_rotor
 from ident.discovery.search import EffectKey, Finding, effect_key, is_better, rank_families
 from ident.discovery.structure import is_inadequate
-from ident.effects.effect import PlacedEffect
+from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import is_unnamed
 from ident.errors import NotConverged, RankDeficient
@@ -73,7 +74,8 @@ class JointFit:
 
 def linearised(evidence: Evidence, cache: ColumnCache) -> JointFit:
     """Linearise the problem around a joint fit."""
-    problem = prepare_search(evidence.model, evidence.fit_runs, evidence.training, evidence.estimate, cache)
+    model, estimate = evidence.model, evidence.estimate
+    problem = prepare_search(model, evidence.fit_runs, evidence.training, estimate, cache, evidence.effects)
     return JointFit(evidence, problem)
 
 
@@ -174,16 +176,26 @@ def resettled(model: JointFit) -> JointFit:
     """
     for _ in range(REFINEMENTS):
         evidence, last = model.evidence, model.evidence.effects[-1]
-        if not last.effect.refined:
-            break
-        reduced = without_effects_of(model.search_problem, evidence.estimate, (last,))
-        effect = refine_together(reduced.search_problem, last.effect, last.axis)
+        effect = _refined_in(model, last)
         if effect == last.effect:
             break
         others = evidence.effects[:-1]
         refitted = with_effects(evidence, (*others, PlacedEffect(effect, last.axis)), model.search_problem.runs)
         model = _linearised_after(refitted, model)
     return model
+
+
+def _refined_in(model: JointFit, placed: PlacedEffect) -> Effect:
+    """Return an effect of a joint fit with the settings that are fitted refined around it."""
+    effect, axis, estimate = placed.effect, placed.axis, model.evidence.estimate
+    if effect.settings.get("with_rotor"):
+        own = own_unknowns(estimate, (placed,))
+        fitted = estimate.parameters[own], estimate.parameters_std[own]
+        return refined_rotor(model.search_problem, effect, axis, *fitted)
+    if effect.refined:
+        reduced = without_effects_of(model.search_problem, estimate, (placed,))
+        return refine_together(reduced.search_problem, effect, axis)
+    return effect
 
 
 def as_joined(accepted: Finding, evidence: Evidence) -> Finding:

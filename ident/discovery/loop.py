@@ -25,6 +25,7 @@ from ident.discovery.gates import (
     without_effects_of,
 )
 from ident.discovery.joining import (
+    UNFITTED,
     JointFit,
     SetAside,
     as_joined,
@@ -36,6 +37,7 @@ from ident.discovery.joining import (
 )
 from ident.discovery.resonance import propose_resonances
 from ident.discovery.ripple import propose_orders
+from ident.discovery.rotor import declared_forms, propose_rotors
 from ident.discovery.search import (
     EffectKey,
     Finding,
@@ -171,6 +173,7 @@ def with_declared(
 
     Raises:
         EffectRefused: the model contains an effect already, or its coefficients are impossible.
+        EffectRefused: a rotor's inertia is given where the load does not contain the rotor.
         NotConverged, RankDeficient: see `ident.identify`.
     """
     gates, cache, evidence, steps = Gates(), ColumnCache(), start, list[Step]()
@@ -178,7 +181,7 @@ def with_declared(
     for placed in declared:
         name = placed.name_among(names)
         progress(f"fitting the declared {name}")
-        joined = with_effects(evidence, (*evidence.effects, placed))
+        joined = _with_declared_form(evidence, declared_forms(placed, evidence.training, names))
         model = resettled(linearised(replace(joined, declared=len(joined.effects)), cache))
         evidence, estimate, last = model.evidence, model.evidence.estimate, model.evidence.effects[-1]
         reduced = without_effects_of(model.search_problem, estimate, (last,))
@@ -192,6 +195,17 @@ def with_declared(
         limits_nm = detection_limits_nm(model.search_problem, gates)
         steps.append(Step((), (), limits_nm, finding, evidence, declared=True))
     return tuple(steps)
+
+
+def _with_declared_form(evidence: Evidence, forms: Sequence[PlacedEffect]) -> Evidence:
+    """Refit with the first form of a declared effect that the data can fit; the last one must be possible."""
+    *richer, plain = forms
+    for form in richer:
+        try:
+            return with_effects(evidence, (*evidence.effects, form))
+        except UNFITTED:
+            continue
+    return with_effects(evidence, (*evidence.effects, plain))
 
 
 def _with_choice(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
@@ -292,7 +306,8 @@ def _proposals(
     balanced = [placed.axis for placed in effects if isinstance(placed.effect, Counterbalance)]
     balancers = propose_balancers(search_problem, gates, families, balanced)
     found = (ripples, resonances, balancers)
-    return {axis: tuple(f for one in found for f in one.get(axis, ())) for axis in {a for one in found for a in one}}
+    own = {axis: tuple(f for one in found for f in one.get(axis, ())) for axis in {a for one in found for a in one}}
+    return propose_rotors(search_problem, gates, families, own)
 
 
 def _first_of_axis(aside: Sequence[SetAside], new: SetAside) -> tuple[SetAside, ...]:

@@ -55,7 +55,8 @@ def _elastic(search_problem: SearchProblem, axis: int, inertia: float, least: fl
     compliances = _compliances(inertia, FREQUENCIES_HZ)
 
     def bent(run: Signals) -> FloatArray:
-        own, torque = run.inertia(axis, axis), run.load_torque_nm[axis]
+        own = run.inertia(axis, axis)
+        torque = run.link_torque(axis)
         passed = [spring_torque(torque, own, run.rate_hz, one, DAMPING_RATIOS[-1]) for one in compliances[::2]]
         return np.stack([curvature(one, run.rate_hz) for one in passed])
 
@@ -71,7 +72,8 @@ def _with_gap(search_problem: SearchProblem, axis: int, inertia: float, least: f
     gaps, compliances = (np.array(values) for values in zip(*pairs, strict=True))
 
     def bent(run: Signals) -> FloatArray:
-        own, torque = run.inertia(axis, axis), run.geared_torque_nm[axis]
+        own = run.inertia(axis, axis)
+        torque = run.gear_torque(axis)
         return twist_acceleration(torque, own, run.rate_hz, gaps, compliances, FLANK_DAMPING)
 
     shares = shares_explained(search_problem, _tried(search_problem, axis, bent))
@@ -95,7 +97,7 @@ def _gathered_at_turns(search_problem: SearchProblem, axis: int) -> float:
     """
     near: list[BoolArray] = []
     for run in search_problem.rows:
-        turned = np.diff(np.sign(run.geared_torque_nm[axis]), prepend=0.0) != 0.0
+        turned = np.diff(np.sign(run.gear_torque(axis)), prepend=0.0) != 0.0
         near.append(np.convolve(turned, np.ones(round(SETTLED_S * run.rate_hz)))[: len(turned)] > 0.0)
     is_near, problem = np.concatenate(near), search_problem.folds.linearisation
     shares = [0.0]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 
 from ident.arrays import FloatArray
 from ident.effects.effect import AxisNumber, Effect, Property, Range, Sense, Side, Switch
+from ident.effects.rotor import loss_columns
 from ident.effects.signals import REFERENCE_C, Abscissa, Signals, distance_since_reversal
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
@@ -83,6 +84,9 @@ class AsymmetricViscous(Effect):
 class LoadFriction(Effect):
     """τ = c · |τ_L| · sign(q̇) · |q̇|^η, τ_L the torque for links and payload;  c > 0: friction grows with the load.
 
+    Where the model's τ_L contains the rotor, J q̈ is taken off, and d · ∂τ/∂J / c is a second column (`with_rotor`): see
+    `ident.effects.rotor`.
+
     Source: Amontons' law at the gear mesh; Hamon, Gautier & Garrec, IROS 2010, "Dynamic identification of robots with
     a dry friction model depending on load and velocity". Signature: sign × load; loaded and unloaded runs differ in it.
     """
@@ -92,17 +96,30 @@ class LoadFriction(Effect):
     abscissa = Abscissa.LOAD
 
     speed_exponent: Switch  #: η, 0 for dry and 1 for viscous friction
+    rotor_inertia_kg_m2: Annotated[float, Range(0.0, 1e6)] = 0.0  #: J, of the rotor in the model's load torque
+    with_rotor: Switch = 0  #: 1 where the rest of the rotor's inertia is fitted, d = c (Ia − J), else 0
 
     @property
     def coefficients(self) -> tuple[Column, ...]:
-        """Linear parameter, with a unit that depends on the exponent."""
-        return (Column("coefficient", "(rad/s)^-1" if self.speed_exponent else "Nm/Nm", least=0.0),)
+        """C, and d with the rotor; units depend on the exponent."""
+        if self.speed_exponent:
+            columns = (Column("coefficient", "(rad/s)^-1", least=0.0), Column("rotor rest", "kg m²/(rad/s)"))
+        else:
+            columns = (Column("coefficient", "Nm/Nm", least=0.0), Column("rotor rest", "kg m²"))
+        return columns[: 1 + self.with_rotor]
+
+    @property
+    def forms(self) -> tuple[LoadFriction, ...]:
+        """With J as it is, then with the rest of it where that is fitted."""
+        return tuple(replace(self, with_rotor=fitted) for fitted in range(1 + self.with_rotor))
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
-        """Columns, shape (1, k)."""
+        """Columns, shape (1 or 2, k)."""
         v = signals.velocity_rad_s[axis]
         rubbing = np.sign(v) * np.abs(v) ** self.speed_exponent
-        return np.asarray(np.abs(signals.load_torque_nm[axis]) * rubbing)[None]
+        load_nm = signals.load_torque_nm[axis]
+        with_rotor = bool(self.with_rotor)
+        return loss_columns(signals, axis, load_nm, rubbing, self.rotor_inertia_kg_m2, with_rotor=with_rotor)
 
 
 @dataclass(frozen=True, slots=True)

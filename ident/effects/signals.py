@@ -104,6 +104,8 @@ class Signals:
     leverage: FloatArray = field(default_factory=lambda: np.empty((0, 0, 0)))
     #: What made the torques; None where they were not made of a model. Effects that change the geometry need it.
     arm: Arm | None = None
+    #: Inertia of each axis' rotor that load and mass matrix contain, as far as it is known; empty without any.
+    rotor_inertia_kg_m2: tuple[float, ...] = ()
 
     def temperature(self, axis: int) -> FloatArray:
         """Temperature of an axis [°C], shape (k,); REFERENCE_C where it was not recorded."""
@@ -112,12 +114,32 @@ class Signals:
         recorded = self.temperature_c[axis]
         return np.asarray(np.where(np.isnan(recorded), REFERENCE_C, recorded))
 
+    def rotor_inertia(self, axis: int) -> float:
+        """Inertia of an axis' rotor that its load contains [kg m²]; 0 where none is known."""
+        return self.rotor_inertia_kg_m2[axis] if axis < len(self.rotor_inertia_kg_m2) else 0.0
+
+    def link_torque(self, axis: int) -> FloatArray:
+        """Torque of an axis for links and payload, less that of a known rotor [Nm], shape (k,)."""
+        return self._without_rotor(self.load_torque_nm, axis)
+
+    def gear_torque(self, axis: int) -> FloatArray:
+        """Torque through the gear of an axis, load and friction, less that of a known rotor [Nm], shape (k,)."""
+        return self._without_rotor(self.geared_torque_nm, axis)
+
+    def _without_rotor(self, torque_nm: FloatArray, axis: int) -> FloatArray:
+        inertia_kg_m2 = self.rotor_inertia(axis)
+        if not inertia_kg_m2:
+            return np.asarray(torque_nm[axis])
+        return np.asarray(torque_nm[axis] - inertia_kg_m2 * self.acceleration_rad_s2[axis])
+
     def inertia(self, joints: int | slice, axis: int) -> FloatArray:
         """Torque at joints per unit of acceleration of the joint `axis` along the run, shape (…, k).
 
-        It is interpolated between postures, because it changes slowly.
+        It is interpolated between postures, because it changes slowly. A known rotor is left out.
         """
-        coarse = self.inertia_kg_m2[joints, axis]
+        of_axis = self.inertia_kg_m2[:, axis].copy()
+        of_axis[axis] -= self.rotor_inertia(axis)
+        coarse = of_axis[joints]
         at = _postures(len(self.time_s), coarse.shape[-1])
         step = np.diff(at)
         following = step + (np.arange(len(step)) == len(step) - 1)  # the last sample is a posture, too
@@ -131,13 +153,13 @@ class Signals:
         choices: dict[Abscissa, Callable[[], FloatArray]] = {
             Abscissa.VELOCITY: lambda: self.velocity_rad_s[axis],
             Abscissa.POSITION: lambda: self.position_rad[axis],
-            Abscissa.LOAD: lambda: self.load_torque_nm[axis],
+            Abscissa.LOAD: lambda: self.link_torque(axis),
             Abscissa.TIME: lambda: self.time_s,
             Abscissa.SESSION: lambda: self.session_s,
             Abscissa.MOTOR_ANGLE: lambda: np.mod(self.motor_position_rad[axis], 2.0 * np.pi),
             Abscissa.CURRENT: lambda: self.current_a[axis],
             Abscissa.TORQUE_RATE: lambda: np.gradient(self.motor_torque_nm[axis]) * self.rate_hz,
-            Abscissa.LOAD_CURVATURE: lambda: curvature(self.load_torque_nm[axis], self.rate_hz),
+            Abscissa.LOAD_CURVATURE: lambda: curvature(self.link_torque(axis), self.rate_hz),
             Abscissa.DISTANCE: lambda: distance_since_reversal(self.velocity_rad_s[axis], self.rate_hz)[1],
             Abscissa.TEMPERATURE: lambda: self.temperature(axis),
             Abscissa.OTHER_VELOCITY: lambda: self.velocity_rad_s[axis if other is None else other],
@@ -192,7 +214,8 @@ def declared_signals(
         session_began_s: start of the first run by the clock of `Dataset.started_s`; None if unknown.
         inertia: whether the mass matrix is needed, by effects through the links.
     """
-    # A base parameter is named after its leading standard one; Ia of J1, regrouped into Izz1, thus counts as load.
+    # A base parameter is named after its leading standard one; Ia of J1, regrouped into Izz1, thus counts as load
+    # until a loss shows how much it is (`ident.effects.rotor`).
     motion, leverage = data.motion(), np.empty((0, 0, 0))
     load, geared, total = model.torques(motion, standard)
     position, velocity, acceleration = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -10,6 +10,7 @@ from scipy.linalg import lapack
 
 from ident.arrays import FloatArray
 from ident.effects.effect import AxisNumber, Effect, Property, Range, Side, Switch
+from ident.effects.rotor import loss_columns
 from ident.effects.signals import Abscissa, Signals, curvature
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
@@ -47,7 +48,8 @@ class Backlash(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (n, 1, k)."""
-        torque, inertia = signals.geared_torque_nm[axis], signals.inertia(slice(None), axis)
+        torque = signals.gear_torque(axis)
+        inertia = signals.inertia(slice(None), axis)
         if self.half_gap_rad > 0.0 and self.resonant_rad_nm > 0.0:
             gap = (np.array([self.half_gap_rad]), np.array([self.resonant_rad_nm]), self.damping_ratio)
             crossing = twist_acceleration(torque, inertia[axis], signals.rate_hz, *gap)[0] / self.half_gap_rad
@@ -145,7 +147,8 @@ class Elasticity(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (n, 1, k)."""
-        inertia, torque = signals.inertia(slice(None), axis), signals.load_torque_nm[axis]
+        inertia = signals.inertia(slice(None), axis)
+        torque = signals.link_torque(axis)
         passed = spring_torque(torque, inertia[axis], signals.rate_hz, self.resonant_rad_nm, self.damping_ratio)
         return np.asarray(-inertia * curvature(passed, signals.rate_hz))[:, None]
 
@@ -192,20 +195,38 @@ class Efficiency(Effect):
     on τ_L alone is `load-friction`; here the share σ of the joint's own friction passes the mesh too. Source: Hamon,
     Gautier, Garrec & Janot, AIM 2010, "Dynamic identification of robot with a load-dependent joint friction model".
     Signature: sign × torque through the gear, with a step where the load turns.
+
+    Where the model's τ_L contains the rotor, J q̈ is taken off, and d · ∂τ/∂J / c is a second column (`with_rotor`): see
+    `ident.effects.rotor`.
     """
 
     name = "efficiency"
     declares = Property.ODD_IN_VELOCITY
     abscissa = Abscissa.LOAD
-    coefficients = (Column("loss", "Nm/Nm", least=0.0),)
 
     friction_share: Annotated[float, Range(1e-3, 1.0)]  #: σ, of the joint's friction that lies behind the gear
+    rotor_inertia_kg_m2: Annotated[float, Range(0.0, 1e6)] = 0.0  #: J, of the rotor in the model's load torque
+    with_rotor: Switch = 0  #: 1 where the rest of the rotor's inertia is fitted, d = c (Ia − J), else 0
+
+    @property
+    def coefficients(self) -> tuple[Column, ...]:
+        """C, and d with the rotor."""
+        columns = (Column("loss", "Nm/Nm", least=0.0), Column("rotor rest", "kg m²"))
+        return columns[: 1 + self.with_rotor]
+
+    @property
+    def forms(self) -> tuple[Efficiency, ...]:
+        """With J as it is, then with the rest of it where that is fitted."""
+        return tuple(replace(self, with_rotor=fitted) for fitted in range(1 + self.with_rotor))
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
-        """Columns, shape (1, k)."""
-        load = signals.load_torque_nm[axis]
-        through = load + self.friction_share * (signals.geared_torque_nm[axis] - load)
-        return np.asarray(np.abs(through) * np.sign(signals.velocity_rad_s[axis]))[None]
+        """Columns, shape (1 or 2, k)."""
+        load_nm = signals.load_torque_nm[axis]
+        friction_nm = signals.geared_torque_nm[axis] - load_nm
+        through_nm = load_nm + self.friction_share * friction_nm
+        direction = np.sign(signals.velocity_rad_s[axis])
+        with_rotor = bool(self.with_rotor)
+        return loss_columns(signals, axis, through_nm, direction, self.rotor_inertia_kg_m2, with_rotor=with_rotor)
 
 
 @dataclass(frozen=True, slots=True)

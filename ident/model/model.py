@@ -153,6 +153,11 @@ class Model:
         return JOINT_COLUMNS * np.array(self.robot.axis_joints) + 12
 
     @property
+    def rotor_columns(self) -> IntArray:
+        """Column of Ia of each axis among the standard ones, shape (m,)."""
+        return JOINT_COLUMNS * np.array(self.robot.axis_joints) + len(LINK_PARAMETERS)
+
+    @property
     def flange(self) -> slice:
         """The ten columns of the link that carries the payload; a payload on it has the same."""
         first = JOINT_COLUMNS * self.robot.carrier

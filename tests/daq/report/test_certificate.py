@@ -16,13 +16,14 @@ from daq.errors import CalibrationRefused, ExitCode
 from daq.report.certificate import Verdict, certificate_document, certify, without_controller
 from daq.report.certificate_page import certificate_page
 from daq.report.controller_schemas import CertificateReport
-from daq.report.effect_names import curve_of, size_text
+from daq.report.effect_names import curve_of, named_size, size_text
 from daq.report.gains import with_deviation
 from daq.report.text import json_text
 from daq.workflow.calibration_file import save_calibration
 from daq.writeback.gates.gate import Gate
 from ident.calibration import AcceptedEffect, Calibration, Parameter, PayloadMass
 from ident.effects.effect import PlacedEffect
+from ident.effects.friction import LoadFriction
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Smooth
 from tests.daq.calibrations import RECORDED, demo_calibration, with_recordings
@@ -153,6 +154,16 @@ def test_a_term_without_a_name_is_its_curve() -> None:
     for internal in ("lower", "upper", "other_axis", "signed", "part 7", "2.38838"):
         assert internal not in text.partition("</style>")[2]
     assert size_text(calibration.effects[0], calibration) in " ".join(Reader(text).texts)
+
+
+def test_a_loss_beside_a_rotor_shows_the_inertia_of_the_rotor() -> None:
+    """The setting and the coefficient that remains of it are one number to a reader: J + d/c ± σ_d/c."""
+    loss, rest = Parameter("c", 0.1, 0.001, "Nm/Nm"), Parameter("d", 0.002, 0.004, "kg m²")
+    text = named_size(LoadFriction(0, 0.58, 1), (loss, rest))
+    assert (
+        text == f"{with_deviation(10.0, 0.1)} % of the load torque, beside a rotor of {with_deviation(0.6, 0.04)} kg m²"
+    )
+    assert named_size(LoadFriction(0), (loss,)) == f"{with_deviation(10.0, 0.1)} % of the load torque"
 
 
 def test_the_curve_of_a_sliding_axis_is_a_force_over_metres() -> None:

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from ident.discovery.structure import VARIABLES
 from ident.effects.dictionary import EFFECTS, GEOMETRY
-from ident.effects.effect import Effect, Property, Side, at_joints, is_placeable
+from ident.effects.effect import Effect, PlacedEffect, Property, Side, at_joints, is_placeable
 from ident.effects.electrical import Cogging, Lag, Saturation, TimeSkew
 from ident.effects.friction import AsymmetricViscous, Coupling, LoadFriction, PositionFriction, Stribeck
 from ident.effects.position import Hinge, Spring
+from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Abscissa, Signals
-from ident.effects.transmission import Elasticity
+from ident.effects.transmission import Efficiency, Elasticity
 from ident.effects.unnamed import INTERVALS, Periodic, Smooth
 from ident.model.model import DriveTrain
 from ident.model.urdf import robot_from_urdf
@@ -297,3 +298,36 @@ def test_with_no_filter_it_is_the_central_difference() -> None:
     slope = np.gradient(signals.motor_torque_nm[2]) * signals.rate_hz
     assert Lag().columns(signals, 2)[0] == pytest.approx(-slope)
     assert TimeSkew().columns(signals, 0)[2, 0] == pytest.approx(-slope)
+
+
+@pytest.mark.parametrize(
+    "effect", [LoadFriction(0, 0.4, 1), LoadFriction(1, 0.4, 1), Efficiency(0.5, 0.4, 1)], ids=lambda one: one.name
+)
+def test_the_rest_of_a_rotor_is_the_derivative_of_a_loss(effect: LoadFriction | Efficiency) -> None:
+    s, axis, step = random_signals(3), 2, 1e-7
+    loss, rest = effect.columns(s, axis)
+    (before,) = replace(effect, rotor_inertia_kg_m2=0.4 - step, with_rotor=0).columns(s, axis)
+    (after,) = replace(effect, rotor_inertia_kg_m2=0.4 + step, with_rotor=0).columns(s, axis)
+    np.testing.assert_allclose(rest, (after - before) / (2.0 * step), atol=1e-6)
+    bare = replace(s, load_torque_nm=s.load_torque_nm - 0.4 * s.acceleration_rad_s2)
+    geared = replace(bare, geared_torque_nm=s.geared_torque_nm - 0.4 * s.acceleration_rad_s2)
+    (expected,) = replace(effect, rotor_inertia_kg_m2=0.0, with_rotor=0).columns(geared, axis)
+    np.testing.assert_allclose(loss, expected, atol=1e-12)
+
+
+def test_effects_behind_the_gear_leave_a_known_rotor_out() -> None:
+    s, axis = random_signals(4), 2
+    loss = PlacedEffect(LoadFriction(0, 0.3, 1), axis)
+    known = beside_rotors(s, (PlacedEffect(Elasticity(), 1), loss))
+    turning_nm = 0.3 * s.acceleration_rad_s2[axis]
+    np.testing.assert_allclose(known.link_torque(axis), s.load_torque_nm[axis] - turning_nm)
+    np.testing.assert_allclose(known.gear_torque(axis), s.geared_torque_nm[axis] - turning_nm)
+    np.testing.assert_allclose(known.variable(Abscissa.LOAD, axis), s.load_torque_nm[axis] - turning_nm)
+    np.testing.assert_allclose(known.link_torque(1), s.load_torque_nm[1])
+    own = np.arange(JOINTS)[:, None] == axis
+    np.testing.assert_allclose(known.inertia(slice(None), axis), s.inertia(slice(None), axis) - 0.3 * own)
+    np.testing.assert_allclose(known.inertia(axis, axis), s.inertia(axis, axis) - 0.3)
+    np.testing.assert_array_equal(known.inertia(slice(None), 1), s.inertia(slice(None), 1))
+    np.testing.assert_array_equal(loss.effect.columns(known, axis), loss.effect.columns(s, axis))
+    assert not np.allclose(Elasticity().columns(known, axis), Elasticity().columns(s, axis))
+    assert beside_rotors(s, (PlacedEffect(LoadFriction(0), axis),)) is s

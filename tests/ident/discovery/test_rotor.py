@@ -1,0 +1,223 @@
+"""Load friction beside a heavy rotor: the load that it multiplies is that of the links alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ident.calibration import Calibration
+from ident.data.dataset import Dataset
+from ident.discovery.evidence import Evidence, gather, with_effects
+from ident.discovery.gates import Gates
+from ident.discovery.loop import find_effects, with_declared
+from ident.discovery.rotor import axes_with_rotor_in_load, largest_inertia
+from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.friction import LoadFriction
+from ident.effects.transmission import Efficiency
+from ident.errors import EffectRefused
+from ident.estimators.identify import identify
+from ident.prediction import placed_effect, predict_torque
+from tests.ident.closed_recordings import recorded
+from tests.ident.mechanisms import FIVE_BAR, PLANAR, THREE_LEGS, Mechanism
+from tests.ident.recordings import (
+    MOUNTED,
+    PAYLOAD_TRUTH,
+    Truth,
+    acting_on,
+    bent,
+    calibrated,
+    gathered,
+    record,
+    search_problem_of,
+    three_axes_truth,
+)
+
+FloatArray = NDArray[np.float64]
+
+AXIS = 1  #: Its rotor moves as its link does
+COEFFICIENT = 0.1
+ROTORS_KG_M2 = (1.5, 1.2, 0.1)
+GATES = Gates(draws=199)
+NAMES = ("J1", "J2", "J3")
+
+
+def _truth(rotors_kg_m2: tuple[float, ...]) -> Truth:
+    truth = three_axes_truth()
+    parameters = truth.parameters.copy()
+    parameters[truth.model.rotor_columns] = rotors_kg_m2
+    return replace(truth, parameters=parameters)
+
+
+def _clean(truth: Truth) -> Evidence:
+    rng = np.random.default_rng(5)
+    runs = []
+    for number in range(4):
+        payload = MOUNTED if number % 2 else None
+        runs.append(record(truth, f"run{number}", rng, payload, noise_a=0.02, seconds=16.0, rate_hz=500.0))
+    return gathered(truth, tuple(runs))
+
+
+def _with_load_friction(truth: Truth) -> Evidence:
+    """Recordings with friction that grows with the torque for links and payload, by the regressor's link columns."""
+
+    def torque(data: Dataset) -> FloatArray:
+        parameters = truth.parameters.copy()
+        if data.payload is not None:
+            parameters[truth.model.flange] += list(PAYLOAD_TRUTH.values())
+        links = np.isin(np.arange(len(parameters)), truth.model.link_columns)
+        load_nm = np.einsum("jck,c->jk", truth.model.regressor(data.motion()), parameters * links)[AXIS]
+        friction_nm = COEFFICIENT * np.abs(load_nm) * np.sign(data.velocity_rad_s[:, AXIS])
+        return acting_on(AXIS, len(truth.gains), friction_nm)
+
+    return bent(_clean(truth), truth, torque)
+
+
+@pytest.fixture(scope="module")
+def heavy_truth() -> Truth:
+    return _truth(ROTORS_KG_M2)
+
+
+@pytest.fixture(scope="module")
+def heavy(heavy_truth: Truth) -> Evidence:
+    return _with_load_friction(heavy_truth)
+
+
+@pytest.fixture(scope="module")
+def found(heavy: Evidence) -> Evidence:
+    return find_effects(heavy, np.random.default_rng(0), GATES)[-1].after
+
+
+def _loss(evidence: Evidence) -> tuple[FloatArray, FloatArray]:
+    """Coefficients of the only effect and their σ."""
+    first = len(evidence.rows_without_effects.columns)
+    return evidence.estimate.parameters[first:], evidence.estimate.parameters_std[first:]
+
+
+def _own(evidence: Evidence) -> LoadFriction:
+    (placed,) = evidence.effects
+    assert isinstance(placed.effect, LoadFriction)
+    assert placed.axis == AXIS
+    return placed.effect
+
+
+def _assert_true(evidence: Evidence, truth: Truth, rotor_kg_m2: float) -> None:
+    """Coefficient, rotor and gains are true within 3 σ, and σ is small."""
+    effect = _own(evidence)
+    assert effect.with_rotor == 1
+    values, deviations = (part[:2] for part in _loss(evidence))
+    assert abs(values[0] - COEFFICIENT) < 3.0 * deviations[0]
+    assert deviations[0] < 0.02 * COEFFICIENT
+    inertia_std = deviations[1] / values[0]
+    inertia_kg_m2 = effect.rotor_inertia_kg_m2 + values[1] / values[0]
+    assert abs(inertia_kg_m2 - rotor_kg_m2) < 3.0 * inertia_std
+    assert inertia_std < 0.2
+    errors = (evidence.estimate.gains - truth.gains) / evidence.estimate.gains_std
+    assert np.max(np.abs(errors)) < 3.5
+
+
+def test_load_friction_beside_a_heavy_rotor_is_true(found: Evidence, heavy: Evidence, heavy_truth: Truth) -> None:
+    _assert_true(found, heavy_truth, ROTORS_KG_M2[AXIS])
+    assert abs(_loss(found)[0][1]) < _loss(found)[1][1]
+    # What it is for: with the rotor in the load the coefficient is wrong.
+    plain = with_effects(heavy, (PlacedEffect(LoadFriction(0), AXIS),))
+    values, deviations = _loss(plain)
+    assert abs(values[0] - COEFFICIENT) > 5.0 * deviations[0]
+
+
+def test_without_a_rotor_the_coefficient_is_true_as_well() -> None:
+    truth = _truth((0.0, 0.0, 0.0))
+    after = find_effects(_with_load_friction(truth), np.random.default_rng(0), GATES)[-1].after
+    _assert_true(after, truth, 0.0)
+
+
+def test_deviations_hold_what_is_open_about_the_rotor(found: Evidence) -> None:
+    effect = _own(found)
+    known = with_effects(found, (PlacedEffect(replace(effect, with_rotor=0), AXIS),))
+    assert _loss(found)[1][0] > _loss(known)[1][0]
+
+
+def _predicted(calibration: Calibration, truth: Truth, data: Dataset) -> FloatArray:
+    return predict_torque(calibration, truth.model, data)[:, AXIS]
+
+
+def test_a_calibration_predicts_the_same_load_friction(found: Evidence, heavy_truth: Truth) -> None:
+    calibration = calibrated(found)
+    (accepted,) = calibration.effects
+    assert placed_effect(accepted, calibration)[0].effect == _own(found)
+    data = found.datasets[1]
+    names = {coefficient.name for coefficient in accepted.coefficients}
+    declared = tuple(parameter for parameter in calibration.parameters if parameter.name not in names)
+    bare = replace(calibration, effects=(), parameters=declared)
+    friction_nm = _predicted(calibration, heavy_truth, data) - _predicted(bare, heavy_truth, data)
+    parameters = heavy_truth.parameters.copy()
+    parameters[heavy_truth.model.flange] += list(PAYLOAD_TRUTH.values())
+    load_nm = heavy_truth.model.torques(data.motion(), parameters)[0][AXIS]
+    expected_nm = COEFFICIENT * np.abs(load_nm) * np.sign(data.velocity_rad_s[:, AXIS])
+    assert np.linalg.norm(friction_nm - expected_nm) < 0.03 * np.linalg.norm(expected_nm)
+
+
+def test_a_calibration_of_an_earlier_version_has_no_rotor(heavy: Evidence) -> None:
+    calibration = calibrated(with_effects(heavy, (PlacedEffect(LoadFriction(0), AXIS),)))
+    (accepted,) = calibration.effects
+    earlier = replace(accepted, settings={"speed_exponent": 0.0})
+    assert placed_effect(earlier, calibration)[0].effect == LoadFriction(0)
+    assert [one.name for one in accepted.coefficients] == ["load-friction coefficient 2 (speed_exponent 0)"]
+
+
+@pytest.mark.parametrize(
+    ("mechanism", "expected"),
+    [(FIVE_BAR, (0, 1)), (PLANAR, (0, 1, 2, 3)), (THREE_LEGS, ())],
+    ids=lambda one: getattr(one, "name", None),
+)
+def test_cranks_carry_their_rotors_and_slides_do_not(mechanism: Mechanism, expected: tuple[int, ...]) -> None:
+    made = recorded(mechanism, 7, seconds=12.0, noise_a=0.01)
+    rows = identify(made.model, made.runs, made.conditioning, keep_rows=True).gathered
+    assert rows is not None
+    assert axes_with_rotor_in_load(rows[1]) == expected
+
+
+def test_only_the_first_two_axes_of_an_arm_carry_their_rotors(heavy: Evidence) -> None:
+    assert axes_with_rotor_in_load(heavy.training) == (0, 1)
+    problem = search_problem_of(heavy)
+    for axis in (0, 1):
+        assert largest_inertia(problem, axis) > 0.9 * ROTORS_KG_M2[axis]
+
+
+def test_the_bound_of_a_rotor_holds_for_a_redundant_drive() -> None:
+    """With nothing but one rotor in the mass matrix of torques without preload, the bound is that rotor."""
+    made = recorded(PLANAR, 7, seconds=12.0, noise_a=0.01)
+    problem = search_problem_of(gather(identify(made.model, made.runs, made.conditioning, keep_rows=True)))
+    (run, _) = problem.runs
+    (data, _) = problem.datasets
+    followed = made.model.follow(data.motion())
+    back = np.linalg.pinv(followed.to_motors)
+    projector = np.einsum("kmd,kdj->kmj", followed.to_motors, back)[:20]
+    rotors_kg_m2 = np.array([0.3, 0.2, 0.4, 0.5])
+    inertia_kg_m2 = np.einsum("kij,j,kjl->ilk", projector, rotors_kg_m2, projector)
+    alone = replace(problem, runs=(replace(run, inertia_kg_m2=inertia_kg_m2),))
+    assert np.min(inertia_kg_m2[0, 0]) < rotors_kg_m2[0]
+    assert largest_inertia(alone, 0) >= rotors_kg_m2[0] - 1e-9
+
+
+def _declared(heavy: Evidence, effect: Effect, axis: int) -> Evidence:
+    return with_declared(heavy, [PlacedEffect(effect, axis)], np.random.default_rng(0))[-1].after
+
+
+def test_a_declared_loss_leaves_the_rotor_out(heavy: Evidence, heavy_truth: Truth) -> None:
+    _assert_true(_declared(heavy, LoadFriction(0), AXIS), heavy_truth, ROTORS_KG_M2[AXIS])
+
+
+def test_a_declared_inertia_is_kept(heavy: Evidence) -> None:
+    given = LoadFriction(0, ROTORS_KG_M2[AXIS])
+    after = _declared(heavy, given, AXIS)
+    assert _own(after) == given
+    values, deviations = _loss(after)
+    assert abs(values[0] - COEFFICIENT) < 3.0 * deviations[0]
+
+
+def test_a_declared_inertia_that_is_a_parameter_of_its_own_is_refused(heavy: Evidence) -> None:
+    with pytest.raises(EffectRefused, match="J3 is given a rotor"):
+        with_declared(heavy, [PlacedEffect(Efficiency(1.0, 0.1), 2)], np.random.default_rng(0), axes=NAMES)
