@@ -21,7 +21,7 @@ the others, and a hypothesis must lower the errors of these predictions, in sum 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -29,9 +29,13 @@ import numpy as np
 import scipy  # loads its modules when they are first used
 
 from ident.arrays import FloatArray, IntArray
+from ident.data.conditioning import Conditioning
+from ident.data.run import Run
 from ident.equations.instants import Instants
-from ident.errors import Diagnosis, ModelError
-from ident.estimators.refusals import FRICTION, SMALL_ERROR
+from ident.errors import Diagnosis, IdentificationError, ModelError
+from ident.estimators.identify import identify
+from ident.estimators.method import Method
+from ident.estimators.refusals import FRICTION, LARGEST_TOTAL_PERCENT, SMALL_ERROR
 from ident.model.base import SMALLEST_COLUMN
 from ident.model.bodies import LINK_PARAMETERS
 from ident.model.model import Model
@@ -297,6 +301,47 @@ def _moved(gravity: FloatArray, step: FloatArray) -> FloatArray:
     return np.asarray(size * direction / np.linalg.norm(direction))
 
 
+# Confirmation
+
+
+def is_confirmed(
+    geometry: TurnedGeometry,
+    model: Model,
+    runs: Iterable[Run],
+    conditioning: Conditioning,
+    gains: FloatArray,
+    *,
+    gains_fixed: bool,
+    before_percent: float | None,
+) -> bool:
+    """Whether a fit of all rows in another geometry has a smaller error than as declared.
+
+    Args:
+        geometry: found in a few rows.
+        model, conditioning: as declared.
+        runs: of the fit, as they were read.
+        gains: nameplate, shape (m,).
+        gains_fixed: the fit holds them.
+        before_percent: relative error of the fit as declared; None where it was refused.
+    """
+    signs = np.ones(len(gains))
+    signs[list(geometry.reversed_currents)] = -1.0
+    method = Method.WLS if gains_fixed else Method.ML
+    fixed = gains * signs if gains_fixed else None
+    corrected = _corrected(geometry, runs)
+    try:
+        found = identify(geometry.model(model), corrected, conditioning, method=method, fixed_gains=fixed, judge=False)
+    except IdentificationError:
+        return False
+    limit = LARGEST_TOTAL_PERCENT if before_percent is None else before_percent
+    return found.training_error.total < limit
+
+
+def _corrected(geometry: TurnedGeometry, runs: Iterable[Run]) -> Iterator[Run]:
+    for run in runs:
+        yield replace(run, position_rad=geometry.corrected_positions(run.position_rad))
+
+
 # Judgement
 
 
@@ -319,7 +364,7 @@ class Judged:
     @property
     def floored_error(self) -> FloatArray:
         """Error of each motor, at least the smallest, shape (m,)."""
-        return np.maximum(np.sqrt(self.left.sum(axis=1)), self.smallest)
+        return np.asarray(np.maximum(np.sqrt(self.left.sum(axis=1)), self.smallest))
 
     @property
     def percent(self) -> FloatArray:
@@ -339,7 +384,7 @@ class Judged:
         usual = np.minimum(before.floored_error, self.floored_error)[:, None] ** 2 / PARTS
         falls = 0.5 * np.sum(np.log((before.left + usual) / (self.left + usual)), axis=0)
         std = float(np.std(falls, ddof=1)) / np.sqrt(len(falls))
-        return float(np.mean(falls)) > LEAST_T * std
+        return bool(np.mean(falls) > LEAST_T * std)
 
     def contradictions(self, gains: FloatArray) -> float:
         """Number of currents with another sign than the nameplate.
@@ -470,7 +515,7 @@ class Products:
     @property
     def current_square(self) -> FloatArray:
         """Sums of squares of the currents [A²], shape (m, PARTS)."""
-        return self.square[:, :, -1, -1]
+        return np.asarray(self.square[:, :, -1, -1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -484,7 +529,7 @@ class GravityProducts:
     @property
     def columns(self) -> int:
         """Number c of columns of A."""
-        return self.square.shape[-1] - 1 - 3 * len(self.weighty)
+        return int(self.square.shape[-1]) - 1 - 3 * len(self.weighty)
 
     def along(self, component: int) -> slice:
         """Columns G_k."""
