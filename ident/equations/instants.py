@@ -32,6 +32,21 @@ class Instants:
     move: IntArray  #: number of each row's move within the run, shape (k,)
     mounting: str | None  #: of the payload; None without load
 
+    def every(self, step: int) -> Instants:
+        """Every so many of the rows."""
+        motion = self.motion
+        return Instants(
+            motion=Motion(
+                np.ascontiguousarray(motion.position_rad[::step]),
+                np.ascontiguousarray(motion.velocity_rad_s[::step]),
+                np.ascontiguousarray(motion.acceleration_rad_s2[::step]),
+            ),
+            current_a=self.current_a[:, ::step],
+            use=self.use[:, ::step],
+            move=self.move[::step],
+            mounting=self.mounting,
+        )
+
 
 def instants_of(model: Model, data: Dataset, conditioning: Conditioning) -> Instants | None:
     """Take evenly spaced rows of a run; None where the run is too short to decimate, or no row counts.

@@ -22,6 +22,7 @@ the others, and a hypothesis must lower the errors of these predictions, in sum 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -54,6 +55,8 @@ LARGEST_DIRECTION_STD_DEG = 10.0  #: A direction that is less certain is not nam
 ALIKE_FALL = 0.85
 """Share of the largest fall above which a hypothesis is as good: a mirror image of an arm has the same torques."""
 LARGEST_FACTOR = 3.0  #: Of a gain beside its nameplate and the other gains
+SCREENED_ROWS = 500  #: Rows of all runs together with which every recording is screened
+SUSPECT_FALL = 0.25  #: Fall of the errors of the fits themselves, as LEAST_FALL, above which predictions are judged
 RIDGE = 1e-7  #: Added to products of columns of unit length, for combinations that no row shows
 FIT_ROUNDS, NEXT_ROUNDS = 6, 2  #: Rounds of a fit from the nameplate, and of one from a neighbouring solution
 TURN_ROUNDS = 6  #: Of Gauss-Newton
@@ -168,6 +171,8 @@ def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: Floa
     if model.is_redundant or not instants:
         return None
     reference = 1.0 / np.abs(gains)
+    if not _is_suspect(model, _thinned(instants), reference):
+        return None
     weighed = gravity_products(model, instants)
     declared = model.robot.gravity_m_s2
     as_declared = weighed.directed(declared)
@@ -201,6 +206,41 @@ def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: Floa
     )
 
 
+def _thinned(instants: Sequence[Instants]) -> tuple[Instants, ...]:
+    """Keep SCREENED_ROWS of all runs together, evenly spaced."""
+    step = -(-sum(len(one.move) for one in instants) // SCREENED_ROWS)
+    return tuple(one.every(step) for one in instants)
+
+
+def _is_suspect(model: Model, instants: Sequence[Instants], reference: FloatArray) -> bool:
+    """Whether another geometry may explain rows better, by the errors of the fits themselves.
+
+    No direction of gravity leaves less than three directions at once, each with moments of its own, and a reversed
+    position has as many parameters as the declared one. Nearly all recordings need no other judgement.
+
+    Args:
+        model: the declared model.
+        instants: few rows of all runs.
+        reference: 1/|g| of the nameplate [A/Nm or A/N], shape (m,).
+    """
+    weighed = gravity_products(model, instants, part_count=1)
+    rows = weighed.rows.sum(axis=1)
+    as_declared = weighed.directed(model.robot.gravity_m_s2)
+    start = first_fit(model, as_declared, reference)
+    square = as_declared.square[:, 0]
+    limit = _log_error(square, improved(square, rows, start, reference, FIT_ROUNDS)) - SUSPECT_FALL
+    any_gravity = weighed.square[:, 0]
+    if _log_error(any_gravity, improved(any_gravity, rows, start, reference, FIT_ROUNDS)) < limit:
+        return True
+    for axis in range(model.robot.axis_count):
+        with suppress(ModelError):  # the loops of a closed chain cannot be closed so
+            square = reversed_products(model, instants, axis, part_count=1).square[:, 0]
+            opposite = start.with_opposite(axis)
+            if _log_error(square, improved(square, rows, opposite, reference, FIT_ROUNDS)) < limit:
+                return True
+    return False
+
+
 def _reversed_geometries(
     model: Model, instants: Sequence[Instants], before: Judged, start: MotorFit, reference: FloatArray
 ) -> list[Judged]:
@@ -211,9 +251,7 @@ def _reversed_geometries(
             products = reversed_products(model, instants, axis)
         except ModelError:  # the loops of a closed chain cannot be closed so
             continue
-        signs = np.ones(len(reference))
-        signs[axis] = -1.0  # friction brakes the motion that was recorded
-        opposite = replace(start, per_unit=start.per_unit * signs)
+        opposite = start.with_opposite(axis)
         fit = improved(products.square.sum(axis=1), products.rows.sum(axis=1), opposite, reference, FIT_ROUNDS)
         in_sample = np.sqrt(left_over(products.square.sum(axis=1), fit))
         # Prediction is never better than the fit: most hypotheses end here.
@@ -428,6 +466,12 @@ class MotorFit:
     parameters: FloatArray  #: χ in the same scale, shape (c,)
     weight: FloatArray  #: 1/σ² of each motor's current [1/A²], shape (m,)
 
+    def with_opposite(self, axis: int) -> MotorFit:
+        """The fit with the other sign of a motor: friction brakes the motion of a reversed position."""
+        signs = np.ones(len(self.per_unit))
+        signs[axis] = -1.0
+        return replace(self, per_unit=self.per_unit * signs)
+
 
 def first_fit(model: Model, products: Products, reference: FloatArray) -> MotorFit:
     """Begin a fit with the nameplate's gains, and the signs with which each motor's friction brakes.
@@ -583,12 +627,13 @@ class GravityProducts:
         return np.asarray(sideways @ solution[-2:])
 
 
-def gravity_products(model: Model, instants: Sequence[Instants]) -> GravityProducts:
+def gravity_products(model: Model, instants: Sequence[Instants], part_count: int = PARTS) -> GravityProducts:
     """Products for any direction of gravity, of runs with any payloads.
 
     Args:
         model: the declared model, its gravity apart.
         instants: of all runs, of the axes of the model.
+        part_count: number of parts of the moves.
 
     Raises:
         ModelError: the loops of a closed chain cannot be closed.
@@ -601,18 +646,20 @@ def gravity_products(model: Model, instants: Sequence[Instants]) -> GravityProdu
     weighty = (first[:, None] + np.array(WEIGHTY)).ravel()
     squares = list[FloatArray]()
     rows = list[IntArray]()
-    for one, parts in zip(instants, _parts(instants), strict=True):
+    for one, parts in zip(instants, _parts(instants, part_count), strict=True):
         still = np.zeros_like(one.motion.position_rad)
         rest = Motion(one.motion.position_rad, still, still)
         moving = _motor_columns(weightless, one, one.motion, mountings)
         at_rest = [_motor_columns(unit, one, rest, mountings)[:, weighty] for unit in pulled]
-        square, counted = _products(np.concatenate((moving, *at_rest, one.current_a[:, None]), axis=1), one, parts)
+        square, counted = _products(
+            np.concatenate((moving, *at_rest, one.current_a[:, None]), axis=1), one, parts, part_count
+        )
         squares.append(square)
         rows.append(counted)
     return GravityProducts(np.sum(squares, axis=0), np.sum(rows, axis=0), weighty)
 
 
-def reversed_products(model: Model, instants: Sequence[Instants], axis: int) -> Products:
+def reversed_products(model: Model, instants: Sequence[Instants], axis: int, part_count: int = PARTS) -> Products:
     """Products under the hypothesis that the position of an axis counts the other way; arguments as before.
 
     Raises:
@@ -623,26 +670,27 @@ def reversed_products(model: Model, instants: Sequence[Instants], axis: int) -> 
     signs[axis] = -1.0
     squares = list[FloatArray]()
     rows = list[IntArray]()
-    for one, parts in zip(instants, _parts(instants), strict=True):
+    for one, parts in zip(instants, _parts(instants, part_count), strict=True):
         motion = one.motion
         opposite = Motion(
             motion.position_rad * signs, motion.velocity_rad_s * signs, motion.acceleration_rad_s2 * signs
         )
-        columns = _motor_columns(model, one, opposite, mountings)
-        square, counted = _products(np.concatenate((columns, one.current_a[:, None]), axis=1), one, parts)
+        moving = _motor_columns(model, one, opposite, mountings)
+        columns = np.concatenate((moving, one.current_a[:, None]), axis=1)
+        square, counted = _products(columns, one, parts, part_count)
         squares.append(square)
         rows.append(counted)
     return Products(np.sum(squares, axis=0), np.sum(rows, axis=0))
 
 
-def _parts(instants: Sequence[Instants]) -> list[IntArray]:
-    """Which of PARTS each row of each run is in: moves with rows that count, dealt out in turn over all runs."""
+def _parts(instants: Sequence[Instants], part_count: int) -> list[IntArray]:
+    """Which part each row of each run is in: moves with rows that count, dealt out in turn over all runs."""
     dealt = 0
     parts = list[IntArray]()
     for one in instants:
         of_rows = np.full(len(one.move), -1)
         for move in np.unique(one.move[one.use.any(axis=0)]):
-            of_rows[one.move == move] = dealt % PARTS
+            of_rows[one.move == move] = dealt % part_count
             dealt += 1
         parts.append(of_rows)
     return parts
@@ -663,15 +711,16 @@ def _motor_columns(model: Model, one: Instants, motion: Motion, mountings: Seque
     return np.asarray(np.tensordot(model.drive_train.to_motor, columns, axes=1))
 
 
-def _products(columns: FloatArray, one: Instants, parts: IntArray) -> tuple[FloatArray, IntArray]:
+def _products(columns: FloatArray, one: Instants, parts: IntArray, part_count: int) -> tuple[FloatArray, IntArray]:
     """Products of the columns of each motor over its rows of each part, and how many rows; from shape (m, c, k)."""
     count = len(columns)
-    square = np.zeros((count, PARTS, columns.shape[1], columns.shape[1]))
-    rows = np.zeros((count, PARTS), dtype=np.int64)
+    square = np.zeros((count, part_count, columns.shape[1], columns.shape[1]))
+    rows = np.zeros((count, part_count), dtype=np.int64)
     for motor, of_motor in enumerate(columns):
-        for part in range(PARTS):
+        loading = np.flatnonzero(of_motor.any(axis=1))  # a wrist carries few links
+        for part in range(part_count):
             used = one.use[motor] & (parts == part)
-            chosen = of_motor[:, used]
-            square[motor, part] = chosen @ chosen.T
+            chosen = of_motor[np.ix_(loading, used)]
+            square[motor, part][np.ix_(loading, loading)] = chosen @ chosen.T
             rows[motor, part] = np.count_nonzero(used)
     return square, rows
