@@ -60,6 +60,7 @@ SUSPECT_FALL = 0.25  #: Fall of the errors of the fits themselves, as LEAST_FALL
 RIDGE = 1e-7  #: Added to products of columns of unit length, for combinations that no row shows
 FIT_ROUNDS, NEXT_ROUNDS = 6, 2  #: Rounds of a fit from the nameplate, and of one from a neighbouring solution
 TURN_ROUNDS = 6  #: Of Gauss-Newton
+LARGEST_STEP_RAD = 0.5  #: Up to which a step of the direction is trusted
 WEIGHTY = tuple(index for index, name in enumerate(LINK_PARAMETERS) if name.startswith("m"))
 """Parameters of a body that gravity acts on: first moments and mass."""
 
@@ -148,7 +149,8 @@ def _percents(values: FloatArray) -> str:
 
 
 def _numbers(values: FloatArray) -> str:
-    return "[" + ", ".join(f"{value:.2f}" for value in values + 0.0) + "]"
+    rounded = np.round(values, 2) + 0.0  # no minus before a zero
+    return "[" + ", ".join(f"{value:.2f}" for value in rounded) + "]"
 
 
 def with_gravity(model: Model, gravity_m_s2: FloatArray) -> Model:
@@ -191,16 +193,16 @@ def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: Floa
     alike.sort(key=lambda one: (one.contradictions(gains), -one.fall(before)))
     chosen = alike[0]
     fewest = chosen.contradictions(gains)
-    mirrored = tuple(
-        one.reversed_axis
-        for one in alike[1:]
-        if chosen.gravity is None and one.reversed_axis is not None and one.contradictions(gains) == fewest
-    )
-    own = () if chosen.reversed_axis is None else (chosen.reversed_axis,)
+    reversed_axes = list[int]()
+    for one in alike:
+        is_alike = chosen.gravity is None and one.contradictions(gains) == fewest
+        if is_alike and one.reversed_axis is not None:
+            reversed_axes.append(one.reversed_axis)
+    against = np.flatnonzero(chosen.fit.per_unit * gains < 0.0)
     return TurnedGeometry(
         gravity=chosen.gravity,
-        reversed_axes=(*own, *mirrored),
-        reversed_currents=tuple(np.flatnonzero(chosen.fit.per_unit * gains < 0.0).tolist()),
+        reversed_axes=tuple(reversed_axes),
+        reversed_currents=tuple(against.tolist()),
         before_percent=before.percent,
         after_percent=chosen.percent,
     )
@@ -252,10 +254,12 @@ def _reversed_geometries(
         except ModelError:  # the loops of a closed chain cannot be closed so
             continue
         opposite = start.with_opposite(axis)
-        fit = improved(products.square.sum(axis=1), products.rows.sum(axis=1), opposite, reference, FIT_ROUNDS)
-        in_sample = np.sqrt(left_over(products.square.sum(axis=1), fit))
-        # Prediction is never better than the fit: most hypotheses end here.
-        if np.sum(np.log(before.floored_error / np.maximum(in_sample, before.smallest))) < LEAST_FALL:
+        square = products.square.sum(axis=1)
+        rows = products.rows.sum(axis=1)
+        fit = improved(square, rows, opposite, reference, FIT_ROUNDS)
+        fitted = np.maximum(np.sqrt(left_over(square, fit)), before.smallest)
+        falls = np.log(before.floored_error / fitted)
+        if np.sum(falls) < LEAST_FALL:  # prediction is never better than the fit: most hypotheses end here
             continue
         judged.append(replace(judge(products, opposite, reference), reversed_axis=axis))
     return judged
@@ -266,21 +270,20 @@ def _turned_gravity(
 ) -> Judged | None:
     """Judge the best direction of gravity; None where it is near the declared one, or uncertain."""
     found, fit = best_gravity(weighed, declared, start, reference)
-    parts = range(PARTS)
-    left_out = [_without(weighed, part, found, fit, reference) for part in parts]
+    left_out = [_without(weighed, part, found, fit, reference) for part in range(PARTS)]
     directions = np.array([gravity for gravity, _ in left_out])
     unit = directions / np.linalg.norm(found)
-    scatter = (PARTS - 1) / PARTS * np.cov(unit.T, ddof=0) * PARTS
+    scatter = (PARTS - 1) * np.cov(unit.T, ddof=0)  # of the jackknife
     std_deg = float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(scatter)[-1])))
     gravity = GravityFound(declared, found, std_deg)
     if gravity.turned_deg < max(SMALLEST_TURN_DEG, 3.0 * std_deg) or std_deg > LARGEST_DIRECTION_STD_DEG:
         return None
-    left = [
-        left_over(weighed.turned(weighed.square[:, part], one), of_others)
-        for part, (one, of_others) in zip(parts, left_out, strict=True)
-    ]
-    whole = weighed.directed(found)
-    return Judged(fit, np.stack(left, axis=1), whole.current_square, gravity=gravity)
+    left = list[FloatArray]()
+    for part, (of_others, fit_of_others) in enumerate(left_out):
+        own = weighed.turned(weighed.square[:, part], of_others)
+        left.append(left_over(own, fit_of_others))
+    current_square = weighed.directed(found).current_square
+    return Judged(fit, np.stack(left, axis=1), current_square, gravity=gravity)
 
 
 def _without(
@@ -316,9 +319,15 @@ def best_gravity(
         fit = improved(turned, rows, near, reference, rounds)
         return _log_error(turned, fit), fit
 
-    grid = [size * np.array(one) / np.linalg.norm(one) for one in product((-1.0, 0.0, 1.0), repeat=3) if any(one)]
-    tried = [(*fitted(gravity, start, NEXT_ROUNDS), gravity) for gravity in (declared, *grid)]
-    level, fit, gravity = min(tried, key=lambda one: one[0])
+    level, fit = fitted(declared, start, NEXT_ROUNDS)
+    gravity = declared
+    for direction in _grid():
+        tried = size * direction
+        tried_level, tried_fit = fitted(tried, start, NEXT_ROUNDS)
+        if tried_level < level:
+            level = tried_level
+            fit = tried_fit
+            gravity = tried
     for _ in range(TURN_ROUNDS):
         step = weighed.turn(square, gravity, fit)
         following = _moved(gravity, step)
@@ -331,11 +340,23 @@ def best_gravity(
     return gravity, fit
 
 
+def _grid() -> list[FloatArray]:
+    """Directions of the faces, edges and corners of a cube, 26 unit vectors."""
+    directions = list[FloatArray]()
+    for corner in product((-1.0, 0.0, 1.0), repeat=3):
+        length = float(np.linalg.norm(corner))
+        if length > 0.0:
+            directions.append(np.array(corner) / length)
+    return directions
+
+
 def _moved(gravity: FloatArray, step: FloatArray) -> FloatArray:
-    """Gravity after a step of its direction, of the same size; a step of Gauss-Newton is trusted up to 0.5 rad."""
+    """Gravity after a step of its direction, of the same size."""
     length = float(np.linalg.norm(step))
     size = float(np.linalg.norm(gravity))
-    direction = gravity / size + step * min(1.0, 0.5 / max(length, 1e-12))
+    if length > LARGEST_STEP_RAD:
+        step = step * (LARGEST_STEP_RAD / length)
+    direction = gravity / size + step
     return np.asarray(size * direction / np.linalg.norm(direction))
 
 
@@ -408,7 +429,9 @@ class Judged:
     def percent(self) -> FloatArray:
         """Error of each motor, of its current [%], shape (m,)."""
         size = self.current_square.sum(axis=1)
-        return np.asarray(100.0 * np.sqrt(self.left.sum(axis=1) / np.where(size > 0.0, size, 1.0)))
+        size[size == 0.0] = 1.0
+        share = self.left.sum(axis=1) / size
+        return np.asarray(100.0 * np.sqrt(share))
 
     def fall(self, before: Judged) -> float:
         """Fall of the logarithm of the errors from those of another hypothesis, in sum over the motors."""
@@ -420,7 +443,8 @@ class Judged:
             return False
         # The mean error of a part is added on both sides, so that a part of few rows does not decide.
         usual = np.minimum(before.floored_error, self.floored_error)[:, None] ** 2 / PARTS
-        falls = 0.5 * np.sum(np.log((before.left + usual) / (self.left + usual)), axis=0)
+        ratio = (before.left + usual) / (self.left + usual)
+        falls = 0.5 * np.sum(np.log(ratio), axis=0)
         std = float(np.std(falls, ddof=1)) / np.sqrt(len(falls))
         return bool(np.mean(falls) > LEAST_T * std)
 
@@ -519,7 +543,8 @@ def improved(square: FloatArray, rows: IntArray, start: MotorFit, reference: Flo
         per_unit = np.where(per_unit < 0.0, -1.0, 1.0) * reference * limited
         fit = MotorFit(per_unit, common * parameters, fit.weight)
         left = np.maximum(left_over(square, fit), SMALL_ERROR**2 * current)
-        fit = replace(fit, weight=np.maximum(rows, 1) / np.where(left > 0.0, left, 1.0))
+        left[left == 0.0] = 1.0  # a motor without current
+        fit = replace(fit, weight=np.maximum(rows, 1) / left)
     return fit
 
 
@@ -527,14 +552,16 @@ def left_over(square: FloatArray, fit: MotorFit) -> FloatArray:
     """What a fit leaves of each motor's current [A²], sums of squares, shape (m,); arguments as for `improved`."""
     torque = (square[:, :-1, :-1] @ fit.parameters) @ fit.parameters
     mixed = square[:, :-1, -1] @ fit.parameters
-    left = square[:, -1, -1] - 2.0 * fit.per_unit * mixed + fit.per_unit**2 * torque
-    return np.maximum(left, 0.0)
+    explained = 2.0 * fit.per_unit * mixed - fit.per_unit**2 * torque
+    return np.maximum(square[:, -1, -1] - explained, 0.0)
 
 
 def _log_error(square: FloatArray, fit: MotorFit) -> float:
     """Logarithm of the motors' errors, in sum; arguments as for `improved`."""
-    left = np.maximum(left_over(square, fit), SMALL_ERROR**2 * square[:, -1, -1])
-    return 0.5 * float(np.sum(np.log(np.where(left > 0.0, left, 1.0))))
+    floor = SMALL_ERROR**2 * square[:, -1, -1]
+    left = np.maximum(left_over(square, fit), floor)
+    left[left == 0.0] = 1.0  # a motor without current
+    return 0.5 * float(np.sum(np.log(left)))
 
 
 def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
