@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from ident.estimators.identify import Identification as Identification
     from ident.estimators.identify import identify as identify
     from ident.estimators.method import Method as Method
+    from ident.estimators.turned_geometry import find_turned_geometry as find_turned_geometry
     from ident.model.bodies import Payload as Payload
     from ident.model.model import DriveTrain as DriveTrain
     from ident.model.model import Model as Model
@@ -87,6 +88,7 @@ _HOMES = {
     "ident.estimators.estimate": "Estimate RelativeError",
     "ident.estimators.identify": "Identification identify",
     "ident.estimators.method": "Method",
+    "ident.estimators.turned_geometry": "find_turned_geometry",
     "ident.model.bodies": "Payload",
     "ident.model.model": "DriveTrain Model",
     "ident.model.robot": "Motion Robot",

@@ -8,6 +8,7 @@ IdentificationError
 ├── ModelContradicted     the declared model explains less of the data than it leaves
 │   ├── RolesExchanged    loaded and unloaded runs are mistaken for each other
 │   ├── ChannelsExchanged the currents of some axes are each other's
+│   ├── GeometryTurned    gravity, or the position of an axis, points elsewhere than declared
 │   ├── CurrentReversed   a current counts against the sign of its fixed gain
 │   ├── UnitsMistaken     all gains, or the payload's weight, are off by a factor such as 1000
 │   └── PayloadDiffers    a run carries another payload than it says
@@ -95,6 +96,10 @@ class ChannelsExchanged(ModelContradicted):
     """The currents of some axes are each other's."""
 
 
+class GeometryTurned(ModelContradicted):
+    """Gravity, or the position of an axis, points elsewhere than declared."""
+
+
 class CurrentReversed(ModelContradicted):
     """A current counts against the sign of its fixed gain."""
 
@@ -166,8 +171,8 @@ class Diagnosis:
     """Something wrong with a recording or fit that leaves usable numbers, and where to look."""
 
     #: One of axis-error, axis-idle, channels-exchanged, current-off-scale, current-reversed, estimators-disagree,
-    #: gain-off-nameplate, gravity-turned, ill-conditioned, payload-differs, position-late, torque-above-limit,
-    #: zero-off.
+    #: gain-off-nameplate, gravity-tilted, gravity-turned, ill-conditioned, payload-differs, position-late,
+    #: position-reversed, torque-above-limit, zero-off.
     name: str
     runs: tuple[str, ...]  #: those it points at
     axes: tuple[str, ...]  #: likewise

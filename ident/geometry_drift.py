@@ -58,6 +58,8 @@ def geometry_drift(
         left_nm: measured less predicted torque at the rows [Nm or N], shape (m, r).
         use: rows of each axis that count, shape (m, r).
     """
+    if model.is_redundant:
+        return None  # internal preload hides a part of the torque
     corrections = corrections_of(calibration)
     model = corrected_model(model, corrections)
     slow = at_rows(corrected_dataset(data, corrections), conditioning)

@@ -42,6 +42,9 @@ AcceptLossesOption = Annotated[
     bool,
     typer.Option("--accept-losses", help="Use logs with lost frames, less those samples; `apply` refuses the result."),
 ]
+AsWiredOption = Annotated[
+    bool, typer.Option("--channels-as-wired", help="Do not look for exchanged currents: they are each axis' own.")
+]
 GainsOption = Annotated[Gains, typer.Option(help="fixed: hold the nameplate gains (classical IDIM).")]
 KnownOption = Annotated[Known, typer.Option(help="What is known of the payload; cad: its drawing too.")]
 EssentialOption = Annotated[
@@ -81,6 +84,7 @@ def fit_verb(
     pictures: PicturesOption = None,
     cell: CellOption = None,
     accept_losses: AcceptLossesOption = False,
+    channels_as_wired: AsWiredOption = False,
     json: JsonOption = False,
 ) -> None:
     """Identify all drive gains and dynamic parameters from runs without load and with a weighed payload."""
@@ -109,7 +113,15 @@ def fit_verb(
         fixed = gains is Gains.FIXED
         if known is Known.MASS:
             lossy = LossyLogs.ACCEPTED if accept_losses else LossyLogs.REFUSED
-            fitted = fit(logs, holdout=holdout or (), method=method, gains_fixed=fixed, cell=described, lossy=lossy)
+            fitted = fit(
+                logs,
+                holdout=holdout or (),
+                method=method,
+                gains_fixed=fixed,
+                cell=described,
+                lossy=lossy,
+                channels_as_wired=channels_as_wired,
+            )
             found = CaseFit(fitted, (), None)
         else:
             chosen = method or (Method.WLS if fixed else Method.ML)
@@ -134,6 +146,7 @@ def fit_verb(
         same = [word for log in holdout or () for word in ("--holdout", log)]
         same += [] if cell is None else ["--cell", cell]
         same += ["--gains", gains.value] if fixed else []
+        same += ["--channels-as-wired"] if channels_as_wired else []
         say_next("drivegain", "residual", *logs, *same, "--out", out or "calibration.yaml", "--report", "report")
 
 
@@ -193,6 +206,7 @@ def residual_verb(
     ] = False,
     cell: CellOption = None,
     accept_losses: AcceptLossesOption = False,
+    channels_as_wired: AsWiredOption = False,
     accept_worse_holdout: Annotated[
         bool,
         typer.Option(
@@ -234,6 +248,7 @@ def residual_verb(
             cell=None if cell is None else load_cell(cell),
             lossy=LossyLogs.ACCEPTED if accept_losses else LossyLogs.REFUSED,
             keep_rows=True,
+            channels_as_wired=channels_as_wired,
         )
         closed = replace(close_loop(fitted, seed, report_step), accept_worse_holdout=accept_worse_holdout)
         calibration = calibration_of(closed, datetime.now(UTC))
@@ -266,6 +281,7 @@ def residual_verb(
     same += ["--gains", gains.value] if gains is Gains.FIXED else []
     same += ["--seed", str(seed)] if seed else []
     same += ["--accept-losses"] if accept_losses else []
+    same += ["--channels-as-wired"] if channels_as_wired else []
     same += ["--accept-worse-holdout"] if accept_worse_holdout else []
     say_next("drivegain", "residual", *logs, *same, "--out", "calibration.yaml", "--report", report or "report")
 

@@ -13,7 +13,7 @@ from daq.config.cell import Cell, model_of
 from daq.errors import ConfigurationInconsistent
 from daq.workflow.choices import Known
 from daq.workflow.declared_effects import refuse_effects
-from daq.workflow.diagnoses import currents_as_cause
+from daq.workflow.diagnoses import named_causes
 from daq.workflow.fit import Fit, Reading, calibration_of, judged
 from ident.calibration import Calibration, Parameter, Source, factor_of
 from ident.equations.reduction import Reduction, reduce_runs
@@ -107,7 +107,7 @@ def fit_case(
     result = Identification(used.model, used.conditioning, system, rest, estimate)
     paper = None if gains_fixed else tls(system)
     start = Fit(logs.cell, logs.logs, logs.holdout, logs.sources, result, (), paper, given_cell=logs.cell)
-    with currents_as_cause(start.logs, start.read):
+    with named_causes(start.recordings):
         fitted = judged(start)
     if ratio is None:
         return CaseFit(fitted, payloads, None)

@@ -8,17 +8,20 @@ The order of the judgements, causes before their traces:
 1. Each log as it is read: currents without a sign (`ident.estimators.diagnosis.require_explained_currents`).
 2. What leaves no usable number (`ident.estimators.refusals.refuse_mistakes`): a payload that does not show; with fixed
    gains its weight and the signs of the currents; errors; exchanged roles; units. Where one of these refuses, or the
-   estimator does not converge, its causes are looked for in the logs: currents without a sign, exchanged currents.
-3. What is named (`ident.estimators.diagnosis.diagnose`): gains, estimators, payloads, errors, torques, condition.
-4. The same causes, where 3. named a trace of them, or the gains are fixed.
-5. Each held-out log.
+   estimator does not converge, its causes are looked for in the logs: the geometry, currents without a sign, exchanged
+   currents.
+3. The geometry of every fit (`ident.estimators.turned_geometry`): gravity, and the sense of each position. Nothing else
+   is said of a fit in a wrong geometry, because all of it would be wrong.
+4. What is named (`ident.estimators.diagnosis.diagnose`): gains, estimators, payloads, errors, torques, condition.
+5. Currents without a sign and exchanged ones, where 4. named a trace of them, or the gains are fixed.
+6. Each held-out log.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,11 +29,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.config.cell import Cell, model_of, robot_of
+from daq.workflow.geometry import drift_diagnosis
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import Calibration
+from ident.data.dataset import differentiate
 from ident.data.run import Run
+from ident.equations.instants import Instants, read_instants
 from ident.equations.reduction import Reduction
-from ident.errors import ChannelsExchanged, Diagnosis, ModelContradicted, NotConverged, PayloadUnseen
+from ident.errors import (
+    ChannelsExchanged,
+    Diagnosis,
+    GeometryTurned,
+    ModelContradicted,
+    NotConverged,
+    PayloadUnseen,
+)
 from ident.estimators.diagnosis import (
     axis_error_diagnoses,
     diagnose,
@@ -41,6 +54,8 @@ from ident.estimators.diagnosis import (
 from ident.estimators.identify import Identification
 from ident.estimators.payload_diagnosis import payload_diagnoses
 from ident.estimators.refusals import idle_joints
+from ident.estimators.turned_geometry import GEOMETRY, find_turned_geometry, is_confirmed
+from ident.geometry_drift import geometry_drift
 from ident.model.base import BaseParameters
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
@@ -52,31 +67,57 @@ if TYPE_CHECKING:  # which asks for these diagnoses
 
 ReadLog = Callable[[Path], tuple[Run, Cell]]  #: Reads a log, and the description of its cell
 
+CHANNELS_AS_WIRED = "--channels-as-wired"  #: Option of `fit` and `residual` with which no exchange is looked for
 TRACES_OF_CURRENTS = {"axis-error", "current-reversed", "gain-off-nameplate"}
 """Diagnoses that exchanged currents, or currents without a sign, may leave. Fixed gains need not leave any."""
 
 
-def diagnose_fit(found: Identification, cell: Cell, logs: Sequence[Path], read: ReadLog) -> tuple[Diagnosis, ...]:
+@dataclass(frozen=True, slots=True)
+class Recordings:
+    """The logs of a fit and how it used them: they are read again where a cause is looked for."""
+
+    logs: tuple[Path, ...]
+    read: ReadLog  #: reads a log as the fit did
+    gains_fixed: bool  #: the fit holds the nameplate gains
+    channels_as_wired: bool = False  #: the operator says that no currents are exchanged
+
+    def runs(self) -> Iterator[Run]:
+        """One run after the other."""
+        for log in self.logs:
+            yield self.read(log)[0]
+
+
+def diagnose_fit(
+    found: Identification, cell: Cell, recordings: Recordings, instants: Sequence[Instants]
+) -> tuple[Diagnosis, ...]:
     """Judge a fit by the recordings that it has used.
 
     Args:
         found: with all effects.
         cell: description of its cell.
-        logs: of the fit; read again where exchanged currents, or currents without a sign, are looked for.
-        read: reads a log as the fit did.
+        recordings: of the fit.
+        instants: a few rows of each; taken from the logs where there are none.
 
     Raises:
         PayloadUnseen, ModelContradicted: a mistake leaves no usable number.
         CurrentUnsigned: drives report the size of their currents only.
     """
-    nameplate = np.array([axis.nameplate_gain for axis in cell.axes])
+    nameplate = nameplate_of(cell)
+    turned = turned_geometry(recordings, instants, found.training_error.total)
+    if turned is not None:
+        return (turned,)
     effort_limit = read_urdf(cell.urdf).effort_limit[list(robot_of(cell).axis_joints)]
     # Each held-out run is judged alone, as in a validation.
     diagnoses = diagnose(replace(found, holdout=None), cell.axis_names, nameplate, effort_limit)
     suspect = any(one.name in TRACES_OF_CURRENTS for one in diagnoses)
     if suspect or found.estimate.gains_fixed:
-        require_right_currents(logs, read, each=suspect)
+        require_right_currents(recordings, each=suspect)
     return diagnoses
+
+
+def nameplate_of(cell: Cell) -> FloatArray:
+    """Nameplate gain of each axis, shape (m,)."""
+    return np.array([axis.nameplate_gain for axis in cell.axes])
 
 
 def diagnose_run(
@@ -91,9 +132,16 @@ def diagnose_run(
         run: as it was read.
         reduction: of this run alone.
     """
+    if any(one.name in GEOMETRY for one in calibration.diagnoses):
+        return ()  # it predicts in a wrong geometry
     runs = (run.name,)
     axes = [gain.axis for gain in calibration.gains]
     use = validation.use
+    data = differentiate(run, model.drive_train, reduction.conditioning)
+    left_nm = validation.measured_nm - validation.predicted_nm
+    moved = geometry_drift(calibration, model, data, reduction.conditioning, left_nm, use)
+    if moved is not None:
+        return (drift_diagnosis(moved, model, axes, runs),)
     size = _rms(validation.measured_nm, use)
     left = _rms(validation.measured_nm - validation.predicted_nm, use)
     idle = idle_joints(model, size, left)
@@ -102,6 +150,12 @@ def diagnose_run(
     if run.payload is not None and not found:
         found += _payload_diagnoses(calibration, run.payload, model, reduction)
     errors = list(axis_error_diagnoses(size, left, idle, axes, runs))
+    if not errors and not any(one.name == "current-reversed" for one in found):
+        return tuple(found)
+    gains = np.array([gain.value for gain in calibration.gains])
+    turned = find_turned_geometry(model, read_instants(model, (run,), reduction.conditioning), gains)
+    if turned is not None:
+        return (turned.diagnosis(axes, runs),)
     exchanged = exchanged_channels(model, (run,), reduction.conditioning, axes) if errors else None
     if exchanged is not None:
         return (replace(exchanged, runs=runs),)
@@ -143,61 +197,101 @@ def not_repeated(stored: Iterable[Diagnosis], fresh: Iterable[Diagnosis]) -> Ite
             yield one
 
 
-# Currents as the cause
+# Causes in the logs
 
 
 @contextmanager
-def currents_as_cause(logs: Sequence[Path], read: ReadLog) -> Iterator[None]:
-    """Name wrong currents where a fit is refused for what they leave; arguments as for `diagnose_fit`.
+def named_causes(recordings: Recordings) -> Iterator[None]:
+    """Name a wrong geometry or wrong currents where a fit is refused for what they leave.
 
     Raises:
+        GeometryTurned: gravity or a position points elsewhere than declared.
         CurrentUnsigned, ChannelsExchanged: see `require_right_currents`.
     """
     try:
         yield
-    except ChannelsExchanged:
+    except (ChannelsExchanged, GeometryTurned):
         raise
     except (ModelContradicted, NotConverged, PayloadUnseen):
-        require_right_currents(logs, read)
+        turned = turned_geometry(recordings, (), None)
+        if turned is not None:
+            raise GeometryTurned(
+                ", ".join(turned.axes) or "the mounting",
+                found=turned.found,
+                expected=turned.expected,
+                remedy=turned.remedy,
+            ) from None
+        require_right_currents(recordings)
         raise
 
 
-def require_right_currents(logs: Sequence[Path], read: ReadLog, *, each: bool = True) -> None:
+def turned_geometry(
+    recordings: Recordings, instants: Sequence[Instants], error_percent: float | None
+) -> Diagnosis | None:
+    """Another geometry that explains recordings clearly better, confirmed by a fit of all rows; None without any.
+
+    Args:
+        recordings: of the fit.
+        instants: a few rows of each; taken from the logs where there are none.
+        error_percent: of the fit as declared; None where it was refused.
+    """
+    _, cell = recordings.read(recordings.logs[0])
+    model = model_of(cell)
+    nameplate = nameplate_of(cell)
+    rows = instants or read_instants(model, recordings.runs(), cell.conditioning)
+    turned = find_turned_geometry(model, rows, nameplate)
+    if turned is None or not is_confirmed(
+        turned,
+        model,
+        recordings.runs(),
+        cell.conditioning,
+        nameplate,
+        gains_fixed=recordings.gains_fixed,
+        before_percent=error_percent,
+    ):
+        return None
+    return turned.diagnosis(cell.axis_names)
+
+
+def require_right_currents(recordings: Recordings, *, each: bool = True) -> None:
     """Refuse logs with currents without a sign, or with exchanged ones; they are read again.
 
     Args:
-        logs, read: as for `diagnose_fit`.
+        recordings: of the fit.
         each: look for an exchange in each log alone, too.
 
     Raises:
         CurrentUnsigned: drives report the size of the current only.
         ChannelsExchanged: the currents of some axes are each other's.
     """
-    _, cell = read(logs[0])
-    runs = [read(log)[0] for log in logs]
+    _, cell = recordings.read(recordings.logs[0])
+    runs = list(recordings.runs())
     unsigned = unsigned_channels(model_of(cell), runs, cell.conditioning, cell.axis_names)
     if unsigned is not None:
         raise unsigned
-    require_own_channels(logs, read, each=each)
+    if not recordings.channels_as_wired:
+        require_own_channels(recordings, each=each)
 
 
-def require_own_channels(logs: Sequence[Path], read: ReadLog, *, each: bool = True) -> None:
+def require_own_channels(recordings: Recordings, *, each: bool = True) -> None:
     """Refuse logs in which the currents of some axes are each other's; they are read again.
 
     Args:
-        logs, read: as for `diagnose_fit`.
+        recordings: of the fit.
         each: look into each log alone, too: in one of several, an exchange is hidden by the others.
 
     Raises:
         ChannelsExchanged: they are, in all logs together or in one of them.
     """
+    logs = recordings.logs
     alone = [(log,) for log in logs] if each and len(logs) > 1 else []
-    for part in (tuple(logs), *alone):
-        found = _exchange_in(part, read)
+    for part in (logs, *alone):
+        found = _exchange_in(part, recordings.read)
         if found is not None:
             where = f"log {part[0].stem}: " if part in alone else ""
             subject = f"{where}the currents of {' and '.join(found.axes)}"
-            raise ChannelsExchanged(subject, found=found.found, expected=found.expected, remedy=found.remedy)
+            remedy = f"{found.remedy}; if they are right as they are, pass {CHANNELS_AS_WIRED}"
+            raise ChannelsExchanged(subject, found=found.found, expected=found.expected, remedy=remedy)
 
 
 def _exchange_in(logs: Sequence[Path], read: ReadLog) -> Diagnosis | None:

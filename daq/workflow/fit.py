@@ -25,7 +25,7 @@ from daq.workflow.declared_effects import (
     with_declared_again,
     with_effects_of_cell,
 )
-from daq.workflow.diagnoses import currents_as_cause, diagnose_fit
+from daq.workflow.diagnoses import Recordings, diagnose_fit, named_causes
 from daq.workflow.geometry import check_diagnoses, correction_diagnoses, geometry_beside, is_checked
 from daq.workflow.validate import diagnose_log
 from ident.calibration import Calibration, PayloadMass, Source
@@ -43,6 +43,7 @@ from ident.estimators.estimate import Estimate, RelativeError, of_squares
 from ident.estimators.identify import Identification, estimate_with, identify
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
+from ident.estimators.turned_geometry import GEOMETRY
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +66,7 @@ class Fit:
     #: The operator takes effects that held-out runs refute: these have then taken part in the choice.
     accept_worse_holdout: bool = False
     geometry: GeometryCheck | None = None  #: of the declared geometry; None where it was not tested
+    channels_as_wired: bool = False  #: the operator says that no currents are exchanged
 
     @property
     def estimate(self) -> Estimate:
@@ -79,6 +81,11 @@ class Fit:
     def read(self, log: Path) -> tuple[Run, Cell]:
         """Read a log as the fit did, with the description of its cell."""
         return load_run(log, self.given_cell, self.lossy)
+
+    @property
+    def recordings(self) -> Recordings:
+        """The logs of the fit, for what is looked for in them."""
+        return Recordings(self.logs, self.read, self.identification.estimate.gains_fixed, self.channels_as_wired)
 
     def evidence(self) -> Evidence:
         """The rows behind the identification, without effects; the logs are read again unless it has kept them."""
@@ -194,6 +201,7 @@ def fit(
     cell: Cell | None = None,
     lossy: LossyLogs = LossyLogs.REFUSED,
     keep_rows: bool = False,
+    channels_as_wired: bool = False,
 ) -> Fit:
     """Identify gains and parameters.
 
@@ -205,6 +213,7 @@ def fit(
         cell: corrected description of the same cell, which replaces the one in the logs.
         lossy: how to handle logs with losses.
         keep_rows: keep all rows for a search for effects, which then need not read the logs again.
+        channels_as_wired: do not look for exchanged currents.
 
     Raises:
         DataError, ConfigurationError, IdentificationError: see daq/errors.py and ident/errors.py.
@@ -242,11 +251,13 @@ def fit(
             lossy=lossy,
             given_cell=cell,
             torque_slopes=reading.torque_slopes(),
+            channels_as_wired=channels_as_wired,
         )
 
     chosen = method or (Method.WLS if gains_fixed else Method.ML)
+    recordings = Recordings(tuple(logs), lambda log: load_run(log, cell, lossy), gains_fixed, channels_as_wired)
     try:
-        with currents_as_cause(logs, lambda log: load_run(log, cell, lossy)):
+        with named_causes(recordings):
             return judged(attempt(logs, holdout, chosen))
     except PayloadUnseen as error:
         hint = contradicting_log(logs, lambda rest: attempt(rest, (), Method.ML))
@@ -272,11 +283,14 @@ def judged(fitted: Fit) -> Fit:
         IdentificationError: a mistake leaves no number that can be used.
     """
     fitted = with_geometry(fitted)
-    of_fit = (
-        *geometry_diagnoses(fitted),
-        *diagnose_fit(fitted.final, fitted.cell, fitted.logs, fitted.read),
-    )
-    calibration = _calibration(fitted)
+    of_geometry = geometry_diagnoses(fitted)
+    recordings = fitted.recordings
+    if of_geometry:  # what is wrong with the description must not be blamed on the wiring
+        recordings = replace(recordings, channels_as_wired=True)
+    of_fit = diagnose_fit(fitted.final, fitted.cell, recordings, fitted.identification.instants)
+    if not any(one.name in GEOMETRY for one in of_fit):
+        of_fit = (*of_geometry, *of_fit)
+    calibration = replace(_calibration(fitted), diagnoses=of_fit)
     of_holdout: list[Diagnosis] = []
     for log in fitted.holdout:
         run, described = fitted.read(log)
@@ -355,7 +369,7 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
     closed = replace(start, identification=before, steps=(*known, *steps))
     if closed.estimate is start.estimate:
         return closed
-    with currents_as_cause(closed.logs, closed.read):
+    with named_causes(closed.recordings):
         return judged(closed)
 
 

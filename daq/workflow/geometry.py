@@ -17,6 +17,7 @@ from ident.effects.geometry import GravityDirection, LatePosition, ZeroOffset, i
 from ident.errors import Diagnosis, TooFewMoves
 from ident.estimators.identify import estimate_with
 from ident.estimators.method import Method
+from ident.geometry_drift import GeometryDrift
 from ident.model.model import Model
 from ident.model.robot import JointKind
 
@@ -80,6 +81,55 @@ def correction_diagnoses(evidence: Evidence, cell: Cell, runs: Sequence[str]) ->
     return tuple(found)
 
 
+def drift_diagnosis(drift: GeometryDrift, model: Model, axes: Sequence[str], runs: Sequence[str]) -> Diagnosis:
+    """Diagnosis of a geometry that has changed since a calibration.
+
+    Args:
+        drift: by a run that the fit has not seen.
+        model: as declared.
+        axes: names of its axes.
+        runs: name of the run.
+    """
+    placed = drift.placed
+    name = axes[placed.axis]
+    values = drift.values
+    deviations = drift.deviations
+    share = f"it explains {100.0 * drift.share:.0f} % of the squared error that friction and gains do not"
+    match placed.effect:
+        case ZeroOffset():
+            unit, scale, _ = _zero_unit(model, placed.axis)
+            size = f"{scale * values[0]:+.2f} ± {scale * deviations[0]:.2f} {unit}"
+            return Diagnosis(
+                name="zero-off",
+                runs=tuple(runs),
+                axes=(name,),
+                found=f"the zero of {name} off by {size} since the calibration; {share}",
+                expected="the zero of the calibration",
+                remedy="reference the axis again, or calibrate anew",
+            )
+        case LatePosition():
+            size = f"{1e3 * values[0]:+.2f} ± {1e3 * deviations[0]:.2f} ms"
+            return Diagnosis(
+                name="position-late",
+                runs=tuple(runs),
+                axes=(name,),
+                found=f"the position of {name} late by {size} more than in the calibration; {share}",
+                expected="positions and currents of one moment",
+                remedy="look for what delays this encoder alone",
+            )
+        case _:
+            angle = float(np.degrees(np.linalg.norm(values)))
+            std = float(np.degrees(np.linalg.norm(values * deviations) / np.linalg.norm(values)))
+            return Diagnosis(
+                name="gravity-tilted",
+                runs=tuple(runs),
+                axes=(),
+                found=f"gravity turned by {angle:.2f} ± {std:.2f}° since the calibration; {share}",
+                expected="the mounting of the calibration",
+                remedy="level the base as it was, or correct `gravity_m_s2` in the cell file and calibrate anew",
+            )
+
+
 def _diagnosis(
     placed: PlacedEffect, values: FloatArray, deviations: FloatArray, cell: Cell, model: Model, runs: Sequence[str]
 ) -> list[Diagnosis]:
@@ -108,7 +158,7 @@ def _diagnosis(
             std = np.degrees(np.linalg.norm(values * deviations) / max(float(np.linalg.norm(values)), 1e-12))
             return [
                 Diagnosis(
-                    name="gravity-turned",
+                    name="gravity-tilted",
                     runs=tuple(runs),
                     axes=(),
                     found=f"gravity along {vector_text(turned)}, turned by {angle:.2f} ± {std:.2f}°",

@@ -17,6 +17,7 @@ from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.demand import with_demand
 from ident.data.run import Run
+from ident.equations.instants import Instants, instants_of
 from ident.equations.rows import CHUNK_ROWS, Rows, RunRows, rows_of
 from ident.equations.system import System
 from ident.equations.triangles import Triangles, qr_update, triangle
@@ -65,6 +66,7 @@ class Reduction:
     clusters: tuple[Cluster, ...]  #: in the order of the runs
     instrumented: bool = False  #: the clusters hold instruments, made of the demanded motion
     kept: tuple[RunRows, ...] = ()  #: the runs with all their rows, where they were asked for
+    instants: tuple[Instants, ...] = ()  #: a few rows of each run, where they were asked for
 
     def base(self) -> BaseParameters:
         """The base parameters that these rows show.
@@ -179,6 +181,7 @@ def reduce_runs(
     payloads: Sequence[Payload] = (),
     instruments: bool = False,
     keep_rows: bool = False,
+    keep_instants: bool = False,
     chunk_rows: int = CHUNK_ROWS,
 ) -> Reduction:
     """Reduce runs one after the other; no more than one of them is held, unless their rows are asked for.
@@ -191,6 +194,7 @@ def reduce_runs(
         payloads: known beforehand; others are added as runs bring them.
         instruments: keep those of the demanded motion beside the rows; where it is not known, the recorded one serves.
         keep_rows: keep all runs and their rows, for `observe`.
+        keep_instants: keep a few rows of each run, for hypotheses about its geometry.
         chunk_rows: rows built at once; the result does not depend on it.
 
     Raises:
@@ -205,11 +209,15 @@ def reduce_runs(
     names: list[str] = []
     clusters: list[Cluster] = []
     kept: list[RunRows] = []
+    instants: list[Instants] = []
     known = False
     for run in runs:
         data = run.data if isinstance(run, RunRows) else differentiate(run, model.drive_train, conditioning)
         mounting = mounting_index(data.payload, seen_payloads, data.name)
         joints += [[np.zeros((c, c)) for c in width] for _ in range(len(seen_payloads) + 1 - len(joints))]
+        if keep_instants:
+            chosen = instants_of(model, data, conditioning)
+            instants += [] if chosen is None else [chosen]
         if instruments:
             data = with_demand(data, model.drive_train, conditioning)
             known |= data.demanded is not None
@@ -252,6 +260,7 @@ def reduce_runs(
         clusters=tuple(clusters),
         instrumented=known,
         kept=tuple(kept),
+        instants=tuple(instants),
     )
 
 

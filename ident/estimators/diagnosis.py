@@ -26,7 +26,7 @@ from ident.data.unsigned_current import missing_sign, one_sided_currents, unsign
 from ident.equations.reduction import layout
 from ident.equations.rows import rows_of
 from ident.equations.system import System
-from ident.equations.triangles import qr_update
+from ident.equations.triangles import qr_update, triangle
 from ident.errors import CurrentUnsigned, DataUnfit, Diagnosis, IdentificationError
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import wls
@@ -34,7 +34,6 @@ from ident.estimators.maximum_likelihood import ml
 from ident.estimators.method import Method
 from ident.estimators.payload_diagnosis import payload_diagnoses
 from ident.estimators.refusals import (
-    EXCHANGE,
     idle_joints,
     joint_torques,
     numbers_text,
@@ -53,6 +52,11 @@ LARGEST_CONDITION = 1e6
 all parameters together where the condition exceeds s_max ‖χ‖. That is 1e4 to 2e5 in real and simulated recordings."""
 GAIN_DIFFERENCE, GAIN_SIGMAS = 0.1, 3.0  #: Of another estimator's gain from that of ml: relative, and in σ of ml
 SCALE_BLOCKS = 20  #: Stretches of a run of which each is left out once, for σ of the scale of a current
+CHANNEL_FALL = 0.4
+"""Least fall of the logarithm of a motor's error with another current than its own. With any two currents of two real
+robots and of the simulated arm exchanged it is 0.8 and more of both motors, but for one pair of a coupled wrist."""
+CHANNEL_T = 4.0  #: Least mean of the falls of the blocks, in σ of that mean
+CHANNEL_BLOCKS = 8  #: Blocks of moves of which each shows whether an exchange explains it
 ALIKE = 0.25  #: Least squared correlation of two torques of which one is the other's, reversed
 
 
@@ -342,7 +346,7 @@ def condition_diagnoses(estimate: Estimate) -> Iterator[Diagnosis]:
 def exchanged_channels(
     model: Model, runs: Iterable[Run], conditioning: Conditioning, axes: Sequence[str]
 ) -> Diagnosis | None:
-    """Whether another order of the channels explains all motors clearly better, in all runs together.
+    """Whether another order of the channels explains each motor that it moves clearly better, in all runs together.
 
     Args:
         model, conditioning: of the fit.
@@ -354,13 +358,13 @@ def exchanged_channels(
     """
     if model.is_redundant:  # internal preload is in every current: no motor has an equation without those of the others
         return None
-    errors = channel_errors(model, runs, conditioning)
+    evidence = channel_evidence(model, runs, conditioning)
+    errors = evidence.errors
     if not np.all((errors > 0.0) & np.isfinite(errors)):
         return None
-    level = np.log(errors)
-    best = scipy.optimize.linear_sum_assignment(level)[1].tolist()
+    best = scipy.optimize.linear_sum_assignment(np.log(errors))[1].tolist()
     moved = [motor for motor, channel in enumerate(best) if motor != channel]
-    if sum(level[motor, motor] - level[motor, best[motor]] for motor in moved) < EXCHANGE:
+    if not moved or not all(evidence.is_clearly_better(motor, best[motor]) for motor in moved):
         return None
     return Diagnosis(
         "channels-exchanged",
@@ -435,23 +439,70 @@ def channel_errors(model: Model, runs: Iterable[Run], conditioning: Conditioning
     Raises:
         DataUnfit: as of `ident.equations.reduction.reduce_runs`.
     """
-    count, plan, to_motor = model.robot.axis_count, layout(model), model.drive_train.to_motor
-    factors: list[FloatArray | None] = [None] * count
+    return channel_evidence(model, runs, conditioning).errors
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChannelEvidence:
+    """How well the equation of each motor explains each current."""
+
+    errors: FloatArray  #: share of the current k that the equation of motor i leaves, shape (m, m); NaN where unknown
+    #: Square of that share, of which each block of moves has a part, shape (CHANNEL_BLOCKS, m, m).
+    block_shares: FloatArray
+
+    def is_clearly_better(self, motor: int, channel: int) -> bool:
+        """Whether a motor explains another current better than its own, by CHANNEL_FALL and in the blocks alike."""
+        fall = float(np.log(self.errors[motor, motor] / self.errors[motor, channel]))
+        if not fall >= CHANNEL_FALL:
+            return False
+        own = self.block_shares[:, motor, motor]
+        other = self.block_shares[:, motor, channel]
+        # The mean of a block is added on both sides, so that a block of few rows does not decide.
+        usual = float(np.mean(other))
+        falls = 0.5 * np.log((own + usual) / (other + usual))
+        std = float(np.std(falls, ddof=1)) / np.sqrt(len(falls))
+        return bool(np.mean(falls) > CHANNEL_T * std)
+
+
+def channel_evidence(model: Model, runs: Iterable[Run], conditioning: Conditioning) -> ChannelEvidence:
+    """Explain the current of each channel by the equation of each motor.
+
+    Raises:
+        DataUnfit: as of `ident.equations.reduction.reduce_runs`.
+    """
+    count = model.robot.axis_count
+    motor_columns = layout(model).motor
+    to_motor = model.drive_train.to_motor
+    factors: list[list[FloatArray | None]] = [[None] * CHANNEL_BLOCKS for _ in range(count)]
     seen = np.zeros(count)
-    for run in runs:
+    for run_number, run in enumerate(runs):
         data = differentiate(run, model.drive_train, conditioning)
         for rows in rows_of(model, data, conditioning):
+            block_of_row = (rows.move + run_number) % CHANNEL_BLOCKS
             for motor, used in enumerate(rows.motor_use):
                 joints = np.flatnonzero(to_motor[motor])
-                mixed = np.sum([to_motor[motor, joint] * rows.standard[joint][:, used] for joint in joints], axis=0)
+                mixed = np.sum([to_motor[motor, joint] * rows.standard[joint] for joint in joints], axis=0)
                 payload = mixed[model.flange] * (run.payload is not None)  # one body for all mountings will do
-                columns = np.concatenate((mixed[plan.motor[motor]], payload, rows.current[:, used]))
-                factors[motor] = qr_update(factors[motor], columns)
+                columns = np.concatenate((mixed[motor_columns[motor]], payload, rows.current))
+                for block in np.unique(block_of_row[used]).tolist():
+                    chosen = columns[:, used & (block_of_row == block)]
+                    factors[motor][block] = qr_update(factors[motor][block], chosen)
                 seen[motor] += np.count_nonzero(used)
     errors = np.full((count, count), np.nan)
-    for motor, factor in enumerate(factors):
-        if factor is not None and seen[motor] > len(factor):
-            first = len(factor) - count
-            left = np.linalg.norm(factor[first:, first:], axis=0) / np.linalg.norm(factor[:, first:], axis=0)
-            errors[motor] = left * np.sqrt(seen[motor] / (seen[motor] - first))
-    return errors
+    shares = np.zeros((CHANNEL_BLOCKS, count, count))
+    for motor, of_motor in enumerate(factors):
+        blocks = {number: factor for number, factor in enumerate(of_motor) if factor is not None}
+        if not blocks:
+            continue
+        whole = triangle(blocks.values(), next(iter(blocks.values())).shape[1])
+        if seen[motor] <= whole.shape[1]:
+            continue
+        first = whole.shape[1] - count
+        size = np.linalg.norm(whole[:, first:], axis=0)
+        errors[motor] = np.linalg.norm(whole[first:, first:], axis=0) / size
+        errors[motor] *= np.sqrt(seen[motor] / (seen[motor] - first))
+        explained = scipy.linalg.lstsq(whole[:first, :first], whole[:first, first:])[0]
+        for number, factor in blocks.items():
+            left = factor[:, first:] - factor[:, :first] @ explained
+            shares[number, motor] = np.sum(left**2, axis=0) / size**2
+    return ChannelEvidence(errors, shares)

@@ -12,6 +12,7 @@ from ident.arrays import FloatArray, as_array, require_kind
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.data.run import Run
+from ident.equations.instants import Instants
 from ident.equations.reduction import reduce_runs
 from ident.equations.rows import Observation, observe
 from ident.equations.system import System, require_distinct
@@ -44,6 +45,7 @@ class Identification:
     estimate: Estimate  #: from ``system`` alone
     #: All runs, held-out runs last, and their rows; none unless they were asked for.
     gathered: tuple[tuple[Dataset, ...], Observation] | None = None
+    instants: tuple[Instants, ...] = ()  #: a few rows of each run of the fit, for `ident.estimators.turned_geometry`
 
     @property
     def training_error(self) -> RelativeError:
@@ -111,7 +113,9 @@ def identify(
             raise ModelError(f"fixed_gains is {fixed_gains.tolist()}; expected no zero: such a motor moves nothing")
     axes = axes or [joint.name for joint in model.robot.axes]
     used = with_signed_currents(each_run(runs), model, conditioning, axes)
-    reduction = reduce_runs(model, used, conditioning, instruments=method is Method.IV, keep_rows=keep_rows)
+    reduction = reduce_runs(
+        model, used, conditioning, instruments=method is Method.IV, keep_rows=keep_rows, keep_instants=True
+    )
     if not reduction.runs:
         raise DataUnfit("", "no run was given; expected one without load and one with a weighed payload")
     system = reduction.system(reduction.base(), reduction.payload_columns())
@@ -133,7 +137,7 @@ def identify(
     left_out = with_signed_currents(each_run(holdout, system.payloads), model, conditioning, axes)
     rest = reduce_runs(model, left_out, conditioning, payloads=system.payloads, keep_rows=keep_rows)
     unseen = rest.system(system.base, system.payload_columns) if rest.runs else None
-    found = Identification(model, conditioning, system, unseen, estimate)
+    found = Identification(model, conditioning, system, unseen, estimate, instants=reduction.instants)
     if not keep_rows:
         return found
     kept = (*reduction.kept, *rest.kept)

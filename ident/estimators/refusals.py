@@ -31,8 +31,7 @@ IDLE_TORQUE, IDLE_ERROR = 1e-3, 1e-2
 """Torque and error of an idle axis, relative to the largest torque of any: 0.01 Nm of a wrist beside the 30 Nm of a
 shoulder is below every friction. The wrist of a real robot carries 0.02 of it and more."""
 EXCHANGE = 0.4
-"""Least fall of the logarithm of the motors' errors, in sum, of exchanged channels; with the right ones it is zero. Of
-all pairs of channels of two real robots and of five simulated arms the smallest is 0.6."""
+"""Least fall of the logarithm of the motors' errors, in sum, of a fixed gain with the other sign."""
 LEVEL = 0.05  #: Largest rise of the same, where it decides nothing and the sign of the friction must
 SMALL_ERROR = 0.02  #: Relative error of a motor below which its current needs no other explanation
 FRICTION = re.compile(r"f[vs](m?)([0-9]+)\b")  #: Names of the friction of a joint or of its coupled motor

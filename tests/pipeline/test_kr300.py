@@ -15,8 +15,10 @@ from ident.discovery.evidence import gather
 from ident.discovery.gates import impossible
 from ident.discovery.loop import find_effects
 from ident.discovery.noise_floor import FloorSource, noise_floors
+from ident.equations.instants import read_instants
 from ident.estimators.identify import identify
 from ident.estimators.method import Method
+from ident.estimators.turned_geometry import find_turned_geometry, with_gravity
 
 
 def _run(folder: Path, name: str) -> Run:
@@ -42,6 +44,20 @@ def test_no_impossible_effect_joins_and_no_effect_raises_the_held_out_error(shar
     estimate = after.estimate
     assert not impossible(estimate.unknowns, estimate.parameters, estimate.parameters_std)
     assert not any(placed.effect.name == "warm-up" for placed in after.effects)
+
+
+@pytest.mark.parametrize("gravity", [(9.81, 0.0, 0.0), (0.0, 9.81, 0.0), (0.0, 0.0, 9.81)])
+def test_a_wrong_mounting_is_found(shared_data: Path, gravity: tuple[float, ...]) -> None:
+    folder = shared_data / "kr300"
+    cell, runs = load_cell(folder / "kr300-cell.yaml"), [_run(folder, name) for name in "ABC"]
+    gains = np.array([axis.nameplate_gain for axis in cell.axes])
+    right = model_of(cell)
+    instants = read_instants(right, runs, cell.conditioning)
+    assert find_turned_geometry(right, instants, gains) is None
+    found = find_turned_geometry(with_gravity(right, np.array(gravity)), instants, gains)
+    assert found is not None
+    assert found.gravity is not None
+    assert found.gravity.found_m_s2[2] < -9.81 * np.cos(np.deg2rad(5.0))
 
 
 def test_the_current_at_standstill_is_no_noise_floor(shared_data: Path) -> None:

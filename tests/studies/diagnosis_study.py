@@ -18,11 +18,13 @@ import numpy as np
 
 from ident.data.run import Run
 from ident.data.unsigned_current import unsigned_currents
+from ident.equations.instants import read_instants
 from ident.errors import CurrentUnsigned, IdentificationError
-from ident.estimators import payload_diagnosis, refusals
+from ident.estimators import diagnosis, payload_diagnosis, turned_geometry
 from ident.estimators.diagnosis import diagnose, exchanged_channels, unsigned_channels
 from ident.estimators.identify import identify
 from ident.estimators.method import Method
+from ident.estimators.turned_geometry import find_turned_geometry, is_confirmed, with_gravity
 from tests.ident.mistaken import AXES, BODY, SMALL, small_recordings, turned, with_currents
 from tests.ident.recordings import FloatArray, Truth, three_axes_truth
 
@@ -48,6 +50,7 @@ def named(
     """
     gains = truth.gains if nameplate is None else nameplate
     names: list[str] = []
+    error_percent = None
     try:
         found = identify(
             truth.model,
@@ -58,11 +61,18 @@ def named(
             fixed_gains=gains if fixed else None,
             axes=AXES,
         )
+        error_percent = found.training_error.total
         names += [" ".join((one.name, *one.runs, *one.axes)) for one in diagnose(found, AXES, gains, LIMIT_NM)]
     except CurrentUnsigned as error:
         return [" ".join(("CurrentUnsigned", *error.axes))]
     except IdentificationError as error:
         names.append(type(error).__name__)
+    turned = find_turned_geometry(truth.model, read_instants(truth.model, runs, SMALL), gains)
+    if turned is not None and is_confirmed(
+        turned, truth.model, runs, SMALL, gains, gains_fixed=fixed, before_percent=error_percent
+    ):
+        one = turned.diagnosis(AXES)
+        return [" ".join((one.name, *one.axes))]
     unsigned = unsigned_channels(truth.model, runs, SMALL, AXES)
     if unsigned is not None:
         return [" ".join(("CurrentUnsigned", *unsigned.axes))]
@@ -103,6 +113,25 @@ def lifted(truth: Truth, seed: int) -> list[str]:
     return names
 
 
+def mounted(truth: Truth, seed: int, fixed: bool, gravity_m_s2: Sequence[float]) -> list[str]:
+    """Diagnoses of an arm whose cell declares another gravity; NOISES_A in turn."""
+    runs = small_recordings(truth, seed, noise_a=NOISES_A[seed % len(NOISES_A)])
+    declared = replace(truth, model=with_gravity(truth.model, np.array(gravity_m_s2)))
+    return named(declared, runs, fixed=fixed)
+
+
+def counted(truth: Truth, seed: int, fixed: bool, axis: int, current_sign: float) -> list[str]:
+    """Diagnoses where the position of an axis counts the other way, alone or with its current; NOISES_A in turn."""
+    runs = []
+    for run in small_recordings(truth, seed, noise_a=NOISES_A[seed % len(NOISES_A)]):
+        position = run.position_rad.copy()
+        position[:, axis] *= -1.0
+        current = run.current_a.copy()
+        current[:, axis] *= current_sign
+        runs.append(replace(run, position_rad=position, current_a=current))
+    return named(truth, runs, fixed=fixed)
+
+
 MISTAKES: dict[str, Callable[[Truth, int, bool], list[str]]] = {
     "r3 turned by 90 degrees": lambda t, s, f: carried(t, s, f, turned(0.5 * np.pi)),
     "r3 without payload": lambda t, s, f: carried(t, s, f, 0.0 * BODY),
@@ -116,6 +145,12 @@ MISTAKES: dict[str, Callable[[Truth, int, bool], list[str]]] = {
     "size of the current of J1": lambda t, s, f: sized(t, s, f, [0]),
     "size of the current of J2": lambda t, s, f: sized(t, s, f, [1]),
     "size of the current of J3": lambda t, s, f: sized(t, s, f, [2]),
+    "gravity turned by 90 degrees about y": lambda t, s, f: mounted(t, s, f, (9.81, 0.0, 0.0)),
+    "gravity turned by 90 degrees about x": lambda t, s, f: mounted(t, s, f, (0.0, 9.81, 0.0)),
+    "gravity turned by 180 degrees": lambda t, s, f: mounted(t, s, f, (0.0, 0.0, 9.81)),
+    "position of J2 reversed": lambda t, s, f: counted(t, s, f, 1, 1.0),
+    "position of J3 reversed": lambda t, s, f: counted(t, s, f, 2, 1.0),
+    "position and current of J3 reversed": lambda t, s, f: counted(t, s, f, 2, -1.0),
 }
 
 
@@ -125,6 +160,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--cells", type=int, default=50)
     parser.add_argument("--mistaken", type=int, default=10)
     parser.add_argument("--out", type=Path, default=Path("out/diagnoses.csv"))
+    parser.add_argument("--only", default="", help="Mistakes whose names contain this text.")
     given = parser.parse_args(arguments)
     rows = [("recordings", "gains", "said", "sessions")]
     truth, alarms = three_axes_truth(), Counter[str]()
@@ -142,6 +178,8 @@ def main(arguments: Sequence[str]) -> int:
     )
     rows.append(("clean", "both", "; ".join(alarms) or "nothing", f"{sum(alarms.values())} false of {given.cells}"))
     for mistake, said in MISTAKES.items():
+        if given.only not in mistake:
+            continue
         for fixed in (False, True):
             counts = Counter(" + ".join(said(truth, seed, fixed)) or "nothing" for seed in range(given.mistaken))
             gains = "fixed" if fixed else "free"
@@ -150,7 +188,7 @@ def main(arguments: Sequence[str]) -> int:
                 rows.append((mistake, gains, words, f"{times} of {given.mistaken}"))
     _say(
         f"limits: share {payload_diagnosis.LEAST_SHARE:g}, p {payload_diagnosis.LARGEST_PROBABILITY:g}, "
-        f"exchange {refusals.EXCHANGE:g}"
+        f"exchange {diagnosis.CHANNEL_FALL:g}, geometry {turned_geometry.LEAST_FALL:g}"
     )
     given.out.parent.mkdir(parents=True, exist_ok=True)
     with given.out.open("w", newline="", encoding="utf-8") as file:

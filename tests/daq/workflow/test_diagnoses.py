@@ -109,6 +109,13 @@ def test_exchanged_currents_in_the_fit_are_an_error(shelf: Shelf) -> None:
         shelf.runs.update({n: replace(run, current_a=run.current_a[:, CROSSED]) for n, run in crossed.items()})
 
 
+def test_the_operator_may_say_that_no_currents_are_exchanged(shelf: Shelf) -> None:
+    logs = [*FIT, Path("crossed")]
+    with pytest.raises(ChannelsExchanged, match="--channels-as-wired"):
+        fit(logs)
+    assert {one.name for one in fit(logs, channels_as_wired=True).diagnoses} >= {"axis-error"}
+
+
 @pytest.mark.parametrize("fixed", [False, True])
 def test_exchanged_currents_in_one_log_of_the_fit_name_it(shelf: Shelf, fixed: bool) -> None:
     with pytest.raises(ChannelsExchanged, match="log crossed: the currents of J2 and J3"):

@@ -24,6 +24,7 @@ from daq.workflow.fit import calibration_of, close_loop, fit, fit_logs
 from daq.workflow.validate import cross_validate
 from ident.data.run import Run
 from ident.errors import Diagnosis, IdentificationError
+from ident.estimators.turned_geometry import with_gravity
 from tests.ident.arms import THREE_AXES
 from tests.ident.mistaken import small_recordings, turned, with_currents
 from tests.ident.recordings import three_axes_truth
@@ -84,6 +85,18 @@ def noisy(run: Run) -> Run:
     return replace(run, current_a=run.current_a + noise)
 
 
+def reversed_position(run: Run) -> Run:
+    """A run in which the position of J2 counts the other way."""
+    return replace(run, position_rad=run.position_rad * np.array([1.0, -1.0, 1.0]))
+
+
+def mounted_on_a_wall(runs: Runs) -> Runs:
+    """Recordings of an arm whose base is turned from what the cell says."""
+    truth = three_axes_truth()
+    wall = replace(truth, model=with_gravity(truth.model, np.array([0.0, -9.81, 0.0])))
+    return small_recordings(wall, 0, count=len(runs))
+
+
 def exchanged(run: Run) -> Run:
     """A run with the currents of J2 and J3 exchanged."""
     return replace(run, current_a=run.current_a[:, [0, 2, 1]])
@@ -106,6 +119,8 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
     "sizes": (of_size(0, 1, 2), "CurrentUnsigned"),
     "size of J3": (of_size(2), "CurrentUnsigned"),
     "J2 and J3 exchanged": (lambda runs: [exchanged(run) for run in runs], "ChannelsExchanged"),
+    "position of J2 reversed": (lambda runs: [reversed_position(run) for run in runs], "position-reversed J2"),
+    "mounted on a wall": (mounted_on_a_wall, "GeometryTurned"),
     "payload turned": (carrying(turned(np.pi)), "payload-differs r3"),
     "payload left off": (carrying(np.zeros(10)), "PayloadUnseen"),
     "noise on J3": (lambda runs: [*map(noisy, runs[:USED]), *runs[USED:]], "axis-error J3"),
@@ -114,6 +129,7 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
         "current-off-scale r7 J2",
     ),
     "held out: exchanged": (in_one(6, exchanged), "channels-exchanged r6 J2 J3"),
+    "held out: position of J2 reversed": (in_one(6, reversed_position), "position-reversed r6 J2"),
     "held out: noise on J3": (in_one(6, noisy), "axis-error r6 J3"),
     "held out: without payload": (in_one(7, forgotten), "payload-differs r7"),
 }  # fmt: skip

@@ -18,6 +18,7 @@ from ident.discovery.evidence import gather
 from ident.errors import CurrentReversed, CurrentUnsigned, ModelContradicted, PayloadDiffers, UnitsMistaken
 from ident.estimators.diagnosis import (
     axis_error_diagnoses,
+    channel_errors,
     diagnose,
     exchanged_channels,
     gain_diagnoses,
@@ -106,6 +107,19 @@ def test_exchanged_currents_are_named(small_truth: Truth, clean: list[Run], orde
     found = exchanged_channels(small_truth.model, with_currents(clean[:2], 1.0, order), SMALL, AXES)
     assert found is not None
     assert found.axes == tuple(name for name, place in zip(AXES, order, strict=True) if AXES[place] != name)
+
+
+def test_one_motor_that_explains_another_current_better_is_no_exchange(small_truth: Truth, clean: list[Run]) -> None:
+    """Both equations of a pair must ask for the exchange, not their sum: here only that of J2 does."""
+    mixed = []
+    for run in clean[:2]:
+        current = run.current_a.copy()
+        current[:, 2] = current[:, 1] + 0.3 * current[:, 2]
+        current[:, 1] += 2.0 * np.random.default_rng(3).standard_normal(len(current))
+        mixed.append(replace(run, current_a=current))
+    errors = channel_errors(small_truth.model, mixed, SMALL)
+    assert errors[1, 2] < errors[1, 1]
+    assert exchanged_channels(small_truth.model, mixed, SMALL, AXES) is None
 
 
 def test_a_reversed_current_only_turns_a_free_gain(small_truth: Truth, clean: list[Run]) -> None:

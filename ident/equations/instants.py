@@ -1,0 +1,95 @@
+"""A few rows of a recording: a motion and the currents that made it, for hypotheses about the model itself.
+
+A hypothesis that changes the geometry needs columns of its own. Some hundred rows of a run are enough to see a gross
+mistake, and cost little to build again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.data.conditioning import Conditioning, decimator
+from ident.data.dataset import Dataset, differentiate
+from ident.data.run import Run
+from ident.equations.rows import row_masks
+from ident.model.model import Model
+from ident.model.robot import Motion
+
+ROWS_OF_RUN = 450  #: Rows taken of a run
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Instants:
+    """Evenly spaced rows of a run, decimated as those of a fit."""
+
+    motion: Motion  #: of the axes, shape (k, m)
+    current_a: FloatArray  #: of the motors, shape (m, k)
+    use: BoolArray  #: rows of each motor that count, shape (m, k)
+    move: IntArray  #: number of each row's move within the run, shape (k,)
+    mounting: str | None  #: of the payload; None without load
+
+    def every(self, step: int) -> Instants:
+        """Every so many of the rows."""
+        motion = self.motion
+        return Instants(
+            motion=Motion(
+                np.ascontiguousarray(motion.position_rad[::step]),
+                np.ascontiguousarray(motion.velocity_rad_s[::step]),
+                np.ascontiguousarray(motion.acceleration_rad_s2[::step]),
+            ),
+            current_a=self.current_a[:, ::step],
+            use=self.use[:, ::step],
+            move=self.move[::step],
+            mounting=self.mounting,
+        )
+
+
+def instants_of(model: Model, data: Dataset, conditioning: Conditioning) -> Instants | None:
+    """Take evenly spaced rows of a run; None where the run is too short to decimate, or no row counts.
+
+    The motion is filtered in place of the columns: it is slow enough for that where no number of a fit depends on it.
+
+    Args:
+        model: the declared model.
+        data: a differentiated run.
+        conditioning: the filters.
+    """
+    filter_ = decimator(data.rate_hz, conditioning.decimation_cutoff_hz)
+    samples = len(data.time_s)
+    count = filter_.rows(samples)
+    if count < 1:
+        return None
+    _, motor_use = row_masks(model, data, conditioning)
+    step = -(-count // ROWS_OF_RUN)
+    use = motor_use[:, ::step]
+    if not use.any():
+        return None
+    slow = [
+        np.ascontiguousarray(filter_(state.T)[:, ::step].T)
+        for state in (data.position_rad, data.velocity_rad_s, data.acceleration_rad_s2)
+    ]
+    return Instants(
+        motion=Motion(slow[0], slow[1], slow[2]),
+        current_a=filter_(data.current_a.T)[:, ::step],
+        use=use,
+        move=data.move[filter_.centres(samples)][::step],
+        mounting=None if data.payload is None else data.payload.mounting,
+    )
+
+
+def read_instants(model: Model, runs: Iterable[Run], conditioning: Conditioning) -> tuple[Instants, ...]:
+    """Take rows of runs, which are read one after the other; arguments as for `instants_of`.
+
+    Raises:
+        DataUnfit: as of `ident.data.dataset.differentiate`.
+    """
+    found = list[Instants]()
+    for run in runs:
+        instants = instants_of(model, differentiate(run, model.drive_train, conditioning), conditioning)
+        if instants is not None:
+            found.append(instants)
+    return tuple(found)

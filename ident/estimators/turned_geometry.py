@@ -1,0 +1,753 @@
+"""Gross mistakes of geometry: gravity that points elsewhere than declared, and a position that counts the other way.
+
+Either makes the equations of most motors wrong at once, and its traces look like those of wrong currents: a gain of the
+wrong sign, a large error, an iteration that does not converge. So geometry is judged before the currents are.
+
+**Fit.** Each hypothesis about the geometry is fitted to some hundred rows of each run,
+
+    v_i = s_i (T W χ)_i        of motor i, with s_i = ± 1/g_i,
+
+by least squares for χ and s in turn, each motor weighted by its own error. Signs and a common scale of s are free, and
+each s_i within LARGEST_FACTOR of its nameplate: neither reversed currents nor a payload of wrong mass, nor any unit,
+take part in the judgement. Everything is done in products of the columns [W | v_i].
+
+**Gravity** enters W linearly, W(g) = A + Σ_k g_k G_k, so products of [A | G_x | G_y | G_z | v_i] serve every direction.
+A direction opposite to the right one is stationary; therefore the search begins at 26 directions and goes on from the
+best by Gauss-Newton. σ of the direction comes from leaving out parts of the moves in turn.
+
+**Judgement.** Another gravity makes other parameters identifiable. So each part of the moves is predicted from a fit of
+the others, and a hypothesis must lower the errors of these predictions, in sum over the motors and in most parts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+import scipy  # loads its modules when they are first used
+
+from ident.arrays import FloatArray, IntArray
+from ident.data.conditioning import Conditioning
+from ident.data.run import Run
+from ident.equations.instants import Instants
+from ident.errors import Diagnosis, IdentificationError, ModelError
+from ident.estimators.identify import identify
+from ident.estimators.method import Method
+from ident.estimators.refusals import FRICTION, LARGEST_TOTAL_PERCENT, SMALL_ERROR
+from ident.model.base import SMALLEST_COLUMN
+from ident.model.bodies import LINK_PARAMETERS
+from ident.model.model import Model
+from ident.model.robot import Motion
+
+GRAVITY_TURNED = "gravity-turned"
+POSITION_REVERSED = "position-reversed"
+GEOMETRY = frozenset((GRAVITY_TURNED, POSITION_REVERSED))  #: Names of these diagnoses
+
+PARTS = 8  #: Parts of the moves, of which each is predicted from the others
+LEAST_FALL = 0.5
+"""Least fall of the logarithm of the motors' errors, in sum. See `make diagnosis-study` for false alarms."""
+LEAST_T = 4.0  #: Least mean of the falls of the parts, in σ of that mean
+SMALLEST_TURN_DEG = 10.0  #: Smaller turns of gravity are no gross mistake: they are an effect of the mounting
+LARGEST_DIRECTION_STD_DEG = 10.0  #: A direction that is less certain is not named
+ALIKE_FALL = 0.85
+"""Share of the largest fall above which a hypothesis is as good: a mirror image of an arm has the same torques."""
+LARGEST_FACTOR = 3.0  #: Of a gain beside its nameplate and the other gains
+SCREENED_ROWS = 500  #: Rows of all runs together with which every recording is screened
+SUSPECT_FALL = 0.25  #: Fall of the errors of the fits themselves, as LEAST_FALL, above which predictions are judged
+RIDGE = 1e-7  #: Added to products of columns of unit length, for combinations that no row shows
+FIT_ROUNDS, NEXT_ROUNDS = 6, 2  #: Rounds of a fit from the nameplate, and of one from a neighbouring solution
+TURN_ROUNDS = 6  #: Of Gauss-Newton
+LARGEST_STEP_RAD = 0.5  #: Up to which a step of the direction is trusted
+WEIGHTY = tuple(index for index, name in enumerate(LINK_PARAMETERS) if name.startswith("m"))
+"""Parameters of a body that gravity acts on: first moments and mass."""
+
+
+# Hypotheses
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GravityFound:
+    """Direction of gravity by the recordings."""
+
+    declared_m_s2: FloatArray  #: in the base frame, shape (3,)
+    found_m_s2: FloatArray  #: of the same size, shape (3,)
+    std_deg: float  #: σ of the direction, in its worst plane
+
+    @property
+    def turned_deg(self) -> float:
+        """Angle between the two [deg]."""
+        cosine = self.declared_m_s2 @ self.found_m_s2 / float(np.sum(self.declared_m_s2**2))
+        return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TurnedGeometry:
+    """Another geometry than the declared one, which predicts left-out moves clearly better."""
+
+    gravity: GravityFound | None  #: where gravity is turned
+    reversed_axes: tuple[int, ...]  #: else the axis of a reversed position, and others that explain the same
+    reversed_currents: tuple[int, ...]  #: axes whose gains have another sign than their nameplates in this geometry
+    before_percent: FloatArray  #: error of each motor's current on left-out moves, as declared, shape (m,)
+    after_percent: FloatArray  #: the same in this geometry
+
+    def model(self, declared: Model) -> Model:
+        """The model with this gravity; for a reversed position see `corrected_positions`."""
+        if self.gravity is None:
+            return declared
+        return with_gravity(declared, self.gravity.found_m_s2)
+
+    def corrected_positions(self, position_rad: FloatArray) -> FloatArray:
+        """Positions of a run in this geometry [rad or m], shape (k, m)."""
+        signs = np.ones(len(self.before_percent))
+        signs[list(self.reversed_axes[:1])] = -1.0
+        return np.asarray(position_rad * signs)
+
+    def diagnosis(self, axes: Sequence[str], runs: tuple[str, ...] = ()) -> Diagnosis:
+        """Name the mistake.
+
+        Args:
+            axes: their names.
+            runs: that it was found in, empty for those of a fit.
+        """
+        errors = f"errors of {_percents(self.after_percent)} % of the currents of left-out moves"
+        declared = f"{_percents(self.before_percent)} % as declared"
+        if self.gravity is not None:
+            found = self.gravity
+            unit = found.found_m_s2 / np.linalg.norm(found.found_m_s2)
+            return Diagnosis(
+                GRAVITY_TURNED,
+                runs,
+                (),
+                f"gravity along {_numbers(unit)}, turned by {found.turned_deg:.1f} ± {found.std_deg:.1f} deg from what "
+                f"the cell says, with {errors}, {declared}",
+                f"gravity along the declared {_numbers(found.declared_m_s2)}",
+                f"how is the base mounted? correct `gravity_m_s2` of the cell: {_numbers(found.found_m_s2)} m/s² by "
+                "these recordings; nothing else is judged until it is right",
+            )
+        first = self.reversed_axes[0]
+        alike = [axes[axis] for axis in self.reversed_axes[1:]]
+        others = f"; the mirror image, {' or '.join(alike)} reversed, explains them as well" if alike else ""
+        if first in self.reversed_currents:
+            remedy = "reverse the axis of this joint in the URDF, or the signs of both its position and its current"
+        else:
+            remedy = "reverse the sign of its position, not of its current, in the cell or the import"
+        return Diagnosis(
+            POSITION_REVERSED,
+            runs,
+            (axes[first],),
+            f"a position that counts the other way: so read, it leaves {errors}, {declared}{others}",
+            "each position to count about the axis of its joint in the URDF",
+            f"{remedy}; nothing else is judged until it is right",
+        )
+
+
+def _percents(values: FloatArray) -> str:
+    return ", ".join(f"{value:.2g}" for value in values)
+
+
+def _numbers(values: FloatArray) -> str:
+    rounded = np.round(values, 2) + 0.0  # no minus before a zero
+    return "[" + ", ".join(f"{value:.2f}" for value in rounded) + "]"
+
+
+def with_gravity(model: Model, gravity_m_s2: FloatArray) -> Model:
+    """The same model under another gravity."""
+    return Model(replace(model.robot, gravity_m_s2=gravity_m_s2), model.drive_train)
+
+
+def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: FloatArray) -> TurnedGeometry | None:
+    """Look for another geometry that explains recordings clearly better than the declared one.
+
+    Args:
+        model: the declared model; a redundantly driven robot is not judged, because internal preload is in every
+            current.
+        instants: rows of all runs.
+        gains: nameplate, shape (m,).
+
+    Returns:
+        the hypothesis with the largest fall of the errors; None where the declared geometry is as good as any.
+    """
+    if model.is_redundant or not instants:
+        return None
+    reference = 1.0 / np.abs(gains)
+    if not _is_suspect(model, _thinned(instants), reference):
+        return None
+    weighed = gravity_products(model, instants)
+    declared = model.robot.gravity_m_s2
+    as_declared = weighed.directed(declared)
+    start = first_fit(model, as_declared, reference)
+    before = judge(as_declared, start, reference)
+    judged = _reversed_geometries(model, instants, before, start, reference)
+    turned = _turned_gravity(weighed, declared, start, reference)
+    if turned is not None:
+        judged.append(turned)
+    better = [one for one in judged if one.is_better(before)]
+    if not better:
+        return None
+    best = max(one.fall(before) for one in better)
+    alike = [one for one in better if one.fall(before) >= ALIKE_FALL * best]
+    # A mirror image of an arm needs more reversed currents than the mistake itself does.
+    alike.sort(key=lambda one: (one.contradictions(gains), -one.fall(before)))
+    chosen = alike[0]
+    fewest = chosen.contradictions(gains)
+    reversed_axes = list[int]()
+    for one in alike:
+        is_alike = chosen.gravity is None and one.contradictions(gains) == fewest
+        if is_alike and one.reversed_axis is not None:
+            reversed_axes.append(one.reversed_axis)
+    against = np.flatnonzero(chosen.fit.per_unit * gains < 0.0)
+    return TurnedGeometry(
+        gravity=chosen.gravity,
+        reversed_axes=tuple(reversed_axes),
+        reversed_currents=tuple(against.tolist()),
+        before_percent=before.percent,
+        after_percent=chosen.percent,
+    )
+
+
+def _thinned(instants: Sequence[Instants]) -> tuple[Instants, ...]:
+    """Keep SCREENED_ROWS of all runs together, evenly spaced."""
+    step = -(-sum(len(one.move) for one in instants) // SCREENED_ROWS)
+    return tuple(one.every(step) for one in instants)
+
+
+def _is_suspect(model: Model, instants: Sequence[Instants], reference: FloatArray) -> bool:
+    """Whether another geometry may explain rows better, by the errors of the fits themselves.
+
+    No direction of gravity leaves less than three directions at once, each with moments of its own, and a reversed
+    position has as many parameters as the declared one. Nearly all recordings need no other judgement.
+
+    Args:
+        model: the declared model.
+        instants: few rows of all runs.
+        reference: 1/|g| of the nameplate [A/Nm or A/N], shape (m,).
+    """
+    weighed = gravity_products(model, instants, part_count=1)
+    rows = weighed.rows.sum(axis=1)
+    as_declared = weighed.directed(model.robot.gravity_m_s2)
+    start = first_fit(model, as_declared, reference)
+    square = as_declared.square[:, 0]
+    limit = _log_error(square, improved(square, rows, start, reference, FIT_ROUNDS)) - SUSPECT_FALL
+    any_gravity = weighed.square[:, 0]
+    if _log_error(any_gravity, improved(any_gravity, rows, start, reference, FIT_ROUNDS)) < limit:
+        return True
+    for axis in range(model.robot.axis_count):
+        with suppress(ModelError):  # the loops of a closed chain cannot be closed so
+            square = reversed_products(model, instants, axis, part_count=1).square[:, 0]
+            opposite = start.with_opposite(axis)
+            if _log_error(square, improved(square, rows, opposite, reference, FIT_ROUNDS)) < limit:
+                return True
+    return False
+
+
+def _reversed_geometries(
+    model: Model, instants: Sequence[Instants], before: Judged, start: MotorFit, reference: FloatArray
+) -> list[Judged]:
+    """Judge each axis with its position reversed."""
+    judged = list[Judged]()
+    for axis in range(model.robot.axis_count):
+        try:
+            products = reversed_products(model, instants, axis)
+        except ModelError:  # the loops of a closed chain cannot be closed so
+            continue
+        opposite = start.with_opposite(axis)
+        square = products.square.sum(axis=1)
+        rows = products.rows.sum(axis=1)
+        fit = improved(square, rows, opposite, reference, FIT_ROUNDS)
+        fitted = np.maximum(np.sqrt(left_over(square, fit)), before.smallest)
+        falls = np.log(before.floored_error / fitted)
+        if np.sum(falls) < LEAST_FALL:  # prediction is never better than the fit: most hypotheses end here
+            continue
+        judged.append(replace(judge(products, opposite, reference), reversed_axis=axis))
+    return judged
+
+
+def _turned_gravity(
+    weighed: GravityProducts, declared: FloatArray, start: MotorFit, reference: FloatArray
+) -> Judged | None:
+    """Judge the best direction of gravity; None where it is near the declared one, or uncertain."""
+    found, fit = best_gravity(weighed, declared, start, reference)
+    left_out = [_without(weighed, part, found, fit, reference) for part in range(PARTS)]
+    directions = np.array([gravity for gravity, _ in left_out])
+    unit = directions / np.linalg.norm(found)
+    scatter = (PARTS - 1) * np.cov(unit.T, ddof=0)  # of the jackknife
+    std_deg = float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(scatter)[-1])))
+    gravity = GravityFound(declared, found, std_deg)
+    if gravity.turned_deg < max(SMALLEST_TURN_DEG, 3.0 * std_deg) or std_deg > LARGEST_DIRECTION_STD_DEG:
+        return None
+    left = list[FloatArray]()
+    for part, (of_others, fit_of_others) in enumerate(left_out):
+        own = weighed.turned(weighed.square[:, part], of_others)
+        left.append(left_over(own, fit_of_others))
+    current_square = weighed.directed(found).current_square
+    return Judged(fit, np.stack(left, axis=1), current_square, gravity=gravity)
+
+
+def _without(
+    weighed: GravityProducts, part: int, found: FloatArray, fit: MotorFit, reference: FloatArray
+) -> tuple[FloatArray, MotorFit]:
+    """Gravity and fit without one part of the moves, from those of all."""
+    others = weighed.square.sum(axis=1) - weighed.square[:, part]
+    rows = weighed.rows.sum(axis=1) - weighed.rows[:, part]
+    gravity = found
+    for _ in range(NEXT_ROUNDS):
+        fit = improved(weighed.turned(others, gravity), rows, fit, reference, NEXT_ROUNDS)
+        gravity = _moved(gravity, weighed.turn(others, gravity, fit))
+    return gravity, improved(weighed.turned(others, gravity), rows, fit, reference, NEXT_ROUNDS)
+
+
+def best_gravity(
+    weighed: GravityProducts, declared: FloatArray, start: MotorFit, reference: FloatArray
+) -> tuple[FloatArray, MotorFit]:
+    """Gravity that explains all rows best, of the declared size, and its fit.
+
+    Args:
+        weighed: products for any direction of gravity.
+        declared: gravity of the model [m/s²], shape (3,).
+        start: of the declared geometry.
+        reference: 1/|g| of the nameplate [A/Nm or A/N], shape (m,).
+    """
+    square = weighed.square.sum(axis=1)
+    rows = weighed.rows.sum(axis=1)
+    size = float(np.linalg.norm(declared))
+
+    def fitted(gravity: FloatArray, near: MotorFit, rounds: int) -> tuple[float, MotorFit]:
+        turned = weighed.turned(square, gravity)
+        fit = improved(turned, rows, near, reference, rounds)
+        return _log_error(turned, fit), fit
+
+    level, fit = fitted(declared, start, NEXT_ROUNDS)
+    gravity = declared
+    for direction in _grid():
+        tried = size * direction
+        tried_level, tried_fit = fitted(tried, start, NEXT_ROUNDS)
+        if tried_level < level:
+            level = tried_level
+            fit = tried_fit
+            gravity = tried
+    for _ in range(TURN_ROUNDS):
+        step = weighed.turn(square, gravity, fit)
+        following = _moved(gravity, step)
+        next_level, next_fit = fitted(following, fit, NEXT_ROUNDS)
+        if not next_level < level:
+            break
+        level = next_level
+        fit = next_fit
+        gravity = following
+    return gravity, fit
+
+
+def _grid() -> list[FloatArray]:
+    """Directions of the faces, edges and corners of a cube, 26 unit vectors."""
+    directions = list[FloatArray]()
+    for corner in product((-1.0, 0.0, 1.0), repeat=3):
+        length = float(np.linalg.norm(corner))
+        if length > 0.0:
+            directions.append(np.array(corner) / length)
+    return directions
+
+
+def _moved(gravity: FloatArray, step: FloatArray) -> FloatArray:
+    """Gravity after a step of its direction, of the same size."""
+    length = float(np.linalg.norm(step))
+    size = float(np.linalg.norm(gravity))
+    if length > LARGEST_STEP_RAD:
+        step = step * (LARGEST_STEP_RAD / length)
+    direction = gravity / size + step
+    return np.asarray(size * direction / np.linalg.norm(direction))
+
+
+# Confirmation
+
+
+def is_confirmed(
+    geometry: TurnedGeometry,
+    model: Model,
+    runs: Iterable[Run],
+    conditioning: Conditioning,
+    gains: FloatArray,
+    *,
+    gains_fixed: bool,
+    before_percent: float | None,
+) -> bool:
+    """Whether a fit of all rows in another geometry has a smaller error than as declared.
+
+    Args:
+        geometry: found in a few rows.
+        model, conditioning: as declared.
+        runs: of the fit, as they were read.
+        gains: nameplate, shape (m,).
+        gains_fixed: the fit holds them.
+        before_percent: relative error of the fit as declared; None where it was refused.
+    """
+    signs = np.ones(len(gains))
+    signs[list(geometry.reversed_currents)] = -1.0
+    method = Method.WLS if gains_fixed else Method.ML
+    fixed = gains * signs if gains_fixed else None
+    corrected = _corrected(geometry, runs)
+    try:
+        found = identify(geometry.model(model), corrected, conditioning, method=method, fixed_gains=fixed, judge=False)
+    except IdentificationError:
+        return False
+    limit = LARGEST_TOTAL_PERCENT if before_percent is None else before_percent
+    return found.training_error.total < limit
+
+
+def _corrected(geometry: TurnedGeometry, runs: Iterable[Run]) -> Iterator[Run]:
+    for run in runs:
+        yield replace(run, position_rad=geometry.corrected_positions(run.position_rad))
+
+
+# Judgement
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """A hypothesis with the errors of its predictions."""
+
+    fit: MotorFit  #: of all rows
+    left: FloatArray  #: of each motor's current on each part, by the fit of the others, sums of squares, shape (m, P)
+    current_square: FloatArray  #: sums of squares of the currents likewise, shape (m, P)
+    reversed_axis: int | None = None
+    gravity: GravityFound | None = None
+
+    @property
+    def smallest(self) -> FloatArray:
+        """Error below which a current needs no other explanation, root of the sum of squares, shape (m,)."""
+        size = np.sqrt(self.current_square.sum(axis=1))
+        return np.asarray(np.where(size > 0.0, SMALL_ERROR * size, 1.0))
+
+    @property
+    def floored_error(self) -> FloatArray:
+        """Error of each motor, at least the smallest, shape (m,)."""
+        return np.asarray(np.maximum(np.sqrt(self.left.sum(axis=1)), self.smallest))
+
+    @property
+    def percent(self) -> FloatArray:
+        """Error of each motor, of its current [%], shape (m,)."""
+        size = self.current_square.sum(axis=1)
+        size[size == 0.0] = 1.0
+        share = self.left.sum(axis=1) / size
+        return np.asarray(100.0 * np.sqrt(share))
+
+    def fall(self, before: Judged) -> float:
+        """Fall of the logarithm of the errors from those of another hypothesis, in sum over the motors."""
+        return float(np.sum(np.log(before.floored_error / self.floored_error)))
+
+    def is_better(self, before: Judged) -> bool:
+        """Whether the errors fall by LEAST_FALL, and in the parts alike."""
+        if self.fall(before) < LEAST_FALL:
+            return False
+        # The mean error of a part is added on both sides, so that a part of few rows does not decide.
+        usual = np.minimum(before.floored_error, self.floored_error)[:, None] ** 2 / PARTS
+        ratio = (before.left + usual) / (self.left + usual)
+        falls = 0.5 * np.sum(np.log(ratio), axis=0)
+        std = float(np.std(falls, ddof=1)) / np.sqrt(len(falls))
+        return bool(np.mean(falls) > LEAST_T * std)
+
+    def contradictions(self, gains: FloatArray) -> float:
+        """Number of currents with another sign than the nameplate.
+
+        That of a reversed axis counts half: where the axis of the URDF points the other way, both are reversed.
+        """
+        against = self.fit.per_unit * gains < 0.0
+        count = float(np.count_nonzero(against))
+        if self.reversed_axis is not None and against[self.reversed_axis]:
+            count -= 0.5
+        return count
+
+
+def judge(products: Products, start: MotorFit, reference: FloatArray) -> Judged:
+    """Fit a hypothesis, and predict each part of the moves from the others.
+
+    Args:
+        products: under the hypothesis.
+        start: of the fit.
+        reference: 1/|g| of the nameplate [A/Nm or A/N], shape (m,).
+    """
+    square = products.square.sum(axis=1)
+    rows = products.rows.sum(axis=1)
+    fit = improved(square, rows, start, reference, FIT_ROUNDS)
+    left = np.zeros(products.rows.shape)
+    for part in range(PARTS):
+        own = products.square[:, part]
+        others = improved(square - own, rows - products.rows[:, part], fit, reference, NEXT_ROUNDS)
+        left[:, part] = left_over(own, others)
+    return Judged(fit, left, products.current_square)
+
+
+# Fit of one hypothesis
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotorFit:
+    """Parameters with which all motors' equations hold best."""
+
+    per_unit: FloatArray  #: s, current per unit of torque [A/Nm or A/N] up to a common factor, shape (m,)
+    parameters: FloatArray  #: χ in the same scale, shape (c,)
+    weight: FloatArray  #: 1/σ² of each motor's current [1/A²], shape (m,)
+
+    def with_opposite(self, axis: int) -> MotorFit:
+        """The fit with the other sign of a motor: friction brakes the motion of a reversed position."""
+        signs = np.ones(len(self.per_unit))
+        signs[axis] = -1.0
+        return replace(self, per_unit=self.per_unit * signs)
+
+
+def first_fit(model: Model, products: Products, reference: FloatArray) -> MotorFit:
+    """Begin a fit with the nameplate's gains, and the signs with which each motor's friction brakes.
+
+    Args:
+        model, products: of the hypothesis.
+        reference: 1/|g| of the nameplate [A/Nm or A/N], shape (m,).
+    """
+    square = products.square.sum(axis=1)
+    friction = [index for index, column in enumerate(model.columns) if FRICTION.match(column.name)]
+    dry = model.dry_friction_columns[list(model.drive_train.joints)]
+    signs = np.ones(len(square))
+    for motor, own in enumerate(square):
+        alone = _solved(own[:-1, :-1], own[:-1, -1])
+        if own[friction, dry[motor]] @ alone[friction] < 0.0:
+            signs[motor] = -1.0
+    size = products.current_square.sum(axis=1)
+    weight = products.rows.sum(axis=1) / np.where(size > 0.0, size, 1.0)
+    return MotorFit(signs * reference, np.zeros(square.shape[1] - 1), weight)
+
+
+def improved(square: FloatArray, rows: IntArray, start: MotorFit, reference: FloatArray, rounds: int) -> MotorFit:
+    """Fit χ, s and the weights in turn.
+
+    Args:
+        square: products of [W | v_i], shape (m, c + 1, c + 1).
+        rows: of each motor, shape (m,).
+        start: of the iteration; its parameters are not used.
+        reference: 1/|g| of the nameplate [A/Nm or A/N], shape (m,).
+        rounds: at least one.
+    """
+    of_columns = square[:, :-1, :-1]
+    with_current = square[:, :-1, -1]
+    current = square[:, -1, -1]
+    fit = start
+    for _ in range(rounds):
+        normal = np.einsum("i,iab->ab", fit.weight * fit.per_unit**2, of_columns)
+        parameters = _solved(normal, (fit.weight * fit.per_unit) @ with_current)
+        torque = (of_columns @ parameters) @ parameters
+        mixed = with_current @ parameters
+        per_unit = mixed / np.where(torque > 0.0, torque, 1.0)
+        ratio = np.maximum(np.abs(per_unit) / reference, 1e-12)
+        common = float(np.exp(np.median(np.log(ratio))))
+        limited = np.clip(ratio / common, 1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
+        per_unit = np.where(per_unit < 0.0, -1.0, 1.0) * reference * limited
+        fit = MotorFit(per_unit, common * parameters, fit.weight)
+        left = np.maximum(left_over(square, fit), SMALL_ERROR**2 * current)
+        left[left == 0.0] = 1.0  # a motor without current
+        fit = replace(fit, weight=np.maximum(rows, 1) / left)
+    return fit
+
+
+def left_over(square: FloatArray, fit: MotorFit) -> FloatArray:
+    """What a fit leaves of each motor's current [A²], sums of squares, shape (m,); arguments as for `improved`."""
+    torque = (square[:, :-1, :-1] @ fit.parameters) @ fit.parameters
+    mixed = square[:, :-1, -1] @ fit.parameters
+    explained = 2.0 * fit.per_unit * mixed - fit.per_unit**2 * torque
+    return np.maximum(square[:, -1, -1] - explained, 0.0)
+
+
+def _log_error(square: FloatArray, fit: MotorFit) -> float:
+    """Logarithm of the motors' errors, in sum; arguments as for `improved`."""
+    floor = SMALL_ERROR**2 * square[:, -1, -1]
+    left = np.maximum(left_over(square, fit), floor)
+    left[left == 0.0] = 1.0  # a motor without current
+    return 0.5 * float(np.sum(np.log(left)))
+
+
+def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve normal equations in columns of unit length, with RIDGE; columns of rounding errors get zero."""
+    size = np.sqrt(np.diag(normal))
+    size[size <= SMALLEST_COLUMN * size.max(initial=0.0)] = np.inf
+    scaled = normal / np.outer(size, size)
+    scaled[np.diag_indices_from(scaled)] += RIDGE
+    return np.asarray(scipy.linalg.solve(scaled, right / size, assume_a="pos") / size)
+
+
+# Products of columns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Products:
+    """Products of the columns [W | v_i] of each motor, each part of the moves for itself."""
+
+    square: FloatArray  #: shape (m, PARTS, c + 1, c + 1)
+    rows: IntArray  #: shape (m, PARTS)
+
+    @property
+    def current_square(self) -> FloatArray:
+        """Sums of squares of the currents [A²], shape (m, PARTS)."""
+        return np.asarray(self.square[:, :, -1, -1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GravityProducts:
+    """Products of the columns [A | G_x | G_y | G_z | v_i] of each motor, each part of the moves for itself."""
+
+    square: FloatArray  #: shape (m, PARTS, c + 3 f + 1, c + 3 f + 1)
+    rows: IntArray  #: shape (m, PARTS)
+    weighty: IntArray  #: columns of A that gravity changes, shape (f,)
+
+    @property
+    def columns(self) -> int:
+        """Number c of columns of A."""
+        return int(self.square.shape[-1]) - 1 - 3 * len(self.weighty)
+
+    def along(self, component: int) -> slice:
+        """Columns G_k."""
+        first = self.columns + component * len(self.weighty)
+        return slice(first, first + len(self.weighty))
+
+    def directed(self, gravity_m_s2: FloatArray) -> Products:
+        """Products of [W(g) | v_i]."""
+        return Products(self.turned(self.square, gravity_m_s2), self.rows)
+
+    def turned(self, square: FloatArray, gravity_m_s2: FloatArray) -> FloatArray:
+        """Products of [W(g) | v_i] from those of [A | G_x | G_y | G_z | v_i], shapes (…, c + 3 f + 1, c + 3 f + 1)."""
+        last = square.shape[-1] - 1
+        kept = np.append(np.arange(self.columns), last)
+        out = square[..., kept[:, None], kept]
+        heavy = np.zeros((*square.shape[:-2], len(self.weighty), last + 1))
+        for component, size in enumerate(gravity_m_s2):
+            heavy += size * square[..., self.along(component), :]
+        with_all = heavy[..., kept]
+        out[..., self.weighty, :] += with_all
+        out[..., :, self.weighty] += np.swapaxes(with_all, -1, -2)
+        for component, size in enumerate(gravity_m_s2):
+            out[..., self.weighty[:, None], self.weighty] += size * heavy[..., self.along(component)]
+        return out
+
+    def turn(self, square: FloatArray, gravity_m_s2: FloatArray, fit: MotorFit) -> FloatArray:
+        """Step of gravity's direction by Gauss-Newton, χ fitted with it [rad], shape (3,).
+
+        Args:
+            square: products of [A | G_x | G_y | G_z | v_i], shape (m, c + 3 f + 1, c + 3 f + 1).
+            gravity_m_s2: at which it is taken.
+            fit: for this gravity.
+        """
+        last = square.shape[-1] - 1
+        count = self.columns
+        size = float(np.linalg.norm(gravity_m_s2))
+        sideways = scipy.linalg.null_space(gravity_m_s2[None])  # two directions across gravity, (3, 2)
+        basis = np.zeros((last + 1, count + 3))
+        basis[:count, :count] = np.eye(count)
+        basis[last, -1] = 1.0
+        for component in range(3):
+            rows = np.arange(last + 1)[self.along(component)]
+            basis[rows, self.weighty] = gravity_m_s2[component]
+            moments = size * fit.parameters[self.weighty]
+            basis[rows, count : count + 2] = moments[:, None] * sideways[component]
+        whole = np.einsum("i,iab->ab", fit.weight * fit.per_unit**2, square)
+        whole[:, -1] = (fit.weight * fit.per_unit) @ square[:, :, -1]
+        whole[-1, :] = whole[:, -1]
+        projected = basis.T @ whole @ basis
+        solution = _solved(projected[:-1, :-1], projected[:-1, -1])
+        return np.asarray(sideways @ solution[-2:])
+
+
+def gravity_products(model: Model, instants: Sequence[Instants], part_count: int = PARTS) -> GravityProducts:
+    """Products for any direction of gravity, of runs with any payloads.
+
+    Args:
+        model: the declared model, its gravity apart.
+        instants: of all runs, of the axes of the model.
+        part_count: number of parts of the moves.
+
+    Raises:
+        ModelError: the loops of a closed chain cannot be closed.
+    """
+    mountings = _mountings(instants)
+    weightless = with_gravity(model, np.zeros(3))
+    pulled = [with_gravity(model, unit) for unit in np.eye(3)]
+    payload_columns = len(model.columns) + len(LINK_PARAMETERS) * np.arange(len(mountings))
+    first = np.append(model.link_columns[:, 0], payload_columns)
+    weighty = (first[:, None] + np.array(WEIGHTY)).ravel()
+    squares = list[FloatArray]()
+    rows = list[IntArray]()
+    for one, parts in zip(instants, _parts(instants, part_count), strict=True):
+        still = np.zeros_like(one.motion.position_rad)
+        rest = Motion(one.motion.position_rad, still, still)
+        moving = _motor_columns(weightless, one, one.motion, mountings)
+        at_rest = [_motor_columns(unit, one, rest, mountings)[:, weighty] for unit in pulled]
+        square, counted = _products(
+            np.concatenate((moving, *at_rest, one.current_a[:, None]), axis=1), one, parts, part_count
+        )
+        squares.append(square)
+        rows.append(counted)
+    return GravityProducts(np.sum(squares, axis=0), np.sum(rows, axis=0), weighty)
+
+
+def reversed_products(model: Model, instants: Sequence[Instants], axis: int, part_count: int = PARTS) -> Products:
+    """Products under the hypothesis that the position of an axis counts the other way; arguments as before.
+
+    Raises:
+        ModelError: the loops of a closed chain cannot be closed.
+    """
+    mountings = _mountings(instants)
+    signs = np.ones(model.robot.axis_count)
+    signs[axis] = -1.0
+    squares = list[FloatArray]()
+    rows = list[IntArray]()
+    for one, parts in zip(instants, _parts(instants, part_count), strict=True):
+        motion = one.motion
+        opposite = Motion(
+            motion.position_rad * signs, motion.velocity_rad_s * signs, motion.acceleration_rad_s2 * signs
+        )
+        moving = _motor_columns(model, one, opposite, mountings)
+        columns = np.concatenate((moving, one.current_a[:, None]), axis=1)
+        square, counted = _products(columns, one, parts, part_count)
+        squares.append(square)
+        rows.append(counted)
+    return Products(np.sum(squares, axis=0), np.sum(rows, axis=0))
+
+
+def _parts(instants: Sequence[Instants], part_count: int) -> list[IntArray]:
+    """Which part each row of each run is in: moves with rows that count, dealt out in turn over all runs."""
+    dealt = 0
+    parts = list[IntArray]()
+    for one in instants:
+        of_rows = np.full(len(one.move), -1)
+        for move in np.unique(one.move[one.use.any(axis=0)]):
+            of_rows[one.move == move] = dealt % part_count
+            dealt += 1
+        parts.append(of_rows)
+    return parts
+
+
+def _mountings(instants: Sequence[Instants]) -> list[str]:
+    return sorted({one.mounting for one in instants if one.mounting is not None})
+
+
+def _motor_columns(model: Model, one: Instants, motion: Motion, mountings: Sequence[str]) -> FloatArray:
+    """Columns (T W)_i of the standard parameters, then of the body of each mounting, shape (m, c, k)."""
+    standard = model.regressor(motion)
+    bodies = np.zeros((len(standard), len(LINK_PARAMETERS) * len(mountings), standard.shape[2]))
+    if one.mounting is not None:
+        first = len(LINK_PARAMETERS) * mountings.index(one.mounting)
+        bodies[:, first : first + len(LINK_PARAMETERS)] = standard[:, model.flange]
+    columns = np.concatenate((standard, bodies), axis=1)
+    return np.asarray(np.tensordot(model.drive_train.to_motor, columns, axes=1))
+
+
+def _products(columns: FloatArray, one: Instants, parts: IntArray, part_count: int) -> tuple[FloatArray, IntArray]:
+    """Products of the columns of each motor over its rows of each part, and how many rows; from shape (m, c, k)."""
+    count = len(columns)
+    square = np.zeros((count, part_count, columns.shape[1], columns.shape[1]))
+    rows = np.zeros((count, part_count), dtype=np.int64)
+    for motor, of_motor in enumerate(columns):
+        loading = np.flatnonzero(of_motor.any(axis=1))  # a wrist carries few links
+        for part in range(part_count):
+            used = one.use[motor] & (parts == part)
+            chosen = of_motor[np.ix_(loading, used)]
+            square[motor, part][np.ix_(loading, loading)] = chosen @ chosen.T
+            rows[motor, part] = np.count_nonzero(used)
+    return square, rows

@@ -1,0 +1,151 @@
+"""Gravity that points elsewhere than declared, and positions that count the other way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ident.data.run import Run
+from ident.equations.instants import Instants, read_instants
+from ident.estimators.turned_geometry import (
+    GRAVITY_TURNED,
+    POSITION_REVERSED,
+    SMALLEST_TURN_DEG,
+    TurnedGeometry,
+    find_turned_geometry,
+    gravity_products,
+    is_confirmed,
+    with_gravity,
+)
+from tests.ident.mistaken import AXES, SMALL, small_recordings, with_currents
+from tests.ident.recordings import FloatArray, Truth, three_axes_truth
+
+DOWN = np.array([0.0, 0.0, -9.81])
+
+
+@pytest.fixture(scope="module")
+def truth() -> Truth:
+    return three_axes_truth()
+
+
+@pytest.fixture(scope="module")
+def clean(truth: Truth) -> list[Run]:
+    return small_recordings(truth, 0)
+
+
+def found_in(truth: Truth, runs: list[Run], gains: FloatArray | None = None) -> TurnedGeometry | None:
+    """The geometry that is found in runs under the model of an arm."""
+    instants = read_instants(truth.model, runs, SMALL)
+    return find_turned_geometry(truth.model, instants, truth.gains if gains is None else gains)
+
+
+def with_positions(runs: list[Run], signs: FloatArray) -> list[Run]:
+    """The same with positions that count the other way."""
+    return [replace(run, position_rad=run.position_rad * signs) for run in runs]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_is_found_in_clean_recordings(truth: Truth, seed: int) -> None:
+    assert found_in(truth, small_recordings(truth, seed, noise_a=0.15)) is None
+
+
+@pytest.mark.parametrize("declared", [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (1, 1, 1), (2, -1, 1)])
+def test_gravity_is_found_within_a_degree(truth: Truth, clean: list[Run], declared: tuple[int, ...]) -> None:
+    gravity = 9.81 * np.array(declared) / np.linalg.norm(declared)
+    found = found_in(replace(truth, model=with_gravity(truth.model, gravity)), clean)
+    assert found is not None
+    assert found.gravity is not None
+    assert found.diagnosis(AXES).name == GRAVITY_TURNED
+    cosine = found.gravity.found_m_s2 @ DOWN / 9.81**2
+    assert np.rad2deg(np.arccos(min(cosine, 1.0))) < max(1.0, 4.0 * found.gravity.std_deg)
+    assert found.gravity.std_deg < 2.0
+    assert np.linalg.norm(found.gravity.found_m_s2) == pytest.approx(9.81)
+
+
+def test_a_small_turn_of_gravity_is_no_gross_mistake(truth: Truth, clean: list[Run]) -> None:
+    angle = np.deg2rad(0.5 * SMALLEST_TURN_DEG)
+    tilted = with_gravity(truth.model, 9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)]))
+    assert found_in(replace(truth, model=tilted), clean) is None
+
+
+@pytest.mark.parametrize("current_sign", [1.0, -1.0])
+@pytest.mark.parametrize("axis", [1, 2])
+def test_a_reversed_position_is_found(truth: Truth, clean: list[Run], axis: int, current_sign: float) -> None:
+    signs = np.ones(3)
+    signs[axis] = -1.0
+    currents = np.ones(3)
+    currents[axis] = current_sign
+    found = found_in(truth, with_currents(with_positions(clean, signs), currents))
+    assert found is not None
+    said = found.diagnosis(AXES)
+    assert (said.name, said.axes) == (POSITION_REVERSED, (AXES[axis],))
+    assert found.reversed_currents == ((axis,) if current_sign < 0.0 else ())
+    assert ("in the URDF, or the signs of both" in said.remedy) == (current_sign < 0.0)
+    assert found.corrected_positions(np.ones((1, 3))).tolist() == [signs.tolist()]
+
+
+@pytest.mark.parametrize(
+    ("factor", "order"),
+    [
+        (np.array([1.0, -1.0, 1.0]), (0, 1, 2)),
+        (np.array([-1.0, -1.0, -1.0]), (0, 1, 2)),
+        (np.array([1.0, 0.5, 2.0]), (0, 1, 2)),
+        (np.full(3, 1000.0), (0, 1, 2)),
+        (np.ones(3), (0, 2, 1)),
+        (np.ones(3), (1, 0, 2)),
+    ],
+)
+def test_mistakes_of_currents_are_no_geometry(
+    truth: Truth, clean: list[Run], factor: FloatArray, order: tuple[int, ...]
+) -> None:
+    assert found_in(truth, with_currents(clean, factor, order)) is None
+
+
+def test_a_reversed_current_beside_a_wrong_gravity_does_not_hide_it(truth: Truth, clean: list[Run]) -> None:
+    wall = replace(truth, model=with_gravity(truth.model, np.array([9.81, 0.0, 0.0])))
+    found = found_in(wall, with_currents(clean, np.array([1.0, -1.0, 1.0])))
+    assert found is not None
+    assert found.gravity is not None
+    assert found.reversed_currents == (1,)
+
+
+@pytest.mark.parametrize("gains_fixed", [False, True])
+def test_a_fit_of_all_rows_confirms_it(truth: Truth, clean: list[Run], gains_fixed: bool) -> None:
+    wall = replace(truth, model=with_gravity(truth.model, np.array([0.0, 9.81, 0.0])))
+    found = found_in(wall, clean)
+    assert found is not None
+
+    def confirmed(before_percent: float | None) -> bool:
+        return is_confirmed(
+            found, wall.model, clean, SMALL, truth.gains, gains_fixed=gains_fixed, before_percent=before_percent
+        )
+
+    assert confirmed(None)
+    assert confirmed(40.0)
+    assert not confirmed(1.0)  # the declared geometry has left less
+
+
+def test_products_serve_every_direction(truth: Truth, clean: list[Run]) -> None:
+    instants = read_instants(truth.model, clean[:2], SMALL)
+    gravity = np.array([3.0, -4.0, 5.0])
+    weighed = gravity_products(truth.model, instants)
+    square = weighed.directed(gravity).square.sum(axis=1)
+    own = gravity_products(with_gravity(truth.model, gravity), instants)
+    assert np.array_equal(own.square, weighed.square)  # the declared gravity takes no part
+    columns = with_gravity(truth.model, gravity).regressor(instants[0].motion)[1]
+    first = square_of(columns, instants[0], 1)
+    bare = gravity_products(truth.model, instants[:1]).directed(gravity).square.sum(axis=1)[1]
+    np.testing.assert_allclose(bare[:-1, :-1], first * truth.model.drive_train.to_motor[1, 1] ** 2, atol=1e-9)
+    assert square.shape[-1] == len(truth.model.columns) + 10 + 1
+
+
+def square_of(columns: FloatArray, instants: Instants, motor: int) -> FloatArray:
+    """Products of columns over the rows of a motor that count."""
+    used = columns[:, instants.use[motor]]
+    return used @ used.T
+
+
+def test_without_rows_nothing_is_found(truth: Truth) -> None:
+    assert find_turned_geometry(truth.model, (), truth.gains) is None
