@@ -3,7 +3,7 @@
 An encoder that lost its zero, or a base that was moved, leaves a part of the prediction's error that is the derivative
 of the whole arm's torque (`ident.effects.geometry`). Friction and gains change with temperature and wear, so what they
 explain is left out of the comparison: on each axis the predicted torque, its speed, the direction of motion and a
-constant.
+constant. So is what another payload, or another way of mounting it, explains.
 """
 
 from __future__ import annotations
@@ -70,7 +70,10 @@ def geometry_drift(
     signals = declared_signals(model, slow, standard, gains, calibration.session_began_s, inertia=False)
     scale = np.array([_rms(row[used]) for row, used in zip(left_nm, use, strict=True)])
     weight = np.where(use, 1.0 / np.maximum(scale, np.finfo(np.float64).tiny)[:, None], 0.0)
-    nuisance = _nuisance(signals.geared_torque_nm, signals.velocity_rad_s)
+    payload_nm = np.empty((0, *left_nm.shape))
+    if data.payload is not None:
+        payload_nm = np.moveaxis(model.regressor(slow.motion())[:, model.flange], 1, 0)
+    nuisance = _nuisance(signals.geared_torque_nm, signals.velocity_rad_s, payload_nm)
     left = _beyond(nuisance, left_nm[:, None], weight)[:, 0]
     best: GeometryDrift | None = None
     for placed in _candidates(model):
@@ -88,18 +91,28 @@ def _candidates(model: Model) -> Iterator[PlacedEffect]:
                 yield PlacedEffect(effect, axis)
 
 
-def _nuisance(torque_nm: FloatArray, velocity: FloatArray) -> FloatArray:
-    """What may have changed on each axis without a change of the geometry, shape (m, 4, r)."""
-    return np.stack((torque_nm, velocity, np.sign(velocity), np.ones_like(velocity)), axis=1)
+def _nuisance(torque_nm: FloatArray, velocity: FloatArray, payload_nm: FloatArray) -> FloatArray:
+    """What may have changed without a change of the geometry, shape (4 m + p, m, r).
+
+    Args:
+        torque_nm: of each axis, shape (m, r): a gain.
+        velocity: of each axis, shape (m, r): friction and offset.
+        payload_nm: columns of the mounted payload, shape (p, m, r); none without load.
+    """
+    own = np.stack((torque_nm, velocity, np.sign(velocity), np.ones_like(velocity)))
+    each = [np.eye(len(velocity))[axis][:, None] * shape for axis in range(len(velocity)) for shape in own]
+    return np.concatenate((np.stack(each), payload_nm))
 
 
 def _beyond(nuisance: FloatArray, columns: FloatArray, weight: FloatArray) -> FloatArray:
-    """Weighted columns, shape (m, p, r), less what the nuisance of each axis explains of them."""
-    out = columns * weight[:, None]
-    for axis, own in enumerate(nuisance * weight[:, None]):
-        solution = np.linalg.lstsq(own.T, out[axis].T, rcond=None)[0]
-        out[axis] -= (own.T @ solution).T
-    return np.asarray(out)
+    """Weighted columns, shape (m, p, r), less what the nuisance explains of them."""
+    weighted = (nuisance * weight).reshape(len(nuisance), -1)
+    scale = np.linalg.norm(weighted, axis=1)
+    basis = weighted[scale > 0.0] / scale[scale > 0.0][:, None]
+    out = np.moveaxis(columns * weight[:, None], 1, 0)
+    flat = out.reshape(len(out), -1)
+    solution = np.linalg.lstsq(basis.T, flat.T, rcond=1e-9)[0]
+    return np.moveaxis((flat - solution.T @ basis).reshape(out.shape), 0, 1)
 
 
 def _fitted(placed: PlacedEffect, columns: FloatArray, left: FloatArray, move: IntArray) -> GeometryDrift | None:
