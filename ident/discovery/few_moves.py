@@ -23,6 +23,9 @@ FEWEST_MOVES = 3.0  #: Effective number of moves below which their random signs 
 FEW_MOVES = (
     8.0  #: The same below which a candidate sets no limit for others, and is tested without those of most leverage
 )
+SHARE = 0.01
+"""Share of Φ⊥ᵀΦ⊥ that the other moves must hold: with less they know the coefficients ten times worse, and a test by
+them says nothing."""
 LEVERAGE = 3  #: Moves left out then
 
 RECORD = {
@@ -100,8 +103,7 @@ def without_most_leverage(
     declared_score = folds.cluster_score[left] - folds.cluster_hessian[left] @ step
     score = own_score - declared_score @ along
     whole = gram.sum(axis=0)
-    # A share of the columns that rounding alone would leave is nothing.
-    if np.any(np.diag(whole) <= 1e-9 * np.diag(squares.sum(axis=0))):
+    if np.any(np.diag(whole) < SHARE * np.diag(projected.sum(axis=0))):
         return None
     coefficients = np.linalg.pinv(whole) @ score.sum(axis=0)
     scatter_of_all = np.zeros_like(scores)
@@ -111,13 +113,20 @@ def without_most_leverage(
     return MoveScores(score.sum(axis=0), scatter_of_all, gram_of_all)
 
 
-def what_to_record(effect: Effect, gram: FloatArray) -> str:
-    """Say that a candidate rests on too few moves to be tested, and what to record.
+def is_tested_on_others(rest: MoveScores | None) -> bool:
+    """Whether a candidate that rests on few moves rests on enough others, too, to be tested by these."""
+    return rest is not None and moves_behind(rest.gram) >= FEW_MOVES
+
+
+def what_to_record(effect: Effect, gram: FloatArray, rest: MoveScores | None) -> str:
+    """Say that a candidate rests on too few moves to be believed, and what to record.
 
     Args:
         effect: of the candidate.
         gram: Φ⊥ᵀΦ⊥ of each cluster, shape (clusters, p, p).
+        rest: the candidate without the moves of most leverage.
     """
     count = max(round(moves_behind(gram)), 1)
     noun = "move" if count == 1 else "moves"
-    return f"it rests on {NUMBERS[count]} {noun}, too few to test it: record more {RECORD[effect.abscissa]}"
+    why = "and the others do not show it" if is_tested_on_others(rest) else "too few to test it"
+    return f"it rests on {NUMBERS[count]} {noun}, {why}: record more {RECORD[effect.abscissa]}"

@@ -30,7 +30,7 @@ import scipy  # loads scipy.special when it is first used: a fit needs none of i
 
 from ident.arrays import BoolArray, FloatArray
 from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial
-from ident.discovery.few_moves import FEW_MOVES, FEWEST_MOVES, ByMove, moves_behind, what_to_record
+from ident.discovery.few_moves import FEW_MOVES, FEWEST_MOVES, ByMove, is_tested_on_others, moves_behind, what_to_record
 from ident.discovery.gates import SIGMAS, Gates, impossible
 from ident.discovery.refinement import refine_together
 from ident.effects.dictionary import EFFECTS
@@ -55,8 +55,8 @@ class Finding:
     axis: int  #: index of the joint (or motor)
     coefficients: FloatArray  #: first estimate of its linear parameters
     deviations: FloatArray  #: their σ by the scatter of moves
-    #: That noise alone makes a candidate this strong among all, or among those of known families; None where it rests on
-    #: too few moves for a test.
+    #: That noise alone makes a candidate this strong among all, or among those of known families; None where it rests
+    #: on too few moves for a test.
     probability: float | None
     folds_better: float  #: share of folds on which it lowers the error
     explained: float  #: share of the squared residual of the motor that it affects most
@@ -244,8 +244,8 @@ def _judge(
     strong = folds_better >= gates.strong_folds and error_fall >= gates.strong_fall
     false_alarm = gates.strong_false_alarm if strong else gates.false_alarm
     chance = None if np.isnan(probability[best]) else float(probability[best])
-    if chance is None:
-        by_chance = what_to_record(effect, trial.gram)
+    if chance is None or is_tested_on_others(trial.rest):
+        by_chance = what_to_record(effect, trial.gram, trial.rest)
     else:
         by_chance = f"noise makes one as strong with p = {chance:.3f}"
     verdicts = (
@@ -306,7 +306,7 @@ def _max_t(trials: tuple[Trial, ...], rng: np.random.Generator, draws: int) -> F
     for number, trial in enumerate(trials):
         if moves_behind(trial.gram) >= FEW_MOVES:
             of_many[number] = trial
-        elif trial.rest is not None and moves_behind(trial.rest.gram) >= FEW_MOVES:
+        elif trial.rest is not None and is_tested_on_others(trial.rest):
             of_many[number] = trial.rest
         elif moves_behind(trial.gram) >= FEWEST_MOVES:
             of_few[number] = trial
@@ -323,7 +323,7 @@ def _surprises(candidates: Sequence[ByMove], signs: FloatArray) -> tuple[FloatAr
     widths = np.array([len(one.score) for one in candidates], dtype=np.int64)
     observed, surprise = np.empty(len(candidates)), np.zeros(len(signs))
     for freedom in np.unique(widths).tolist():
-        numbers = np.flatnonzero(widths == freedom)
+        numbers = np.flatnonzero(widths == freedom).tolist()
         alike = [candidates[number] for number in numbers]
         score, scatter = (np.stack(parts) for parts in zip(*((one.score, one.scatter) for one in alike), strict=True))
         # The candidate is in the fit here: else its own torque would count as noise, and the strongest would hide best.

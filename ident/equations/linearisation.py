@@ -476,9 +476,8 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
     motors, jacobian, width = len(problem.gamma), problem.jacobian, problem.jacobian.width
     order = np.lexsort((problem.cluster, fold_of[problem.cluster], problem.motor))
     orders = [order[problem.rows_of(motor)] - problem.rows_of(motor).start for motor in range(motors)]
-    problem = replace(problem, **{name: getattr(problem, name)[order] for name in LINEARISATION_ROWS})
-    if problem.scatter is not None:
-        problem = replace(problem, scatter=problem.scatter.sorted(orders))
+    problem = _with_sorted_rows(problem, order, orders)
+    scatter = problem.scatter
     change = (np.diff(problem.cluster, prepend=-1) != 0) | (np.diff(problem.motor, prepend=-1) != 0)
     starts = np.flatnonzero(change)
     rows_of = (slice(int(a), int(b)) for a, b in pairwise((*starts, len(problem.motor))))
@@ -539,8 +538,15 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
         part_score=part_score,
         motor_score=motor_score,
         residual=residual,
-        estimate_factor=full_factor if problem.scatter is None else _estimate_factor(problem, problem.scatter, hessian),
+        estimate_factor=full_factor if scatter is None else _estimate_factor(problem, scatter, hessian),
     )
+
+
+def _with_sorted_rows(problem: Linearisation, order: IntArray, orders: Sequence[IntArray]) -> Linearisation:
+    """Sort everything but the Jacobian: all rows by one order, the scatter by those of each motor."""
+    sorted_rows = {name: getattr(problem, name)[order] for name in LINEARISATION_ROWS}
+    scatter = None if problem.scatter is None else problem.scatter.sorted(orders)
+    return replace(problem, scatter=scatter, **sorted_rows)
 
 
 def _estimate_factor(problem: Linearisation, scatter: RunScatter, hessian: FloatArray) -> tuple[FloatArray, bool]:

@@ -122,7 +122,7 @@ def test_a_candidate_that_rests_on_one_move_is_not_tested_and_hides_no_other(
     assert judged == {"spring": only[0].probability, "hinge": None}
     (hinge,) = (found for found in ranked if found.effect.name == "hinge")
     assert hinge.refusals[0] == (
-        "it rests on one move, too few to test it: record more moves to that end of the axis' range"
+        "it rests on three moves, too few to test it: record more moves to that end of the axis' range"
     )
 
 
