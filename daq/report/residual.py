@@ -305,8 +305,8 @@ def _refused(fitted: Fit) -> Iterator[str]:
         name = PlacedEffect(finding.effect, axis).axis_name(axes)
         if finding.impossible and finding.refusals == (finding.impossible,):
             yield (
-                f"{name}: {effect_text(finding.effect, axes)} ranks first on this axis, but its size is impossible: "
-                f"{finding.impossible}. The cause may be another one."
+                f"{name}: {effect_text(finding.effect, axes)} ranks first on this axis, but its sign or size is "
+                f"impossible: {finding.impossible}. The cause may be another one."
             )
             if strongest.get(axis) is finding:
                 strongest.pop(axis)

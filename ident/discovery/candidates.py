@@ -40,7 +40,7 @@ SHORTEST_PIECE_S = 0.25
 REDUNDANT_SHARE = 1e-6  #: Share of a column that must be left when all declared directions are projected out of it
 UNSEEN = 1e-9  #: Share of a direction, squared, below which the folds of a fit do not show it
 FRICTION_OF_A_RUN = 0.03
-"""Standard deviation of fv and fs from run to run, as a share of each: a few degrees of the grease (docs/method)."""
+"""Standard deviation of fv and fs from run to run, as a share of each: a few degrees of the grease make as much."""
 FAST = frozenset({Abscissa.MOTOR_ANGLE})  #: Variables that turn within a decimated row
 
 

@@ -316,7 +316,9 @@ def test_rivals_are_those_that_stop_passing_beside_it(small: Evidence, small_tru
 
     families = tuple(family for family in EFFECTS if family[0].name in {"hinge", "gravity-compensator", "stribeck"})
     start = bent(small, small_truth, torque)
-    steps = find_effects(start, np.random.default_rng(0), GATES, families)
+    # What the hinge leaves of the hump may not join: it lowers the error by two per cent.
+    gates = replace(GATES, error_fall=0.05, false_alarm=0.02)
+    steps = find_effects(start, np.random.default_rng(0), gates, families)
     first, second = steps[:2]
     assert first.accepted is not None
     assert first.accepted.ambiguity
