@@ -174,6 +174,15 @@ class Linearisation:
         step = linalg.cho_solve(linalg.cho_factor(hessian, lower=True), self.jacobian.on_columns(self.residual))
         return replace(self, residual=self.residual - self.jacobian @ step), step
 
+    def decorrelated(self, columns: FloatArray) -> FloatArray:
+        """V^(−1/2) times columns, shape (rows,); the columns themselves where runs share no errors."""
+        if self.scatter is None:
+            return columns
+        parts = [
+            self.scatter.decorrelate(motor, columns[None, self.rows_of(motor)])[0] for motor in range(len(self.gamma))
+        ]
+        return np.concatenate(parts)
+
     def correlated(self, columns: FloatArray) -> FloatArray:
         """V times decorrelated columns, shape (rows,); the columns themselves where runs share no errors."""
         if self.scatter is None:
