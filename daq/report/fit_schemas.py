@@ -243,7 +243,7 @@ class FindingEntry(PlacedEffectEntry):
     """Result of testing one effect on one axis."""
 
     variable: str
-    probability: float
+    probability: Figure = Field(description="by noise alone; null where it rests on too few moves for a test")
     folds_better: float
     explained: Figure
     error_before_percent: Figure

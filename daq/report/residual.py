@@ -103,6 +103,7 @@ def turns_view(fitted: Fit) -> Iterator[RenderableType]:
     yield ""
 
 
+UNTESTED = "–"  #: In the place of a probability: it rests on too few moves for a test
 CANDIDATES = "best candidates on left-out moves, before the refit"
 CANDIDATE_HEADINGS = ("effect", "axis", "p", "folds", "explains", "left-out error", "gates")
 
@@ -118,7 +119,7 @@ def candidate_rows(fitted: Fit, step: Step, count: int) -> Iterator[tuple[str, .
         yield (
             finding.effect.name,
             fitted.cell.place_names[finding.axis],
-            f"{finding.probability:.3f}",
+            UNTESTED if finding.probability is None else f"{finding.probability:.3f}",
             f"{100 * finding.folds_better:.0f} %",
             f"{100 * finding.explained:.1f} %",
             f"{finding.error_before_percent:.2f} → {finding.error_after_percent:.2f} %",
@@ -287,19 +288,32 @@ def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
 
 
 def _refused(fitted: Fit) -> Iterator[str]:
-    """Sentences on the strongest candidate of each axis that failed a check, but would explain much of the residual."""
+    """Sentences on candidates that failed a check: of each axis the strongest, where it would explain much of the
+    residual, and the first one, where physics alone does not allow it.
+    """
     axes, last = fitted.cell.place_names, fitted.steps[-1]
     # Those are reported with the reason already.
     reported = {(aside.finding.effect, aside.finding.axis) for aside in last.set_aside}
+    first: dict[int, Finding] = {}
     strongest: dict[int, Finding] = {}
     for finding in last.findings:
+        first.setdefault(finding.axis, finding)
         failed = finding.explained >= MUCH and finding.refusals and (finding.effect, finding.axis) not in reported
         if failed and (finding.axis not in strongest or finding.explained > strongest[finding.axis].explained):
             strongest[finding.axis] = finding
+    for axis, finding in first.items():
+        name = PlacedEffect(finding.effect, axis).axis_name(axes)
+        if finding.impossible and finding.refusals == (finding.impossible,):
+            yield (
+                f"{name}: {effect_text(finding.effect, axes)} ranks first on this axis, but its sign or size is "
+                f"impossible: {finding.impossible}. The cause may be another one."
+            )
+            if strongest.get(axis) is finding:
+                strongest.pop(axis)
     for finding in strongest.values():
-        axis = PlacedEffect(finding.effect, finding.axis).axis_name(axes)
+        name = PlacedEffect(finding.effect, finding.axis).axis_name(axes)
         yield (
-            f"{axis}: {effect_text(finding.effect, axes)} would explain {100.0 * finding.explained:.0f} % of the "
+            f"{name}: {effect_text(finding.effect, axes)} would explain {100.0 * finding.explained:.0f} % of the "
             f"squared residual, but failed a check: {'; '.join(finding.refusals)}. The cause may be another one."
         )
 

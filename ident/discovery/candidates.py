@@ -1,5 +1,10 @@
 """Candidates tested on a residual: the search problem, and trials of effects on it, in-sample and on held-out moves.
 
+Friction differs from run to run, as temperature and mounting do. A search that took moves of all runs as exchangeable
+would find laws in that. So `prepare_search` takes the friction of every run as drawn around the common one: the rows
+are decorrelated (`ident.equations.run_scatter`), and trials, folds and bootstrap see what a law within the runs
+explains. The estimate knows nothing of it: shifts of gains are those of the estimate (`Folds.estimate_factor`).
+
 A *candidate* is an effect with one choice of settings on one axis. A *trial* projects its columns off all declared
 directions, gains included, and measures what they explain of the residual: in-sample, and on folds of held-out moves. A
 *family* is one effect with all settings that the dictionary tries.
@@ -16,12 +21,13 @@ from scipy import linalg
 
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.dataset import Dataset
+from ident.discovery.few_moves import FEW_MOVES, MoveScores, moves_behind, without_most_leverage
 from ident.discovery.noise_floor import noise_floors
 from ident.effects.effect import Effect, PlacedEffect, at_joints, columns_at, effect_columns, is_placeable
 from ident.effects.geometry import GeometryEffect
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
-from ident.equations.linearisation import Folds, MotorRows, cut_into_folds, linearise
+from ident.equations.linearisation import Folds, Linearisation, MotorRows, cut_into_folds, linearise
 from ident.equations.rows import Observation, decimate_rows
 from ident.estimators.estimate import Estimate
 from ident.model.model import Model
@@ -37,6 +43,8 @@ SHORTEST_PIECE_S = 0.25
 REDUNDANT_SHARE = 1e-6  #: Share of a column that must be left when all declared directions are projected out of it
 UNSEEN = 1e-9  #: Share of a direction, squared, below which the folds of a fit do not show it
 NO_SERIES = frozenset({"rate_hz", "rotor_inertia_kg_m2", "arm"})  #: Fields of `Signals` that do not change in a run
+FRICTION_OF_A_RUN = 0.03
+"""Standard deviation of fv and fs from run to run, as a share of each: a few degrees of the grease make as much."""
 FAST = frozenset({Abscissa.MOTOR_ANGLE})  #: Variables that turn within a decimated row
 
 
@@ -52,6 +60,8 @@ class SearchProblem:
     folds: Folds  #: the problem around the estimate, in folds of moves
     #: Estimate of each motor's noise in a row, which no model of motion explains [A]; None where not known.
     floors_a: tuple[float | None, ...]
+    #: From the estimate to the best fit where friction differs by run, in the scale of the unknowns, shape (f,).
+    step: FloatArray
     #: Columns of motion and time alone, which stay the same from turn to turn, before they are placed at joints.
     cache: ColumnCache = field(default_factory=dict)
 
@@ -130,6 +140,8 @@ class Trial:
     score: FloatArray  #: Φ⊥ᵀe, shape (p,)
     scatter: FloatArray  #: Φ⊥ᵀe of each cluster with the candidate fitted: its noise alone, shape (clusters, p)
     gram: FloatArray  #: Φ⊥ᵀΦ⊥ of each cluster, shape (clusters, p, p)
+    #: Without the moves of most leverage, of a candidate that rests on few; None of one that rests on many.
+    rest: MoveScores | None = None
 
 
 def shares_explained(search_problem: SearchProblem, trials: Sequence[Trial | None]) -> list[float]:
@@ -155,17 +167,10 @@ def prepare_search(
     Raises:
         TooFewMoves: there are too few moves to leave some out.
     """
-    pieces, move_of = pieces_of(observation)
     began_s = session_began_s(datasets)
     fitted = (fitted_signals(model, data, observation, estimate, began_s) for data in datasets)
     runs = tuple(beside_rotors(run, effects) for run in fitted)
-    problem = linearise(
-        replace(observation, move=pieces),
-        estimate.gains,
-        estimate.parameters,
-        estimate.axis_noise,
-        gains_fixed=estimate.gains_fixed,
-    )
+    folds, step = folds_around(model, observation, estimate)
     floors = noise_floors(datasets, observation.conditioning)
     rows: list[Signals] = []
     for run, data in zip(runs, datasets, strict=True):
@@ -196,13 +201,44 @@ def prepare_search(
         observation=observation,
         runs=runs,
         rows=tuple(rows),
-        folds=cut_into_folds(problem, move_of=move_of),
+        folds=folds,
         floors_a=tuple(None if floor is None else floor.noise_a for floor in floors),
+        step=step,
         cache={} if cache is None else cache,
     )
 
 
-def pieces_of(observation: Observation) -> tuple[IntArray, IntArray]:
+def folds_around(model: Model, observation: Observation, estimate: Estimate) -> tuple[Folds, FloatArray]:
+    """The problem around an estimate in folds, with friction that differs by run, and the step to its best fit.
+
+    Raises:
+        TooFewMoves: there are too few moves to leave some out.
+    """
+    pieces, move_of = _pieces(observation)
+    problem = linearise(
+        replace(observation, move=pieces),
+        estimate.gains,
+        estimate.parameters,
+        estimate.axis_noise,
+        gains_fixed=estimate.gains_fixed,
+    )
+    problem, step = _with_friction_of_runs(problem, model, observation, estimate).fitted()
+    return cut_into_folds(problem, move_of=move_of), step
+
+
+def _with_friction_of_runs(
+    problem: Linearisation, model: Model, observation: Observation, estimate: Estimate
+) -> Linearisation:
+    """Let viscous and dry friction differ at random from run to run; the same problem of a single run."""
+    if len(np.unique(observation.run)) < 2:
+        return problem
+    rubbing = np.flatnonzero(np.isin(observation.base.independent, model.friction_columns))
+    deviation = FRICTION_OF_A_RUN * np.abs(estimate.parameters[rubbing])
+    torque = observation.regressor[:, rubbing] * deviation[:, None]
+    return problem.beside_scatter(torque, model.drive_train.to_motor, observation.run)
+
+
+def _pieces(observation: Observation) -> tuple[IntArray, IntArray]:
     """Piece of a move that each row belongs to, shape (r,), and the move that each piece with rows belongs to.
 
     The scatter of moves is known well only from many: moves of a short recording are cut into pieces of many
@@ -313,6 +349,7 @@ def _scored_together(folds: Folds, width: int, candidates: Sequence[Felt]) -> tu
     held_out += np.einsum("kcp,kncpq,kcq->knc", without, inside, without)
     training = np.sum(drive * without, axis=-1)
     score = cluster_score.sum(axis=0)
+    rests = [_rest(folds, made, place, gram[:, place]) for place in range(len(candidates))]
     return tuple(
         Trial(
             coefficients=fitted[place],
@@ -322,6 +359,7 @@ def _scored_together(folds: Folds, width: int, candidates: Sequence[Felt]) -> tu
             score=score[place],
             scatter=scatter[:, place],
             gram=gram[:, place],
+            rest=rests[place],
         )
         for place in range(len(candidates))
     )
@@ -345,6 +383,22 @@ def _products(own: MotorRows, candidates: Sequence[Felt]) -> _Products:
     flat = own.sums(inside.reshape(-1, inside.shape[-1]), own.equations)
     beside = flat.reshape(len(flat), *inside.shape[:2], -1)
     return _Products(own, felt, beside[..., :-2], own.sums(inside, inside), beside[..., -2], beside[..., -1])
+
+
+def _rest(folds: Folds, made: Sequence[_Products], place: int, projected: FloatArray) -> MoveScores | None:
+    """One candidate without the moves of most leverage; None where it rests on many."""
+    if moves_behind(projected) >= FEW_MOVES:
+        return None
+    crossed = np.zeros((*projected.shape[:2], folds.linearisation.jacobian.width))
+    squares = np.zeros(projected.shape)
+    scores = np.zeros(projected.shape[:2])
+    for one in made:
+        for index in np.flatnonzero(one.felt == place):
+            clusters = one.own.cluster
+            crossed[clusters[:, None], :, one.own.seen] += np.swapaxes(one.jacobian[:, index], 1, 2)
+            squares[clusters] += one.gram[:, index]
+            scores[clusters] += one.score[:, index]
+    return without_most_leverage(folds, crossed, squares, scores, projected)
 
 
 def _is_new(gram: FloatArray, squares: FloatArray) -> BoolArray:

@@ -68,7 +68,7 @@ def choice_covariance(
 
 def is_small(finding: Finding, gates: Gates) -> bool:
     """Whether a finding is no noise and possible, but too small for the other gates."""
-    if finding.probability > gates.false_alarm:
+    if finding.probability is None or finding.probability > gates.false_alarm:
         return False
     if impossible(finding.effect.coefficients, finding.coefficients, finding.deviations):
         return False

@@ -25,7 +25,7 @@ from scipy import linalg
 from ident.arrays import FloatArray, IntArray
 from ident.discovery.candidates import UNSEEN, SearchProblem
 from ident.effects.effect import Effect, PlacedEffect
-from ident.equations.linearisation import Folds, cut_into_folds
+from ident.equations.linearisation import RIDGE, Folds, cut_into_folds, sum_of_squares
 from ident.equations.rows import Observation
 from ident.estimators.estimate import Estimate
 from ident.model.model import Column
@@ -33,7 +33,6 @@ from ident.model.model import Column
 SIGMAS = 2.0  #: A coefficient outside its possible values by more than this many σ is impossible
 MIN_RUNS = 3  #: With two runs, one left out leaves a fit of the other alone
 CONFIDENCE = 0.95  #: Of a coefficient that is not zero; one-sided, of a rise by more than noise
-_RIDGE = 1e-10  #: Share of the diagonal of JᵀJ added to it
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,20 +236,19 @@ def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effect
         for other, (part, seen) in enumerate(zip(rest.parts, rest.seen, strict=True)):
             passed = problem.transform[problem.source[problem.rows_of(other)], other, motor]
             part[seen == place] += lost * passed * problem.noise[motor] * scale
-    hessian = np.zeros((rest.width, rest.width))
-    for part, seen in zip(rest.parts, rest.seen, strict=True):
-        hessian[np.ix_(seen, seen)] += part @ part.T
-    absorbed = linalg.cho_solve(_factor(hessian), rest.on_columns(torque))
+    # Around the estimate, from which the torque was taken.
+    residual = problem.residual + problem.jacobian @ search_problem.step + torque
+    step = linalg.cho_solve(_factor(sum_of_squares(rest)), rest.on_columns(residual))
     reduced = replace(
         problem,
         jacobian=rest,
-        residual=problem.residual + torque - rest @ absorbed,
+        residual=residual - rest @ step,
         free=problem.free[~taken],
         scale=problem.scale[~taken],
     )
     # The rows keep their order: they are dealt to the same folds again.
     folds = cut_into_folds(reduced, move_of=problem.of_clusters(search_problem.observation.move))
-    return Reduced(replace(search_problem, folds=folds), columns, torque)
+    return Reduced(replace(search_problem, folds=folds, step=step), columns, torque)
 
 
 def gain_shifts(folds: Folds, torque: FloatArray) -> FloatArray:
@@ -265,7 +263,8 @@ def shifts_by(folds: Folds, torque: FloatArray, size: int) -> FloatArray:
     It is zero for what is fixed and for what the problem does not hold.
     """
     problem, shifts = folds.linearisation, np.zeros(size)
-    shifts[problem.free] = -linalg.cho_solve(folds.full_factor, problem.jacobian.on_columns(torque)) * problem.scale
+    score = problem.jacobian.on_columns(problem.correlated(torque))
+    shifts[problem.free] = -linalg.cho_solve(folds.estimate_factor, score) * problem.scale
     return shifts
 
 
@@ -277,6 +276,6 @@ def moved_gains(shifts: FloatArray, gains_std: FloatArray) -> tuple[tuple[int, f
 
 def _factor(hessian: FloatArray) -> tuple[FloatArray, bool]:
     """Cholesky factor of JᵀJ; directions that the rows do not show stay where they are."""
-    regular = hessian + _RIDGE * np.diag(np.diag(hessian))
+    regular = hessian + RIDGE * np.diag(np.diag(hessian))
     factor, _ = linalg.cho_factor(regular, lower=True)
     return factor, True

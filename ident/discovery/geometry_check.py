@@ -8,12 +8,12 @@ effect of one axis does: a spring that nobody declared looks like a wrong zero i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.discovery.candidates import FamilyTrials, SearchProblem, pieces_of
+from ident.discovery.candidates import FamilyTrials, SearchProblem, folds_around
 from ident.discovery.evidence import Evidence
 from ident.discovery.gates import Gates
 from ident.discovery.search import Finding, rank_families
@@ -21,7 +21,6 @@ from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import Effect, is_placeable
 from ident.effects.geometry import LARGEST_ZERO, GravityDirection, ZeroOffset, turned_gravity
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
-from ident.equations.linearisation import cut_into_folds, linearise
 from ident.equations.rows import at_rows
 
 AT_ROWS = frozenset(
@@ -119,25 +118,19 @@ def _slow(families: Sequence[Sequence[Effect]]) -> tuple[Sequence[Effect], ...]:
 def _problem_at_rows(evidence: Evidence) -> SearchProblem:
     """The residual of a fit with signals of the decimated motion: a twentieth of the samples."""
     observation, estimate = evidence.training, evidence.estimate
-    pieces, move_of = pieces_of(observation)
     began_s = session_began_s(evidence.fit_runs)
     rows: list[Signals] = []
     for data in evidence.fit_runs:
         slow = at_rows(data, evidence.conditioning)
         rows.append(fitted_signals(evidence.model, slow, observation, estimate, began_s, inertia=False))
-    problem = linearise(
-        replace(observation, move=pieces),
-        estimate.gains,
-        estimate.parameters,
-        estimate.axis_noise,
-        gains_fixed=estimate.gains_fixed,
-    )
+    folds, step = folds_around(evidence.model, observation, estimate)
     return SearchProblem(
         model=evidence.model,
         datasets=evidence.fit_runs,
         observation=observation,
         runs=tuple(rows),
         rows=tuple(rows),
-        folds=cut_into_folds(problem, move_of=move_of),
+        folds=folds,
+        step=step,
         floors_a=(None,) * observation.axis_count,
     )

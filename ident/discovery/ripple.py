@@ -121,6 +121,8 @@ def periodogram(search_problem: SearchProblem, axis: int, of_joint: int) -> Peri
     # A whitened line is T_D times its torque at the axes. T_D = P D⁻¹ and P e = e: T_Dᵀe = D⁻¹e, also with preload.
     weights = torque * problem.gamma / problem.noise
     filters = [row_filter(data, observation.conditioning) for data in search_problem.datasets]
+    # A line is decorrelated as the residual was: (V^(−1/2)Φ)ᵀe = Φᵀ(V^(−1/2)e).
+    residual = problem.decorrelated(problem.residual)
     starts = np.searchsorted(observation.run, np.arange(len(angles)))
     scores = np.zeros((problem.cluster_count, last - first), dtype=np.complex64)
     for rows, _, cluster, motor in search_problem.folds.blocks:
@@ -131,7 +133,7 @@ def periodogram(search_problem: SearchProblem, axis: int, of_joint: int) -> Peri
         begin, end = int(source.min()), int(source.max())
         filter_ = filters[run]
         stuffed = np.zeros((end - begin) * filter_.factor + 1)
-        stuffed[(source - begin) * filter_.factor] = weights[motor] * problem.residual[rows]
+        stuffed[(source - begin) * filter_.factor] = weights[motor] * residual[rows]
         spread = np.convolve(stuffed, filter_.taps)
         sample = (begin - int(starts[run])) * filter_.factor
         place = places[run][sample : sample + len(spread)]

@@ -30,6 +30,7 @@ import scipy  # loads scipy.special when it is first used: a fit needs none of i
 
 from ident.arrays import BoolArray, FloatArray
 from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial
+from ident.discovery.few_moves import FEW_MOVES, FEWEST_MOVES, ByMove, is_tested_on_others, moves_behind, what_to_record
 from ident.discovery.gates import SIGMAS, Gates, impossible
 from ident.discovery.refinement import refine_together
 from ident.effects.dictionary import EFFECTS
@@ -38,7 +39,6 @@ from ident.effects.geometry import GeometryEffect
 
 EffectKey = tuple[str, int, tuple[float, ...]]
 
-FEWEST_MOVES = 3.0  #: Effective number of moves below which their random signs test nothing
 AS_GOOD = 0.99  #: Share of the best one's fall on held-out moves that counts as equal
 CLEARLY = 0.95
 """Confidence of a paired comparison over folds (Student's t; folds share training data, so it is a rough one)."""
@@ -56,7 +56,9 @@ class Finding:
     axis: int  #: index of the joint (or motor)
     coefficients: FloatArray  #: first estimate of its linear parameters
     deviations: FloatArray  #: their σ by the scatter of moves
-    probability: float  #: that noise alone makes a candidate this strong among all, or among those of known families
+    #: That noise alone makes a candidate this strong among all, or among those of known families; None where it rests
+    #: on too few moves for a test.
+    probability: float | None
     folds_better: float  #: share of folds on which it lowers the error
     explained: float  #: share of the squared residual of the motor that it affects most
     error_before_percent: float  #: error of that motor on held-out moves without it, ‖e‖/‖v‖ of the current [%]
@@ -71,6 +73,7 @@ class Finding:
     #: where it is not known, or nothing is left beyond it. No gate uses it.
     share_of_excess: float | None = None
     refusals: tuple[str, ...] = ()  #: gates that it did not pass, in words
+    impossible: str = ""  #: coefficients that physics does not allow, in words: one of the refusals
 
 
 def rank_effects(
@@ -128,7 +131,7 @@ def rank_families(
     for alike in (is_known, is_geometry):
         if alike.any():
             among_them = _max_t(tuple(trials[index] for index in np.flatnonzero(alike)), rng, gates.draws)
-            probability[alike] = np.minimum(probability[alike], among_them)
+            probability[alike] = np.fmin(probability[alike], among_them)
     probabilities = iter(probability)
     before = search_problem.folds.square_sum(search_problem.folds.residual)
     findings = [_judge(search_problem, before, family, probabilities, gates) for family in tested]
@@ -232,7 +235,7 @@ def _judge(
     if len(effect.coefficients) > fewest:
         # High powers rest on few moves, whose random signs test nothing: the simplest form is surprising for both.
         plain = (index for index in possible if len(family.members[index][0].coefficients) == fewest)
-        probability[best] = min((probability[best], *(probability[index] for index in plain)))
+        probability[best] = float(np.fmin.reduce([probability[best], *(probability[index] for index in plain)]))
     after = replace(family, members=tuple(family.members[index] for index in possible)).nested()
     fall = before.sum(axis=1) - after.sum(axis=1)
     # Another motor may supply a joint's torque (R): the drive in question is the one whose residual falls most.
@@ -246,8 +249,13 @@ def _judge(
     is_geometry = isinstance(effect, GeometryEffect)
     strong = folds_better >= gates.strong_folds and error_fall >= gates.strong_fall
     false_alarm = gates.strong_false_alarm if strong else gates.false_alarm
+    chance = None if np.isnan(probability[best]) else float(probability[best])
+    if chance is None or is_tested_on_others(trial.rest):
+        by_chance = what_to_record(effect, trial.gram, trial.rest)
+    else:
+        by_chance = f"noise makes one as strong with p = {chance:.3f}"
     verdicts = (
-        (probability[best] > false_alarm, f"noise makes one as strong with p = {probability[best]:.3f}"),
+        (chance is None or chance > false_alarm, by_chance),
         (folds_better < gates.folds_better, f"it is better on {100 * folds_better:.0f} % of the folds only"),
         # A small mistake of the geometry is spread over all motors, and bends their gains.
         (
@@ -269,7 +277,7 @@ def _judge(
         axis=family.axis,
         coefficients=trial.coefficients,
         deviations=_sigma(trial),
-        probability=float(probability[best]),
+        probability=chance,
         folds_better=folds_better,
         explained=explained,
         error_before_percent=100.0 * error_before,
@@ -280,6 +288,7 @@ def _judge(
         share_of_excess=min(float(trial.fallen[motor]) / excess, 1.0) if excess > 0.0 else None,
         fold_errors=after.sum(axis=1),
         refusals=refusals,
+        impossible=ruled_out[best],
     )
 
 
@@ -301,16 +310,35 @@ def _sigma(trial: Trial) -> FloatArray:
 def _max_t(trials: tuple[Trial, ...], rng: np.random.Generator, draws: int) -> FloatArray:
     """Probability of each candidate's Wald statistic under random signs of the moves, for the largest of all.
 
-    A candidate that rests on one or two moves, as a hinge at the end of an axis' range, has no scatter to compare with:
-    its statistic is large in half of the draws, and would hide every other candidate. It is never surprising.
+    A candidate that rests on few moves has a heavy tail, and would hide every other one: it competes with all, but the
+    others do not compete with it. It is tested without the moves of most leverage where the others are enough, and has
+    no probability (NaN) where no test is left.
     """
-    clusters, widths = len(trials[0].scatter), np.array([len(trial.score) for trial in trials])
-    shown = np.array([moves_behind(trial) >= FEWEST_MOVES for trial in trials])
-    signs = rng.choice((-1.0, 1.0), size=(draws, clusters))
-    observed, surprise = np.empty(len(trials)), np.zeros(draws)
-    for freedom in np.unique(widths[shown]).tolist():
-        numbers = np.flatnonzero(shown & (widths == freedom))
-        alike = [trials[number] for number in numbers]
+    signs = rng.choice((-1.0, 1.0), size=(draws, len(trials[0].scatter)))
+    of_many: dict[int, ByMove] = {}
+    of_few: dict[int, ByMove] = {}
+    for number, trial in enumerate(trials):
+        if moves_behind(trial.gram) >= FEW_MOVES:
+            of_many[number] = trial
+        elif trial.rest is not None and is_tested_on_others(trial.rest):
+            of_many[number] = trial.rest
+        elif moves_behind(trial.gram) >= FEWEST_MOVES:
+            of_few[number] = trial
+    probability, surprise = np.full(len(trials), np.nan), np.zeros(draws)
+    for part in (of_many, of_few):
+        observed, drawn = _surprises(list(part.values()), signs)
+        surprise = np.maximum(surprise, drawn)
+        probability[list(part)] = (1.0 + np.sum(surprise[None] >= observed[:, None], axis=1)) / (draws + 1.0)
+    return probability
+
+
+def _surprises(candidates: Sequence[ByMove], signs: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Surprise of each candidate, shape (c,), and of the most surprising one of each draw, shape (draws,)."""
+    widths = np.array([len(one.score) for one in candidates], dtype=np.int64)
+    observed, surprise = np.empty(len(candidates)), np.zeros(len(signs))
+    for freedom in np.unique(widths).tolist():
+        numbers = np.flatnonzero(widths == freedom).tolist()
+        alike = [candidates[number] for number in numbers]
         score, scatter = (np.stack(parts) for parts in zip(*((one.score, one.scatter) for one in alike), strict=True))
         # The candidate is in the fit here: else its own torque would count as noise, and the strongest would hide best.
         inverse = np.linalg.pinv(np.swapaxes(scatter, 1, 2) @ scatter)
@@ -322,14 +350,7 @@ def _max_t(trials: tuple[Trial, ...], rng: np.random.Generator, draws: int) -> F
         # On the scale of −log p, so that candidates with one and with two coefficients compete alike.
         observed[numbers] = _surprise(wald, freedom)
         surprise = np.maximum(surprise, _surprise(drawn, freedom))
-    probability = (1.0 + np.sum(surprise[None] >= observed[:, None], axis=1)) / (draws + 1.0)
-    return np.where(shown, probability, 1.0)
-
-
-def moves_behind(trial: Trial) -> float:
-    """Effective number of moves that a candidate's columns rest on, (Σ G_m)²/Σ G_m², the least of its coefficients."""
-    own = np.diagonal(trial.gram, axis1=1, axis2=2)
-    return float(np.min(own.sum(axis=0) ** 2 / np.sum(own**2, axis=0)))
+    return observed, surprise
 
 
 def _surprise(wald: FloatArray, freedom: int) -> FloatArray:
@@ -337,7 +358,7 @@ def _surprise(wald: FloatArray, freedom: int) -> FloatArray:
     return np.asarray(-np.log(np.maximum(scipy.special.chdtrc(freedom, wald), np.finfo(np.float64).tiny)))
 
 
-def _drawn_wald(trial: Trial, signs: FloatArray) -> FloatArray:
+def _drawn_wald(trial: ByMove, signs: FloatArray) -> FloatArray:
     """Wald statistic of each draw, with a scatter of its own; with one for all, few moves would look too certain.
 
     In a draw, x_m becomes s_m x_m; its sum S is taken for an effect β = G⁻¹S, and the rest in move m is

@@ -18,6 +18,7 @@ from scipy import linalg
 from ident.arrays import FloatArray, IntArray
 from ident.equations.currents import PreloadedCurrents, whitening_transform
 from ident.equations.rows import Observation
+from ident.equations.run_scatter import RunScatter
 from ident.equations.system import System
 from ident.errors import TooFewMoves
 
@@ -25,6 +26,7 @@ LINEARISATION_ROWS = ("residual", "current", "motor", "cluster", "source")
 """Fields of a linearisation that have a number a row."""
 MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter
 FOLDS = MIN_MOVES_TO_LEAVE_OUT  #: Of moves; each holds one at least
+RIDGE = 1e-10  #: Share of the diagonal of JᵀJ added to it: two effects may be nearly equal
 CORRELATED = 2.0  #: Standard errors of the correlation of neighbouring clusters, above which they are joined
 
 
@@ -70,6 +72,14 @@ class Jacobian:
         return out
 
 
+def sum_of_squares(jacobian: Jacobian) -> FloatArray:
+    """JᵀJ, shape (f, f)."""
+    hessian = np.zeros((jacobian.width, jacobian.width))
+    for part, seen in zip(jacobian.parts, jacobian.seen, strict=True):
+        hessian[np.ix_(seen, seen)] += part @ part.T
+    return hessian
+
+
 @dataclass(frozen=True, slots=True)
 class Linearisation:
     """Rows of all motors below each other, motor 1 first."""
@@ -87,6 +97,8 @@ class Linearisation:
     scale: FloatArray
     #: T_D of each of the observation's rows for a redundantly driven robot, shape (r, m, m); None where it is D⁻¹.
     transform: FloatArray | None = None
+    #: Errors that the rows of a run share, and that the rows are decorrelated from; None where there are none.
+    scatter: RunScatter | None = None
 
     @property
     def cluster_count(self) -> int:
@@ -123,13 +135,62 @@ class Linearisation:
                 source = self.source[self.rows_of(motor)]
                 torque = torque_nm.take(source, axis=2)
                 felt[motor] = np.einsum("rj,jer->er", self.transform[source, motor], torque)
-            return felt
+            return self._decorrelated(felt)
         for joint in np.flatnonzero(torque_nm.any(axis=(1, 2))):
             for motor in np.flatnonzero(to_motor[:, joint]).tolist():
                 own = torque_nm[joint].take(self.source[self.rows_of(motor)], axis=1)
                 own *= to_motor[motor, joint] * self.gamma[motor] / self.noise[motor]
                 felt[motor] = felt[motor] + own if motor in felt else own
-        return felt
+        return self._decorrelated(felt)
+
+    def _decorrelated(self, felt: dict[int, FloatArray]) -> dict[int, FloatArray]:
+        """Take out of each motor's columns, shape (extra, rows), what its runs share."""
+        if self.scatter is None:
+            return felt
+        return {motor: self.scatter.decorrelate(motor, own) for motor, own in felt.items()}
+
+    def beside_scatter(self, torque_nm: FloatArray, to_motor: FloatArray, run: IntArray) -> Linearisation:
+        """The same problem where the rows of a run share errors, decorrelated from these; the unknowns stay.
+
+        Args:
+            torque_nm: of one standard deviation of each error, shape (m, k, r).
+            to_motor: T (DriveTrain.to_motor).
+            run: of each of the observation's rows, shape (r,).
+        """
+        motors = range(len(self.gamma))
+        whole = self.whitened(torque_nm, to_motor).T
+        rows = [self.rows_of(motor) for motor in motors]
+        scatter = RunScatter.of([whole[:, own] for own in rows], [run[self.source[own]] for own in rows])
+        parts = tuple(scatter.decorrelate(motor, self.jacobian.parts[motor]) for motor in motors)
+        residual = [scatter.decorrelate(motor, self.residual[None, own])[0] for motor, own in enumerate(rows)]
+        return replace(
+            self, jacobian=replace(self.jacobian, parts=parts), residual=np.concatenate(residual), scatter=scatter
+        )
+
+    def fitted(self) -> tuple[Linearisation, FloatArray]:
+        """The same around the best fit of its rows, and the step to it, shape (f,), in the scale of the unknowns."""
+        hessian = sum_of_squares(self.jacobian)
+        hessian[np.diag_indices_from(hessian)] *= 1.0 + RIDGE
+        step = linalg.cho_solve(linalg.cho_factor(hessian, lower=True), self.jacobian.on_columns(self.residual))
+        return replace(self, residual=self.residual - self.jacobian @ step), step
+
+    def decorrelated(self, columns: FloatArray) -> FloatArray:
+        """V^(−1/2) times columns, shape (rows,); the columns themselves where runs share no errors."""
+        if self.scatter is None:
+            return columns
+        parts = [
+            self.scatter.decorrelate(motor, columns[None, self.rows_of(motor)])[0] for motor in range(len(self.gamma))
+        ]
+        return np.concatenate(parts)
+
+    def correlated(self, columns: FloatArray) -> FloatArray:
+        """V times decorrelated columns, shape (rows,); the columns themselves where runs share no errors."""
+        if self.scatter is None:
+            return columns
+        parts = [
+            self.scatter.correlate(motor, columns[None, self.rows_of(motor)])[0] for motor in range(len(self.gamma))
+        ]
+        return np.concatenate(parts)
 
     def whitened(self, torque_nm: FloatArray, to_motor: FloatArray) -> FloatArray:
         """The same as columns beside the Jacobian, shape (rows, extra)."""
@@ -390,6 +451,8 @@ class Folds:
     part_score: FloatArray  #: Jᵀr of each fold and motor, shape (folds, m, f)
     motor_score: FloatArray  #: Jᵀe of each motor, shape (m, f)
     residual: FloatArray  #: r, the e of each row predicted by a fit that did not see its fold, shape (rows,)
+    #: Cholesky factor of the JᵀJ of the estimate, in which rows of a run share no errors.
+    estimate_factor: tuple[FloatArray, bool]
 
     @property
     def count(self) -> int:
@@ -421,7 +484,9 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
     fold_of = move_of % FOLDS
     motors, jacobian, width = len(problem.gamma), problem.jacobian, problem.jacobian.width
     order = np.lexsort((problem.cluster, fold_of[problem.cluster], problem.motor))
-    problem = replace(problem, **{name: getattr(problem, name)[order] for name in LINEARISATION_ROWS})
+    orders = [order[problem.rows_of(motor)] - problem.rows_of(motor).start for motor in range(motors)]
+    problem = _with_sorted_rows(problem, order, orders)
+    scatter = problem.scatter
     change = (np.diff(problem.cluster, prepend=-1) != 0) | (np.diff(problem.motor, prepend=-1) != 0)
     starts = np.flatnonzero(change)
     rows_of = (slice(int(a), int(b)) for a, b in pairwise((*starts, len(problem.motor))))
@@ -434,7 +499,7 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
     for i in np.unique(motor):
         here, whole, seen = motor == i, problem.rows_of(int(i)), jacobian.seen[i]
         equations = np.empty((len(seen) + 2, whole.stop - whole.start))
-        np.take(jacobian.parts[i], order[whole] - whole.start, axis=1, out=equations[:-2], mode="clip")
+        np.take(jacobian.parts[i], orders[i], axis=1, out=equations[:-2], mode="clip")
         sorted_parts[i], equations[-2] = equations[:-2], problem.residual[whole]
         own = MotorRows(
             int(i), whole, starts[here] - whole.start, fold_of[cluster[here]], cluster[here], seen, equations
@@ -449,12 +514,12 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
     by_fold = part_hessian.sum(axis=1)
     hessian, score = by_fold.sum(axis=0), motor_score.sum(axis=0)
     # Two effects may be nearly equal: regularise the direction in which they differ.
-    hessian[np.diag_indices_from(hessian)] *= 1.0 + 1e-10
+    hessian[np.diag_indices_from(hessian)] *= 1.0 + RIDGE
     factors, scores_without = [], []
     for k in range(FOLDS):
         rest = hessian - by_fold[k]
         # A direction that only this fold sees must not explode: it stays where the whole data put it.
-        rest[np.diag_indices_from(rest)] += 1e-10 * np.diag(hessian)
+        rest[np.diag_indices_from(rest)] += RIDGE * np.diag(hessian)
         factors.append(linalg.cho_factor(rest, lower=True))
         scores_without.append(score - cluster_score[fold_of == k].sum(axis=0))
     steps = [linalg.cho_solve(factor, part) for factor, part in zip(factors, scores_without, strict=True)]
@@ -466,14 +531,14 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
         residual[own.rows] = left
         parts = own.by_fold(own.sums(own.equations[:-2], left[None])[..., 0], FOLDS)
         part_score[:, own.motor][:, own.seen] = parts
+    problem = replace(problem, jacobian=replace(jacobian, parts=tuple(sorted_parts)))  # held once, by MotorRows
+    full_factor = (linalg.cho_factor(hessian, lower=True)[0], True)
     return Folds(
-        linearisation=replace(
-            problem, jacobian=replace(jacobian, parts=tuple(sorted_parts))
-        ),  # held once, by MotorRows
+        linearisation=problem,
         moves=moves,
         blocks=blocks,
         motors=tuple(by_motor),
-        full_factor=(linalg.cho_factor(hessian, lower=True)[0], True),
+        full_factor=full_factor,
         factors=tuple(factors),
         scores=np.stack(scores_without),
         cluster_hessian=cluster_hessian,
@@ -482,4 +547,20 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
         part_score=part_score,
         motor_score=motor_score,
         residual=residual,
+        estimate_factor=full_factor if scatter is None else _estimate_factor(problem, scatter, hessian),
     )
+
+
+def _with_sorted_rows(problem: Linearisation, order: IntArray, orders: Sequence[IntArray]) -> Linearisation:
+    """Sort everything but the Jacobian: all rows by one order, the scatter by those of each motor."""
+    sorted_rows = {name: getattr(problem, name)[order] for name in LINEARISATION_ROWS}
+    scatter = None if problem.scatter is None else problem.scatter.sorted(orders)
+    return replace(problem, scatter=scatter, **sorted_rows)
+
+
+def _estimate_factor(problem: Linearisation, scatter: RunScatter, hessian: FloatArray) -> tuple[FloatArray, bool]:
+    """Cholesky factor of J₀ᵀJ₀ = JᵀVJ, J = V^(−1/2) J₀ being the decorrelated Jacobian, from JᵀJ."""
+    whole = hessian.copy()
+    for motor, (part, seen) in enumerate(zip(problem.jacobian.parts, problem.jacobian.seen, strict=True)):
+        whole[np.ix_(seen, seen)] += scatter.shared(motor, part)
+    return linalg.cho_factor(whole, lower=True)[0], True

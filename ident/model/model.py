@@ -158,6 +158,14 @@ class Model:
         return JOINT_COLUMNS * np.array(self.robot.axis_joints) + len(LINK_PARAMETERS)
 
     @property
+    def friction_columns(self) -> IntArray:
+        """Columns of fv and fs of each axis, and of fvm and fsm of each motor that turns with several joints."""
+        of_axes = JOINT_COLUMNS * np.array(self.robot.axis_joints)[:, None] + np.array([11, 12])
+        first = JOINT_COLUMNS * self.robot.joint_count
+        of_coupled = first + 3 * np.arange(len(self.drive_train.coupled))[:, None] + np.array([1, 2])
+        return np.concatenate((of_axes.ravel(), of_coupled.ravel()))
+
+    @property
     def flange(self) -> slice:
         """The ten columns of the link that carries the payload; a payload on it has the same."""
         first = JOINT_COLUMNS * self.robot.carrier

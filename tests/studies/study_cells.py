@@ -26,14 +26,23 @@ class World:
     Attributes:
         noise_factor: of the current noise, against the clean cell.
         disturbance_percent: torque disturbance inside the position loop, root mean square in percent of rated torque.
+        friction_percent: standard deviation of each axis' friction from run to run, in percent; within a run it stays.
     """
 
     noise_factor: float
     disturbance_percent: float
+    friction_percent: float = 0.0
 
 
-WORLDS = {"measurement": World(1.59, 0.0), "loop3": World(1.0, 3.0), "loop8": World(1.0, 8.0)}
-"""The first leaves a relative error of 3.5 % without any effect (docs/evidence/estimators.md)."""
+WORLDS = {
+    "measurement": World(1.59, 0.0),
+    "loop3": World(1.0, 3.0),
+    "loop8": World(1.0, 8.0),
+    "runs": World(1.59, 0.0, 2.0),
+}
+"""The first leaves a relative error of 3.5 % without any effect (docs/evidence/estimators.md).
+
+The last has its noise, and friction that differs from run to run, as temperature and remounting make it."""
 CORRELATION_S = (0.002, 0.050)
 """Range of the disturbance's correlation time, drawn for each axis, logarithmically uniform [s]."""
 GAIN_SPREAD = 0.10
@@ -94,12 +103,14 @@ class StudyCell:
         noise_factor: of the current noise, against the clean cell.
         bare: without load.
         bodies: that can be mounted, by name.
+        friction_percent: standard deviation of each axis' friction from run to run.
     """
 
     seed: int
     noise_factor: float
     bare: CellSpec
     bodies: dict[str, Body]
+    friction_percent: float = 0.0
 
 
 def study_cell(seed: int, noise_factor: float = 1.0, disturbance_percent: float = 0.0) -> StudyCell:
@@ -147,7 +158,8 @@ def study_cell(seed: int, noise_factor: float = 1.0, disturbance_percent: float 
 def world_cell(seed: int, world: str) -> StudyCell:
     """Draw a cell of one of WORLDS."""
     chosen = WORLDS[world]
-    return study_cell(seed, chosen.noise_factor, chosen.disturbance_percent)
+    cell = study_cell(seed, chosen.noise_factor, chosen.disturbance_percent)
+    return replace(cell, friction_percent=chosen.friction_percent)
 
 
 def spec_of(cell: StudyCell, payload: str | None, run: int) -> CellSpec:
@@ -156,10 +168,24 @@ def spec_of(cell: StudyCell, payload: str | None, run: int) -> CellSpec:
     Args:
         cell: drawn.
         payload: name of the mounted body, or None.
-        run: each run of a cell has a noise of its own.
+        run: each run of a cell has a noise of its own, and a friction where it differs from run to run.
     """
     body = None if payload is None else cell.bodies[payload]
-    return replace(cell.bare, payload=body, seed=1000 * cell.seed + run)
+    rng = np.random.default_rng(np.random.SeedSequence(cell.seed, spawn_key=(5, run)))
+    factors = 1.0 + 0.01 * cell.friction_percent * rng.standard_normal(len(cell.bare.axes))
+    axes = tuple(_rubbing(axis, float(factor)) for axis, factor in zip(cell.bare.axes, factors, strict=True))
+    return replace(cell.bare, axes=axes, payload=body, seed=1000 * cell.seed + run)
+
+
+def _rubbing(axis: AxisSpec, factor: float) -> AxisSpec:
+    """The same axis with all of its friction times a factor."""
+    return replace(
+        axis,
+        viscous_nm_s_rad=factor * axis.viscous_nm_s_rad,
+        coulomb_nm=factor * axis.coulomb_nm,
+        motor_viscous_nm_s_rad=factor * axis.motor_viscous_nm_s_rad,
+        motor_coulomb_nm=factor * axis.motor_coulomb_nm,
+    )
 
 
 def truth_of(cell: StudyCell) -> Truth:

@@ -154,6 +154,16 @@ def test_cells_of_one_seed_have_one_truth_in_every_world() -> None:
         assert CORRELATION_S[0] <= min(times_s) < max(times_s) <= CORRELATION_S[1]
 
 
+def test_friction_differs_from_run_to_run_in_one_world_alone() -> None:
+    plain = spec_of(world_cell(7, "measurement"), None, 0)
+    ratios = []
+    for run in range(24):
+        assert spec_of(world_cell(7, "measurement"), None, run).axes == plain.axes
+        own = spec_of(world_cell(7, "runs"), None, run)
+        ratios += [one.coulomb_nm / same.coulomb_nm for one, same in zip(own.axes, plain.axes, strict=True)]
+    assert np.std(ratios) == pytest.approx(0.02, rel=0.25)  # of 144 draws
+
+
 @settings(max_examples=2)
 @given(seed=st.integers(0, 2**31))
 def test_blind_cells_are_the_same_however_many_are_drawn_and_can_be_built(seed: int) -> None:

@@ -33,6 +33,7 @@ from daq.report.html import page, paragraph, table
 from daq.report.plots import draw_fit
 from daq.report.residual import (
     _gear_sentence,
+    candidate_rows,
     error_change_text,
     headline,
     residual_document,
@@ -553,6 +554,39 @@ def test_a_strong_candidate_that_failed_a_check_is_named_with_it(closed: Closed)
         "J2: friction that grows with the load would explain 40 % of the squared residual, but failed a check: "
         "coefficient is -1 ± 0.1. The cause may be another one."
     ]
+
+
+def test_a_first_candidate_that_physics_alone_refuses_is_named_however_little_it_explains(closed: Closed) -> None:
+    first, last = closed.fitted.steps
+    why = "coefficient is -1 ± 0.1 ; physics allows no less than 0"
+    refused = replace(
+        _finding(PlacedEffect(LoadFriction(0), 1), passed=False), explained=0.1, refusals=(why,), impossible=why
+    )
+    second = replace(refused, effect=Spring())
+    noise = replace(refused, axis=2, refusals=("noise makes one as strong with p = 0.400", why))
+    asked = replace(closed.fitted, steps=(first, replace(last, findings=(refused, second, noise))))
+    sentences = [one for one in summary(asked, closed.account, ()) if "impossible" in one]
+    assert sentences == [
+        "J2: friction that grows with the load ranks first on this axis, but its sign or size is impossible: "
+        f"{why}. The cause may be another one."
+    ]
+    much = replace(asked, steps=(first, replace(last, findings=(replace(refused, explained=0.4),))))
+    assert len([one for one in summary(much, closed.account, ()) if why in one]) == 1
+
+
+def test_a_candidate_that_was_not_tested_has_no_probability(closed: Closed) -> None:
+    first, last = closed.fitted.steps
+    why = "it rests on two moves, too few to test it: record more moves with a large current of this axis"
+    untested = replace(
+        _finding(PlacedEffect(LoadFriction(0), 1), passed=False), probability=None, explained=0.4, refusals=(why,)
+    )
+    step = replace(last, findings=(untested,))
+    asked = replace(closed.fitted, steps=(first, step))
+    assert next(candidate_rows(asked, step, 1))[2] == "–"
+    (sentence,) = (one for one in summary(asked, closed.account, ()) if why in one)
+    assert "p =" not in sentence
+    document = residual_document(asked, closed.account, calibration_of(closed.fitted, CREATED))
+    assert document["turns"][-1]["findings"][0]["probability"] is None
 
 
 def test_a_name_that_structure_refutes_is_reported_with_what_it_depends_on(closed: Closed) -> None:

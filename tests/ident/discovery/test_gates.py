@@ -15,6 +15,7 @@ from ident.data.run import Run
 from ident.discovery import joining, loop
 from ident.discovery.candidates import SearchProblem, score_candidates
 from ident.discovery.evidence import Evidence, gather, with_effects
+from ident.discovery.few_moves import FEWEST_MOVES, moves_behind
 from ident.discovery.gates import (
     MIN_RUNS,
     Gates,
@@ -25,16 +26,13 @@ from ident.discovery.gates import (
     in_noise,
     moved_gains,
     runs_to_leave_out,
-    whitened_columns,
     without_effects_of,
 )
 from ident.discovery.joining import SetAside
 from ident.discovery.loop import find_effects
 from ident.discovery.search import (
-    FEWEST_MOVES,
     Finding,
     effect_key,
-    moves_behind,
     rank_effects,
     rank_families,
 )
@@ -109,19 +107,23 @@ def test_a_time_constant_is_no_longer_than_the_data(search_problem: SearchProble
     assert {finding.effect.name for finding in tried} == {"spring"}
 
 
-def test_a_candidate_that_rests_on_one_move_is_never_surprising_and_hides_no_other(
+def test_a_candidate_that_rests_on_one_move_is_not_tested_and_hides_no_other(
     search_problem: SearchProblem,
 ) -> None:
     position = np.concatenate([run.position_rad[1] for run in search_problem.rows])
     counted = position[search_problem.observation.use[1]]
     farthest = (Hinge(float(counted.max()) - 0.02, 1),)
     (family,) = search_problem.test((farthest,), 1)
-    assert moves_behind(family.members[0][1]) < FEWEST_MOVES
+    assert moves_behind(family.members[0][1].gram) < FEWEST_MOVES
     trials = [search_problem.test(((Spring(),),), 1)[0], family]
     ranked = rank_families(search_problem, trials, np.random.default_rng(0), GATES)
     judged = {found.effect.name: found.probability for found in ranked}
     only = rank_families(search_problem, trials[:1], np.random.default_rng(0), GATES)
-    assert judged == {"spring": only[0].probability, "hinge": 1.0}
+    assert judged == {"spring": only[0].probability, "hinge": None}
+    (hinge,) = (found for found in ranked if found.effect.name == "hinge")
+    assert hinge.refusals[0] == (
+        "it rests on three moves, too few to test it: record more moves to that end of the axis' range"
+    )
 
 
 def test_friction_against_temperature_is_tried_where_every_run_has_one_that_changes(
@@ -224,22 +226,17 @@ def test_an_error_on_runs_left_out_is_that_of_a_fit_of_the_others(search_problem
 
 
 def _levels(small: Evidence, truth: Truth, levels: tuple[float, ...]) -> SearchProblem:
-    """Dry friction of joint 2 that has another level in each run."""
+    """A spring at joint 2 that has another stiffness in each run."""
     names = [data.name for data in small.datasets]
-    start = bent(
-        small,
-        truth,
-        lambda data: acting_on(1, 3, levels[names.index(data.name)] * np.sign(data.velocity_rad_s[:, 1])),
-    )
+    start = bent(small, truth, lambda data: acting_on(1, 3, levels[names.index(data.name)] * data.position_rad[:, 1]))
     return search_problem_of(start)
 
 
 def _powers_of_the_run(problem: SearchProblem, powers: int) -> FloatArray:
-    """Friction of joint 2 as a polynomial of the run's number, whitened, shape (rows, powers)."""
-    linear = problem.folds.linearisation
-    run = problem.observation.run[linear.source].astype(np.float64)
-    rubbing = whitened_columns(problem, Stribeck(100.0), 1)  # sign(q̇), as good as
-    return np.asarray(rubbing * run[:, None] ** np.arange(1, powers + 1))
+    """The spring at joint 2 as a polynomial of the run's number, whitened, shape (rows, powers)."""
+    run = problem.observation.run.astype(np.float64)
+    torque = problem.torque(Spring(), 1)[:, :1] * run ** np.arange(1, powers + 1)[:, None]
+    return problem.folds.linearisation.whitened(torque, problem.model.drive_train.to_motor)
 
 
 @pytest.mark.parametrize(("levels", "powers"), [((4.0, -4.0, 4.0, -4.0), 3), ((0.0, 3.0, 6.0, 9.0), 1)])
@@ -319,7 +316,9 @@ def test_rivals_are_those_that_stop_passing_beside_it(small: Evidence, small_tru
 
     families = tuple(family for family in EFFECTS if family[0].name in {"hinge", "gravity-compensator", "stribeck"})
     start = bent(small, small_truth, torque)
-    steps = find_effects(start, np.random.default_rng(0), GATES, families)
+    # What the hinge leaves of the hump may not join: it lowers the error by two per cent.
+    gates = replace(GATES, error_fall=0.05, false_alarm=0.02)
+    steps = find_effects(start, np.random.default_rng(0), gates, families)
     first, second = steps[:2]
     assert first.accepted is not None
     assert first.accepted.ambiguity

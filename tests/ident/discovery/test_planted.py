@@ -13,9 +13,10 @@ from ident.data.dataset import Dataset
 from ident.data.run import Run
 from ident.discovery.candidates import ColumnCache
 from ident.discovery.evidence import Evidence, with_effects
+from ident.discovery.few_moves import FEWEST_MOVES, moves_behind
 from ident.discovery.gates import Gates
 from ident.discovery.loop import find_effects
-from ident.discovery.search import FEWEST_MOVES, moves_behind, rank_effects, rank_families
+from ident.discovery.search import rank_effects, rank_families
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect, Side
 from ident.effects.electrical import Lag, Saturation
@@ -362,7 +363,7 @@ def test_a_second_term_keeps_the_gain_of_a_saturated_motor(arm: Arm) -> None:
     """It rests on few moves, whose random signs test nothing: the first one says whether the effect is there."""
     planted = Planted("saturation", 2, lambda t: _saturated(t.motor_torque, GAINS[2], 12.0) - t.motor_torque, ())
     (family,) = search_problem_of(_with(arm, planted)).test((_family("saturation"),), 2)
-    first, both = (moves_behind(trial) for _, trial in family.members)
+    first, both = (moves_behind(trial.gram) for _, trial in family.members)
     assert both < FEWEST_MOVES < first
     found, plain, whole = _gain_errors(arm, planted, Saturation())
     assert found == Saturation(two_terms=1)

@@ -1,0 +1,132 @@
+"""Candidates that rest on few moves: tested without the moves of most leverage, or left untested with what to record.
+
+The moves' random signs tell noise from an effect by the scatter of moves. A candidate whose columns are large in one or
+two moves, as a saturation that only the largest currents reach, has no scatter to compare with: its statistic is large
+in half of the draws, true or not. So the moves of most leverage are left out, everything is projected and fitted again
+on the others, and these are tested where there are enough of them. What rests on few moves sets no limit for others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy import linalg
+
+from ident.arrays import FloatArray
+from ident.effects.effect import Effect
+from ident.effects.signals import Abscissa
+from ident.equations.linearisation import RIDGE, Folds
+
+FEWEST_MOVES = 3.0  #: Effective number of moves below which their random signs test nothing
+FEW_MOVES = (
+    8.0  #: The same below which a candidate sets no limit for others, and is tested without those of most leverage
+)
+SHARE = 0.01
+"""Share of Φ⊥ᵀΦ⊥ that the other moves must hold: with less they know the coefficients ten times worse, and a test by
+them says nothing."""
+LEVERAGE = 3  #: Moves left out then
+
+RECORD = {
+    Abscissa.VELOCITY: "moves at such speeds",
+    Abscissa.POSITION: "moves to that end of the axis' range",
+    Abscissa.LOAD: "moves with a large load torque on this axis",
+    Abscissa.TIME: "and longer runs",
+    Abscissa.SESSION: "runs, over a longer session",
+    Abscissa.MOTOR_ANGLE: "slow moves over the whole range of this axis",
+    Abscissa.CURRENT: "moves with a large current of this axis (fast starts and stops, or more payload)",
+    Abscissa.TORQUE_RATE: "moves with fast starts and stops of this axis",
+    Abscissa.LOAD_CURVATURE: "moves with fast starts and stops of this axis",
+    Abscissa.DISTANCE: "moves with reversals of this axis",
+    Abscissa.OTHER_VELOCITY: "moves of both joints at once",
+    Abscissa.TEMPERATURE: "runs at other temperatures",
+}
+"""What to record for an effect that shows itself against a variable."""
+NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
+
+
+class ByMove(Protocol):
+    """What a test needs of a candidate, by cluster; see `MoveScores`."""
+
+    @property
+    def score(self) -> FloatArray: ...
+    @property
+    def scatter(self) -> FloatArray: ...
+    @property
+    def gram(self) -> FloatArray: ...
+
+
+@dataclass(frozen=True, slots=True)
+class MoveScores:
+    """Projected products of a candidate, cluster by cluster; zero for clusters that were left out."""
+
+    score: FloatArray  #: Φ⊥ᵀe, shape (p,)
+    scatter: FloatArray  #: Φ⊥ᵀe of each cluster with the candidate fitted: its noise alone, shape (clusters, p)
+    gram: FloatArray  #: Φ⊥ᵀΦ⊥ of each cluster, shape (clusters, p, p)
+
+
+def moves_behind(gram: FloatArray) -> float:
+    """Effective number of moves that a candidate's columns rest on, (Σ G_m)²/Σ G_m², the least of its coefficients.
+
+    Args:
+        gram: Φ⊥ᵀΦ⊥ of each cluster, shape (clusters, p, p).
+    """
+    own = np.diagonal(gram, axis1=1, axis2=2)
+    squares = np.maximum(np.sum(own**2, axis=0), np.finfo(np.float64).tiny)
+    return float(np.min(own.sum(axis=0) ** 2 / squares))
+
+
+def without_most_leverage(
+    folds: Folds, crossed: FloatArray, squares: FloatArray, scores: FloatArray, projected: FloatArray
+) -> MoveScores | None:
+    """Fit everything again without the clusters of most leverage; None where the others do not show the candidate.
+
+    Args:
+        folds: the problem.
+        crossed: ΦᵀJ of each cluster, shape (clusters, p, f).
+        squares: ΦᵀΦ of each cluster, shape (clusters, p, p).
+        scores: Φᵀe of each cluster, shape (clusters, p).
+        projected: Φ⊥ᵀΦ⊥ of each cluster on all rows, shape (clusters, p, p).
+    """
+    share = np.einsum("mpq,qp->m", projected, np.linalg.pinv(projected.sum(axis=0)))
+    left = np.sort(np.argsort(share)[:-LEVERAGE])
+    hessian = folds.cluster_hessian[left].sum(axis=0)
+    diagonal = np.diag(folds.cluster_hessian.sum(axis=0))
+    factor = linalg.cho_factor(hessian + RIDGE * np.diag(diagonal), lower=True)
+    along = linalg.cho_solve(factor, crossed[left].sum(axis=0).T)
+    step = linalg.cho_solve(factor, folds.cluster_score[left].sum(axis=0))
+    pushed = folds.cluster_hessian[left] @ along
+    beside = crossed[left] @ along
+    gram = squares[left] - beside - np.swapaxes(beside, 1, 2) + np.einsum("fp,mfq->mpq", along, pushed)
+    own_score = scores[left] - crossed[left] @ step
+    declared_score = folds.cluster_score[left] - folds.cluster_hessian[left] @ step
+    score = own_score - declared_score @ along
+    whole = gram.sum(axis=0)
+    if np.any(np.diag(whole) < SHARE * np.diag(projected.sum(axis=0))):
+        return None
+    coefficients = np.linalg.pinv(whole) @ score.sum(axis=0)
+    scatter_of_all = np.zeros_like(scores)
+    scatter_of_all[left] = score - gram @ coefficients
+    gram_of_all = np.zeros_like(squares)
+    gram_of_all[left] = gram
+    return MoveScores(score.sum(axis=0), scatter_of_all, gram_of_all)
+
+
+def is_tested_on_others(rest: MoveScores | None) -> bool:
+    """Whether a candidate that rests on few moves rests on enough others, too, to be tested by these."""
+    return rest is not None and moves_behind(rest.gram) >= FEW_MOVES
+
+
+def what_to_record(effect: Effect, gram: FloatArray, rest: MoveScores | None) -> str:
+    """Say that a candidate rests on too few moves to be believed, and what to record.
+
+    Args:
+        effect: of the candidate.
+        gram: Φ⊥ᵀΦ⊥ of each cluster, shape (clusters, p, p).
+        rest: the candidate without the moves of most leverage.
+    """
+    count = max(round(moves_behind(gram)), 1)
+    noun = "move" if count == 1 else "moves"
+    why = "and the others do not show it" if is_tested_on_others(rest) else "too few to test it"
+    return f"it rests on {NUMBERS[count]} {noun}, {why}: record more {RECORD[effect.abscissa]}"
