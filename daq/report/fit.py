@@ -24,7 +24,7 @@ from daq.report.text import Sentence, percent_text, picked, plain_table
 from daq.workflow.calibration_file import as_document
 from daq.workflow.cases import CASES, CaseFit
 from daq.workflow.fit import DOUBTFUL_PERCENT, Fit
-from daq.workflow.geometry import hidden_zeros_text
+from daq.workflow.description import hidden_zeros_text
 from daq.workflow.nameplates import actual_current_note
 from daq.workflow.verdicts import needed_verdicts
 from ident.arrays import FloatArray

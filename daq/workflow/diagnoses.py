@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.config.cell import Cell, model_of, robot_of
-from daq.workflow.geometry import drift_diagnosis
+from daq.workflow.description import drift_diagnosis
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import Calibration
 from ident.data.dataset import differentiate

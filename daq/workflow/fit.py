@@ -26,7 +26,7 @@ from daq.workflow.declared_effects import (
     with_effects_of_cell,
 )
 from daq.workflow.diagnoses import Recordings, diagnose_fit, named_causes
-from daq.workflow.geometry import check_diagnoses, correction_diagnoses, geometry_beside, is_checked
+from daq.workflow.description import check_diagnoses, correction_diagnoses, geometry_beside, is_checked
 from daq.workflow.validate import diagnose_log
 from ident.calibration import Calibration, PayloadMass, Source
 from ident.calibration import calibration_of as identified_calibration
