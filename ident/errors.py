@@ -166,7 +166,7 @@ class Diagnosis:
     """Something wrong with a recording or fit that leaves usable numbers, and where to look."""
 
     #: One of axis-error, axis-idle, channels-exchanged, current-off-scale, current-reversed, estimators-disagree,
-    #: gain-off-nameplate, ill-conditioned, payload-differs, torque-above-limit.
+    #: gain-off-nameplate, geometry-off, ill-conditioned, length-off, payload-differs, torque-above-limit, zero-off.
     name: str
     runs: tuple[str, ...]  #: those it points at
     axes: tuple[str, ...]  #: likewise

@@ -11,7 +11,9 @@ The order of the judgements, causes before their traces:
    estimator does not converge, its causes are looked for in the logs: currents without a sign, exchanged currents.
 3. What is named (`ident.estimators.diagnosis.diagnose`): gains, estimators, payloads, errors, torques, condition.
 4. The same causes, where 3. named a trace of them, or the gains are fixed.
-5. Each held-out log.
+5. Zeros and lengths that the encoders contradict (`daq.workflow.geometry`), where there are more of them than degrees
+   of freedom: found before any torque is looked at, and named first.
+6. Each held-out log.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.config.cell import Cell, model_of, robot_of
+from daq.workflow.geometry import geometry_diagnoses
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import Calibration
 from ident.data.run import Run
@@ -49,6 +52,7 @@ from ident.prediction import mounted_parameters, standard_parameters
 
 if TYPE_CHECKING:  # which asks for these diagnoses
     from daq.workflow.validate import Validation
+    from ident.estimators.geometry import GeometryFinding
 
 ReadLog = Callable[[Path], tuple[Run, Cell]]  #: Reads a log, and the description of its cell
 
@@ -56,7 +60,15 @@ TRACES_OF_CURRENTS = {"axis-error", "current-reversed", "gain-off-nameplate"}
 """Diagnoses that exchanged currents, or currents without a sign, may leave. Fixed gains need not leave any."""
 
 
-def diagnose_fit(found: Identification, cell: Cell, logs: Sequence[Path], read: ReadLog) -> tuple[Diagnosis, ...]:
+def diagnose_fit(
+    found: Identification,
+    cell: Cell,
+    logs: Sequence[Path],
+    read: ReadLog,
+    geometry: GeometryFinding | None = None,
+    *,
+    corrected: bool = False,
+) -> tuple[Diagnosis, ...]:
     """Judge a fit by the recordings that it has used.
 
     Args:
@@ -64,6 +76,8 @@ def diagnose_fit(found: Identification, cell: Cell, logs: Sequence[Path], read: 
         cell: description of its cell.
         logs: of the fit; read again where exchanged currents, or currents without a sign, are looked for.
         read: reads a log as the fit did.
+        geometry: what the encoders say of the geometry; None for a robot without redundant ones.
+        corrected: the fit is one with the corrected geometry.
 
     Raises:
         PayloadUnseen, ModelContradicted: a mistake leaves no usable number.
@@ -76,7 +90,7 @@ def diagnose_fit(found: Identification, cell: Cell, logs: Sequence[Path], read: 
     suspect = any(one.name in TRACES_OF_CURRENTS for one in diagnoses)
     if suspect or found.estimate.gains_fixed:
         require_right_currents(logs, read, each=suspect)
-    return diagnoses
+    return (*geometry_diagnoses(geometry, cell, applied=corrected), *diagnoses)
 
 
 def diagnose_run(

@@ -26,21 +26,27 @@ from daq.workflow.declared_effects import (
     with_effects_of_cell,
 )
 from daq.workflow.diagnoses import currents_as_cause, diagnose_fit
+from daq.workflow.geometry import encoder_misfit_of
 from daq.workflow.validate import diagnose_log
+from ident.arrays import FloatArray
 from ident.calibration import Calibration, PayloadMass, Source
 from ident.calibration import calibration_of as identified_calibration
 from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
 from ident.discovery.before_after import error_on, holdout_change
 from ident.discovery.evidence import Evidence, gather, without_effects
+from ident.discovery.geometry import evidence_with_geometry, geometry_covariance, with_geometry_covariance
 from ident.discovery.loop import Step, find_effects
 from ident.effects.friction import TemperatureFriction
 from ident.errors import Diagnosis, IdentificationError, PayloadUnseen
 from ident.estimators.comparison import Comparison, compare
 from ident.estimators.estimate import Estimate, RelativeError, of_squares
+from ident.estimators.geometry import GeometryFinding, Positions, estimate_geometry, thinned
 from ident.estimators.identify import Identification, estimate_with, identify
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
+from ident.model.geometry_derivatives import corrected_model
+from ident.model.model import Model
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +68,15 @@ class Fit:
     torque_slopes: tuple[TorqueSlope | None, ...] = ()
     #: The operator takes effects that held-out runs refute: these have then taken part in the choice.
     accept_worse_holdout: bool = False
+    #: What the encoders say of the geometry; None for a robot without redundant ones.
+    geometry: GeometryFinding | None = None
+    #: Covariance that the corrected geometry adds to gains and parameters; None where the described one was used.
+    geometry_covariance: FloatArray | None = None
+
+    @property
+    def is_corrected(self) -> bool:
+        """Whether the identification is one with a corrected geometry."""
+        return self.geometry_covariance is not None
 
     @property
     def estimate(self) -> Estimate:
@@ -95,6 +110,7 @@ class Reading:
         self._read = read
         self._seen: dict[str, Path] = {}
         self._torques: list[tuple[TorqueChannel, ...]] = []
+        self._positions: list[Positions] = []
         self._corrections = Corrections()
 
     @classmethod
@@ -139,6 +155,8 @@ class Reading:
             self._seen[content] = log
             if run.torque_channels and role == "fit":
                 self._torques.append(run.torque_channels)
+            if self.cell.chain is not None and role == "fit":
+                self._positions.append(thinned(run))
             name, mass_kg = (None, None) if run.payload is None else (run.payload.name, run.payload.known.get("m"))
             self.sources.append(Source(run.name, run.digest, role, run.partial, name, mass_kg, run.recording))
             yield run
@@ -146,6 +164,14 @@ class Reading:
     def torque_slopes(self) -> tuple[TorqueSlope | None, ...]:
         """Slope of each axis's own torque over the runs of the fit; empty without such torques."""
         return tuple(torque_slope(channels) for channels in zip(*self._torques, strict=True))
+
+    def geometry(self, model: Model) -> GeometryFinding | None:
+        """What the encoders of the runs of the fit say of the geometry of a model.
+
+        Raises:
+            ModelError: the encoders contradict each other so much that no pose fits them.
+        """
+        return estimate_geometry(model, self._positions) if self._positions else None
 
 
 _LOG = logging.getLogger("drivegain")
@@ -214,8 +240,9 @@ def fit(
         effects = declared_effects(declared)
         if method is Method.IV:
             refuse_effects(declared, "--method iv")
+        model = model_of(declared)
         result = identify(
-            model_of(declared),
+            model,
             reading.runs(used, "fit"),
             declared.conditioning,
             holdout=reading.runs(unseen, "holdout"),
@@ -239,6 +266,7 @@ def fit(
             lossy=lossy,
             given_cell=cell,
             torque_slopes=reading.torque_slopes(),
+            geometry=reading.geometry(model),
         )
 
     chosen = method or (Method.WLS if gains_fixed else Method.ML)
@@ -268,7 +296,9 @@ def judged(fitted: Fit) -> Fit:
     Raises:
         IdentificationError: a mistake leaves no number that can be used.
     """
-    of_fit = diagnose_fit(fitted.final, fitted.cell, fitted.logs, fitted.read)
+    of_fit = diagnose_fit(
+        fitted.final, fitted.cell, fitted.logs, fitted.read, fitted.geometry, corrected=fitted.is_corrected
+    )
     calibration = _calibration(fitted)
     of_holdout: list[Diagnosis] = []
     for log in fitted.holdout:
@@ -314,6 +344,8 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
     Raises:
         IdentificationError: a refit failed.
     """
+    described = start.estimate
+    start = with_corrected_geometry(start)
     known = start.steps  # with what the cell declares
     evidence = known[-1].after if known else start.evidence()
     cold = [data.name for data in evidence.fit_runs if data.temperature_c is None]
@@ -327,11 +359,53 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
         evidence = with_declared_again(evidence, by_ml) if known else replace(evidence, estimate=by_ml)
     rng = np.random.default_rng(seed)
     steps = find_effects(evidence, rng, progress=progress, axes=start.cell.place_names)
+    if start.geometry_covariance is not None:
+        last = replace(steps[-1], after=evidence_with_geometry(steps[-1].after, start.geometry_covariance))
+        steps = (*steps[:-1], last)
     closed = replace(start, identification=before, steps=(*known, *steps))
-    if closed.estimate is start.estimate:
+    if closed.estimate is described:
         return closed
     with currents_as_cause(closed.logs, closed.read):
         return judged(closed)
+
+
+def with_corrected_geometry(start: Fit) -> Fit:
+    """Identify again with the zeros and lengths that the encoders show; the same fit where they contradict none.
+
+    The logs are read again. σ of the gains contains that of the geometry.
+
+    Raises:
+        DataError, IdentificationError: as for `fit`.
+    """
+    finding = start.geometry
+    if finding is None or not finding.corrections or start.is_corrected:
+        return start
+    cell = start.cell
+    model = model_of(cell)
+    effects = declared_effects(cell)
+    described = start.identification.estimate
+    result = identify(
+        corrected_model(model, finding.changes),
+        (start.read(log)[0] for log in start.logs),
+        cell.conditioning,
+        holdout=(start.read(log)[0] for log in start.holdout),
+        method=described.method,
+        fixed_gains=described.gains if described.gains_fixed else None,
+        keep_rows=True,
+        judge=not effects,
+        axes=cell.axis_names,
+    )
+    covariance = geometry_covariance(result, model, finding)
+    result = with_geometry_covariance(result, covariance)
+    steps = with_effects_of_cell(result, effects, cell.place_names) if effects else ()
+    last = steps[-1].after.identification if steps else result
+    return replace(
+        start,
+        identification=result,
+        steps=steps,
+        paper=None if described.gains_fixed else tls(last.system),
+        geometry_covariance=covariance,
+    )
 
 
 def check_holdout(fitted: Fit) -> None:
@@ -400,6 +474,7 @@ def _calibration(fitted: Fit) -> Calibration:
         sources=fitted.sources,
         configuration_sha256=cell.digest,
         recording_configuration_sha256=cell.recording_digest,
+        encoder_misfit=encoder_misfit_of(fitted.geometry, cell, applied=fitted.is_corrected),
     )
 
 
