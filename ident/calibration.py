@@ -126,13 +126,11 @@ class GeometryCorrection:
 
 @dataclass(frozen=True, slots=True)
 class EncoderMisfit:
-    """How well the encoders of a robot with more of them than degrees of freedom fit its loops, and why not better.
+    """How well the encoders of a robot with more of them than degrees of freedom fit its loops, and why not better."""
 
-    Misfits are root mean squares [rad, or of the robot's size].
-    """
-
-    described: float  #: with the described geometry
-    left: float  #: with the corrections; without any, the same
+    described: float  #: root mean square of the misfit with the described geometry [unit]
+    left: float  #: the same with the corrections; without any, with all zeros and lengths that fit best [unit]
+    unit: str  #: rad; with prismatic axes `rad or robot size`
     significant: bool  #: the described one is more than noise makes
     corrections: tuple[GeometryCorrection, ...]  #: the fewest numbers that explain it; empty without an explanation
     applied: bool  #: the gains and parameters of the calibration are those of the corrected geometry

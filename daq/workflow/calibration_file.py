@@ -132,6 +132,7 @@ class EncoderMisfitEntry(StrictModel):
 
     described: _Positive
     left: _Positive
+    unit: str
     significant: bool
     corrections: tuple[GeometryCorrectionEntry, ...]
     applied: bool

@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # who predicts with a calibration estimates no geometry
 
 NAMES = {GeometryKind.ZERO: "zero-off", GeometryKind.LENGTH: "length-off"}  #: Diagnoses of one wrong number
 SEVERAL = "geometry-off"  #: Diagnosis of several, and of a misfit without an explanation
+ANGLE = "rad"  #: Unit of misfits of a robot without prismatic axes
 _SHOWN_ALTERNATIVES = 3
 
 
@@ -36,12 +37,12 @@ def geometry_diagnoses(finding: GeometryFinding | None, cell: Cell, *, applied: 
     """
     if finding is None or not finding.is_significant:
         return
-    model = model_of(cell)
-    misfit = f"encoders that miss the loops by {misfit_text(finding.misfit, model)}"
-    expected = f"{misfit_text(finding.misfit_left, model)}, as with zeros and lengths that fit them"
+    unit = _misfit_unit(model_of(cell))
+    misfit = f"encoders that miss the loops by {misfit_text(finding.misfit, unit)}"
+    expected = f"{misfit_text(finding.misfit_left, unit)}, as with zeros and lengths that fit them"
     used = "the gains are those of the corrected geometry"
     if not applied:
-        used = "the gains are those of the described geometry, and off: `drivegain residual` corrects it"
+        used = "the gains are those of the described geometry: `drivegain residual` identifies with the corrected one"
     if not finding.corrections:
         yield Diagnosis(
             name=SEVERAL,
@@ -49,7 +50,7 @@ def geometry_diagnoses(finding: GeometryFinding | None, cell: Cell, *, applied: 
             axes=(),
             found=f"{misfit}, which no three zeros or lengths explain",
             expected=expected,
-            remedy="measure zeros and lengths, and correct the cell file and the URDF; the gains are off",
+            remedy="measure zeros and lengths, and correct cell file and URDF; the gains are those of the described ones",
         )
         return
     texts = [_correction_text(one, cell) for one in finding.corrections]
@@ -69,11 +70,15 @@ def geometry_diagnoses(finding: GeometryFinding | None, cell: Cell, *, applied: 
     )
 
 
-def misfit_text(misfit: float, model: Model) -> str:
-    """Write a misfit in mrad, or in thousandths where an axis is prismatic."""
+def _misfit_unit(model: Model) -> str:
+    """Unit of misfits: that of the axes, or a share of the robot's size too."""
     kinds = {joint.kind for joint in model.robot.axes}
-    unit = "mrad" if kinds == {JointKind.REVOLUTE} else "‰ (rad, or of the robot's size)"
-    return f"{1e3 * misfit:.2g} {unit}"
+    return ANGLE if kinds == {JointKind.REVOLUTE} else "rad or robot size"
+
+
+def misfit_text(misfit: float, unit: str) -> str:
+    """Write a misfit [unit] in thousandths."""
+    return f"{1e3 * misfit:.2g} {'mrad' if unit == ANGLE else f'thousandths ({unit})'}"
 
 
 def _axes_of(corrections: Sequence[GeometryEstimate], cell: Cell) -> Iterator[str]:
@@ -132,6 +137,7 @@ def encoder_misfit_of(finding: GeometryFinding | None, cell: Cell, *, applied: b
     return EncoderMisfit(
         described=_rounded(finding.misfit),
         left=_rounded(finding.misfit_left),
+        unit=_misfit_unit(model),
         significant=finding.is_significant,
         corrections=tuple(_kept(one, cell, model) for one in finding.corrections),
         applied=applied,
