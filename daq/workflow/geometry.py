@@ -50,7 +50,7 @@ def geometry_diagnoses(finding: GeometryFinding | None, cell: Cell, *, applied: 
             axes=(),
             found=f"{misfit}, which no three zeros or lengths explain",
             expected=expected,
-            remedy="measure zeros and lengths, and correct cell file and URDF; the gains are those of the described ones",
+            remedy="measure zeros and lengths, and correct cell file and URDF; the gains are those of the described",
         )
         return
     texts = [_correction_text(one, cell) for one in finding.corrections]
@@ -150,7 +150,7 @@ def _kept(one: GeometryEstimate, cell: Cell, model: Model) -> GeometryCorrection
     parameter = one.parameter
     if parameter.kind is GeometryKind.ZERO:
         axis = _axis_of(parameter, model)
-        described = cell.axes[axis].zero_offset_rad
+        described = float(cell.axes[axis].zero_offset_rad)
         unit = "rad" if model.robot.axes[axis].kind is JointKind.REVOLUTE else "m"
     else:
         described = described_length(model.robot, parameter)

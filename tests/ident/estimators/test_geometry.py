@@ -1,4 +1,4 @@
-"""Zeros and lengths from redundant encoders: one wrong number is named with its σ, and a right description says nothing."""
+"""Zeros and lengths from redundant encoders: one wrong number is named, and a right description says nothing."""
 
 from __future__ import annotations
 
