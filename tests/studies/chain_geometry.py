@@ -1,4 +1,4 @@
-"""A redundant drive whose zeros or rods are not as described, over the whole driver path: what `fit` and `residual` say.
+"""A redundant drive whose zero or rod is not as described, over the whole driver path: what `fit` and `residual` say.
 
     python -m tests.studies.chain_geometry --seeds 1
 
