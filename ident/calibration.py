@@ -112,6 +112,33 @@ class PayloadMass:
 
 
 @dataclass(frozen=True, slots=True)
+class GeometryCorrection:
+    """A number of the robot's description that the encoders contradict."""
+
+    kind: str  #: `zero` of a joint, or `length` of a link
+    joint: str  #: name of the joint with the zero, or of the one that moves the link
+    end: str  #: of a length: name of the joint or of the closure at the other end of the link; empty for a zero
+    described: float  #: as the fit found it described: the zero offset, or the length [unit]
+    change: float  #: what has to be added to it [unit]
+    std: float  #: σ of the change [unit]
+    unit: str  #: rad or m
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderMisfit:
+    """How well the encoders of a robot with more of them than degrees of freedom fit its loops, and why not better."""
+
+    described: float  #: root mean square of the misfit with the described geometry [unit]
+    left: float  #: the same with the corrections; without any, with all zeros and lengths that fit best [unit]
+    unit: str  #: rad; with prismatic axes `rad or robot size`
+    significant: bool  #: the described one is more than noise makes
+    corrections: tuple[GeometryCorrection, ...]  #: the fewest numbers that explain it; empty without an explanation
+    applied: bool  #: the gains and parameters of the calibration are those of the corrected geometry
+    alternatives: tuple[str, ...] = ()  #: other explanations that these positions cannot distinguish from it
+    unobservable: tuple[str, ...] = ()  #: directions of zeros and lengths that no position shows
+
+
+@dataclass(frozen=True, slots=True)
 class Source:
     """One log that the calibration rests on."""
 
@@ -164,6 +191,8 @@ class Calibration:
     #: How the gains depend on the mass of each payload whose mass is known; empty for fixed gains, and in calibrations
     #: of earlier versions.
     payload_mass: tuple[PayloadMass, ...] = ()
+    #: Of a robot with more encoders than degrees of freedom; None for others, and in calibrations of earlier versions.
+    encoder_misfit: EncoderMisfit | None = None
 
     @property
     def places(self) -> tuple[str, ...]:

@@ -171,8 +171,8 @@ class Diagnosis:
     """Something wrong with a recording or fit that leaves usable numbers, and where to look."""
 
     #: One of axis-error, axis-idle, channels-exchanged, current-off-scale, current-reversed, estimators-disagree,
-    #: gain-off-nameplate, gravity-tilted, gravity-turned, ill-conditioned, payload-differs, position-late,
-    #: position-reversed, torque-above-limit, zero-off.
+    #: gain-off-nameplate, geometry-off, gravity-tilted, gravity-turned, ill-conditioned, length-off, payload-differs,
+    #: position-late, position-reversed, torque-above-limit, zero-off.
     name: str
     runs: tuple[str, ...]  #: those it points at
     axes: tuple[str, ...]  #: likewise

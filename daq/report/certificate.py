@@ -19,7 +19,7 @@ from daq.errors import CalibrationRefused, DaqError
 from daq.ledger.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, judge, noise_note, query_history
 from daq.report.effect_names import accepted_text, size_text
 from daq.report.fit import error_document
-from daq.report.gains import mass_texts
+from daq.report.gains import encoder_text, mass_texts
 from daq.report.proposal import refusal_document
 from daq.report.text import picked
 from daq.writeback.file_target import FileEdit, FileTarget
@@ -282,7 +282,10 @@ def _require_whole(calibration: Calibration) -> None:
 
 
 def identity(calibration: Calibration) -> tuple[tuple[str, str], ...]:
-    """Cell, drives, operator, payload, dates and software as pairs of name and text; what is missing is said."""
+    """Cell, drives, operator, payload, dates, encoders and software as pairs of name and text; what is missing is said.
+
+    Encoders are there where the robot has more of them than degrees of freedom.
+    """
     recordings = [source.recording for source in calibration.sources if source.recording is not None]
     operators = sorted({one.operator for one in recordings if one.operator})
     times = sorted(one.recorded_s for one in recordings if one.recorded_s is not None)
@@ -295,11 +298,14 @@ def identity(calibration: Calibration) -> tuple[tuple[str, str], ...]:
     # Calibrations of earlier versions do not say more.
     influences = influences or "a wrong mass changes every gain, by the same share where nothing else of it is known"
     weighed = f"{payloads}; {influences}" if payloads and not calibration.gains_fixed else payloads
+    misfit = calibration.encoder_misfit
+    encoders = () if misfit is None else (("Encoders", encoder_text(misfit)),)
     return (
         ("Serial numbers", _serials(calibration)),
         ("Operator", ", ".join(operators) or "not known: the recordings name none"),
         ("Payload", weighed or "none: every run was recorded without load"),
         ("Recorded", f"{between} UTC" if between else "not known: the logs have no time of day"),
+        *encoders,
         ("Fitted", f"{_minute(calibration.created)}, {calibration.software or 'software not known'}"),
     )
 
@@ -362,6 +368,7 @@ def certificate_document(certificate: Certificate) -> dict[str, Any]:
         "nameplate_holdout_error_percent": error_document(calibration.nameplate_holdout_error_percent),
         "relative_error_percent": error_document(calibration.relative_error_percent),
         "payload_mass": [asdict(one) for one in calibration.payload_mass],
+        "encoder_misfit": None if calibration.encoder_misfit is None else asdict(calibration.encoder_misfit),
         "effects": [
             {
                 "axis": effect.axis,

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from daq.config.yaml_file import StrictModel
 from daq.report.fit_schemas import Errors, Figure
-from ident.calibration import PayloadMass
+from ident.calibration import EncoderMisfit, PayloadMass
 
 
 class Refused(StrictModel):
@@ -163,6 +163,7 @@ class CertificateReport(StrictModel):
     nameplate_holdout_error_percent: Errors | None
     relative_error_percent: Errors
     payload_mass: tuple[PayloadMass, ...] = ()
+    encoder_misfit: EncoderMisfit | None = None
     effects: list[CertifiedEffect]
     beside: EarlierCalibration | None
 

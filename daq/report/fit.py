@@ -23,8 +23,8 @@ from daq.report.gains import (
 from daq.report.text import Sentence, percent_text, picked, plain_table
 from daq.workflow.calibration_file import as_document
 from daq.workflow.cases import CASES, CaseFit
-from daq.workflow.fit import DOUBTFUL_PERCENT, Fit
 from daq.workflow.description import hidden_zeros_text
+from daq.workflow.fit import DOUBTFUL_PERCENT, Fit
 from daq.workflow.nameplates import actual_current_note
 from daq.workflow.verdicts import needed_verdicts
 from ident.arrays import FloatArray
@@ -71,7 +71,7 @@ def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | 
         f"{estimate.condition:.0f}; position filter {filter_.position_cutoff_hz:g} Hz, decimation "
         f"{filter_.decimation_cutoff_hz:g} Hz. Compare relative errors only under the same filters."
     )
-    yield from map(Sentence, geometry_notes(fitted.geometry, axes))
+    yield from map(Sentence, geometry_notes(fitted.description, axes))
     yield from map(Sentence, identifiability_notes(fitted, calibration.payload_mass))
     yield from map(Sentence, advice(fitted, needed_verdicts(fitted)))
     if comparison is not None:
@@ -128,7 +128,7 @@ def fit_document(found: CaseFit, calibration: Calibration, comparison: Compariso
     return {
         **as_document(calibration),
         "compared": compared,
-        "geometry": geometry_document(fitted.geometry, axes),
+        "geometry": geometry_document(fitted.description, axes),
         **(
             {"torque_channel": torque_document(fitted.torque_slopes, calibration.gains)} if fitted.torque_slopes else {}
         ),

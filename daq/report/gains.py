@@ -11,7 +11,8 @@ from rich.table import Table
 
 from daq.report.picture import BLUE, GREEN, GREY, legend_below, render, single
 from daq.report.text import SHOWN_SIGMAS, plain_table, terminal_text
-from ident.calibration import Calibration, Gain, PayloadMass
+from daq.workflow.geometry import misfit_text
+from ident.calibration import Calibration, EncoderMisfit, Gain, GeometryCorrection, PayloadMass
 from ident.data.torque_channel import TorqueSlope
 from ident.errors import Diagnosis
 
@@ -134,6 +135,31 @@ def partial_note(calibration: Calibration) -> str | None:
 def diagnosis_texts(diagnoses: Iterable[Diagnosis]) -> tuple[str, ...]:
     """One sentence for each diagnosis, for a view or a page."""
     return tuple(f"CHECK {one.text}." for one in diagnoses)
+
+
+def encoder_text(misfit: EncoderMisfit) -> str:
+    """Say how well redundant encoders fit the loops, what would explain their misfit, and which geometry was used."""
+    described = misfit_text(misfit.described, misfit.unit)
+    if not misfit.significant:
+        return f"fit the loops of the described geometry within {described}"
+    left = misfit_text(misfit.left, misfit.unit)
+    if not misfit.corrections:
+        return f"miss the loops by {described}; no three zeros or lengths explain it, all together leave {left}"
+    texts = " and ".join(map(_correction_text, misfit.corrections))
+    others = f", or by {'; or by '.join(misfit.alternatives)}" if misfit.alternatives else ""
+    used = "corrected" if misfit.applied else "described"
+    return (
+        f"miss the loops by {described}, explained by {texts}{others}, which leaves {left}; the gains are those of the "
+        f"{used} geometry"
+    )
+
+
+def _correction_text(one: GeometryCorrection) -> str:
+    """Write what has to be added to a number of the description."""
+    scale = 180.0 / math.pi if one.unit == "rad" else 1e3
+    unit = "deg" if one.unit == "rad" else "mm"
+    place = one.joint if not one.end else f"{one.joint} to {one.end}"
+    return f"the {one.kind} of {place} {scale * one.change:+.4f} ± {max(scale * one.std, 5e-5):.4f} {unit}"
 
 
 def mass_texts(influences: Iterable[PayloadMass]) -> tuple[str, ...]:

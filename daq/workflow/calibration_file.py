@@ -22,7 +22,17 @@ from daq.config.cell_schema import CUTOFF_HZ, FILTER_ORDER
 from daq.config.yaml_file import MAX_BYTES, StrictModel, parse_yaml, read_model
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, SchemaMismatch, YamlInvalid
 from daq.files import read_regular, replace_file
-from ident.calibration import AcceptedEffect, Calibration, Gain, MassInfluence, Parameter, PayloadMass, Source
+from ident.calibration import (
+    AcceptedEffect,
+    Calibration,
+    EncoderMisfit,
+    Gain,
+    GeometryCorrection,
+    MassInfluence,
+    Parameter,
+    PayloadMass,
+    Source,
+)
 from ident.errors import Diagnosis
 from ident.estimators.estimate import RelativeError
 
@@ -105,6 +115,31 @@ class PayloadMassEntry(StrictModel):
     gains: tuple[MassInfluenceEntry, ...]
 
 
+class GeometryCorrectionEntry(StrictModel):
+    """One number of the robot's description that the encoders contradict."""
+
+    kind: Literal["zero", "length"]
+    joint: str
+    end: str
+    described: _Number
+    change: _Number
+    std: _Positive
+    unit: Literal["rad", "m"]
+
+
+class EncoderMisfitEntry(StrictModel):
+    """How well redundant encoders fit the loops of the robot."""
+
+    described: _Positive
+    left: _Positive
+    unit: str
+    significant: bool
+    corrections: tuple[GeometryCorrectionEntry, ...]
+    applied: bool
+    alternatives: tuple[str, ...]
+    unobservable: tuple[str, ...]
+
+
 class CalibrationBody(StrictModel):
     """Schema of a calibration, without the envelope of a file."""
 
@@ -131,6 +166,7 @@ class CalibrationBody(StrictModel):
     current_residual: tuple[_Positive, ...] | None = None
     passive_joints: tuple[str, ...] = ()
     payload_mass: tuple[PayloadMassEntry, ...] = ()
+    encoder_misfit: EncoderMisfitEntry | None = None
 
     @model_validator(mode="after")
     def _check_axes_of_payload_mass(self) -> Self:
@@ -156,6 +192,8 @@ _CLASSES: dict[type, type] = {
     EffectEntry: AcceptedEffect,
     MassInfluenceEntry: MassInfluence,
     PayloadMassEntry: PayloadMass,
+    GeometryCorrectionEntry: GeometryCorrection,
+    EncoderMisfitEntry: EncoderMisfit,
 }
 
 

@@ -19,6 +19,7 @@ from ident.calibration import Calibration, Parameter, Source, factor_of
 from ident.equations.reduction import Reduction, reduce_runs
 from ident.equations.system import require_distinct
 from ident.estimators.comparison import Essential, essential
+from ident.estimators.geometry import GeometryFinding
 from ident.estimators.identify import Identification, each_run, estimate_with
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
@@ -57,6 +58,7 @@ class ReducedLogs:
     sources: tuple[Source, ...]  #: all of them, with digests and roles
     used: Reduction  #: rows of `logs`, reduced
     unseen: Reduction  #: rows of `holdout`, reduced
+    geometry: GeometryFinding | None = None  #: what redundant encoders say of the geometry
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +87,9 @@ def reduce_logs(
     used = reduce_runs(model, reading.runs(logs, "fit"), conditioning, instruments=instruments)
     rest = each_run(reading.runs(holdout, "holdout"), used.payloads)
     unseen = reduce_runs(model, rest, conditioning, payloads=used.payloads)
-    return ReducedLogs(reading.cell, tuple(logs), tuple(holdout), tuple(reading.sources), used, unseen)
+    return ReducedLogs(
+        reading.cell, tuple(logs), tuple(holdout), tuple(reading.sources), used, unseen, reading.geometry(model)
+    )
 
 
 def fit_case(
@@ -106,7 +110,17 @@ def fit_case(
     rest = unseen.system(system.base, system.payload_columns) if unseen.runs else None
     result = Identification(used.model, used.conditioning, system, rest, estimate)
     paper = None if gains_fixed else tls(system)
-    start = Fit(logs.cell, logs.logs, logs.holdout, logs.sources, result, (), paper, given_cell=logs.cell)
+    start = Fit(
+        cell=logs.cell,
+        logs=logs.logs,
+        holdout=logs.holdout,
+        sources=logs.sources,
+        identification=result,
+        steps=(),
+        paper=paper,
+        given_cell=logs.cell,
+        geometry=logs.geometry,
+    )
     with named_causes(start.recordings):
         fitted = judged(start)
     if ratio is None:

@@ -14,7 +14,9 @@ The order of the judgements, causes before their traces:
    is said of a fit in a wrong geometry, because all of it would be wrong.
 4. What is named (`ident.estimators.diagnosis.diagnose`): gains, estimators, payloads, errors, torques, condition.
 5. Currents without a sign and exchanged ones, where 4. named a trace of them, or the gains are fixed.
-6. Each held-out log.
+6. Zeros and lengths that the encoders contradict (`daq.workflow.geometry`), where there are more of them than degrees
+   of freedom: found before any torque is looked at, and named first.
+7. Each held-out log.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ import numpy as np
 
 from daq.config.cell import Cell, model_of, robot_of
 from daq.workflow.description import drift_diagnosis
+from daq.workflow.geometry import geometry_diagnoses
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import Calibration
 from ident.data.dataset import differentiate
@@ -64,6 +67,7 @@ from ident.prediction import mounted_parameters, standard_parameters
 
 if TYPE_CHECKING:  # which asks for these diagnoses
     from daq.workflow.validate import Validation
+    from ident.estimators.geometry import GeometryFinding
 
 ReadLog = Callable[[Path], tuple[Run, Cell]]  #: Reads a log, and the description of its cell
 
@@ -88,7 +92,13 @@ class Recordings:
 
 
 def diagnose_fit(
-    found: Identification, cell: Cell, recordings: Recordings, instants: Sequence[Instants]
+    found: Identification,
+    cell: Cell,
+    recordings: Recordings,
+    instants: Sequence[Instants],
+    geometry: GeometryFinding | None = None,
+    *,
+    corrected: bool = False,
 ) -> tuple[Diagnosis, ...]:
     """Judge a fit by the recordings that it has used.
 
@@ -97,6 +107,8 @@ def diagnose_fit(
         cell: description of its cell.
         recordings: of the fit.
         instants: a few rows of each; taken from the logs where there are none.
+        geometry: what the encoders say of the geometry; None for a robot without redundant ones.
+        corrected: the fit is one with the corrected geometry.
 
     Raises:
         PayloadUnseen, ModelContradicted: a mistake leaves no usable number.
@@ -112,7 +124,7 @@ def diagnose_fit(
     suspect = any(one.name in TRACES_OF_CURRENTS for one in diagnoses)
     if suspect or found.estimate.gains_fixed:
         require_right_currents(recordings, each=suspect)
-    return diagnoses
+    return (*geometry_diagnoses(geometry, cell, applied=corrected), *diagnoses)
 
 
 def nameplate_of(cell: Cell) -> FloatArray:

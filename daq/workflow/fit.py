@@ -25,25 +25,31 @@ from daq.workflow.declared_effects import (
     with_declared_again,
     with_effects_of_cell,
 )
-from daq.workflow.diagnoses import Recordings, diagnose_fit, named_causes
 from daq.workflow.description import check_diagnoses, correction_diagnoses, geometry_beside, is_checked
+from daq.workflow.diagnoses import Recordings, diagnose_fit, named_causes
+from daq.workflow.geometry import encoder_misfit_of
 from daq.workflow.validate import diagnose_log
+from ident.arrays import FloatArray
 from ident.calibration import Calibration, PayloadMass, Source
 from ident.calibration import calibration_of as identified_calibration
 from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
 from ident.discovery.before_after import error_on, holdout_change
 from ident.discovery.evidence import Evidence, gather, without_effects
+from ident.discovery.geometry import evidence_with_geometry, geometry_covariance, with_geometry_covariance
 from ident.discovery.geometry_check import GeometryCheck
 from ident.discovery.loop import Step, find_effects
 from ident.effects.friction import TemperatureFriction
 from ident.errors import Diagnosis, IdentificationError, PayloadUnseen
 from ident.estimators.comparison import Comparison, compare
 from ident.estimators.estimate import Estimate, RelativeError, of_squares
+from ident.estimators.geometry import GeometryFinding, Positions, estimate_geometry, thinned
 from ident.estimators.identify import Identification, estimate_with, identify
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
 from ident.estimators.turned_geometry import GEOMETRY
+from ident.model.geometry_derivatives import corrected_model
+from ident.model.model import Model
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +71,17 @@ class Fit:
     torque_slopes: tuple[TorqueSlope | None, ...] = ()
     #: The operator takes effects that held-out runs refute: these have then taken part in the choice.
     accept_worse_holdout: bool = False
-    geometry: GeometryCheck | None = None  #: of the declared geometry; None where it was not tested
+    description: GeometryCheck | None = None  #: zeros, mounting and clocks by torque; None where it was not tested
     channels_as_wired: bool = False  #: the operator says that no currents are exchanged
+    #: What the encoders say of the geometry; None for a robot without redundant ones.
+    geometry: GeometryFinding | None = None
+    #: Covariance that the corrected geometry adds to gains and parameters; None where the described one was used.
+    geometry_covariance: FloatArray | None = None
+
+    @property
+    def is_corrected(self) -> bool:
+        """Whether the identification is one with a corrected geometry."""
+        return self.geometry_covariance is not None
 
     @property
     def estimate(self) -> Estimate:
@@ -105,6 +120,7 @@ class Reading:
         self._read = read
         self._seen: dict[str, Path] = {}
         self._torques: list[tuple[TorqueChannel, ...]] = []
+        self._positions: list[Positions] = []
         self._corrections = Corrections()
 
     @classmethod
@@ -149,6 +165,8 @@ class Reading:
             self._seen[content] = log
             if run.torque_channels and role == "fit":
                 self._torques.append(run.torque_channels)
+            if self.cell.chain is not None and role == "fit":
+                self._positions.append(thinned(run))
             name, mass_kg = (None, None) if run.payload is None else (run.payload.name, run.payload.known.get("m"))
             self.sources.append(Source(run.name, run.digest, role, run.partial, name, mass_kg, run.recording))
             yield run
@@ -156,6 +174,14 @@ class Reading:
     def torque_slopes(self) -> tuple[TorqueSlope | None, ...]:
         """Slope of each axis's own torque over the runs of the fit; empty without such torques."""
         return tuple(torque_slope(channels) for channels in zip(*self._torques, strict=True))
+
+    def geometry(self, model: Model) -> GeometryFinding | None:
+        """What the encoders of the runs of the fit say of the geometry of a model.
+
+        Raises:
+            ModelError: the encoders contradict each other so much that no pose fits them.
+        """
+        return estimate_geometry(model, self._positions) if self._positions else None
 
 
 _LOG = logging.getLogger("drivegain")
@@ -226,8 +252,9 @@ def fit(
         effects = declared_effects(declared)
         if method is Method.IV:
             refuse_effects(declared, "--method iv")
+        model = model_of(declared)
         result = identify(
-            model_of(declared),
+            model,
             reading.runs(used, "fit"),
             declared.conditioning,
             holdout=reading.runs(unseen, "holdout"),
@@ -252,6 +279,7 @@ def fit(
             given_cell=cell,
             torque_slopes=reading.torque_slopes(),
             channels_as_wired=channels_as_wired,
+            geometry=reading.geometry(model),
         )
 
     chosen = method or (Method.WLS if gains_fixed else Method.ML)
@@ -282,14 +310,21 @@ def judged(fitted: Fit) -> Fit:
     Raises:
         IdentificationError: a mistake leaves no number that can be used.
     """
-    fitted = with_geometry(fitted)
-    of_geometry = geometry_diagnoses(fitted)
+    fitted = with_description(fitted)
+    of_description = description_diagnoses(fitted)
     recordings = fitted.recordings
-    if of_geometry:  # what is wrong with the description must not be blamed on the wiring
+    if of_description:  # what is wrong with the description must not be blamed on the wiring
         recordings = replace(recordings, channels_as_wired=True)
-    of_fit = diagnose_fit(fitted.final, fitted.cell, recordings, fitted.identification.instants)
+    of_fit = diagnose_fit(
+        fitted.final,
+        fitted.cell,
+        recordings,
+        fitted.identification.instants,
+        fitted.geometry,
+        corrected=fitted.is_corrected,
+    )
     if not any(one.name in GEOMETRY for one in of_fit):
-        of_fit = (*of_geometry, *of_fit)
+        of_fit = (*of_description, *of_fit)
     calibration = replace(_calibration(fitted), diagnoses=of_fit)
     of_holdout: list[Diagnosis] = []
     for log in fitted.holdout:
@@ -298,22 +333,22 @@ def judged(fitted: Fit) -> Fit:
     return replace(fitted, diagnoses=(*of_fit, *of_holdout))
 
 
-def with_geometry(fitted: Fit) -> Fit:
+def with_description(fitted: Fit) -> Fit:
     """Test the declared geometry beside a fit that has kept its rows; a search has tested it itself."""
-    if fitted.geometry is not None or fitted.identification.gathered is None:
+    if fitted.description is not None or fitted.identification.gathered is None:
         return fitted
     evidence = fitted.steps[-1].after if fitted.steps else fitted.evidence()
-    return replace(fitted, geometry=geometry_beside(evidence, BOOTSTRAP_SEED))
+    return replace(fitted, description=geometry_beside(evidence, BOOTSTRAP_SEED))
 
 
-def geometry_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
+def description_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
     """What a fit says of the declared geometry: corrections of its search, or else what the test beside it found."""
     runs = fitted.identification.system.runs
     if fitted.steps:
         return correction_diagnoses(fitted.steps[-1].after, fitted.cell, runs)
-    if fitted.geometry is None:
+    if fitted.description is None:
         return ()
-    return check_diagnoses(fitted.geometry, fitted.cell, fitted.identification.model, runs)
+    return check_diagnoses(fitted.description, fitted.cell, fitted.identification.model, runs)
 
 
 def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: None) -> Comparison:
@@ -353,6 +388,8 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
     Raises:
         IdentificationError: a refit failed.
     """
+    described = start.estimate
+    start = with_corrected_geometry(start)
     known = start.steps  # with what the cell declares
     evidence = known[-1].after if known else start.evidence()
     cold = [data.name for data in evidence.fit_runs if data.temperature_c is None]
@@ -366,11 +403,53 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
         evidence = with_declared_again(evidence, by_ml) if known else replace(evidence, estimate=by_ml)
     rng = np.random.default_rng(seed)
     steps = find_effects(evidence, rng, progress=progress, axes=start.cell.place_names)
+    if start.geometry_covariance is not None:
+        last = replace(steps[-1], after=evidence_with_geometry(steps[-1].after, start.geometry_covariance))
+        steps = (*steps[:-1], last)
     closed = replace(start, identification=before, steps=(*known, *steps))
-    if closed.estimate is start.estimate:
+    if closed.estimate is described:
         return closed
     with named_causes(closed.recordings):
         return judged(closed)
+
+
+def with_corrected_geometry(start: Fit) -> Fit:
+    """Identify again with the zeros and lengths that the encoders show; the same fit where they contradict none.
+
+    The logs are read again. σ of the gains contains that of the geometry.
+
+    Raises:
+        DataError, IdentificationError: as for `fit`.
+    """
+    finding = start.geometry
+    if finding is None or not finding.corrections or start.is_corrected:
+        return start
+    cell = start.cell
+    model = model_of(cell)
+    effects = declared_effects(cell)
+    described = start.identification.estimate
+    result = identify(
+        corrected_model(model, finding.changes),
+        (start.read(log)[0] for log in start.logs),
+        cell.conditioning,
+        holdout=(start.read(log)[0] for log in start.holdout),
+        method=described.method,
+        fixed_gains=described.gains if described.gains_fixed else None,
+        keep_rows=True,
+        judge=not effects,
+        axes=cell.axis_names,
+    )
+    covariance = geometry_covariance(result, model, finding)
+    result = with_geometry_covariance(result, covariance)
+    steps = with_effects_of_cell(result, effects, cell.place_names) if effects else ()
+    last = steps[-1].after.identification if steps else result
+    return replace(
+        start,
+        identification=result,
+        steps=steps,
+        paper=None if described.gains_fixed else tls(last.system),
+        geometry_covariance=covariance,
+    )
 
 
 def check_holdout(fitted: Fit) -> None:
@@ -439,6 +518,7 @@ def _calibration(fitted: Fit) -> Calibration:
         sources=fitted.sources,
         configuration_sha256=cell.digest,
         recording_configuration_sha256=cell.recording_digest,
+        encoder_misfit=encoder_misfit_of(fitted.geometry, cell, applied=fitted.is_corrected),
     )
 
 

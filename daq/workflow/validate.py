@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from daq.config.cell import Cell, model_of
+from daq.config.cell import Cell
 from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationUnreadable, LogsDiffer
 from daq.log.conversion import load_run
 from daq.workflow.corrections import Corrections
 from daq.workflow.diagnoses import diagnose_run, not_repeated
+from daq.workflow.geometry import calibrated_model
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
@@ -109,7 +110,8 @@ def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None =
         corrections.note(log, run)
         check_cell(calibration, log, described)
         warn_without_temperature(calibration, run.name, run.temperature_c)
-        validations.append(predicted(calibration, conditioning, model_of(described), log, run, described.digest))
+        model = calibrated_model(calibration, described)
+        validations.append(predicted(calibration, conditioning, model, log, run, described.digest))
     return tuple(validations)
 
 
@@ -306,7 +308,7 @@ def cross_validate(
     for log in logs:
         run, described = load_run(log, cell)
         corrections.note(log, run)
-        model = model_of(described)
+        model = calibrated_model(calibrations[first], described)
         found: dict[str, Validation] = {}
         reasons: dict[str, list[str]] = {}
         for label, calibration in calibrations.items():
@@ -316,7 +318,8 @@ def cross_validate(
             if reason:
                 reasons.setdefault(reason, []).append(label)
             else:
-                found[label] = predicted(calibration, conditioning, model, log, run, described.digest)
+                own = calibrated_model(calibration, described)
+                found[label] = predicted(calibration, conditioning, own, log, run, described.digest)
         if first in found:
             validations.append(found[first])
         condition, reduction = None, None
@@ -379,7 +382,7 @@ def diagnose_log(calibration: Calibration, log: Path, run: Run, described: Cell)
     """
     if unpredictable(calibration, run.payload):
         return ()
-    model = model_of(described)
+    model = calibrated_model(calibration, described)
     conditioning = conditioning_of(calibration)
     validation = predicted(calibration, conditioning, model, log, run, described.digest)
     with suppress(IdentificationError):

@@ -7,12 +7,13 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from daq.config.cell import Cell, model_of
+from daq.config.cell import Cell
 from daq.config.same_cell import differing_sections
 from daq.errors import ConfigurationError, LogRepeated, LogsDiffer
 from daq.log.conversion import load_run
 from daq.workflow.corrections import Corrections
 from daq.workflow.experiment import experiment_of, extra_moves
+from daq.workflow.geometry import calibrated_model
 from daq.workflow.validate import (
     check_cell,
     conditioning_of,
@@ -75,7 +76,8 @@ def weigh_logs(
     _require_once((*logs, *bare), (*loaded, *without))
     fitted = warn_of_fitted(calibration, loaded, "the agreement proves nothing; weigh a log that the fit has not seen")
     described = reading.described
-    body = weigh(calibration, model_of(described), loaded, conditioning_of(calibration), bare=without)
+    model = calibrated_model(calibration, described)
+    body = weigh(calibration, model, loaded, conditioning_of(calibration), bare=without)
     help_: tuple[Help, ...] = ()
     if not body.identifiable.all():
         with suppress(ConfigurationError):  # the cell does not say enough to plan moves in it
@@ -100,7 +102,7 @@ def contact_in(
     reading = _Logs(calibration, cell)
     run = reading.load(log)
     described = reading.described
-    model = model_of(described)
+    model = calibrated_model(calibration, described)
     band = None
     if quiet:
         calm = [reading.load(one) for one in quiet]

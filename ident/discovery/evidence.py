@@ -265,6 +265,14 @@ def without_effects(evidence: Evidence, estimate: Estimate) -> Evidence:
     return replace(evidence, training=training, holdout=rest, effects=(), estimate=estimate, declared=0)
 
 
+def with_covariance(evidence: Evidence, covariance: FloatArray) -> Evidence:
+    """Return the same estimate with another covariance of (gains, parameters), its equations kept."""
+    estimate = replace(evidence.estimate, covariance=covariance)
+    changed = replace(evidence, estimate=estimate)
+    changed._identification.extend(replace(one, estimate=estimate) for one in evidence._identification)
+    return changed
+
+
 def _split_holdout(observation: Observation, held_out: int) -> tuple[Observation, Observation | None]:
     """Split rows of all runs into those of the fit and those of the last, held-out runs."""
     if not held_out:

@@ -261,6 +261,20 @@ def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
     return Reach(found, gap, np.max(np.abs(found[:, motors] - axes_rad), axis=1), condition)
 
 
+def reach_near(robot: Robot, assembly: Assembly, near_rad: FloatArray, axes_rad: FloatArray) -> Reach:
+    """Close the loops from poses near by, as those of the same robot with slightly other lengths or zeros.
+
+    Args:
+        robot: whose loops are closed.
+        assembly: of this robot, or of the other one: which joints follow is the same.
+        near_rad: positions of all joints, shape (k, n).
+        axes_rad: of the motors' joints, shape (k, m).
+    """
+    motors = list(robot.axis_joints)
+    found, gap, condition = _newton(robot, assembly, near_rad, axes_rad)
+    return Reach(found, gap, np.max(np.abs(found[:, motors] - axes_rad), axis=1), condition)
+
+
 def _newton(
     robot: Robot, assembly: Assembly, position: FloatArray, axes_rad: FloatArray, *, on_the_way: bool = False
 ) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from daq.errors import ExitCode
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from drivers.canopen.bus import open_bus
 from drivers.simulation.cell import SimulatedCell
-from drivers.simulation.spec import UndeclaredEffect
+from drivers.simulation.spec import CellSpec, UndeclaredEffect
 
 
 @dataclass(frozen=True)
@@ -132,6 +132,7 @@ def record_run(
     declared: bool,
     seed: int,
     effects: tuple[UndeclaredEffect, ...] = (),
+    changed: Callable[[CellSpec], CellSpec] = lambda spec: spec,
 ) -> None:
     """Record a plan over the driver.
 
@@ -143,8 +144,9 @@ def record_run(
         declared: whether the recording names it as a weighed payload of the cell.
         seed: of the noise.
         effects: of the plant, beside those of the simulation file.
+        changed: makes another plant of the simulation's.
     """
-    spec = load_simulation(shipped_simulation(job.simulation), mounted)
+    spec = changed(load_simulation(shipped_simulation(job.simulation), mounted))
     axes = tuple(replace(axis, current_noise_a=job.noise * axis.current_noise_a) for axis in spec.axes)
     chosen = []
     if declared:

@@ -1,0 +1,241 @@
+"""A wrong zero or length of a redundant drive: named by a fit, corrected for `residual`, kept by the calibration."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import cache
+from math import radians
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daq.config.cell import Cell, model_of
+from daq.config.cell_file import load_cell
+from daq.log.reader import LossyLogs
+from daq.report.certificate import certificate_document, certify, without_controller
+from daq.report.controller_schemas import CertificateReport
+from daq.report.text import json_text
+from daq.workflow import fit as fitting
+from daq.workflow.calibration_file import load_calibration, save_calibration
+from daq.workflow.fit import Fit, calibration_of, fit, with_corrected_geometry
+from daq.workflow.geometry import calibrated_model, encoder_misfit_of, geometry_diagnoses
+from ident.data.dataset import differentiate
+from ident.data.run import Run
+from ident.discovery.evidence import gather, with_effects
+from ident.discovery.geometry import evidence_with_geometry
+from ident.effects.effect import PlacedEffect
+from ident.effects.position import Spring
+from ident.estimators.geometry import GeometryEstimate, GeometryFinding
+from ident.model.closed_chain import positions, reach
+from ident.model.geometry import GeometryKind, GeometryParameter, described_length
+from tests.conftest import CHECKOUT
+from tests.daq.calibrations import RECORDED
+
+FloatArray = NDArray[np.float64]
+CELL = load_cell(CHECKOUT / "configs/cells/dualv.yaml")
+GAINS = np.array([7.3, 6.8, -7.1, -7.5])
+LOGS = (Path("bare.mcap"), Path("loaded.mcap"))
+ZERO = GeometryParameter(GeometryKind.ZERO, "crank-2")
+ROD = GeometryParameter(GeometryKind.LENGTH, "elbow-3", "arm-3")
+RATE_HZ, COUNT_RAD = 250.0, 2.0 * np.pi / (65536 * 5)
+
+
+def _positions(seed: int) -> FloatArray:
+    """Positions of the motors, 12 s, that the closures allow: the poses that fit a smooth motion best."""
+    model = model_of(CELL)
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(0.0, 12.0, 1.0 / RATE_HZ)[:, None, None]
+    frequency_hz = rng.uniform(0.2, 1.4, (4, 5))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (4, 5))
+    wished = 0.06 * np.sum(np.sin(2.0 * np.pi * frequency_hz * time_s + phase), axis=2)
+    home = model.assembly.position_rad[list(model.robot.axis_joints)]
+    found = reach(model.robot, model.assembly, home + wished).position_rad
+    axes = found[:, list(model.robot.axis_joints)]
+    assert np.allclose(positions(model.robot, model.assembly, axes), found, atol=1e-8)
+    return axes
+
+
+@cache
+def _runs() -> tuple[Run, Run]:
+    """A run without load and one with the cell's payload, internal preload in both."""
+    model = model_of(CELL)
+    rng = np.random.default_rng(0)
+    standard = np.zeros(len(model.columns))
+    for columns in model.link_columns:
+        standard[columns] = 0.004, 0.0, 0.0, 0.005, 0.0, 0.006, 0.08, 0.01, 0.0, 0.8
+    for joint in model.robot.axis_joints:
+        standard[14 * joint + 10 : 14 * joint + 14] = 0.03, 0.1, 0.3, 0.02
+    body = CELL.payloads[0].payload
+    made: list[Run] = []
+    for seed, payload in ((3, None), (4, body)):
+        exact = _positions(seed)
+        blank = Run(LOGS[len(made)].stem, np.arange(len(exact)) / RATE_HZ, exact, np.zeros_like(exact), payload)
+        data = differentiate(blank, model.drive_train, CELL.conditioning)
+        mounted = standard.copy()
+        if payload is not None:
+            mass_kg = payload.known["m"]
+            mounted[model.flange] += 0.05, 0.0, 0.0, 0.05, 0.0, 0.09, 0.9, 0.3, 0.0, mass_kg
+        torque = np.einsum("mck,c->km", model.regressor(data.motion()), mounted)
+        hidden = np.linalg.qr(model.follow(data.motion()).to_motors, mode="complete").Q[:, :, 3]
+        hidden = hidden * np.sign(hidden[:, :1])
+        torque = torque + (1.0 + 2.0 * np.sin(1.3 * data.time_s))[:, None] * hidden
+        current = 0.004 * rng.standard_normal(exact.shape)
+        current[1:-1] += torque / GAINS
+        counted = COUNT_RAD * np.round(exact / COUNT_RAD)
+        made.append(replace(blank, position_rad=counted, current_a=current))
+    return made[0], made[1]
+
+
+def _read(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let logs be those runs, as another description of the cell converts them."""
+    offset = np.array([axis.zero_offset_rad for axis in cell.axes])
+    runs = dict(zip(LOGS, _runs(), strict=True))
+
+    def load_run(path: Path, given: Cell | None = None, lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+        del given, lossy
+        run = runs[Path(path)]
+        return replace(run, position_rad=run.position_rad + offset), cell
+
+    monkeypatch.setattr(fitting, "load_run", load_run)
+
+
+def _with_zero(degrees: float) -> Cell:
+    axes = [replace(one, zero_offset_rad=radians(degrees)) if one.name == "crank-2" else one for one in CELL.axes]
+    return replace(CELL, axes=tuple(axes))
+
+
+def _with_rod(percent: float) -> Cell:
+    before, name, after = CELL.urdf.partition('<joint name="tip-3"')
+    longer = f'xyz="{0.28 * (1.0 + percent / 100.0)!r} 0 0"'
+    return replace(CELL, urdf=before + name + after.replace('xyz="0.28 0 0"', longer, 1))
+
+
+def _errors(fitted: Fit) -> FloatArray:
+    """Errors of the gains in their σ."""
+    return np.asarray((fitted.estimate.gains - GAINS) / fitted.estimate.gains_std)
+
+
+@pytest.fixture(scope="module")
+def clean() -> Fit:
+    with pytest.MonkeyPatch.context() as patch:
+        _read(CELL, patch)
+        return fit(LOGS)
+
+
+def test_a_right_description_is_fitted_as_it_is(clean: Fit) -> None:
+    assert clean.geometry is not None
+    assert not clean.geometry.is_significant
+    assert clean.diagnoses == ()
+    assert with_corrected_geometry(clean) is clean
+    kept = calibration_of(clean, RECORDED).encoder_misfit
+    assert kept is not None
+    assert (kept.applied, kept.significant, kept.corrections, kept.unit) == (False, False, (), "rad")
+    assert np.all(np.abs(_errors(clean)) < 3.0)
+
+
+@pytest.mark.parametrize(
+    ("cell", "parameter", "change", "name", "remedy"),
+    [
+        (_with_zero(0.5), ZERO, -np.radians(0.5), "zero-off", "add -0.500. deg to `zero_offset_deg` of crank-2"),
+        (_with_rod(0.3), ROD, -0.00084, "length-off", "279.99.|280.00. mm in place of 280.840 mm"),
+    ],
+    ids=["zero", "rod"],
+)
+def test_a_wrong_number_is_named_and_corrected(
+    cell: Cell,
+    parameter: GeometryParameter,
+    change: float,
+    name: str,
+    remedy: str,
+    clean: Fit,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    _read(cell, monkeypatch)
+    fitted = fit(LOGS)
+    first = fitted.diagnoses[0]
+    assert first.name == name
+    assert first.axes == (("crank-2",) if parameter is ZERO else ())
+    assert "explains alone" in first.found
+    assert re.search(remedy, first.remedy)
+    assert "described geometry" in first.remedy
+    assert fitted.geometry is not None
+    (correction,) = fitted.geometry.corrections
+    assert correction.parameter == parameter
+    assert abs(correction.change - change) < 4.0 * correction.std
+    corrected = with_corrected_geometry(fitted)
+    assert with_corrected_geometry(corrected) is corrected
+    assert np.all(np.abs(_errors(corrected)) < 3.0)
+    if parameter is ZERO:
+        assert np.max(np.abs(_errors(fitted))) > 3.0
+    assert np.all(corrected.estimate.gains_std < 1.5 * clean.estimate.gains_std)
+    assert corrected.geometry_covariance is not None
+    added = np.sqrt(np.diag(corrected.geometry_covariance))[: len(GAINS)]
+    assert np.all((added > 0.0) & (added < corrected.estimate.gains_std))
+    (diagnosis,) = geometry_diagnoses(corrected.geometry, cell, applied=True)
+    assert "corrected geometry" in diagnosis.remedy
+    # The calibration keeps the correction, and predicts with it, whatever the description says now.
+    calibration = calibration_of(replace(corrected, diagnoses=(diagnosis,)), RECORDED)
+    save_calibration(calibration, tmp_path / "calibration.yaml")
+    read = load_calibration(tmp_path / "calibration.yaml")
+    assert read.encoder_misfit == calibration.encoder_misfit
+    for described in (cell, CELL):
+        robot = calibrated_model(read, described).robot
+        turned = robot.joints[robot.axis_joints[1]].rotation
+        expected = model_of(CELL).robot.joints[robot.axis_joints[1]].rotation
+        offset = described.axes[1].zero_offset_rad
+        assert np.arccos(np.clip(0.5 * (np.trace(expected.T @ turned) - 1.0), -1.0, 1.0)) == pytest.approx(
+            offset, abs=2e-5
+        )
+        assert described_length(robot, ROD) == pytest.approx(0.28, abs=2e-6)
+    certificate = certify(read, without_controller(read, "not read", RECORDED))
+    document = certificate_document(certificate)
+    CertificateReport.model_validate_json(json_text(document))
+    assert document["encoder_misfit"]["corrections"][0]["kind"] == parameter.kind.value
+    assert "the gains are those of the corrected geometry" in document["identity"]["Encoders"]
+
+
+def test_the_uncertainty_of_the_geometry_reaches_the_gains_beside_effects(clean: Fit) -> None:
+    fitted = replace(clean.final)
+    assert fitted.gathered is None
+    with pytest.MonkeyPatch.context() as patch:
+        _read(CELL, patch)
+        evidence = gather(fitted, _runs())
+    joined = with_effects(evidence, (PlacedEffect(Spring(), 1),))
+    assert joined.identification.estimate is joined.estimate
+    count = len(evidence.estimate.covariance)
+    extra = np.diag(np.arange(1.0, count + 1.0))
+    changed = evidence_with_geometry(joined, extra)
+    difference = np.diag(changed.estimate.covariance - joined.estimate.covariance)
+    names = [column.name for column in joined.estimate.unknowns]
+    bare = [column.name for column in evidence.estimate.unknowns]
+    gains = len(GAINS)
+    expected = {name: float(number) for name, number in zip(bare, range(gains + 1, count + 1), strict=True)}
+    assert list(difference[:gains]) == pytest.approx([1.0, 2.0, 3.0, 4.0])
+    assert list(difference[gains:]) == pytest.approx([expected.get(name, 0.0) for name in names])
+    assert changed.identification.estimate is changed.estimate
+
+
+def _finding(*corrections: GeometryEstimate, alternatives: tuple[tuple[GeometryEstimate, ...], ...]) -> GeometryFinding:
+    covariance = np.diag([one.std**2 for one in corrections]) if corrections else np.zeros((0, 0))
+    return GeometryFinding(4e-4, 5e-6, True, corrections, covariance, alternatives, (), ())
+
+
+def test_what_encoders_cannot_tell_apart_is_said() -> None:
+    zero, rod = GeometryEstimate(ZERO, 1e-3, 1e-5), GeometryEstimate(ROD, -3e-4, 1e-6)
+    (one,) = geometry_diagnoses(_finding(zero, alternatives=((rod,),)), CELL, applied=False)
+    assert one.name == "zero-off"
+    assert "not distinguishable from a length from elbow-3 to arm-3 that is 0.3000 ± 0.0010 mm shorter" in one.found
+    (both,) = geometry_diagnoses(_finding(zero, rod, alternatives=()), CELL, applied=False)
+    assert (both.name, both.axes) == ("geometry-off", ("crank-2",))
+    assert "explain together" in both.found
+    (none,) = geometry_diagnoses(_finding(alternatives=()), CELL, applied=False)
+    assert none.name == "geometry-off"
+    assert "no three zeros or lengths explain" in none.found
+    kept = encoder_misfit_of(_finding(zero, alternatives=((rod,),)), CELL, applied=True)
+    assert kept is not None
+    assert kept.alternatives == ("a length from elbow-3 to arm-3 that is 0.3000 ± 0.0010 mm shorter than described",)
+    assert list(geometry_diagnoses(None, CELL, applied=False)) == []
