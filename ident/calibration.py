@@ -12,7 +12,7 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.data.run import Recording
 from ident.errors import Diagnosis, ModelError
-from ident.estimators.estimate import RelativeError
+from ident.estimators.estimate import SAME_ERROR, RelativeError
 
 if TYPE_CHECKING:  # reading a calibration needs no estimator
     from ident.discovery.loop import Step
@@ -73,8 +73,8 @@ class AcceptedEffect:
 
     @property
     def is_confirmed(self) -> bool:
-        """Whether it lowers the error on data that the fit did not use."""
-        return self.error_after_percent < self.error_before_percent
+        """Whether it does not raise the error on data that the fit did not use, by more than SAME_ERROR of it."""
+        return self.error_after_percent <= (1.0 + SAME_ERROR) * self.error_before_percent
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,6 +305,9 @@ def _accepted(
         raise LookupError(f"{placed} is in the model, and no turn of the loop added it")
     axis = placed.axis_name(places)
     held_out = (before or start).holdout_error, step.after.holdout_error
+    verdict = next((one for one in steps[-1].verdicts if one.placed == placed), None)
+    if verdict is not None:
+        held_out = verdict.before, verdict.after
     errors = [math.nan if e is None else e.at(placed.axis) if axis in places else e.total for e in held_out]
     if not all(map(math.isfinite, errors)):
         # Without a run that was held out, the moves that were left out in turn must do.

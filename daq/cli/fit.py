@@ -197,7 +197,14 @@ def residual_verb(
         bool,
         typer.Option(
             "--accept-worse-holdout",
-            help="Write effects that raise the error of held-out logs by more than its noise, too.",
+            help="Write every effect that was found, whatever held-out logs say.",
+        ),
+    ] = False,
+    write_undecided: Annotated[
+        bool,
+        typer.Option(
+            "--write-undecided",
+            help="Write effects that held-out logs neither confirm nor refute, too.",
         ),
     ] = False,
     verbose: Annotated[
@@ -217,7 +224,7 @@ def residual_verb(
     from daq.report.fit import start_of
     from daq.report.residual import residual_document, residual_view
     from daq.report.residual_page import save_report
-    from daq.workflow.fit import calibration_of, check_holdout, close_loop, fit
+    from daq.workflow.fit import Undecided, calibration_of, check_holdout, close_loop, fit
     from ident.discovery.before_after import account
     from ident.estimators.method import Method
 
@@ -235,7 +242,11 @@ def residual_verb(
             lossy=LossyLogs.ACCEPTED if accept_losses else LossyLogs.REFUSED,
             keep_rows=True,
         )
-        closed = replace(close_loop(fitted, seed, report_step), accept_worse_holdout=accept_worse_holdout)
+        undecided = Undecided.JOIN if write_undecided else Undecided.LEFT_OUT
+        if accept_worse_holdout:
+            undecided = Undecided.ALL_JOIN
+        found = close_loop(fitted, seed, report_step, undecided)
+        closed = replace(found, accept_worse_holdout=accept_worse_holdout)
         calibration = calibration_of(closed, datetime.now(UTC))
         report_step("computing the errors before and after")
         changed = account(start_of(closed), closed.steps, leave_out_runs=leave_out_runs, progress=report_step)
@@ -267,6 +278,7 @@ def residual_verb(
     same += ["--seed", str(seed)] if seed else []
     same += ["--accept-losses"] if accept_losses else []
     same += ["--accept-worse-holdout"] if accept_worse_holdout else []
+    same += ["--write-undecided"] if write_undecided else []
     say_next("drivegain", "residual", *logs, *same, "--out", "calibration.yaml", "--report", report or "report")
 
 

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from enum import Enum
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ from ident.calibration import Calibration, PayloadMass, Source
 from ident.calibration import calibration_of as identified_calibration
 from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
+from ident.discovery.acceptance import accept_on_holdout
 from ident.discovery.before_after import error_on, holdout_change
 from ident.discovery.evidence import Evidence, gather, without_effects
 from ident.discovery.loop import Step, find_effects
@@ -83,6 +85,14 @@ class Fit:
             return gather(self.identification)
         used, unseen = ((load_run(log, self.cell, self.lossy)[0] for log in logs) for logs in (self.logs, self.holdout))
         return gather(self.identification, used, unseen)
+
+
+class Undecided(Enum):
+    """Which effects join the model although held-out logs do not confirm them."""
+
+    LEFT_OUT = "left out"  #: none
+    JOIN = "join"  #: those that held-out logs do not refute either
+    ALL_JOIN = "all join"  #: all: held-out logs are not asked, and refuse the whole set (`check_holdout`), or nothing
 
 
 class Reading:
@@ -303,13 +313,20 @@ def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: 
 DOUBTFUL_PERCENT = DEFAULT_APPLY_POLICY.max_error_percent  #: In total
 
 
-def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _: None) -> Fit:
-    """Detect and add missing effects: refit with every effect that passes the gates.
+def close_loop(
+    start: Fit,
+    seed: int,
+    progress: Callable[[str], None] = lambda _: None,
+    undecided: Undecided = Undecided.LEFT_OUT,
+) -> Fit:
+    """Detect and add missing effects: refit with every effect that passes the gates and that held-out logs confirm.
 
     Args:
         start: of method ``ml``; another one is refitted by ``ml``, in whose terms candidates are judged.
         seed: of the bootstrap.
         progress: receives a line for each step.
+        undecided: whether effects that held-out logs neither confirm nor refute join; all that were found join where
+            `Undecided.ALL_JOIN` overrides the held-out logs.
 
     Raises:
         IdentificationError: a refit failed.
@@ -326,7 +343,11 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
         by_ml = before.estimate
         evidence = with_declared_again(evidence, by_ml) if known else replace(evidence, estimate=by_ml)
     rng = np.random.default_rng(seed)
-    steps = find_effects(evidence, rng, progress=progress, axes=start.cell.place_names)
+    places = start.cell.place_names
+    steps = find_effects(evidence, rng, progress=progress, axes=places)
+    if undecided is not Undecided.ALL_JOIN:
+        join = undecided is Undecided.JOIN
+        steps = accept_on_holdout(evidence, steps, write_undecided=join, progress=progress, axes=places)
     closed = replace(start, identification=before, steps=(*known, *steps))
     if closed.estimate is start.estimate:
         return closed

@@ -17,7 +17,7 @@ from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem,
 from ident.discovery.evidence import Evidence, by_instruments, with_effects
 from ident.discovery.gates import (
     Gates,
-    RunsLeftOut,
+    PartsLeftOut,
     gain_shifts,
     impossible,
     in_noise,
@@ -253,5 +253,5 @@ def _beside_others(model: JointFit, placed: PlacedEffect, rng: np.random.Generat
     values, place = estimate.parameters[own], len(estimate.gains) + own
     joint = in_noise(values, estimate.covariance[np.ix_(place, place)])
     physics = impossible(placed.effect.coefficients, values, estimate.parameters_std[own])
-    reasons = (*finding.refusals, joint, physics, RunsLeftOut.of(problem).refusal(columns))
+    reasons = (*finding.refusals, joint, physics, PartsLeftOut.of(problem).refusal(columns))
     return finding.held_out_fall, "; ".join(dict.fromkeys(reason for reason in reasons if reason))

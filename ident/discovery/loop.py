@@ -17,13 +17,16 @@ from ident.discovery.choice import choice_covariance, is_small
 from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import (
     Gates,
-    RunsLeftOut,
+    PartsLeftOut,
     impossible,
+    in_noise,
     own_unknowns,
+    probability_of_zero,
     whitened_columns,
     without_effects_of,
 )
 from ident.discovery.joining import (
+    UNFITTED,
     JointFit,
     SetAside,
     as_joined,
@@ -45,6 +48,7 @@ from ident.discovery.search import (
     refine_setting,
 )
 from ident.discovery.structure import MIN_MOVES_FOR_STRUCTURE, detection_limits_nm, find_structure, is_inadequate
+from ident.discovery.verdict import Verdict
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.position import Counterbalance
@@ -72,6 +76,7 @@ class Step:
     #: σ of each gain [Nm/A] from the choice of the effects, contained in that of `after`, shape (m,); last turn only.
     choice_std: FloatArray | None = None
     declared: bool = False  #: the cell declares the effect that joined: it was not searched for
+    verdicts: tuple[Verdict, ...] = ()  #: of held-out runs on each effect that was found; last turn only
 
     def ranked(self, count: int) -> tuple[Finding, ...]:
         """The best findings on named effects, and the accepted one wherever it ranks."""
@@ -99,7 +104,7 @@ def find_effects(
     2. passes a candidate only through all gates: larger than noise makes anywhere in the search, better on most folds,
        large enough to matter, and physically possible (`Gates`, `impossible`);
     3. chooses the best on held-out moves, the simplest among equals (`choose_effect`), if it does not raise the error
-       on runs left out (`RunsLeftOut`);
+       on runs left out (`PartsLeftOut`);
     4. tests terms without a name, splines and motor harmonics, on the same axis, or on all axes if no named effect
        passed; one that explains much more replaces the named effect (`find_structure`, `is_inadequate`). A term that
        moves a gain by more than its σ does not join; the name that it refutes then joins only if it moves none either
@@ -114,8 +119,9 @@ def find_effects(
     ambiguity of an accepted effect holds what could not be distinguished from it, passed before, and does not pass
     beside it.
 
-    It ends when nothing passes, at one effect for PIECES_PER_EFFECT pieces, or after MAX_EFFECTS turns. Held-out runs
-    take no part in it. The covariance of the last estimate includes the choice of its effects (`choice_covariance`).
+    It ends when nothing passes, at one effect for PIECES_PER_EFFECT pieces, or after MAX_EFFECTS turns. The covariance
+    of the last estimate includes the choice of its effects (`choice_covariance`); an effect that this σ no longer shows
+    leaves (`end_search`). Held-out runs take no part in it: `ident.discovery.acceptance` judges by them.
 
     Args:
         start: identified by ``ml``, from `gather`.
@@ -144,7 +150,7 @@ def find_effects(
         seen.add(keys_of(model.evidence))
     else:
         steps[-1] = _settled(steps[-1], model.search_problem, (), rng, gates)
-    return (*steps[:-1], _with_choice(steps, model, gates))
+    return (*steps[:-1], end_search(steps, model, gates))
 
 
 def with_declared(
@@ -191,6 +197,71 @@ def with_declared(
     return tuple(steps)
 
 
+def end_search(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
+    """Return the last step with the σ that is reported, and without the effects that this σ does not show.
+
+    σ from the choice of the effects comes last, so that an effect can have passed every gate by a smaller one: it
+    leaves where its coefficients may all be zero by the covariance that is reported, or one of them is impossible. The
+    worst leaves first, and the rest is fitted again.
+
+    Args:
+        steps: of the search; the last one is returned.
+        model: what it ended with.
+        gates: limits of the search.
+    """
+    aside: list[SetAside] = []
+    while True:
+        last = _with_choice(steps, model, gates)
+        last = replace(last, set_aside=(*last.set_aside, *aside))
+        failing = _unshown(last.after)
+        if not failing:
+            return last
+        worst, why, _ = max(failing, key=lambda one: one[2])
+        evidence = model.evidence
+        kept = tuple(placed for placed in evidence.effects if placed != worst)
+        try:
+            rest = with_effects(evidence, kept, model.search_problem.runs)
+            model = linearised(replace(rest, declared=evidence.declared), model.search_problem.cache)
+        except UNFITTED:
+            return last  # the data cannot be fitted without it
+        found = _finding_of(steps, worst)
+        if found is not None:
+            aside.append(SetAside(found, f"by the σ that is reported, {why}"))
+
+
+def _unshown(evidence: Evidence) -> list[tuple[PlacedEffect, str, float]]:
+    """Effects that the covariance of an estimate does not show, why, and the probability of their being zero.
+
+    What the cell declares stays. An impossible coefficient counts like one that is certainly zero.
+    """
+    estimate = evidence.estimate
+    failing: list[tuple[PlacedEffect, str, float]] = []
+    for placed in evidence.effects[evidence.declared :]:
+        own = own_unknowns(estimate, (placed,))
+        place = len(estimate.gains) + own
+        values = estimate.parameters[own]
+        covariance = estimate.covariance[np.ix_(place, place)]
+        wrong = impossible(placed.effect.coefficients, values, estimate.parameters_std[own])
+        std = estimate.parameters_std[own]
+        noise = in_noise(values, covariance)
+        if not noise and not is_unnamed(placed.effect) and np.all(np.abs(values) < std):
+            noise = "each of its coefficients is less than its σ: what they are together is not known"
+        if wrong:
+            failing.append((placed, wrong, 1.0))
+        elif noise:
+            failing.append((placed, noise, probability_of_zero(values, covariance)))
+    return failing
+
+
+def _finding_of(steps: Sequence[Step], placed: PlacedEffect) -> Finding | None:
+    """The finding by which an effect joined last."""
+    for step in reversed(steps):
+        found = step.accepted
+        if found is not None and PlacedEffect(found.effect, found.axis) == placed:
+            return found
+    return None
+
+
 def _with_choice(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
     """Return the last step, what the choice of its effects adds to the covariance of its estimate included."""
     estimate, accepted = model.evidence.estimate, dict[PlacedEffect, tuple[Finding, tuple[Finding, ...]]]()
@@ -228,7 +299,7 @@ def _turn(
     proposed = _proposals(problem, evidence.effects, rng, gates, families)
     present = {placed.effect.name for placed in evidence.effects if not is_unnamed(placed.effect)}
     findings, structures = rank_effects(problem, rng, gates, families, proposed, present), tuple[Finding, ...]()
-    limits_nm, runs = detection_limits_nm(problem, gates), RunsLeftOut.of(problem)
+    limits_nm, runs = detection_limits_nm(problem, gates), PartsLeftOut.of(problem)
     taken, searched, aside, ended = set(keys_of(evidence)), range(0), list[SetAside](), ""
     while True:
         named = choose_effect(findings, taken)

@@ -14,12 +14,12 @@ from ident.data.dataset import Dataset
 from ident.data.run import Run
 from ident.discovery import joining, loop
 from ident.discovery.candidates import SearchProblem, score_candidates
+from ident.discovery.error_change import compare_by_move
 from ident.discovery.evidence import Evidence, gather, with_effects
 from ident.discovery.gates import (
     MIN_RUNS,
     Gates,
-    RunsLeftOut,
-    compare_by_move,
+    PartsLeftOut,
     gain_shifts,
     impossible,
     in_noise,
@@ -220,7 +220,7 @@ def test_an_error_on_runs_left_out_is_that_of_a_fit_of_the_others(search_problem
         for matrix, sign in ((both, 1.0), (declared, -1.0)):
             fitted = np.linalg.lstsq(matrix[~own], problem.residual[~own], rcond=None)[0]
             rise += sign * float(np.sum((problem.residual[own] - matrix[own] @ fitted) ** 2))
-    assert RunsLeftOut.of(search_problem).change(columns).rise == pytest.approx(rise, rel=1e-4)
+    assert PartsLeftOut.of(search_problem).change(columns).total.rise == pytest.approx(rise, rel=1e-4)
 
 
 def _levels(small: Evidence, truth: Truth, levels: tuple[float, ...]) -> SearchProblem:
@@ -252,7 +252,7 @@ def test_what_only_moves_of_the_same_run_predict_is_refused(
     (trial,) = score_candidates(problem.folds, columns, (slice(0, powers),))
     assert trial is not None
     assert trial.held_out.sum() < 0.9 * problem.folds.square_sum(problem.folds.residual).sum()
-    assert bool(RunsLeftOut.of(problem).refusal(columns)) == (powers == 3)
+    assert bool(PartsLeftOut.of(problem).refusal(columns)) == (powers == 3)
 
 
 def test_without_an_effect_the_joint_fit_is_the_declared_one_to_first_order(sticking: Evidence) -> None:
@@ -368,6 +368,6 @@ def test_an_effect_joins_beside_a_disturbance_in_the_loop(disturbed: Evidence, s
 def test_two_runs_are_judged_on_moves_alone(small: Evidence, small_runs: tuple[Run, ...]) -> None:
     rows = small.training.run < MIN_RUNS - 1
     short = replace(small, training=small.training.only(rows), datasets=small.datasets[: MIN_RUNS - 1])
-    runs = RunsLeftOut.of(search_problem_of(short))
+    runs = PartsLeftOut.of(search_problem_of(short))
     assert runs.others == ()
     assert runs.refusal(np.ones((1, 1))) == ""
