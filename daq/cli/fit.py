@@ -242,9 +242,7 @@ def residual_verb(
             lossy=LossyLogs.ACCEPTED if accept_losses else LossyLogs.REFUSED,
             keep_rows=True,
         )
-        undecided = Undecided.JOIN if write_undecided else Undecided.LEFT_OUT
-        if accept_worse_holdout:
-            undecided = Undecided.ALL_JOIN
+        undecided = Undecided.of(write=write_undecided, ignore_holdout=accept_worse_holdout)
         found = close_loop(fitted, seed, report_step, undecided)
         closed = replace(found, accept_worse_holdout=accept_worse_holdout)
         calibration = calibration_of(closed, datetime.now(UTC))
@@ -276,9 +274,12 @@ def residual_verb(
     same += [word for log in holdout or () for word in ("--holdout", log)]
     same += ["--gains", gains.value] if gains is Gains.FIXED else []
     same += ["--seed", str(seed)] if seed else []
-    same += ["--accept-losses"] if accept_losses else []
-    same += ["--accept-worse-holdout"] if accept_worse_holdout else []
-    same += ["--write-undecided"] if write_undecided else []
+    switches = {
+        "--accept-losses": accept_losses,
+        "--accept-worse-holdout": accept_worse_holdout,
+        "--write-undecided": write_undecided,
+    }
+    same += [name for name, given in switches.items() if given]
     say_next("drivegain", "residual", *logs, *same, "--out", "calibration.yaml", "--report", report or "report")
 
 

@@ -92,7 +92,14 @@ class Undecided(Enum):
 
     LEFT_OUT = "left out"  #: none
     JOIN = "join"  #: those that held-out logs do not refute either
-    ALL_JOIN = "all join"  #: all: held-out logs are not asked, and refuse the whole set (`check_holdout`), or nothing
+    ALL_JOIN = "all join"  #: all: held-out logs judge none of them
+
+    @classmethod
+    def of(cls, *, write: bool, ignore_holdout: bool) -> Undecided:
+        """Choose by what the operator asks for: to write undecided effects, or all whatever held-out logs say."""
+        if ignore_holdout:
+            return cls.ALL_JOIN
+        return cls.JOIN if write else cls.LEFT_OUT
 
 
 class Reading:
@@ -357,6 +364,8 @@ def close_loop(
 
 def check_holdout(fitted: Fit) -> None:
     """Refuse effects that raise the error of held-out runs by more than its noise.
+
+    `close_loop` has taken out what held-out runs refute; this refuses a fit that was made in another way.
 
     Raises:
         EffectsRefuted: they do, and the operator has not accepted it.

@@ -275,7 +275,8 @@ def _with_choice(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
         left += [one.finding for one in last.set_aside if one.moved and is_unnamed(one.finding.effect)]
         left += [found for found in (*last.findings, *last.structures) if is_small(found, gates)]
     choice = choice_covariance(model.search_problem, estimate, tuple(accepted.values()), left)
-    last = replace(last, choice_std=np.sqrt(np.diag(choice)[: len(estimate.gains)]))
+    choice_std = np.sqrt(np.diag(choice)[: len(estimate.gains)])
+    last = replace(last, after=model.evidence, choice_std=choice_std)
     if not choice.any():
         return last
     chosen = replace(estimate, covariance=estimate.covariance + choice)
