@@ -10,8 +10,8 @@ differs over a region of the workspace differs in a dozen moves at once, which p
 blocks than FEWEST_BLOCKS show nothing, whatever they say: the signs of four agree by chance once in 16 times. One block
 that outweighs all others does not either: t is then near one.
 
-A model can be worse on one motor and better in total. So the total is judged at CONFIDENCE, and every motor at
-MOTOR_CONFIDENCE, one-sided, for all motors together. A rise by less than SAME_ERROR of the error is none, however
+A model can be worse on one motor and better in total. So the total is judged at CONFIDENCE, and a rise of any motor at
+MOTOR_CONFIDENCE, one-sided, for all motors together; a fall of one motor, the others being noise, is one, too. A rise by less than SAME_ERROR of the error is none, however
 certain it is: 5.76 % against 5.76 % refutes nothing.
 """
 
@@ -92,17 +92,25 @@ class ErrorChange:
         )
 
     @property
+    def is_enough(self) -> bool:
+        """Whether there are blocks enough to tell a change from noise."""
+        return self.total.moves >= FEWEST_BLOCKS
+
+    @property
     def is_rise(self) -> bool:
         """Whether the whole error rises by more than noise, and by more than the tolerance."""
-        enough = self.total.moves >= FEWEST_BLOCKS and _is_beyond(self.total, float(self.before.sum()), SAME_ERROR)
-        return enough and self.total.rises(CONFIDENCE)
+        is_large = _is_beyond(self.total, float(self.before.sum()), SAME_ERROR)
+        return self.is_enough and is_large and self.total.rises(CONFIDENCE)
 
     @property
     def is_fall(self) -> bool:
         """Whether the error falls by more than noise, in total or of one motor."""
-        if self.total.moves >= FEWEST_BLOCKS and self.total.falls(CONFIDENCE):
-            return True
-        return any(one.moves >= FEWEST_BLOCKS and one.falls(self.each_confidence) for one in self.motors)
+        if not self.is_enough:
+            return False
+        each = 1.0 - (1.0 - CONFIDENCE) / len(self.motors)
+        return self.total.falls(CONFIDENCE) or any(
+            one.moves >= FEWEST_BLOCKS and one.falls(each) for one in self.motors
+        )
 
     def harm(self, data: str) -> str:
         """Say where the error on some data rises by more than noise; empty where it does nowhere."""

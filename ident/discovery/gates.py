@@ -216,7 +216,15 @@ class PartsLeftOut:
         """Why whitened columns may not join; empty where they may, or where nothing can be left out."""
         if not self.others:
             return ""
-        return self.change(columns).harm(f"{self.name} left out")
+        change = self.change(columns)
+        data = f"{self.name} left out"
+        if harm := change.harm(data):
+            return harm
+        # Too few blocks show nothing, but forbid nothing either: the folds of moves have judged.
+        if not change.is_enough or change.is_fall:
+            return ""
+        size = f"{change.total.rise:.3g} ± {change.total.std:.2g} noise variances"
+        return f"the squared error on {data} changes by {size}, which may be noise"
 
 
 def whitened_columns(search_problem: SearchProblem, effect: Effect, axis: int) -> FloatArray:

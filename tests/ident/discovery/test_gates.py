@@ -56,7 +56,6 @@ EITHER_SIGN = {
     "position-friction",
     "spring",
     "passive-spring",
-    "hinge",
     "gravity-compensator",
     "cogging",
     "ripple",
