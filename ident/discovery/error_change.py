@@ -11,8 +11,8 @@ blocks than FEWEST_BLOCKS show nothing, whatever they say: the signs of four agr
 that outweighs all others does not either: t is then near one.
 
 A model can be worse on one motor and better in total. So the total is judged at CONFIDENCE, and a rise of any motor at
-MOTOR_CONFIDENCE, one-sided, for all motors together; a fall of one motor, the others being noise, is one, too. A rise by less than SAME_ERROR of the error is none, however
-certain it is: 5.76 % against 5.76 % refutes nothing.
+MOTOR_CONFIDENCE, one-sided, for all motors together; the fall of one motor beside others that do not change is a fall,
+too. A rise by less than SAME_ERROR of the error is none, however certain it is: 5.76 % against 5.76 % refutes nothing.
 """
 
 from __future__ import annotations
