@@ -15,9 +15,14 @@ from ident.errors import Diagnosis, ModelError
 from ident.estimators.estimate import SAME_ERROR, RelativeError
 
 if TYPE_CHECKING:  # reading a calibration needs no estimator
+    from ident.discovery.evidence import Evidence
     from ident.discovery.loop import Step
     from ident.effects.effect import PlacedEffect
     from ident.estimators.identify import Identification
+
+EXTRAPOLATED = 1.5
+"""Times the largest torque of an effect in the fit that it may have in a prediction: a power of the speed or of the
+current grows without end where nothing was recorded. Samples differ from the filtered rows of a fit by less."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +75,10 @@ class AcceptedEffect:
     error_before_percent: float
     error_after_percent: float  #: the same with the effect
     ambiguity: tuple[str, ...] = ()  #: families whose held-out score does not differ from this one's
+    #: Largest torque of the effect on the rows of the fit, at each axis [Nm; N]: no more was ever seen of it, and a
+    #: prediction takes no more than EXTRAPOLATED times as much. None of an effect whose torque is a rate, which is far
+    #: larger in a sample than in a filtered row, and in calibrations of earlier versions.
+    largest_torque: tuple[float, ...] | None = None
 
     @property
     def is_confirmed(self) -> bool:
@@ -321,4 +330,20 @@ def _accepted(
         error_before_percent=errors[0],
         error_after_percent=errors[1],
         ambiguity=tuple(rival.name_among(places) for rival in finding.ambiguity),
+        largest_torque=_largest_torque(steps[-1].after, placed),
     )
+
+
+def _largest_torque(evidence: Evidence, placed: PlacedEffect) -> tuple[float, ...] | None:
+    """Largest torque of an effect at each axis, over the rows of the fit [Nm; N]; None where it is a rate."""
+    if placed.effect.is_rate:
+        return None
+    rows = evidence.training
+    estimate = evidence.estimate
+    names = {column.name for column in placed.columns}
+    first = len(rows.columns) - rows.effects.shape[1]
+    own = [index for index, column in enumerate(rows.columns[first:]) if column.name in names]
+    of_parameters = [index for index, column in enumerate(estimate.unknowns) if column.name in names]
+    torque = np.einsum("p,mpr->mr", estimate.parameters[of_parameters], rows.effects[:, own])
+    largest = np.max(np.abs(torque), axis=1, where=rows.use, initial=0.0)
+    return tuple(float(f"{value:.4g}") for value in largest)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.calibration import AcceptedEffect, Calibration, Parameter
+from ident.calibration import EXTRAPOLATED, AcceptedEffect, Calibration, Parameter
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import EFFECTS, UNNAMED
 from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, Side, at_joints, check_settings, columns_at
@@ -22,6 +22,9 @@ SAME_MASS = 0.01  #: Share by which two weighings of one body may differ
 
 def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
     """Predict the joint torque of a motion: W χ + W_uL χ_uL + W_kL χ_kL (paper eq. 17) and the effects.
+
+    Where a motion goes far beyond those of the fit, the torque of an effect is limited
+    (`AcceptedEffect.largest_torque`).
 
     Args:
         calibration: parameters, effects and gains.
@@ -45,10 +48,18 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
         placed, coefficients = placed_effect(accepted, calibration)
         columns = columns_at(placed.effect, run, placed.axis)
         at_all = at_joints(placed.effect, placed.axis, columns, model.drive_train)
-        torque += np.einsum("p,npk->nk", coefficients, at_all)
+        torque += _bounded(np.einsum("p,npk->nk", coefficients, at_all), accepted)
     if calibration.effects and model.is_redundant:
         torque = without_preload(model.follow(data.motion()), torque)
     return np.asarray(torque.T)
+
+
+def _bounded(torque: FloatArray, accepted: AcceptedEffect) -> FloatArray:
+    """Limit the torque of an effect, shape (n, k), to EXTRAPOLATED times the largest that the fit has seen of it."""
+    if accepted.largest_torque is None:
+        return torque
+    limit = EXTRAPOLATED * np.array(accepted.largest_torque)[:, None]
+    return np.clip(torque, -limit, limit)
 
 
 def predict_current(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
