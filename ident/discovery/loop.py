@@ -71,7 +71,7 @@ class Step:
     limits_nm: FloatArray  #: torque (root mean square) that a detectable effect has at each motor, shape (m,)
     accepted: Finding | None  #: the finding, or the structure without a name, that joined the model; None ends the loop
     after: Evidence  #: the model with it
-    set_aside: tuple[SetAside, ...] = ()  #: what would have joined the model, but for runs left out or the joint fit
+    set_aside: tuple[SetAside, ...] = ()  #: what would have joined the model, but for parts left out or the joint fit
     ended: str = ""  #: reason why the search ended here although the residual may call for more; else empty
     #: σ of each gain [Nm/A] from the choice of the effects, contained in that of `after`, shape (m,); last turn only.
     choice_std: FloatArray | None = None
@@ -103,8 +103,8 @@ def find_effects(
        of the squared residual is measured in-sample and on held-out moves (`rank_effects`);
     2. passes a candidate only through all gates: larger than noise makes anywhere in the search, better on most folds,
        large enough to matter, and physically possible (`Gates`, `impossible`);
-    3. chooses the best on held-out moves, the simplest among equals (`choose_effect`), if it does not raise the error
-       on runs left out (`PartsLeftOut`);
+    3. chooses the best on held-out moves, the simplest among equals (`choose_effect`), if it lowers the error on
+       runs or regions of the workspace left out, and raises it there on no motor (`PartsLeftOut`);
     4. tests terms without a name, splines and motor harmonics, on the same axis, or on all axes if no named effect
        passed; one that explains much more replaces the named effect (`find_structure`, `is_inadequate`). A term that
        moves a gain by more than its σ does not join; the name that it refutes then joins only if it moves none either
@@ -115,7 +115,7 @@ def find_effects(
        the model must still pass, beside all the others, or it leaves (`without_effects_of`). A term without a name may
        not make a named effect leave: then it does not join.
 
-    What runs left out or a gate of the joint fit refuse is in `Step.set_aside`, and the next best is tried. The
+    What parts left out or a gate of the joint fit refuse is in `Step.set_aside`, and the next best is tried. The
     ambiguity of an accepted effect holds what could not be distinguished from it, passed before, and does not pass
     beside it.
 
@@ -365,7 +365,7 @@ def _proposals(
 
 
 def _first_of_axis(aside: Sequence[SetAside], new: SetAside) -> tuple[SetAside, ...]:
-    """Finding that runs left out refuse, unless a better finding of its kind on this axis was set aside before."""
+    """Finding that parts left out refuse, unless a better finding of its kind on this axis was set aside before."""
     kind = new.finding.axis, is_unnamed(new.finding.effect)
     return () if kind in {(one.finding.axis, is_unnamed(one.finding.effect)) for one in aside} else (new,)
 
