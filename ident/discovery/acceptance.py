@@ -29,7 +29,7 @@ from ident.discovery.gates import Gates
 from ident.discovery.joining import UNFITTED, linearised
 from ident.discovery.loop import Step, end_search
 from ident.discovery.verdict import Judgement, Verdict, judge
-from ident.effects.effect import PlacedEffect
+from ident.effects.effect import PlacedEffect, Side
 from ident.estimators.estimate import RelativeError
 from ident.estimators.identify import estimate_with
 
@@ -133,7 +133,8 @@ def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> Verdic
         without = start
         is_needed = True
     change = compare_on_holdout(start, without, current)
-    judgement, reason = judge(change)
+    has_motor = placed.axis < len(change.motors) and placed.effect.side is not Side.ALL_MOTORS
+    judgement, reason = judge(change, placed.axis if has_motor else None)
     return Verdict(
         placed=placed,
         judgement=judgement,

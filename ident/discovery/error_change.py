@@ -11,8 +11,9 @@ blocks than FEWEST_BLOCKS show nothing, whatever they say: the signs of four agr
 that outweighs all others does not either: t is then near one.
 
 A model can be worse on one motor and better in total. So the total is judged at CONFIDENCE, and a rise of any motor at
-MOTOR_CONFIDENCE, one-sided, for all motors together; the fall of one motor beside others that do not change is a fall,
-too. A rise by less than SAME_ERROR of the error is none, however certain it is: 5.76 % against 5.76 % refutes nothing.
+MOTOR_CONFIDENCE, one-sided, for all motors together. A fall of the motor on which an effect acts counts as one, too:
+the effect names it before these data are asked. A rise by less than SAME_ERROR of the error is none, however certain it
+is: 5.76 % against 5.76 % refutes nothing.
 """
 
 from __future__ import annotations
@@ -102,15 +103,13 @@ class ErrorChange:
         is_large = _is_beyond(self.total, float(self.before.sum()), SAME_ERROR)
         return self.is_enough and is_large and self.total.rises(CONFIDENCE)
 
-    @property
-    def is_fall(self) -> bool:
-        """Whether the error falls by more than noise, in total or of one motor."""
+    def is_fall(self, motor: int | None = None) -> bool:
+        """Whether the error falls by more than noise, in total, or of the motor that a model claims to know better."""
         if not self.is_enough:
             return False
-        each = 1.0 - (1.0 - CONFIDENCE) / len(self.motors)
-        return self.total.falls(CONFIDENCE) or any(
-            one.moves >= FEWEST_BLOCKS and one.falls(each) for one in self.motors
-        )
+        if self.total.falls(CONFIDENCE):
+            return True
+        return motor is not None and self.motors[motor].moves >= FEWEST_BLOCKS and self.motors[motor].falls(CONFIDENCE)
 
     def harm(self, data: str) -> str:
         """Say where the error on some data rises by more than noise; empty where it does nowhere."""

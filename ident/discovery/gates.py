@@ -221,7 +221,8 @@ class PartsLeftOut:
         if harm := change.harm(data):
             return harm
         # Too few blocks show nothing, but forbid nothing either: the folds of moves have judged.
-        if not change.is_enough or change.is_fall:
+        of_motor = np.bincount(self.search_problem.folds.linearisation.motor, np.sum(columns**2, axis=1))
+        if not change.is_enough or change.is_fall(int(np.argmax(of_motor))):
             return ""
         size = f"{change.total.rise:.3g} ± {change.total.std:.2g} noise variances"
         return f"the squared error on {data} changes by {size}, which may be noise"

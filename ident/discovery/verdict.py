@@ -36,15 +36,20 @@ class Verdict:
         return f"{self.before.total:.2f} % of the held-out torques without it, {self.after.total:.2f} % with it"
 
 
-def judge(change: ErrorChange) -> tuple[Judgement, str]:
-    """Judge a change of errors on held-out runs, and say why."""
+def judge(change: ErrorChange, motor: int | None = None) -> tuple[Judgement, str]:
+    """Judge a change of errors on held-out runs, and say why.
+
+    Args:
+        change: by an effect.
+        motor: on which the effect acts; None for one that acts on all of them, or on a joint without a motor.
+    """
     if harm := change.harm("held-out runs"):
         return Judgement.REFUTED, harm
     blocks = change.total.moves
     if blocks < FEWEST_BLOCKS:
         few = f"held-out runs have {blocks} independent blocks of moves, and fewer than {FEWEST_BLOCKS} show nothing"
         return Judgement.UNDECIDED, few
-    if not change.is_fall:
+    if not change.is_fall(motor):
         size = f"{change.total.rise:.3g} ± {change.total.std:.2g} noise variances"
         return Judgement.UNDECIDED, f"the squared error on held-out runs changes by {size}, which may be noise"
     if doubtful := change.doubtful_motors:

@@ -134,7 +134,7 @@ def test_effects_that_are_no_better_together_than_none_are_not_written(
 ) -> None:
     """Even where no single one was refuted: here because the judge was bribed."""
     start = _planted(small, small_truth, _only_in(("run0", "run1", "run2"), _asymmetric))
-    monkeypatch.setattr(acceptance, "judge", lambda _: (Judgement.CONFIRMED, "bribed"))
+    monkeypatch.setattr(acceptance, "judge", lambda *_: (Judgement.CONFIRMED, "bribed"))
     (*_, last) = accept_on_holdout(start, _steps(start, (ASYMMETRIC,)), axes=NAMES)
     assert last.after.effects == ()
     (verdict,) = last.verdicts

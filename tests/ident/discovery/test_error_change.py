@@ -39,6 +39,17 @@ def test_a_fall_that_is_more_than_noise_is_confirmed() -> None:
     assert judge(change)[0] is Judgement.CONFIRMED
 
 
+def test_a_fall_of_the_motor_that_the_effect_names_is_a_fall() -> None:
+    """The noise of the other motors hides it in the total; a motor that was not named proves nothing by itself."""
+    by_move = np.random.default_rng(7).normal(0.0, 5.0, (20, MOTORS))
+    by_move[:, 1:] -= by_move[:, 1:].mean(axis=0) - 0.01
+    by_move[:, 0] = np.random.default_rng(8).normal(-0.5, 0.5, 20)
+    change = _change(by_move)
+    assert judge(change)[0] is Judgement.UNDECIDED
+    assert judge(change, 0)[0] is Judgement.CONFIRMED
+    assert judge(change, 1)[0] is Judgement.UNDECIDED
+
+
 def test_a_rise_that_is_more_than_noise_is_refuted() -> None:
     change = _change(np.random.default_rng(0).normal(5.0, 3.0, (20, MOTORS)))
     judgement, reason = judge(change)
@@ -84,7 +95,7 @@ def test_a_motor_that_may_be_much_worse_is_not_confirmed() -> None:
     by_move[:2, 1] = 80.0, 30.0
     change = _change(by_move)
     assert change.worse_motors == ()
-    judgement, reason = judge(change)
+    judgement, reason = judge(change, 0)
     assert judgement is Judgement.UNDECIDED
     assert "motor 2" in reason
 
