@@ -12,12 +12,17 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.data.run import Recording
 from ident.errors import Diagnosis, ModelError
-from ident.estimators.estimate import RelativeError
+from ident.estimators.estimate import SAME_ERROR, RelativeError
 
 if TYPE_CHECKING:  # reading a calibration needs no estimator
+    from ident.discovery.evidence import Evidence
     from ident.discovery.loop import Step
     from ident.effects.effect import PlacedEffect
     from ident.estimators.identify import Identification
+
+EXTRAPOLATED = 1.5
+"""Times the largest torque of an effect in the fit that it may have in a prediction: a power of the speed or of the
+current grows without end where nothing was recorded. Samples differ from the filtered rows of a fit by less."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +75,15 @@ class AcceptedEffect:
     error_before_percent: float
     error_after_percent: float  #: the same with the effect
     ambiguity: tuple[str, ...] = ()  #: families whose held-out score does not differ from this one's
+    #: Largest torque of the effect on the rows of the fit, at each axis [Nm; N]: no more was ever seen of it, and a
+    #: prediction takes no more than EXTRAPOLATED times as much. None of an effect whose torque is a rate, which is far
+    #: larger in a sample than in a filtered row, and in calibrations of earlier versions.
+    largest_torque: tuple[float, ...] | None = None
 
     @property
     def is_confirmed(self) -> bool:
-        """Whether it lowers the error on data that the fit did not use."""
-        return self.error_after_percent < self.error_before_percent
+        """Whether it does not raise the error on data that the fit did not use, by more than SAME_ERROR of it."""
+        return self.error_after_percent <= (1.0 + SAME_ERROR) * self.error_before_percent
 
 
 @dataclass(frozen=True, slots=True)
@@ -334,6 +343,9 @@ def _accepted(
         raise LookupError(f"{placed} is in the model, and no turn of the loop added it")
     axis = placed.axis_name(places)
     held_out = (before or start).holdout_error, step.after.holdout_error
+    verdict = next((one for one in steps[-1].verdicts if one.placed == placed), None)
+    if verdict is not None:
+        held_out = verdict.before, verdict.after
     errors = [math.nan if e is None else e.at(placed.axis) if axis in places else e.total for e in held_out]
     if not all(map(math.isfinite, errors)):
         # Without a run that was held out, the moves that were left out in turn must do.
@@ -347,4 +359,20 @@ def _accepted(
         error_before_percent=errors[0],
         error_after_percent=errors[1],
         ambiguity=tuple(rival.name_among(places) for rival in finding.ambiguity),
+        largest_torque=_largest_torque(steps[-1].after, placed),
     )
+
+
+def _largest_torque(evidence: Evidence, placed: PlacedEffect) -> tuple[float, ...] | None:
+    """Largest torque of an effect at each axis, over the rows of the fit [Nm; N]; None where it is a rate."""
+    if placed.effect.is_rate:
+        return None
+    rows = evidence.training
+    estimate = evidence.estimate
+    names = {column.name for column in placed.columns}
+    first = len(rows.columns) - rows.effects.shape[1]
+    own = [index for index, column in enumerate(rows.columns[first:]) if column.name in names]
+    of_parameters = [index for index, column in enumerate(estimate.unknowns) if column.name in names]
+    torque = np.einsum("p,mpr->mr", estimate.parameters[of_parameters], rows.effects[:, own])
+    largest = np.max(np.abs(torque), axis=1, where=rows.use, initial=0.0)
+    return tuple(float(f"{value:.4g}") for value in largest)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.calibration import AcceptedEffect, Calibration, Parameter
+from ident.calibration import EXTRAPOLATED, AcceptedEffect, Calibration, Parameter
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import EFFECTS, GEOMETRY, UNNAMED
 from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, at_joints, check_settings, columns_at
@@ -24,6 +24,9 @@ SAME_MASS = 0.01  #: Share by which two weighings of one body may differ
 
 def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
     """Predict the joint torque of a motion: W χ + W_uL χ_uL + W_kL χ_kL (paper eq. 17) and the effects.
+
+    Where a motion goes far beyond those of the fit, the torque of an effect is limited
+    (`AcceptedEffect.largest_torque`).
 
     Args:
         calibration: parameters, effects and gains.
@@ -48,12 +51,12 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
     torque = model.drive_train.direction.T @ run.motor_torque_nm
     effects = [placed_effect(accepted, calibration) for accepted in calibration.effects]
     run = beside_rotors(run, (placed for placed, _ in effects))
-    for placed, coefficients in effects:
+    for accepted, (placed, coefficients) in zip(calibration.effects, effects, strict=True):
         if is_correction(placed):
             continue  # in the model already
         columns = columns_at(placed.effect, run, placed.axis)
         at_all = at_joints(placed.effect, placed.axis, columns, model.drive_train)
-        torque += np.einsum("p,npk->nk", coefficients, at_all)
+        torque += _bounded(np.einsum("p,npk->nk", coefficients, at_all), accepted)
     if calibration.effects and model.is_redundant:
         torque = without_preload(model.follow(data.motion()), torque)
     return np.asarray(torque.T)
@@ -79,6 +82,14 @@ def left_of(placed: PlacedEffect, coefficients: FloatArray) -> tuple[PlacedEffec
         return placed, coefficients
     applied = replace(placed, effect=placed.effect.with_applied(coefficients.tolist()))
     return applied, np.zeros_like(coefficients)
+
+
+def _bounded(torque: FloatArray, accepted: AcceptedEffect) -> FloatArray:
+    """Limit the torque of an effect, shape (n, k), to EXTRAPOLATED times the largest that the fit has seen of it."""
+    if accepted.largest_torque is None:
+        return torque
+    limit = EXTRAPOLATED * np.array(accepted.largest_torque)[:, None]
+    return np.clip(torque, -limit, limit)
 
 
 def predict_current(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:

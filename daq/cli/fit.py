@@ -211,7 +211,14 @@ def residual_verb(
         bool,
         typer.Option(
             "--accept-worse-holdout",
-            help="Write effects that raise the error of held-out logs by more than its noise, too.",
+            help="Write every effect that was found, whatever held-out logs say.",
+        ),
+    ] = False,
+    write_undecided: Annotated[
+        bool,
+        typer.Option(
+            "--write-undecided",
+            help="Write effects that held-out logs neither confirm nor refute, too.",
         ),
     ] = False,
     verbose: Annotated[
@@ -231,7 +238,7 @@ def residual_verb(
     from daq.report.fit import start_of
     from daq.report.residual import residual_document, residual_view
     from daq.report.residual_page import save_report
-    from daq.workflow.fit import calibration_of, check_holdout, close_loop, fit
+    from daq.workflow.fit import Undecided, calibration_of, check_holdout, close_loop, fit
     from ident.discovery.before_after import account
     from ident.estimators.method import Method
 
@@ -250,7 +257,9 @@ def residual_verb(
             keep_rows=True,
             channels_as_wired=channels_as_wired,
         )
-        closed = replace(close_loop(fitted, seed, report_step), accept_worse_holdout=accept_worse_holdout)
+        undecided = Undecided.of(write=write_undecided, ignore_holdout=accept_worse_holdout)
+        found = close_loop(fitted, seed, report_step, undecided)
+        closed = replace(found, accept_worse_holdout=accept_worse_holdout)
         calibration = calibration_of(closed, datetime.now(UTC))
         report_step("computing the errors before and after")
         changed = account(start_of(closed), closed.steps, leave_out_runs=leave_out_runs, progress=report_step)
@@ -280,9 +289,13 @@ def residual_verb(
     same += [word for log in holdout or () for word in ("--holdout", log)]
     same += ["--gains", gains.value] if gains is Gains.FIXED else []
     same += ["--seed", str(seed)] if seed else []
-    same += ["--accept-losses"] if accept_losses else []
-    same += ["--channels-as-wired"] if channels_as_wired else []
-    same += ["--accept-worse-holdout"] if accept_worse_holdout else []
+    switches = {
+        "--accept-losses": accept_losses,
+        "--channels-as-wired": channels_as_wired,
+        "--accept-worse-holdout": accept_worse_holdout,
+        "--write-undecided": write_undecided,
+    }
+    same += [name for name, given in switches.items() if given]
     say_next("drivegain", "residual", *logs, *same, "--out", "calibration.yaml", "--report", report or "report")
 
 

@@ -285,6 +285,20 @@ class TurnEntry(StrictModel):
     detection_limits: list[DetectionLimit]
 
 
+class VerdictEntry(StrictModel):
+    """What held-out runs say of one effect."""
+
+    effect: str
+    axis: str
+    settings: dict[str, float]
+    judgement: str
+    reason: str
+    written: bool
+    blocks: int
+    error_before_percent: Errors | None
+    error_after_percent: Errors | None
+
+
 class ResidualReport(CalibrationBody):
     """`residual`, and the body of `residual.json`."""
 
@@ -299,6 +313,7 @@ class ResidualReport(CalibrationBody):
     after: ModelErrors
     gain_changes: list[ChangedGain]
     worse_holdout: bool | None
+    verdicts: list[VerdictEntry]
     turns: list[TurnEntry]
 
 

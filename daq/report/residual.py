@@ -26,6 +26,7 @@ from ident.discovery.loop import MAX_EFFECTS, Step
 from ident.discovery.noise_floor import CONFIDENCE, FloorSource
 from ident.discovery.search import Finding
 from ident.discovery.time_skew import Skew
+from ident.discovery.verdict import Judgement, Verdict
 from ident.drift.change import FALSE_ALARM
 from ident.effects.effect import PlacedEffect
 from ident.effects.signals import session_began_s
@@ -186,12 +187,34 @@ def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -
     floor = _floor(account).total
     noise = f" ({_floor_text(floor)})" if math.isfinite(floor) else ""
     ending = (*_skew_sentence(account.skew), *_holdout_verdict(fitted, account))
+    judged = tuple(verdict_sentences(fitted))
     if not found:
-        return (*first, f"No structure found: the error {where} is {after.total:.1f} %{noise}.", *ending)
+        none = "No effect is confirmed" if judged else "No structure found"
+        return (*first, f"{none}: the error {where} is {after.total:.1f} %{noise}.", *judged, *ending)
     change = error_change_text(before.total, after.total)
     whole = f"All axes together: the error {where} {change}{noise}{_unconfirmed(account)}."
     gains = gains_sentence(fitted, account)
-    return (*first, *found, whole, *_to_be_refused(effects), *((gains,) if gains else ()), *ending)
+    return (*first, *found, whole, *judged, *_to_be_refused(effects), *((gains,) if gains else ()), *ending)
+
+
+def verdict_sentences(fitted: Fit) -> Iterator[str]:
+    """Name the effects that were found and that held-out runs do not confirm, with the errors that show it."""
+    for verdict in fitted.steps[-1].verdicts:
+        if verdict.judgement is Judgement.CONFIRMED and verdict.written:
+            continue
+        name = verdict.placed.name_among(fitted.cell.place_names)
+        evidence = f"{verdict.reason}; {verdict.error_text()}"
+        if verdict.judgement is Judgement.REFUTED:
+            yield f"Held-out runs refute {name}: {evidence}. It was found in the runs of the fit, and is not written."
+        elif verdict.judgement is Judgement.CONFIRMED:
+            yield f"Held-out runs confirm {name}, but beside the other effects σ no longer shows it: it is not written."
+        elif verdict.written:
+            yield f"Undecided, and written as asked: {name}: {evidence}."
+        else:
+            yield (
+                f"Undecided, and not written: {name}: {evidence}. Hold out more moves, or pass --write-undecided to "
+                "`drivegain residual`."
+            )
 
 
 def statistical_sentences(fitted: Fit, account: Account) -> tuple[str, ...]:
@@ -556,6 +579,7 @@ def residual_document(fitted: Fit, account: Account, calibration: Calibration) -
         ],
         **_before_after(fitted, account.total),
         "worse_holdout": None if account.holdout_change is None else account.holdout_change.is_rise,
+        "verdicts": [_verdict(verdict, fitted.cell.place_names) for verdict in fitted.steps[-1].verdicts],
         "turns": [_turn(fitted, step, turn) for step, turn in zip(fitted.steps, account.turns, strict=True)],
     }
 
@@ -622,6 +646,18 @@ def _errors(errors: Errors) -> dict[str, Any]:
             ],
         },
         "holdout_error_percent": error_document(errors.holdout),
+    }
+
+
+def _verdict(verdict: Verdict, axes: tuple[str, ...]) -> dict[str, Any]:
+    return {
+        **_placed(verdict.placed, axes),
+        "judgement": verdict.judgement.value,
+        "reason": verdict.reason,
+        "written": verdict.written,
+        "blocks": verdict.change.total.moves,
+        "error_before_percent": error_document(verdict.before),
+        "error_after_percent": error_document(verdict.after),
     }
 
 

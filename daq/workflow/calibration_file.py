@@ -95,6 +95,7 @@ class EffectEntry(StrictModel):
     error_before_percent: _Positive
     error_after_percent: _Positive
     ambiguity: tuple[str, ...]
+    largest_torque: tuple[_Positive, ...] | None = None  # files of earlier versions lack it
 
 
 class MassInfluenceEntry(StrictModel):

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from enum import Enum
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,7 @@ from ident.calibration import Calibration, PayloadMass, Source
 from ident.calibration import calibration_of as identified_calibration
 from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
+from ident.discovery.acceptance import accept_on_holdout
 from ident.discovery.before_after import error_on, holdout_change
 from ident.discovery.evidence import Evidence, gather, without_effects
 from ident.discovery.geometry import evidence_with_geometry, geometry_covariance, with_geometry_covariance
@@ -108,6 +110,21 @@ class Fit:
             return gather(self.identification)
         used, unseen = ((load_run(log, self.cell, self.lossy)[0] for log in logs) for logs in (self.logs, self.holdout))
         return gather(self.identification, used, unseen)
+
+
+class Undecided(Enum):
+    """Which effects join the model although held-out logs do not confirm them."""
+
+    LEFT_OUT = "left out"  #: none
+    JOIN = "join"  #: those that held-out logs do not refute either
+    ALL_JOIN = "all join"  #: all: held-out logs judge none of them
+
+    @classmethod
+    def of(cls, *, write: bool, ignore_holdout: bool) -> Undecided:
+        """Choose by what the operator asks for: to write undecided effects, or all whatever held-out logs say."""
+        if ignore_holdout:
+            return cls.ALL_JOIN
+        return cls.JOIN if write else cls.LEFT_OUT
 
 
 class Reading:
@@ -377,13 +394,20 @@ def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: 
 DOUBTFUL_PERCENT = DEFAULT_APPLY_POLICY.max_error_percent  #: In total
 
 
-def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _: None) -> Fit:
-    """Detect and add missing effects: refit with every effect that passes the gates.
+def close_loop(
+    start: Fit,
+    seed: int,
+    progress: Callable[[str], None] = lambda _: None,
+    undecided: Undecided = Undecided.LEFT_OUT,
+) -> Fit:
+    """Detect and add missing effects: refit with every effect that passes the gates and that held-out logs confirm.
 
     Args:
         start: of method ``ml``; another one is refitted by ``ml``, in whose terms candidates are judged.
         seed: of the bootstrap.
         progress: receives a line for each step.
+        undecided: whether effects that held-out logs neither confirm nor refute join; all that were found join where
+            `Undecided.ALL_JOIN` overrides the held-out logs.
 
     Raises:
         IdentificationError: a refit failed.
@@ -402,7 +426,11 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
         by_ml = before.estimate
         evidence = with_declared_again(evidence, by_ml) if known else replace(evidence, estimate=by_ml)
     rng = np.random.default_rng(seed)
-    steps = find_effects(evidence, rng, progress=progress, axes=start.cell.place_names)
+    places = start.cell.place_names
+    steps = find_effects(evidence, rng, progress=progress, axes=places)
+    if undecided is not Undecided.ALL_JOIN:
+        join = undecided is Undecided.JOIN
+        steps = accept_on_holdout(evidence, steps, write_undecided=join, progress=progress, axes=places)
     if start.geometry_covariance is not None:
         last = replace(steps[-1], after=evidence_with_geometry(steps[-1].after, start.geometry_covariance))
         steps = (*steps[:-1], last)
@@ -454,6 +482,8 @@ def with_corrected_geometry(start: Fit) -> Fit:
 
 def check_holdout(fitted: Fit) -> None:
     """Refuse effects that raise the error of held-out runs by more than its noise.
+
+    `close_loop` has taken out what held-out runs refute; this refuses a fit that was made in another way.
 
     Raises:
         EffectsRefuted: they do, and the operator has not accepted it.

@@ -41,8 +41,8 @@ import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
 
 from ident.arrays import FloatArray, IntArray
+from ident.discovery.error_change import PairedChange, compare_by_move
 from ident.discovery.evidence import Evidence, Uncorrected, with_effects
-from ident.discovery.gates import PairedChange, compare_by_move
 from ident.discovery.loop import Step
 from ident.discovery.noise_floor import NoiseFloor, noise_floors
 from ident.discovery.time_skew import Skew, time_skew
@@ -93,6 +93,11 @@ def left_on(observation: Observation, estimate: Estimate) -> FloatArray:
     rows = np.sum(_currents(observation, estimate).shown, axis=1, where=observation.motor_use)
     left = error_on(observation, estimate).left
     return np.asarray(np.sqrt(np.divide(left, rows, out=np.full(len(rows), np.nan), where=rows > 0)))
+
+
+def squares_left(observation: Observation, estimate: Estimate) -> FloatArray:
+    """Squared error e_i² of each motor and row [A²], shape (m, r), whether the row counts or not."""
+    return np.square(_currents(observation, estimate).left)
 
 
 def holdout_change(before: Evidence, after: Evidence) -> PairedChange | None:

@@ -1,13 +1,11 @@
-"""Limits of the search, and gates that are no matter of one score: physics, runs left out, gains, effects together.
+"""Limits of the search, and gates that are no matter of one score: physics, parts left out, gains, effects together.
 
 A column declares which values physics allows its coefficient (`ident.model.model.Column`); `impossible` compares an
-estimate with them. `RunsLeftOut` predicts whole runs without and with a candidate: moves of one run share its
-temperature, payload and wear, so moves left out alone flatter an effect that only this recording has. Both errors are
-compared move by move (`compare_by_move`): with d_m the rise of the squared error in move m of M,
-
-    Σ d_m > t_(95 %, M − 1) · √(M/(M − 1) Σ (d_m − mean)²)
-
-is a rise by more than noise. `without_effects_of` takes effects out of a joint fit again. No refit is needed: at the
+estimate with them. `PartsLeftOut` predicts parts of the data without and with a candidate: whole runs, because moves of
+one run share its temperature, payload and wear; or, where no run can be left out, regions of the workspace, because
+neighbouring moves of one trajectory share their postures. Moves left out alone flatter an effect that holds in this
+recording, or here, only. How the errors of each motor change is judged by `ident.discovery.error_change`.
+`without_effects_of` takes effects out of a joint fit again. No refit is needed: at the
 optimum the residual is orthogonal to all columns, so without Φ with the coefficients c it becomes e + Φ⊥ c, Φ⊥ being
 what the other columns J leave of Φ, and the other unknowns move by (JᵀJ)⁻¹JᵀΦ c. The derivative to a gain is the
 torque of its motor, so it changes with Φ c too.
@@ -24,6 +22,7 @@ from scipy import linalg
 
 from ident.arrays import FloatArray, IntArray
 from ident.discovery.candidates import UNSEEN, SearchProblem
+from ident.discovery.error_change import ErrorChange, change_of_errors
 from ident.effects.effect import Effect, PlacedEffect
 from ident.equations.linearisation import RIDGE, Folds, cut_into_folds, sum_of_squares
 from ident.equations.rows import Observation
@@ -32,7 +31,9 @@ from ident.model.model import Column
 
 SIGMAS = 2.0  #: A coefficient outside its possible values by more than this many σ is impossible
 MIN_RUNS = 3  #: With two runs, one left out leaves a fit of the other alone
-CONFIDENCE = 0.95  #: Of a coefficient that is not zero; one-sided, of a rise by more than noise
+REGIONS = 8  #: Of the workspace, that are left out in turn where no run can be
+MOVES_OF_REGION = 2  #: Fewest moves of a region
+CONFIDENCE = 0.95  #: Of a coefficient that is not zero
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,31 +70,14 @@ def impossible(columns: Sequence[Column], values: FloatArray, deviations: FloatA
 
 def in_noise(values: FloatArray, covariance: FloatArray, confidence: float = CONFIDENCE) -> str:
     """Why coefficients, shape (p,), may all be zero by Wald's test; empty where they may not."""
-    wald = float(values @ np.linalg.pinv(covariance, hermitian=True) @ values)
-    probability = float(scipy.special.chdtrc(len(values), wald))
+    probability = probability_of_zero(values, covariance)
     return "" if probability <= 1.0 - confidence else f"its coefficients may all be zero (p = {probability:.2f})"
 
 
-@dataclass(frozen=True, slots=True)
-class PairedChange:
-    """Change of a squared error on the same rows, and its noise by the scatter of moves."""
-
-    rise: float  #: Σ ‖e‖² after − before; negative where the error falls
-    std: float  #: its σ
-    moves: int  #: number of moves with rows
-
-    @property
-    def is_rise(self) -> bool:
-        """Whether the error rises by more than its noise."""
-        return self.moves > 1 and self.rise > float(scipy.special.stdtrit(self.moves - 1, CONFIDENCE)) * self.std
-
-
-def compare_by_move(change: FloatArray, move: IntArray) -> PairedChange:
-    """Sum the change of each row's squared error, shape (r,), with σ by clusters of moves, shape (r,)."""
-    by_move = np.bincount(np.unique(move, return_inverse=True)[1], change)
-    count = len(by_move)
-    spread = np.sum((by_move - by_move.mean()) ** 2) * count / max(count - 1, 1)
-    return PairedChange(float(by_move.sum()), float(np.sqrt(spread)), count)
+def probability_of_zero(values: FloatArray, covariance: FloatArray) -> float:
+    """Probability that coefficients which are all zero are estimated this far from it, by Wald's test, shape (p,)."""
+    wald = float(values @ np.linalg.pinv(covariance, hermitian=True) @ values)
+    return float(scipy.special.chdtrc(len(values), wald))
 
 
 def runs_to_leave_out(observation: Observation) -> tuple[int, ...]:
@@ -105,80 +89,142 @@ def runs_to_leave_out(observation: Observation) -> tuple[int, ...]:
     return tuple(int(run) for run, own in zip(runs, mounted, strict=True) if np.sum(mounted == own) > 1)
 
 
+def regions_to_leave_out(observation: Observation, position: FloatArray) -> IntArray:
+    """Region of the workspace that each row is in, shape (r,); empty where there are too few moves to leave some out.
+
+    Moves are parted by their mean posture, each joint in units of its scatter: the region with the most moves is cut at
+    the median along the direction in which its moves differ most, until there are REGIONS.
+
+    Args:
+        observation: the rows.
+        position: of each joint in each row, shape (joints, r).
+    """
+    moves, move_of_row = np.unique(observation.move, return_inverse=True)
+    if len(moves) < MOVES_OF_REGION * REGIONS:
+        return np.zeros(0, dtype=np.int64)
+    rows = np.bincount(move_of_row)
+    means = np.stack([np.bincount(move_of_row, joint) / rows for joint in position], axis=1)
+    scatter = means.std(axis=0)
+    posture = (means - means.mean(axis=0)) / np.where(scatter > 0.0, scatter, 1.0)
+    region = np.zeros(len(moves), dtype=np.int64)
+    for new in range(1, REGIONS):
+        largest = np.flatnonzero(region == np.argmax(np.bincount(region)))
+        centred = posture[largest] - posture[largest].mean(axis=0)
+        axis = np.linalg.svd(centred, full_matrices=False)[2][0]
+        order = np.argsort(centred @ axis, kind="stable")
+        region[largest[order[len(order) // 2 :]]] = new
+    return np.asarray(region[move_of_row])
+
+
+def _can_be_left_out(observation: Observation, region: IntArray) -> tuple[int, ...]:
+    """Regions without which every payload, and the arm without one, is still in the data."""
+    found: list[int] = []
+    for own in range(REGIONS):
+        rest = region != own
+        if set(observation.mounting[~rest]) <= set(observation.mounting[rest]):
+            found.append(own)
+    return tuple(found)
+
+
 @dataclass(frozen=True, slots=True)
 class _Others:
-    """A fit of all runs but one."""
+    """A fit of all parts but one."""
 
     factor: tuple[FloatArray, bool]  #: Cholesky factor of JᵀJ
     score: FloatArray  #: Jᵀe, shape (f,)
 
 
 @dataclass(frozen=True, slots=True)
-class RunsLeftOut:
-    """A linearised problem cut into runs: each is predicted by a fit of the others."""
+class PartsLeftOut:
+    """A linearised problem cut into parts, runs or regions of the workspace: the others predict each."""
 
     search_problem: SearchProblem  #: the problem
-    run_of: IntArray  #: run of each of its clusters, shape (clusters,)
-    others: tuple[_Others | None, ...]  #: of each run, None for one that stays; empty where none can be left out
+    name: str  #: of the parts, in words
+    part_of: IntArray  #: part of each of its clusters, shape (clusters,)
+    others: tuple[_Others | None, ...]  #: of each part, None for one that stays; empty where none can be left out
 
     @classmethod
-    def of(cls, search_problem: SearchProblem) -> RunsLeftOut:
-        """Cut a search problem into its runs."""
+    def of(cls, search_problem: SearchProblem) -> PartsLeftOut:
+        """Cut a search problem into its runs; into regions of the workspace where no run can be left out."""
         folds, observation = search_problem.folds, search_problem.observation
-        left_out, run_of = runs_to_leave_out(observation), folds.linearisation.of_clusters(observation.run)
+        left_out = runs_to_leave_out(observation)
+        part_of_row = observation.run
+        name = "runs"
         if not left_out:
-            return cls(search_problem, run_of, ())
-        hessian, score = folds.cluster_hessian, folds.cluster_score
+            position = np.concatenate([run.position_rad for run in search_problem.rows], axis=1)
+            part_of_row = regions_to_leave_out(observation, position)
+            name = "regions of the workspace"
+            if not len(part_of_row):
+                return cls(search_problem, name, part_of_row, ())
+            left_out = _can_be_left_out(observation, part_of_row)
+        part_of = folds.linearisation.of_clusters(part_of_row)
+        hessian = folds.cluster_hessian
+        score = folds.cluster_score
+        others: list[_Others | None] = []
+        for part in range(int(part_of_row.max()) + 1):
+            rest = part_of != part
+            fit = _Others(_factor(hessian[rest].sum(axis=0)), score[rest].sum(axis=0)) if part in left_out else None
+            others.append(fit)
+        return cls(search_problem, name, part_of, tuple(others) if left_out else ())
 
-        def others(run: int) -> _Others | None:
-            if run not in left_out:
-                return None
-            rest = run_of != run
-            return _Others(_factor(hessian[rest].sum(axis=0)), score[rest].sum(axis=0))
-
-        return cls(search_problem, run_of, tuple(map(others, range(len(observation.runs)))))
-
-    def change(self, columns: FloatArray) -> PairedChange:
-        """Change of the error on runs left out when whitened columns, shape (rows, p), join the model."""
+    def change(self, columns: FloatArray) -> ErrorChange:
+        """Change of the errors on parts left out when whitened columns, shape (rows, p), join the model."""
         folds = self.search_problem.folds
         problem, observation, phi = folds.linearisation, self.search_problem.observation, columns.T
         count, width, unknowns = len(self.others), len(phi), problem.jacobian.width
-        # ΦᵀΦ, Φᵀe and ΦᵀJ of each run.
+        # ΦᵀΦ, Φᵀe and ΦᵀJ of each part.
         grams, scores = np.zeros((count, width, width)), np.zeros((count, width))
         crossed = np.zeros((count, width, unknowns))
         for motor in folds.motors:
-            run_of, own = self.run_of[motor.cluster], phi[:, motor.rows]
-            np.add.at(grams, run_of, motor.sums(own, own))
+            part_of, own = self.part_of[motor.cluster], phi[:, motor.rows]
+            np.add.at(grams, part_of, motor.sums(own, own))
             beside = motor.sums(own, motor.equations)
-            np.add.at(scores, run_of, beside[..., -2])
-            for run in np.unique(run_of):
-                crossed[run][:, motor.seen] += beside[run_of == run][..., :-2].sum(axis=0)
+            np.add.at(scores, part_of, beside[..., -2])
+            for part in np.unique(part_of):
+                crossed[part][:, motor.seen] += beside[part_of == part][..., :-2].sum(axis=0)
         unit = np.sqrt(np.maximum(np.diag(grams.sum(axis=0)), np.finfo(np.float64).tiny))
-        # What the fit of the others predicts of each run, without the columns, and what these change of it.
+        # What the fit of the others predicts of each part, without the columns, and what these change of it.
         steps, coefficients = np.zeros((count, 2, unknowns)), np.zeros((count, width))
-        for run, fit in enumerate(self.others):
+        for part, fit in enumerate(self.others):
             if fit is None:
                 continue
-            rest = crossed.sum(axis=0) - crossed[run]
+            rest = crossed.sum(axis=0) - crossed[part]
             along = linalg.cho_solve(fit.factor, rest.T).T
-            left = grams.sum(axis=0) - grams[run] - rest @ along.T
-            drive = scores.sum(axis=0) - scores[run] - along @ fit.score
-            coefficients[run] = np.linalg.pinv(left / np.outer(unit, unit), rcond=UNSEEN) @ (drive / unit) / unit
-            steps[run] = linalg.cho_solve(fit.factor, fit.score), coefficients[run] @ along
+            left = grams.sum(axis=0) - grams[part] - rest @ along.T
+            drive = scores.sum(axis=0) - scores[part] - along @ fit.score
+            coefficients[part] = np.linalg.pinv(left / np.outer(unit, unit), rcond=UNSEEN) @ (drive / unit) / unit
+            steps[part] = linalg.cho_solve(fit.factor, fit.score), coefficients[part] @ along
         without, turned = np.concatenate(
-            [motor.predicted(list(steps[self.run_of[motor.cluster]])) for motor in folds.motors], axis=1
+            [motor.predicted(list(steps[self.part_of[motor.cluster]])) for motor in folds.motors], axis=1
         )
-        run_of_row = self.run_of[problem.cluster]
+        part_of_row = self.part_of[problem.cluster]
         before = problem.residual - without
-        after = before + turned - np.einsum("rp,rp->r", columns, coefficients[run_of_row])
-        shown = np.array([fit is not None for fit in self.others])[run_of_row]
-        return compare_by_move((after**2 - before**2)[shown], observation.move[problem.source[shown]])
+        after = before + turned - np.einsum("rp,rp->r", columns, coefficients[part_of_row])
+        shown = np.array([fit is not None for fit in self.others])[part_of_row]
+        source = problem.source[shown]
+        return change_of_errors(
+            before=before[shown] ** 2,
+            after=after[shown] ** 2,
+            motor=problem.motor[shown],
+            move=observation.move[source],
+            run=observation.run[source],
+            motors=len(problem.gamma),
+        )
 
     def refusal(self, columns: FloatArray) -> str:
-        """Why whitened columns may not join; empty where they may, or where no run can be left out."""
-        if not self.others or not (change := self.change(columns)).is_rise:
+        """Why whitened columns may not join; empty where they may, or where nothing can be left out."""
+        if not self.others:
             return ""
-        return f"the squared error on runs left out rises by {change.rise:.3g} ± {change.std:.2g} noise variances"
+        change = self.change(columns)
+        data = f"{self.name} left out"
+        if harm := change.harm(data):
+            return harm
+        # Too few blocks show nothing, but forbid nothing either: the folds of moves have judged.
+        of_motor = np.bincount(self.search_problem.folds.linearisation.motor, np.sum(columns**2, axis=1))
+        if not change.is_enough or change.is_fall(int(np.argmax(of_motor))):
+            return ""
+        size = f"{change.total.rise:.3g} ± {change.total.std:.2g} noise variances"
+        return f"the squared error on {data} changes by {size}, which may be noise"
 
 
 def whitened_columns(search_problem: SearchProblem, effect: Effect, axis: int) -> FloatArray:

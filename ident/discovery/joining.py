@@ -17,7 +17,7 @@ from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem,
 from ident.discovery.evidence import Evidence, by_instruments, with_effects
 from ident.discovery.gates import (
     Gates,
-    RunsLeftOut,
+    PartsLeftOut,
     gain_shifts,
     impossible,
     in_noise,
@@ -79,7 +79,7 @@ def linearised(evidence: Evidence, cache: ColumnCache) -> JointFit:
     return JointFit(evidence, problem)
 
 
-def _linearised_after(evidence: Evidence, before: JointFit) -> JointFit:
+def linearised_after(evidence: Evidence, before: JointFit) -> JointFit:
     """Linearise around a refit; columns of motion are kept unless a correction has changed the motion."""
     is_same = all(one is other for one, other in zip(evidence.datasets, before.evidence.datasets, strict=True))
     return linearised(evidence, before.search_problem.cache if is_same else ColumnCache())
@@ -150,7 +150,7 @@ def _refit(model: JointFit, accepted: Finding) -> JointFit | SetAside:
         # Asked here: after it, the linearised problem would take memory beside the instruments.
         if why := _refuted_by_instruments(refitted, last):
             return SetAside(accepted, why)
-        joined = resettled(_linearised_after(refitted, model))
+        joined = resettled(linearised_after(refitted, model))
     except UNFITTED as error:
         # The linearised problem distinguished the effect from the model, the whole one does not.
         return SetAside(accepted, f"it cannot be fitted: {error}")
@@ -181,7 +181,7 @@ def resettled(model: JointFit) -> JointFit:
             break
         others = evidence.effects[:-1]
         refitted = with_effects(evidence, (*others, PlacedEffect(effect, last.axis)), model.search_problem.runs)
-        model = _linearised_after(refitted, model)
+        model = linearised_after(refitted, model)
     return model
 
 
@@ -254,7 +254,7 @@ def _pruned(model: JointFit, accepted: Finding, rng: np.random.Generator, gates:
         try:
             kept = tuple(placed for placed in evidence.effects if placed != worst)
             rest = with_effects(evidence, kept, model.search_problem.runs)
-            model = _linearised_after(rest, model)
+            model = linearised_after(rest, model)
         except UNFITTED:
             needed.add(worst)  # the data cannot be fitted without it
 
@@ -275,5 +275,5 @@ def _beside_others(model: JointFit, placed: PlacedEffect, rng: np.random.Generat
     place = len(estimate.gains) + own
     joint = in_noise(values, estimate.covariance[np.ix_(place, place)])
     physics = impossible(placed.effect.coefficients, values, estimate.parameters_std[own])
-    reasons = (*finding.refusals, joint, physics, RunsLeftOut.of(problem).refusal(columns))
+    reasons = (*finding.refusals, joint, physics, PartsLeftOut.of(problem).refusal(columns))
     return finding.held_out_fall, "; ".join(dict.fromkeys(reason for reason in reasons if reason))

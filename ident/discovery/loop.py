@@ -17,9 +17,11 @@ from ident.discovery.choice import choice_covariance, is_small
 from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import (
     Gates,
-    RunsLeftOut,
+    PartsLeftOut,
     impossible,
+    in_noise,
     own_unknowns,
+    probability_of_zero,
     values_of,
     whitened_columns,
     without_effects_of,
@@ -32,6 +34,7 @@ from ident.discovery.joining import (
     join,
     keys_of,
     linearised,
+    linearised_after,
     refuted_by_structure,
     resettled,
 )
@@ -48,6 +51,7 @@ from ident.discovery.search import (
     refine_setting,
 )
 from ident.discovery.structure import MIN_MOVES_FOR_STRUCTURE, detection_limits_nm, find_structure, is_inadequate
+from ident.discovery.verdict import Verdict
 from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.position import Counterbalance
@@ -70,11 +74,12 @@ class Step:
     limits_nm: FloatArray  #: torque (root mean square) that a detectable effect has at each motor, shape (m,)
     accepted: Finding | None  #: the finding, or the structure without a name, that joined the model; None ends the loop
     after: Evidence  #: the model with it
-    set_aside: tuple[SetAside, ...] = ()  #: what would have joined the model, but for runs left out or the joint fit
+    set_aside: tuple[SetAside, ...] = ()  #: what would have joined the model, but for parts left out or the joint fit
     ended: str = ""  #: reason why the search ended here although the residual may call for more; else empty
     #: σ of each gain [Nm/A] from the choice of the effects, contained in that of `after`, shape (m,); last turn only.
     choice_std: FloatArray | None = None
     declared: bool = False  #: the cell declares the effect that joined: it was not searched for
+    verdicts: tuple[Verdict, ...] = ()  #: of held-out runs on each effect that was found; last turn only
 
     def ranked(self, count: int) -> tuple[Finding, ...]:
         """The best findings on named effects, and the accepted one wherever it ranks."""
@@ -102,8 +107,8 @@ def find_effects(
        of the squared residual is measured in-sample and on held-out moves (`rank_effects`);
     2. passes a candidate only through all gates: larger than noise makes anywhere in the search, better on most folds,
        large enough to matter, and physically possible (`Gates`, `impossible`);
-    3. chooses the best on held-out moves, the simplest among equals (`choose_effect`), if it does not raise the error
-       on runs left out (`RunsLeftOut`);
+    3. chooses the best on held-out moves, the simplest among equals (`choose_effect`), if it lowers the error on
+       runs or regions of the workspace left out, and raises it there on no motor (`PartsLeftOut`);
     4. tests terms without a name, splines and motor harmonics, on the same axis, or on all axes if no named effect
        passed; one that explains much more replaces the named effect (`find_structure`, `is_inadequate`). A term that
        moves a gain by more than its σ does not join; the name that it refutes then joins only if it moves none either
@@ -114,12 +119,13 @@ def find_effects(
        the model must still pass, beside all the others, or it leaves (`without_effects_of`). A term without a name may
        not make a named effect leave: then it does not join.
 
-    What runs left out or a gate of the joint fit refuse is in `Step.set_aside`, and the next best is tried. The
+    What parts left out or a gate of the joint fit refuse is in `Step.set_aside`, and the next best is tried. The
     ambiguity of an accepted effect holds what could not be distinguished from it, passed before, and does not pass
     beside it.
 
-    It ends when nothing passes, at one effect for PIECES_PER_EFFECT pieces, or after MAX_EFFECTS turns. Held-out runs
-    take no part in it. The covariance of the last estimate includes the choice of its effects (`choice_covariance`).
+    It ends when nothing passes, at one effect for PIECES_PER_EFFECT pieces, or after MAX_EFFECTS turns. The covariance
+    of the last estimate includes the choice of its effects (`choice_covariance`); an effect that this σ no longer shows
+    leaves (`end_search`). Held-out runs take no part in it: `ident.discovery.acceptance` judges by them.
 
     Args:
         start: identified by ``ml``, from `gather`.
@@ -149,7 +155,7 @@ def find_effects(
         seen.add(keys_of(model.evidence))
     else:
         steps[-1] = _settled(steps[-1], model.search_problem, (), rng, gates)
-    return (*steps[:-1], _with_choice(steps, model, gates))
+    return (*steps[:-1], end_search(steps, model, gates))
 
 
 def with_declared(
@@ -208,6 +214,71 @@ def _with_declared_form(evidence: Evidence, forms: Sequence[PlacedEffect]) -> Ev
     return with_effects(evidence, (*evidence.effects, plain))
 
 
+def end_search(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
+    """Return the last step with the σ that is reported, and without the effects that this σ does not show.
+
+    σ from the choice of the effects comes last, so that an effect can have passed every gate by a smaller one: it
+    leaves where its coefficients may all be zero by the covariance that is reported, or one of them is impossible. The
+    worst leaves first, and the rest is fitted again.
+
+    Args:
+        steps: of the search; the last one is returned.
+        model: what it ended with.
+        gates: limits of the search.
+    """
+    aside: list[SetAside] = []
+    while True:
+        last = _with_choice(steps, model, gates)
+        last = replace(last, set_aside=(*last.set_aside, *aside))
+        failing = _unshown(last.after)
+        if not failing:
+            return last
+        worst, why, _ = max(failing, key=lambda one: one[2])
+        evidence = model.evidence
+        kept = tuple(placed for placed in evidence.effects if placed != worst)
+        try:
+            rest = with_effects(evidence, kept, model.search_problem.runs)
+            model = linearised_after(replace(rest, declared=evidence.declared), model)
+        except UNFITTED:
+            return last  # the data cannot be fitted without it
+        found = _finding_of(steps, worst)
+        if found is not None:
+            aside.append(SetAside(found, f"by the σ that is reported, {why}"))
+
+
+def _unshown(evidence: Evidence) -> list[tuple[PlacedEffect, str, float]]:
+    """Effects that the covariance of an estimate does not show, why, and the probability of their being zero.
+
+    What the cell declares stays. An impossible coefficient counts like one that is certainly zero.
+    """
+    estimate = evidence.estimate
+    failing: list[tuple[PlacedEffect, str, float]] = []
+    for placed in evidence.effects[evidence.declared :]:
+        own = own_unknowns(estimate, (placed,))
+        place = len(estimate.gains) + own
+        values = values_of(estimate, own)
+        covariance = estimate.covariance[np.ix_(place, place)]
+        wrong = impossible(placed.effect.coefficients, values, estimate.parameters_std[own])
+        std = estimate.parameters_std[own]
+        noise = in_noise(values, covariance)
+        if not noise and not is_unnamed(placed.effect) and np.all(np.abs(values) < std):
+            noise = "each of its coefficients is less than its σ: what they are together is not known"
+        if wrong:
+            failing.append((placed, wrong, 1.0))
+        elif noise:
+            failing.append((placed, noise, probability_of_zero(values, covariance)))
+    return failing
+
+
+def _finding_of(steps: Sequence[Step], placed: PlacedEffect) -> Finding | None:
+    """The finding by which an effect joined last."""
+    for step in reversed(steps):
+        found = step.accepted
+        if found is not None and PlacedEffect(found.effect, found.axis) == placed:
+            return found
+    return None
+
+
 def _with_choice(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
     """Return the last step, what the choice of its effects adds to the covariance of its estimate included."""
     estimate, accepted = model.evidence.estimate, dict[PlacedEffect, tuple[Finding, tuple[Finding, ...]]]()
@@ -221,7 +292,8 @@ def _with_choice(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
         left += [one.finding for one in last.set_aside if one.moved and is_unnamed(one.finding.effect)]
         left += [found for found in (*last.findings, *last.structures) if is_small(found, gates)]
     choice = choice_covariance(model.search_problem, estimate, tuple(accepted.values()), left)
-    last = replace(last, choice_std=np.sqrt(np.diag(choice)[: len(estimate.gains)]))
+    choice_std = np.sqrt(np.diag(choice)[: len(estimate.gains)])
+    last = replace(last, after=model.evidence, choice_std=choice_std)
     if not choice.any():
         return last
     chosen = replace(estimate, covariance=estimate.covariance + choice)
@@ -245,7 +317,7 @@ def _turn(
     proposed = _proposals(problem, evidence.effects, rng, gates, families)
     present = {placed.effect.name for placed in evidence.effects if not is_unnamed(placed.effect)}
     findings, structures = rank_effects(problem, rng, gates, families, proposed, present), tuple[Finding, ...]()
-    limits_nm, runs = detection_limits_nm(problem, gates), RunsLeftOut.of(problem)
+    limits_nm, runs = detection_limits_nm(problem, gates), PartsLeftOut.of(problem)
     taken, searched, aside, ended = set(keys_of(evidence)), range(0), list[SetAside](), ""
     while True:
         named = choose_effect(findings, taken)
@@ -311,7 +383,7 @@ def _proposals(
 
 
 def _first_of_axis(aside: Sequence[SetAside], new: SetAside) -> tuple[SetAside, ...]:
-    """Finding that runs left out refuse, unless a better finding of its kind on this axis was set aside before."""
+    """Finding that parts left out refuse, unless a better finding of its kind on this axis was set aside before."""
     kind = new.finding.axis, is_unnamed(new.finding.effect)
     return () if kind in {(one.finding.axis, is_unnamed(one.finding.effect)) for one in aside} else (new,)
 

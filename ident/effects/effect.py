@@ -133,6 +133,11 @@ class Effect(ABC):
         return ()
 
     @property
+    def is_rate(self) -> bool:
+        """Whether the torque is a derivative in time, which a filter makes much smaller."""
+        return self.side is Side.ALL_JOINTS or self.declares in {Property.RATE_OF_TORQUE, Property.RATE_OF_LOAD}
+
+    @property
     def forms(self) -> tuple[Self, ...]:
         """Simpler forms of the effect, then the effect itself; each form's columns are the first ones of the next."""
         return (self,)

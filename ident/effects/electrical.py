@@ -14,6 +14,10 @@ from ident.effects.signals import Abscissa, Signals
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
 
+EARLIEST_S = 0.01
+"""By how much a current may be early on one axis: its reference precedes the torque by the current loop, and a position
+is read a few cycles late; both are milliseconds. More is no cause of what was recorded before it."""
+
 
 @dataclass(frozen=True, slots=True)
 class Saturation(Effect):
@@ -72,7 +76,7 @@ class Cogging(Effect):
 
 @dataclass(frozen=True, slots=True)
 class Lag(Effect):
-    """τ = −c · ẏ,  T ẏ + y = g v;  c > 0: the current is late by c; c < 0: it is early.
+    """τ = −c · ẏ,  T ẏ + y = g v;  c > 0: the current is late by c; c < 0: it is early, by EARLIEST_S at most.
 
     v is the current that the model predicts, other effects left out. A first-order lag of time constant c is this with
     T = c; a delay is v(t − c) ≈ v − c v̇ + c²/2 · v̈, this with T = c/2 to second order. For an early current the filter
@@ -84,7 +88,7 @@ class Lag(Effect):
     side = Side.MOTOR
     declares = Property.RATE_OF_TORQUE
     abscissa = Abscissa.TORQUE_RATE
-    coefficients = (Column("time", "s"),)
+    coefficients = (Column("time", "s", least=-EARLIEST_S),)
 
     filter_s: Annotated[float, Range(0.0, 0.1)] = 0.0  #: T
     backwards: Switch = 0  #: 1 where the filter runs backwards in time, else 0

@@ -116,16 +116,23 @@ class Counterbalance(Effect):
 class Hinge(Effect):
     """τ = c · max(0, σ (q − q₀));  c > 0: the motor pushes in the positive direction beyond q₀.
 
-    Source: Hooke's law of a slack cable or hose. Signature: position, on one side of q₀.
+    A cable or hose only pulls: what it stores beyond q₀ grows, ½ σ c (q − q₀)², and so σ c ≥ 0. One that lets go beyond
+    q₀ is the hinge of the other σ. Source: Hooke's law of a slack cable or hose. Signature: position, on one side.
     """
 
     name = "hinge"
     declares = Property.INDEPENDENT_OF_VELOCITY
     abscissa = Abscissa.POSITION
-    coefficients = (Column("stiffness", "Nm/rad"),)
 
     start_rad: Annotated[float, Range(-1e3, 1e3)]  #: q₀
     sense: Sense  #: σ, 1 where it pulls above q₀, −1 below
+
+    @property
+    def coefficients(self) -> tuple[Column, ...]:
+        """Linear parameter, of the sign of σ."""
+        if self.sense > 0:
+            return (Column("stiffness", "Nm/rad", least=0.0),)
+        return (Column("stiffness", "Nm/rad", largest=0.0),)
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""

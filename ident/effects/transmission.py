@@ -233,7 +233,9 @@ class Efficiency(Effect):
 class InertialCoupling(Effect):
     """τ_i = c · q̈_j and τ_j = c · q̈_i;  c > 0: both joints accelerate the shared body in the same sense.
 
-    Source: a rotor or shaft that both joints turn (paper eq. 25: Ia_m6 beside the diagonal). Signature: another axis'
+    A rotor that turns with n_i q̇_i + n_j q̇_j has the energy ½ J (n_i q̇_i + n_j q̇_j)²: c = J n_i n_j has the sign of the
+    two ratios, so that c < 0 is no negative inertia, but a body that the joints turn against each other. Source:
+    a rotor or shaft that both joints turn (paper eq. 25: Ia_m6 beside the diagonal). Signature: another axis'
     acceleration.
     """
 

@@ -15,6 +15,9 @@ if TYPE_CHECKING:  # a calibration has relative errors, and reading one needs no
     from ident.estimators.method import Method
     from ident.model.model import Column
 
+SAME_ERROR = 0.01
+"""Share of an error by which another one may be larger and still be the same: 5.76 % and 5.76 % differ by chance."""
+
 
 @dataclass(frozen=True, slots=True)
 class RelativeError:

@@ -11,14 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from ident.calibration import AcceptedEffect, Parameter
+from ident.calibration import EXTRAPOLATED, AcceptedEffect, Parameter, _largest_torque
 from ident.data.dataset import Dataset, differentiate, planned
 from ident.data.run import Run
 from ident.discovery.evidence import Evidence, gather, with_effects
+from ident.discovery.gates import own_unknowns
 from ident.effects.dictionary import EFFECTS, UNNAMED
 from ident.effects.effect import ALL_AXES, Effect, PlacedEffect, Side, check_settings
 from ident.effects.electrical import Cogging, Lag, Saturation, TimeSkew
-from ident.effects.friction import LoadFriction, Stribeck, WarmUp
+from ident.effects.friction import LoadFriction, NonlinearViscous, Stribeck, WarmUp
 from ident.effects.position import Spring
 from ident.effects.signals import Abscissa
 from ident.effects.transmission import Elasticity
@@ -68,6 +69,33 @@ def test_so_does_that_of_effects(identified: Evidence, effects: tuple[PlacedEffe
     without = replace(calibrated(after), effects=())
     with pytest.raises(ModelError, match=effects[0].effect.name):
         standard_parameters(without, identified.model)
+
+
+def test_an_effect_has_no_torque_far_beyond_what_the_fit_has_seen(identified: Evidence) -> None:
+    """A power of the speed grows without end: at twice the speed, the fourth is sixteen times as large."""
+    placed = PlacedEffect(NonlinearViscous(4.0), 1)
+    after = with_effects(identified, (placed,))
+    whole = calibrated(after)
+    largest_nm = _largest_torque(after, placed)
+    assert largest_nm is not None
+    rows = after.training.effects[:, 0] * after.estimate.parameters[own_unknowns(after.estimate, (placed,))]
+    assert largest_nm == pytest.approx(np.max(np.abs(rows), axis=1, where=after.training.use, initial=0.0), rel=1e-3)
+    bounded = replace(whole, effects=(replace(whole.effects[0], largest_torque=largest_nm),))
+    data = identified.datasets[0]
+    fast = replace(data, velocity_rad_s=2.0 * data.velocity_rad_s)
+    model = identified.model
+    for motion, is_limited in ((data, False), (fast, True)):
+        free = predict_torque(whole, model, motion)
+        limited = predict_torque(bounded, model, motion)
+        assert np.allclose(free, limited) != is_limited
+    without = predict_torque(replace(whole, effects=(_without_torque(whole.effects[0]),)), model, fast)
+    assert np.max(np.abs(limited - without)) == pytest.approx(EXTRAPOLATED * max(largest_nm), rel=1e-6)
+    assert _largest_torque(after, PlacedEffect(Lag(), 1)) is None
+
+
+def _without_torque(effect: AcceptedEffect) -> AcceptedEffect:
+    """The same effect with coefficients of zero."""
+    return replace(effect, coefficients=tuple(replace(one, value=0.0) for one in effect.coefficients))
 
 
 def test_what_fades_over_a_session_counts_from_its_first_run(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:

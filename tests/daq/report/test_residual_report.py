@@ -50,8 +50,8 @@ from daq.workflow.fit import Fit, calibration_of, fit
 from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.discovery import before_after as before_after_module
 from ident.discovery.before_after import Account, account
+from ident.discovery.error_change import PairedChange
 from ident.discovery.evidence import with_effects
-from ident.discovery.gates import PairedChange
 from ident.discovery.gear_loss import GearLoss
 from ident.discovery.joining import SetAside
 from ident.discovery.loop import Step

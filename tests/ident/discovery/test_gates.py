@@ -11,21 +11,24 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
-from ident.data.run import Run
-from ident.discovery import joining, loop
+from ident.discovery import gates, joining, loop
 from ident.discovery.candidates import SearchProblem, score_candidates
+from ident.discovery.error_change import compare_by_move
 from ident.discovery.evidence import Evidence, gather, with_effects
 from ident.discovery.few_moves import FEWEST_MOVES, moves_behind
 from ident.discovery.gates import (
     MIN_RUNS,
+    REGIONS,
     Gates,
-    RunsLeftOut,
-    compare_by_move,
+    PartsLeftOut,
     gain_shifts,
     impossible,
     in_noise,
     moved_gains,
+    own_unknowns,
+    regions_to_leave_out,
     runs_to_leave_out,
+    whitened_columns,
     without_effects_of,
 )
 from ident.discovery.joining import SetAside
@@ -38,10 +41,13 @@ from ident.discovery.search import (
 )
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.electrical import Lag
 from ident.effects.friction import NonlinearViscous, Stribeck, TemperatureFriction, WarmUp
 from ident.effects.position import Hinge, Spring
 from ident.effects.signals import Abscissa, Signals
 from ident.effects.unnamed import Smooth
+from ident.equations.linearisation import cut_into_folds
+from ident.estimators.estimate import Estimate
 from ident.estimators.identify import identify
 from ident.model.model import Column
 from tests.ident.loops import record_in_loop
@@ -54,7 +60,6 @@ EITHER_SIGN = {
     "position-friction",
     "spring",
     "passive-spring",
-    "hinge",
     "gravity-compensator",
     "cogging",
     "ripple",
@@ -222,7 +227,7 @@ def test_an_error_on_runs_left_out_is_that_of_a_fit_of_the_others(search_problem
         for matrix, sign in ((both, 1.0), (declared, -1.0)):
             fitted = np.linalg.lstsq(matrix[~own], problem.residual[~own], rcond=None)[0]
             rise += sign * float(np.sum((problem.residual[own] - matrix[own] @ fitted) ** 2))
-    assert RunsLeftOut.of(search_problem).change(columns).rise == pytest.approx(rise, rel=1e-4)
+    assert PartsLeftOut.of(search_problem).change(columns).total.rise == pytest.approx(rise, rel=1e-4)
 
 
 def _levels(small: Evidence, truth: Truth, levels: tuple[float, ...]) -> SearchProblem:
@@ -249,7 +254,7 @@ def test_what_only_moves_of_the_same_run_predict_is_refused(
     (trial,) = score_candidates(problem.folds, columns, (slice(0, powers),))
     assert trial is not None
     assert trial.held_out.sum() < 0.9 * problem.folds.square_sum(problem.folds.residual).sum()
-    assert bool(RunsLeftOut.of(problem).refusal(columns)) == (powers == 3)
+    assert bool(PartsLeftOut.of(problem).refusal(columns)) == (powers == 3)
 
 
 def test_without_an_effect_the_joint_fit_is_the_declared_one_to_first_order(sticking: Evidence) -> None:
@@ -308,11 +313,11 @@ def test_the_number_of_effects_is_bounded_by_the_moves(sticking: Evidence, monke
 
 
 def test_rivals_are_those_that_stop_passing_beside_it(small: Evidence, small_truth: Truth) -> None:
-    """A hump over the joint's angle, which hinges and harmonics follow equally well."""
+    """A hose that becomes taut little by little, which hinges and harmonics follow equally well."""
 
     def torque(data: Dataset) -> FloatArray:
         q = data.position_rad[:, 1]
-        return acting_on(1, 3, 6.0 * np.sin(3.0 * q) * np.exp(-(q**2)))
+        return acting_on(1, 3, 3.0 * np.log1p(np.exp(4.0 * (q - 0.3))))
 
     families = tuple(family for family in EFFECTS if family[0].name in {"hinge", "gravity-compensator", "stribeck"})
     start = bent(small, small_truth, torque)
@@ -364,9 +369,107 @@ def test_an_effect_joins_beside_a_disturbance_in_the_loop(disturbed: Evidence, s
     assert first.after.effects == (PlacedEffect(STICKING[0], 1),)
 
 
-def test_two_runs_are_judged_on_moves_alone(small: Evidence, small_runs: tuple[Run, ...]) -> None:
+def test_two_runs_are_judged_on_regions_of_the_workspace(small: Evidence) -> None:
     rows = small.training.run < MIN_RUNS - 1
     short = replace(small, training=small.training.only(rows), datasets=small.datasets[: MIN_RUNS - 1])
-    runs = RunsLeftOut.of(search_problem_of(short))
-    assert runs.others == ()
-    assert runs.refusal(np.ones((1, 1))) == ""
+    problem = search_problem_of(short)
+    parts = PartsLeftOut.of(problem)
+    assert parts.name == "regions of the workspace"
+    assert len(parts.others) == REGIONS
+    position = np.concatenate([run.position_rad for run in problem.rows], axis=1)
+    region = regions_to_leave_out(problem.observation, position)
+    observation = problem.observation
+    # A move is in one region, and regions are postures: moves of one are nearer to each other than to all others.
+    moves = np.unique(observation.move)
+    of_move = np.array([np.unique(region[observation.move == move]) for move in moves])
+    assert of_move.shape == (len(moves), 1)
+    assert np.ptp(np.bincount(of_move[:, 0])) <= 3
+    means = np.stack([position[:, observation.move == move].mean(axis=1) for move in moves])
+    units = (means - means.mean(axis=0)) / means.std(axis=0)
+    inside = [units[of_move[:, 0] == one].var(axis=0).sum() for one in range(REGIONS)]
+    assert np.mean(inside) < 0.8 * units.var(axis=0).sum()
+
+
+def test_few_moves_are_not_parted_into_regions(small: Evidence) -> None:
+    rows = small.training
+    few = rows.only(np.isin(rows.move, np.unique(rows.move)[: 2 * REGIONS - 1]))
+    assert len(regions_to_leave_out(few, np.zeros((3, len(few.move))))) == 0
+
+
+def test_a_region_with_the_only_payload_stays(small: Evidence) -> None:
+    """Where one region holds all the loaded rows, a fit without it knows no gain."""
+    rows = small.training
+    position = np.stack((np.where(rows.mounting >= 0, 1.0, -1.0), np.zeros(len(rows.move))))
+    region = regions_to_leave_out(rows, position)
+    only_one = np.where(rows.mounting >= 0, 0, 1 + region % (REGIONS - 1))
+    assert 0 not in gates._can_be_left_out(rows, only_one)
+
+
+def test_what_holds_in_one_region_alone_is_refused(small: Evidence) -> None:
+    """Dry friction of joint 2 that differs by region at random: seven powers of the region's number follow it."""
+    rows = small.training.run < MIN_RUNS - 1
+    short = replace(small, training=small.training.only(rows), datasets=small.datasets[: MIN_RUNS - 1])
+    problem = search_problem_of(short)
+    parts = PartsLeftOut.of(problem)
+    linear = problem.folds.linearisation
+    region = 2.0 * parts.part_of[linear.cluster] / (REGIONS - 1.0) - 1.0
+    rubbing = whitened_columns(problem, Stribeck(100.0), 1)
+    powers = np.asarray(rubbing * np.polynomial.legendre.legvander(region, REGIONS - 1)[:, 1:])
+    level = np.random.default_rng(6).normal(0.0, 4.0, REGIONS)[parts.part_of[linear.cluster]]
+    torque = rubbing[:, 0] * level
+    bent_rows = replace(linear, residual=linear.residual + torque)
+    folds = cut_into_folds(bent_rows, move_of=linear.of_clusters(problem.observation.move))
+    differing = PartsLeftOut.of(replace(problem, folds=folds))
+    (trial,) = score_candidates(folds, powers, (slice(0, REGIONS - 1),))
+    assert trial is not None
+    assert trial.held_out.sum() < 0.9 * folds.square_sum(folds.residual).sum()
+    assert differing.refusal(powers)
+
+
+def test_an_effect_that_the_reported_sigma_does_not_show_leaves(
+    sticking: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The choice of the effects adds to σ after all gates: what it hides is not reported."""
+    (*_, shown) = find_effects(sticking, np.random.default_rng(0), GATES, (STICKING,))
+    assert [placed.effect for placed in shown.after.effects] == [STICKING[0]]
+    own = len(shown.after.estimate.gains) + own_unknowns(shown.after.estimate, shown.after.effects)
+
+    def wide(_: object, estimate: Estimate, *__: object) -> FloatArray:
+        added = np.zeros_like(estimate.covariance)
+        place = own[own < len(added)]
+        added[place, place] = 1e4
+        return added
+
+    monkeypatch.setattr(loop, "choice_covariance", wide)
+    (*_, last) = find_effects(sticking, np.random.default_rng(0), GATES, (STICKING,))
+    assert last.after.effects == ()
+    assert last.set_aside[-1].finding.effect == STICKING[0]
+    assert last.set_aside[-1].words.startswith("by the σ that is reported, its coefficients may all be zero")
+    assert last.after.estimate.gains == pytest.approx(sticking.estimate.gains, rel=1e-6)
+
+
+def test_an_impossible_part_leaves_with_its_effect(sticking: Evidence) -> None:
+    """Friction that grows while the joint moves fast, from a fit that no gate has judged."""
+    joined = with_effects(sticking, (PlacedEffect(STICKING[0], 1), PlacedEffect(Hinge(0.0, 1), 1)))
+    estimate = joined.estimate
+    own = own_unknowns(estimate, joined.effects[1:])
+    parameters = estimate.parameters.copy()
+    parameters[own] = -3.0
+    covariance = estimate.covariance.copy()
+    place = len(estimate.gains) + own
+    covariance[place, :] = 0.0
+    covariance[:, place] = 0.0
+    covariance[place, place] = 0.01
+    wrong = replace(joined, estimate=replace(estimate, parameters=parameters, covariance=covariance))
+    ((placed, why, _),) = loop._unshown(wrong)
+    assert placed == joined.effects[1]
+    assert "physics allows no less than 0" in why
+    assert not loop._unshown(replace(wrong, declared=2))
+
+
+def test_a_hose_only_pulls_and_a_current_is_early_by_milliseconds() -> None:
+    ranges = {sense: Hinge(0.5, sense).coefficients[0] for sense in (1, -1)}
+    assert (ranges[1].least, ranges[1].largest) == (0.0, np.inf)
+    assert (ranges[-1].least, ranges[-1].largest) == (-np.inf, 0.0)
+    assert impossible(Lag().coefficients, np.array([-0.021]), np.array([0.003]))
+    assert not impossible(Lag().coefficients, np.array([-0.004]), np.array([0.001]))

@@ -1,0 +1,202 @@
+"""Which effects held-out runs confirm: the others leave, one by one, and the rest is fitted again after each.
+
+`accept_on_holdout` is the entry, after `ident.discovery.loop.find_effects`, which has not seen these runs. The burden
+of proof is on the effect:
+
+1. every effect is taken out of the model in turn, everything else is refitted, and both models predict the held-out
+   runs; `judge` compares their errors on every motor;
+2. of what is refuted, the worst leaves, the rest is fitted and judged again: beside it, others may have seemed harmful;
+3. then of what is undecided, the least certain leaves likewise, because two effects of which either does the work seem
+   useless, each beside the other;
+4. what is left must together lower the held-out error of the model without effects, and raise it on no motor; else
+   all of it leaves.
+
+Effects that the cell declares are not judged: it is known that they are there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ident.discovery.before_after import error_on, squares_left
+from ident.discovery.candidates import ColumnCache
+from ident.discovery.error_change import ErrorChange, change_of_errors
+from ident.discovery.evidence import Evidence, with_effects
+from ident.discovery.gates import Gates
+from ident.discovery.joining import UNFITTED, linearised
+from ident.discovery.loop import Step, end_search
+from ident.discovery.verdict import Judgement, Verdict, judge
+from ident.effects.effect import PlacedEffect
+from ident.effects.geometry import is_correction
+from ident.estimators.estimate import RelativeError
+from ident.estimators.identify import estimate_with
+
+
+def accept_on_holdout(
+    start: Evidence,
+    steps: Sequence[Step],
+    *,
+    gates: Gates | None = None,
+    write_undecided: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+    axes: Sequence[str] = (),
+) -> tuple[Step, ...]:
+    """Take out of the last model what held-out runs do not confirm.
+
+    Args:
+        start: the model that the search began with, with the effects that the cell declares.
+        steps: of `find_effects`, from there.
+        gates: limits of the search.
+        write_undecided: keep effects that held-out runs neither confirm nor refute.
+        progress: called with a description of each step.
+        axes: their names in it; those of the robot's joints when empty.
+
+    Returns:
+        the same steps; the last one has the model with what is left, and the verdicts. The steps as they are where
+        nothing was found, or nothing was held out.
+
+    Raises:
+        NotConverged, RankDeficient: see `ident.identify`.
+    """
+    if not steps or start.holdout is None:
+        return tuple(steps)
+    found = steps[-1].after
+    if len(found.effects) == found.declared:
+        return tuple(steps)
+    names = axes or [joint.name for joint in start.model.robot.places]
+    verdicts: dict[PlacedEffect, Verdict] = {}
+    current = found
+    while len(current.effects) > current.declared:
+        progress(f"judging {len(current.effects) - current.declared} effects on held-out runs")
+        judged = [_verdict(start, current, placed) for placed in current.effects[current.declared :]]
+        verdicts |= {one.placed: one for one in judged}
+        leaving = _leaving(judged, write_undecided=write_undecided)
+        if leaving is None:
+            break
+        progress(f"{leaving.placed.name_among(names)} leaves: {leaving.reason}")
+        current = start if leaving.is_needed else _without(current, leaving.placed)
+    kept = current.effects[current.declared :]
+    if kept and (why := _loses(start, current)):
+        progress(f"the effects together leave: {why}")
+        reason = f"together with the other effects: {why}"
+        for placed in kept:
+            verdicts[placed] = replace(verdicts[placed], judgement=Judgement.REFUTED, reason=reason)
+        current = start
+    last = steps[-1]
+    if current.effects != found.effects:
+        refitted = start
+        if current is not start:
+            refitted = replace(with_effects(found, current.effects), declared=found.declared)
+        model = linearised(refitted, ColumnCache())
+        last = end_search((*steps[:-1], last), model, gates or Gates())
+    written = last.after.effects
+    ordered = tuple(
+        replace(verdicts[placed], written=placed in written) for placed in found.effects if placed in verdicts
+    )
+    return (*steps[:-1], replace(last, verdicts=ordered))
+
+
+def compare_on_holdout(start: Evidence, before: Evidence, after: Evidence) -> ErrorChange:
+    """Compare two models of the same data on held-out rows, in units of the noise of a model without effects.
+
+    Raises:
+        ValueError: nothing was held out.
+    """
+    if before.holdout is None or after.holdout is None:
+        raise ValueError("two models can be compared on held-out rows only if runs were held out")
+    rows = before.holdout
+    noise_a = start.estimate.axis_noise
+    first = squares_left(before.holdout, before.estimate)
+    second = squares_left(after.holdout, after.estimate)
+    used = rows.motor_use
+    motor = np.nonzero(used)[0]
+    variance = np.square(noise_a)[motor]
+    source = np.nonzero(used)[1]
+    return change_of_errors(
+        before=first[used] / variance,
+        after=second[used] / variance,
+        motor=motor,
+        move=rows.move[source],
+        run=rows.run[source],
+        motors=len(noise_a),
+    )
+
+
+def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> Verdict:
+    """Judge an effect beside the others; together with them where they cannot be fitted without it."""
+    is_needed = False
+    try:
+        without = _without(current, placed)
+    except UNFITTED:
+        without = start
+        is_needed = True
+    change = compare_on_holdout(start, without, current)
+    has_motor = placed.axis < len(change.motors) and placed.effect.has_axis
+    judgement, reason = judge(change, placed.axis if has_motor else None)
+    return Verdict(
+        placed=placed,
+        judgement=judgement,
+        reason=reason,
+        change=change,
+        before=_torque_error(without),
+        after=_torque_error(current),
+        is_needed=is_needed,
+    )
+
+
+def _leaving(judged: Sequence[Verdict], *, write_undecided: bool) -> Verdict | None:
+    """The worst of what is refuted; then the least certain of what is undecided, unless that is to be written."""
+    refuted = [one for one in judged if one.judgement is Judgement.REFUTED]
+    if refuted:
+        return max(refuted, key=lambda one: one.change.total.rise)
+    undecided = [one for one in judged if one.judgement is Judgement.UNDECIDED]
+    if undecided and not write_undecided:
+        return max(undecided, key=lambda one: one.change.total.rise)
+    return None
+
+
+def _loses(start: Evidence, end: Evidence) -> str:
+    """Why effects together are no better on held-out runs than none; empty where they are."""
+    if harm := compare_on_holdout(start, start, end).harm("held-out runs"):
+        return harm
+    if start.holdout is None or end.holdout is None:
+        return ""
+    weights_nm_a = start.estimate.gains
+    before = error_on(start.holdout, start.estimate).relative(weights_nm_a).total
+    after = error_on(end.holdout, end.estimate).relative(weights_nm_a).total
+    if after < before:
+        return ""
+    return f"the error on held-out runs is {after:.2f} % with them, {before:.2f} % without"
+
+
+def _without(evidence: Evidence, left_out: PlacedEffect) -> Evidence:
+    """Refit without one effect, the columns of the others as they are.
+
+    These hold the load and the current that the model with it predicts, so that the comparison shows the effect alone.
+    """
+    kept = tuple(placed for placed in evidence.effects if placed != left_out)
+    if is_correction(left_out):
+        return with_effects(evidence, kept)  # the description is what it was without it, and with it all columns
+    names = {column.name for column in left_out.columns}
+    bare = len(evidence.rows_without_effects.columns)
+    added = evidence.training.columns[bare:]
+    stays = np.array([column.name not in names for column in added], dtype=np.bool_)
+    columns = tuple(column for column, stay in zip(added, stays, strict=True) if stay)
+    first = evidence.training
+    training = replace(first, columns=(*first.columns[:bare], *columns), effects=first.effects[:, stays])
+    holdout = evidence.holdout
+    if holdout is not None:
+        holdout = replace(holdout, columns=training.columns, effects=holdout.effects[:, stays])
+    fixed = evidence.estimate.gains if evidence.estimate.gains_fixed else None
+    estimate = estimate_with(evidence.estimate.method, training.system(), fixed)
+    return replace(evidence, training=training, holdout=holdout, effects=kept, estimate=estimate)
+
+
+def _torque_error(evidence: Evidence) -> RelativeError:
+    error = evidence.holdout_error
+    if error is None:
+        raise ValueError("two models can be compared on held-out rows only if runs were held out")
+    return error

@@ -1,0 +1,192 @@
+"""Change of the errors of all motors on data that a fit has not seen, beside its noise.
+
+Two models predict the same rows. With d_b the rise of a squared error in block b of B, the errors differ by more than
+noise where
+
+    |Σ d_b| > t_(p, B − 1) · √(B/(B − 1) Σ (d_b − mean)²).
+
+Blocks are moves, and neighbouring moves of a run are joined in pairs while their changes correlate: an error that
+differs over a region of the workspace differs in a dozen moves at once, which prove no more than one of them. Fewer
+blocks than FEWEST_BLOCKS show nothing, whatever they say: the signs of four agree by chance once in 16 times. One block
+that outweighs all others does not either: t is then near one.
+
+A model can be worse on one motor and better in total. So the total is judged at CONFIDENCE, and a rise of any motor at
+MOTOR_CONFIDENCE, one-sided, for all motors together. A fall of the motor on which an effect acts counts as one, too:
+the effect names it before these data are asked. A rise by less than SAME_ERROR of the error is none, however certain it
+is: 5.76 % against 5.76 % refutes nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy  # loads scipy.special when it is first used: a fit needs none of it
+
+from ident.arrays import FloatArray, IntArray
+from ident.equations.linearisation import CORRELATED
+from ident.estimators.estimate import SAME_ERROR
+
+CONFIDENCE = 0.95  #: One-sided, of a change of the whole squared error by more than noise
+MOTOR_CONFIDENCE = 0.99  #: One-sided, that no motor's error seems to change by more than noise where none does
+FEWEST_BLOCKS = 5  #: 2⁻⁵ < 1 − CONFIDENCE: with fewer, not even equal signs of all blocks are rare
+DOUBTFUL = 0.1  #: Share of ‖e‖ of a motor that is no small rise, although it may be noise
+
+
+@dataclass(frozen=True, slots=True)
+class PairedChange:
+    """Change of a squared error on the same rows, and its noise by the scatter of moves, or of blocks of moves."""
+
+    rise: float  #: Σ ‖e‖² after − before; negative where the error falls
+    std: float  #: its σ
+    moves: int  #: number of moves with rows, or of independent blocks of them
+
+    @property
+    def is_rise(self) -> bool:
+        """Whether the error rises by more than its noise."""
+        return self.rises(CONFIDENCE)
+
+    @property
+    def sigmas(self) -> float:
+        """The change in units of its σ; 0 where no σ is known."""
+        return self.rise / self.std if self.std > 0.0 else 0.0
+
+    def rises(self, confidence: float) -> bool:
+        """Whether the error rises by more than its noise, at a one-sided confidence."""
+        return self.moves > 1 and self.rise > float(scipy.special.stdtrit(self.moves - 1, confidence)) * self.std
+
+    def falls(self, confidence: float) -> bool:
+        """Whether the error falls by more than its noise, at a one-sided confidence."""
+        return PairedChange(-self.rise, self.std, self.moves).rises(confidence)
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorChange:
+    """Change of the whitened squared errors of all motors on data that the fit has not seen."""
+
+    total: PairedChange  #: over all motors
+    motors: tuple[PairedChange, ...]  #: of each motor
+    before: FloatArray  #: ‖e_i‖² before, shape (m,)
+
+    @property
+    def each_confidence(self) -> float:
+        """One-sided confidence at which one motor is judged."""
+        return 1.0 - (1.0 - MOTOR_CONFIDENCE) / len(self.motors)
+
+    @property
+    def worse_motors(self) -> tuple[int, ...]:
+        """Motors whose error rises by more than noise, and by more than the tolerance."""
+        found: list[int] = []
+        for motor, change in enumerate(self.motors):
+            enough = change.moves >= FEWEST_BLOCKS and _is_beyond(change, self.before[motor], SAME_ERROR)
+            if enough and change.rises(self.each_confidence):
+                found.append(motor)
+        return tuple(found)
+
+    @property
+    def doubtful_motors(self) -> tuple[int, ...]:
+        """Motors whose error rises by much, although it may be noise."""
+        return tuple(
+            motor
+            for motor, change in enumerate(self.motors)
+            if _is_beyond(change, self.before[motor], DOUBTFUL) and change.rise > change.std
+        )
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether there are blocks enough to tell a change from noise."""
+        return self.total.moves >= FEWEST_BLOCKS
+
+    @property
+    def is_rise(self) -> bool:
+        """Whether the whole error rises by more than noise, and by more than the tolerance."""
+        is_large = _is_beyond(self.total, float(self.before.sum()), SAME_ERROR)
+        return self.is_enough and is_large and self.total.rises(CONFIDENCE)
+
+    def is_fall(self, motor: int | None = None) -> bool:
+        """Whether the error falls by more than noise, in total, or of the motor that a model claims to know better."""
+        if not self.is_enough:
+            return False
+        if self.total.falls(CONFIDENCE):
+            return True
+        return motor is not None and self.motors[motor].moves >= FEWEST_BLOCKS and self.motors[motor].falls(CONFIDENCE)
+
+    def harm(self, data: str) -> str:
+        """Say where the error on some data rises by more than noise; empty where it does nowhere."""
+        if self.is_rise:
+            return f"the squared error on {data} rises by {_size(self.total)}"
+        if worse := self.worse_motors:
+            worst = max(worse, key=lambda motor: self.motors[motor].sigmas)
+            return f"the squared error of motor {worst + 1} on {data} rises by {_size(self.motors[worst])}"
+        return ""
+
+
+def _is_beyond(change: PairedChange, before: float, share: float) -> bool:
+    """Whether an error ‖e‖ rises by more than a share of it."""
+    return change.rise > ((1.0 + share) ** 2 - 1.0) * before
+
+
+def _size(change: PairedChange) -> str:
+    return f"{change.rise:.3g} ± {change.std:.2g} noise variances"
+
+
+def compare_by_move(change: FloatArray, move: IntArray) -> PairedChange:
+    """Sum the change of each row's squared error, shape (r,), with σ by clusters of moves, shape (r,)."""
+    return _of_blocks(np.asarray(np.bincount(np.unique(move, return_inverse=True)[1], change), dtype=np.float64))
+
+
+def compare_by_block(change: FloatArray, move: IntArray, run: IntArray) -> PairedChange:
+    """Sum the change of each row's squared error, with σ by blocks of moves that are independent of each other.
+
+    Neighbouring moves of a run are joined in pairs, again and again, while the changes of neighbours correlate by more
+    than CORRELATED standard errors (batch means, as in `ident.equations.linearisation.independent_blocks`).
+
+    Args:
+        change: of each row, shape (r,).
+        move: number of each row's move, in the order of time, shape (r,).
+        run: of each row, shape (r,).
+    """
+    _, first, move_of_row = np.unique(move, return_index=True, return_inverse=True)
+    sums = np.asarray(np.bincount(move_of_row, change), dtype=np.float64)
+    runs = run[first]
+    while len(sums) > FEWEST_BLOCKS:
+        centred = sums - sums.mean()
+        products = (centred[1:] * centred[:-1])[runs[1:] == runs[:-1]]
+        if float(products.sum()) <= CORRELATED * float(np.linalg.norm(products)):
+            break
+        starts = np.sort(np.concatenate([np.flatnonzero(runs == one)[::2] for one in np.unique(runs)]))
+        if len(starts) == len(sums):
+            break
+        sums = np.add.reduceat(sums, starts)
+        runs = runs[starts]
+    return _of_blocks(sums)
+
+
+def change_of_errors(
+    *, before: FloatArray, after: FloatArray, motor: IntArray, move: IntArray, run: IntArray, motors: int
+) -> ErrorChange:
+    """Compare whitened squared errors of two models on the same rows, of all motors below each other.
+
+    Args:
+        before, after: squared errors, shape (rows,).
+        motor: of each row, shape (rows,).
+        move, run: of each row, shape (rows,).
+        motors: their number; one without rows does not change.
+    """
+    change = after - before
+    parts: list[PairedChange] = []
+    for one in range(motors):
+        own = motor == one
+        part = compare_by_block(change[own], move[own], run[own]) if own.any() else PairedChange(0.0, 0.0, 0)
+        parts.append(part)
+    return ErrorChange(
+        total=compare_by_block(change, move, run),
+        motors=tuple(parts),
+        before=np.asarray(np.bincount(motor, before, minlength=motors), dtype=np.float64),
+    )
+
+
+def _of_blocks(sums: FloatArray) -> PairedChange:
+    count = len(sums)
+    spread = np.sum((sums - sums.mean()) ** 2) * count / max(count - 1, 1)
+    return PairedChange(float(sums.sum()), float(np.sqrt(spread)), count)

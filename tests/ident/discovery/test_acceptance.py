@@ -1,0 +1,166 @@
+"""Which effects held-out runs confirm: the others leave, and the rest is fitted again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ident.data.dataset import Dataset
+from ident.discovery import acceptance
+from ident.discovery.acceptance import accept_on_holdout, compare_on_holdout
+from ident.discovery.evidence import Evidence, with_effects
+from ident.discovery.loop import Step
+from ident.discovery.search import Finding
+from ident.discovery.verdict import Judgement, Verdict
+from ident.effects.effect import PlacedEffect
+from ident.effects.friction import AsymmetricViscous, Stribeck
+from ident.effects.position import Spring
+from tests.ident.recordings import Truth, acting_on, bent
+
+FloatArray = NDArray[np.float64]
+
+STICKING = PlacedEffect(Stribeck(0.3), 1)
+SPRING = PlacedEffect(Spring(), 2)
+ASYMMETRIC = PlacedEffect(AsymmetricViscous(), 0)
+NAMES = ("J1", "J2", "J3")
+
+
+def _held_out(small: Evidence, count: int) -> Evidence:
+    """The same recordings with the last ones held out."""
+    rows = small.rows_without_effects
+    first = len(small.datasets) - count
+    training = rows.only(rows.run < first)
+    return replace(small, held_out=count, training=training, holdout=rows.only(rows.run >= first))
+
+
+def _planted(small: Evidence, truth: Truth, torque: Callable[[Dataset], FloatArray], held_out: int = 1) -> Evidence:
+    """Recordings with a torque, and the last one held out."""
+    made = bent(small, truth, torque)
+    cut = _held_out(made, held_out)
+    return with_effects(cut, ())
+
+
+def _sticks(data: Dataset) -> FloatArray:
+    v = data.velocity_rad_s[:, 1]
+    return acting_on(1, 3, 6.0 * np.sign(v) * np.exp(-np.abs(v) / 0.3))
+
+
+def _only_in(names: tuple[str, ...], torque: Callable[[Dataset], FloatArray]) -> Callable[[Dataset], FloatArray]:
+    """A torque that the recordings of some names have, and the others do not."""
+    return lambda data: torque(data) * (data.name in names)
+
+
+def _asymmetric(data: Dataset) -> FloatArray:
+    return acting_on(0, 3, 4.0 * np.abs(data.velocity_rad_s[:, 0]))
+
+
+def _steps(start: Evidence, effects: tuple[PlacedEffect, ...]) -> tuple[Step, ...]:
+    """What a search that has found these effects returns."""
+    after = with_effects(start, effects)
+    found = [
+        Finding(one.effect, one.axis, np.ones(1), np.ones(1), 0.0, 1.0, 0.1, 5.0, 4.0, 0.2, 9.0, True, np.ones(8))
+        for one in effects
+    ]
+    turns = [Step((), (), np.zeros(3), one, after) for one in found]
+    return (*turns, Step((), (), np.zeros(3), None, after))
+
+
+def _by_place(step: Step) -> dict[PlacedEffect, Verdict]:
+    return {verdict.placed: verdict for verdict in step.verdicts}
+
+
+@pytest.fixture(scope="module")
+def sticking(small: Evidence, small_truth: Truth) -> Evidence:
+    return _planted(small, small_truth, _sticks)
+
+
+def test_a_true_effect_is_confirmed_and_stays(sticking: Evidence) -> None:
+    (*_, last) = accept_on_holdout(sticking, _steps(sticking, (STICKING,)), axes=NAMES)
+    assert last.after.effects == (STICKING,)
+    (verdict,) = last.verdicts
+    assert verdict.judgement is Judgement.CONFIRMED
+    assert verdict.written
+    assert verdict.after.axes[1] < 0.9 * verdict.before.axes[1]
+
+
+def test_a_refuted_effect_leaves_and_the_rest_is_fitted_again(small: Evidence, small_truth: Truth) -> None:
+    """Runs of the fit have a torque that the held-out one lacks: no law of the arm."""
+    fitted = _only_in(("run0", "run1", "run2"), _asymmetric)
+    start = _planted(small, small_truth, lambda data: _sticks(data) + fitted(data))
+    said: list[str] = []
+    (*_, last) = accept_on_holdout(start, _steps(start, (STICKING, ASYMMETRIC)), axes=NAMES, progress=said.append)
+    assert last.after.effects == (STICKING,)
+    verdicts = _by_place(last)
+    assert verdicts[ASYMMETRIC].judgement is Judgement.REFUTED
+    assert not verdicts[ASYMMETRIC].written
+    assert verdicts[STICKING].judgement is Judgement.CONFIRMED
+    assert any("asymmetric-viscous on J1 leaves" in one for one in said)
+    again = with_effects(start, (STICKING,))
+    assert last.after.estimate.parameters == pytest.approx(again.estimate.parameters)
+
+
+def test_an_undecided_effect_is_reported_and_not_written_unless_asked_for(sticking: Evidence) -> None:
+    steps = _steps(sticking, (STICKING, SPRING))  # there is no spring
+    (*_, last) = accept_on_holdout(sticking, steps, axes=NAMES)
+    assert last.after.effects == (STICKING,)
+    verdict = _by_place(last)[SPRING]
+    assert verdict.judgement is not Judgement.CONFIRMED
+    assert not verdict.written
+    (*_, kept) = accept_on_holdout(sticking, steps, write_undecided=True, axes=NAMES)
+    asked = _by_place(kept)
+    assert asked[STICKING].written
+    in_model = SPRING in kept.after.effects
+    assert asked[SPRING].written == in_model
+
+
+def test_few_held_out_moves_decide_nothing(small: Evidence, small_truth: Truth) -> None:
+    start = _planted(small, small_truth, _sticks)
+    assert start.holdout is not None
+    moves = np.unique(start.holdout.move)[:2]
+    short = replace(start, holdout=start.holdout.only(np.isin(start.holdout.move, moves)))
+    found = with_effects(start, (STICKING,))
+    assert found.holdout is not None
+    few = replace(found, holdout=found.holdout.only(np.isin(found.holdout.move, moves)))
+    (verdict,) = [acceptance._verdict(short, few, STICKING)]
+    assert verdict.judgement is Judgement.UNDECIDED
+
+
+def test_effects_that_are_no_better_together_than_none_are_not_written(
+    small: Evidence, small_truth: Truth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even where no single one was refuted: here because the judge was bribed."""
+    start = _planted(small, small_truth, _only_in(("run0", "run1", "run2"), _asymmetric))
+    monkeypatch.setattr(acceptance, "judge", lambda *_: (Judgement.CONFIRMED, "bribed"))
+    (*_, last) = accept_on_holdout(start, _steps(start, (ASYMMETRIC,)), axes=NAMES)
+    assert last.after.effects == ()
+    (verdict,) = last.verdicts
+    assert not verdict.written
+    assert verdict.judgement is Judgement.REFUTED
+    assert verdict.reason.startswith("together with the other effects")
+    assert last.after.estimate.gains == pytest.approx(start.estimate.gains)
+
+
+def test_declared_effects_are_not_judged(sticking: Evidence) -> None:
+    after = replace(with_effects(sticking, (SPRING, STICKING)), declared=1)
+    declared = replace(with_effects(sticking, (SPRING,)), declared=1)
+    steps = (Step((), (), np.zeros(3), None, after),)
+    (last,) = accept_on_holdout(declared, steps, axes=NAMES)
+    assert SPRING in last.after.effects
+    assert last.after.declared == 1
+    assert [one.placed for one in last.verdicts] == [STICKING]
+
+
+def test_without_held_out_runs_nothing_changes(small: Evidence) -> None:
+    steps = _steps(small, (SPRING,))
+    assert accept_on_holdout(small, steps) == steps
+
+
+def test_the_change_is_zero_for_the_same_model(sticking: Evidence) -> None:
+    change = compare_on_holdout(sticking, sticking, sticking)
+    assert change.total.rise == 0.0
+    assert len(change.motors) == 3
+    assert np.all(change.before > 0.0)
