@@ -13,6 +13,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
@@ -71,7 +72,7 @@ def data_folder() -> Path:
 def stretches(run: Run, stretch_s: float) -> IntArray:
     """Number of the stretch of each sample of a run, shape (k,)."""
     since_s = run.time_s - run.time_s[0]
-    return np.floor(since_s / stretch_s + 1e-9).astype(np.int64)
+    return np.asarray(np.floor(since_s / stretch_s + 1e-9), dtype=np.int64)
 
 
 def tx40(folder: Path) -> Recording:
@@ -103,11 +104,12 @@ def ur10(folder: Path) -> Recording:
     bag = folder / "ur10" / "ur10_exciting_trajectory.db3"
     with closing(sqlite3.connect(f"file:{bag}?mode=ro", uri=True)) as database:
         lines = database.execute("SELECT data FROM messages ORDER BY timestamp").fetchall()
-    states = [types.deserialize_cdr(data, UR10_TYPE) for (data,) in lines]
+    states: list[Any] = [types.deserialize_cdr(data, UR10_TYPE) for (data,) in lines]
     order = [states[0].name.index(axis) for axis in cell.axis_names]
-    position = np.array([state.position for state in states])[:, order]
-    effort = np.array([state.effort for state in states])[:, order]
-    run = Run("ur10", UR10_PERIOD_S * np.arange(len(states)), position, effort)
+    position = np.array([state.position for state in states], dtype=np.float64)[:, order]
+    effort = np.array([state.effort for state in states], dtype=np.float64)[:, order]
+    time_s = UR10_PERIOD_S * np.arange(len(states), dtype=np.float64)
+    run = Run("ur10", time_s, position, effort)
     is_fit = np.arange(len(states)) < int(UR10_FIT_SHARE * len(states))
     return Recording("ur10", cell, (run,), 1.0, False, 1, (is_fit.astype(np.int64),))
 

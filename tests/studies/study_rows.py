@@ -98,9 +98,12 @@ def finished_rows(out: Path, units: Iterable[Unit], kind: type[Row]) -> tuple[Ro
 
 
 def work_off(
-    units: Sequence[AnyUnit], do: Callable[[AnyUnit], str], minutes: float, clock_s: Callable[[], float],
+    units: Sequence[AnyUnit],
+    do: Callable[[AnyUnit], str],
+    minutes: float,
+    clock_s: Callable[[], float],
     report_line: Callable[[str], None],
-) -> int:  # fmt: skip
+) -> int:
     """Do units one after the other; none is begun after so many minutes.
 
     Args:
