@@ -187,7 +187,8 @@ def predicted_offset_std(evidence: Evidence) -> FloatArray:
     """σ with which a zero offset of each joint would be found beside the declared model [rad or m], shape (n,).
 
     The column of an offset is ∂τ/∂q_j of the whole arm, on all axes. What the declared directions leave of it, φ⊥,
-    finds the offset with the variance Σ_c (φ⊥_cᵀ e_c)²/(φ⊥ᵀφ⊥)², of clusters c of rows. Infinite where they leave none.
+    finds the offset with the variance Σ_c (φ⊥_cᵀ e_c)²/(φ⊥ᵀφ⊥)², of clusters c of rows and with e the residual beside
+    the column. Infinite where they leave none.
     """
     model = evidence.model
     estimate = evidence.estimate
@@ -211,7 +212,8 @@ def predicted_offset_std(evidence: Evidence) -> FloatArray:
         if size <= UNSEEN * float(whitened @ whitened):
             deviations.append(float("inf"))
             continue
-        scores = np.bincount(problem.cluster, left * problem.residual)
+        offset = float(left @ problem.residual) / size
+        scores = np.bincount(problem.cluster, left * (problem.residual - left * offset))
         deviations.append(float(np.linalg.norm(scores)) / size)
     return np.array(deviations)
 
