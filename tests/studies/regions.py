@@ -30,6 +30,7 @@ PARTS = 4
 LEVEL = 0.01  #: Share of splits in which noise alone makes a rise, over all axes together
 FIRST_BLOCK = 4  #: Rows in half a window of the row filter: what is farther apart shares little of it
 LEAST_BLOCKS = 8
+OWN_RUN_S = 10.0  #: A side in one stretch of this length is as if it had been recorded alone
 CORRELATED = 2.0  #: Standard errors of the correlation of neighbouring blocks, above which they are joined
 
 
@@ -132,12 +133,12 @@ def two_sides(
 
 
 def _side(run: Run, own: BoolArray) -> Run:
-    """A run with the samples of one side, shape (k,); a side that is one stretch is a run of its own."""
+    """A run with the samples of one side, shape (k,); a side that is one long stretch is a run of its own."""
     first = int(np.argmax(own))
     last = len(own) - int(np.argmax(own[::-1]))
-    if not own[first:last].all():
-        return run
     part = slice(first, last)
+    if not own[part].all() or last - first < OWN_RUN_S * run.rate_hz:
+        return run
     return replace(
         run,
         time_s=run.time_s[part],

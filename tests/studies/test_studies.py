@@ -283,13 +283,14 @@ def test_a_split_by_region_leaves_each_sample_on_one_side() -> None:
         assert np.all(one.valid ^ other.valid)
 
 
-def test_a_side_in_one_stretch_is_a_run_of_its_own_and_one_without_a_window_is_none() -> None:
+def test_a_side_in_one_long_stretch_is_a_run_of_its_own_and_one_without_a_window_is_none() -> None:
     run = _circling_run()
     conditioning = Conditioning(decimation_cutoff_hz=20.0)
     window = 2 * decimator(run.rate_hz, conditioning.decimation_cutoff_hz).half + 1
     (rest,), (unseen,) = two_sides([run], [np.arange(4000) >= 3000], conditioning)
-    assert (len(rest.time_s), len(unseen.time_s)) == (3000, 1000)
-    assert unseen.time_s[0] == run.time_s[3000]
+    # 15 s are a run, 5 s are a part of one.
+    assert (len(rest.time_s), len(unseen.time_s)) == (3000, 4000)
+    assert rest.time_s[-1] == run.time_s[2999]
     assert two_sides([run], [np.arange(4000) < window], conditioning)[1] == []
 
 
