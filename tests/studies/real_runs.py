@@ -43,7 +43,7 @@ class Recording:
         cell: as declared.
         runs: without load.
         stretch_s: length of the pieces that a split by region deals out [s]: some windows of the row filter.
-        stretches_are_moves: the recording is too short for moves of the usual length.
+        stretches_are_moves: they are in the split so far, too: moves of the usual length would be too few.
         parts: of a split as it was made so far.
         part_of: the part of each sample of each run in that split, shape (k,) each.
         left_out_whole: a run that the split so far leaves out as a whole; splits by region are of the others. Or empty.

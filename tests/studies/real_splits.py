@@ -56,7 +56,8 @@ class JudgedEffect:
         effect: `family on axis`, or EVERYTHING.
         written: effects of the split; of EVERYTHING alone.
         blocks: independent blocks of the axis with the largest rise.
-        raised_axis: axis with the largest rise in units of its σ.
+        raised_axis: axis with the largest rise in units of its σ, beside the limit.
+        raised_points: rise of its relative error [points].
         t, t_limit: that rise, and the limit above which it is more than noise.
         raises: whether it is.
         total_t, total_t_limit, total_raises: the same of all axes together.
@@ -74,6 +75,7 @@ class JudgedEffect:
     written: tuple[str, ...]
     blocks: int
     raised_axis: str
+    raised_points: float
     t: float
     t_limit: float
     raises: bool
@@ -126,7 +128,8 @@ def sides_of(unit: SplitUnit) -> tuple[list[Run], list[Run]]:
         part_of = split_by_region(runs, recording.stretch_s, unit.seed)
     # A split in two has its held-out part as number 0.
     masks = [part == unit.part for part in part_of]
-    if recording.stretches_are_moves:
+    # A region leaves whole stretches out, and too few moves of the usual length would be left of a short recording.
+    if recording.stretches_are_moves or unit.split == REGION:
         runs = [replace(run, move=stretches(run, recording.stretch_s)) for run in runs]
     return two_sides(runs, masks, recording.cell.conditioning)
 
@@ -189,6 +192,7 @@ def _judged(
     used = first.use.any(axis=0)
     total = judge_rise(change.sum(axis=0)[used], first.run[used])
     errors = of_squares(size, left_before), of_squares(size, left_after)
+    points = np.subtract(errors[1].axes, errors[0].axes)
     return JudgedEffect(
         recording=unit.recording,
         split=unit.split,
@@ -198,13 +202,14 @@ def _judged(
         written=written,
         blocks=rises[worst].blocks,
         raised_axis=axes[worst],
+        raised_points=float(points[worst]),
         t=rises[worst].t,
         t_limit=rises[worst].limit,
         raises=any(rise.is_shown for rise in rises),
         total_t=total.t,
         total_t_limit=total.limit,
         total_raises=total.is_shown,
-        largest_rise_points=float(np.nanmax(np.subtract(errors[1].axes, errors[0].axes))),
+        largest_rise_points=float(np.nanmax(points)),
         total_rise_points=errors[1].total - errors[0].total,
         size_nm2=tuple(size.tolist()),
         before_nm2=tuple(left_before.tolist()),
