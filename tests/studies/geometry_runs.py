@@ -7,6 +7,7 @@ times and noise are those of the robot study (any_robot.py), so the relative err
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -68,11 +69,12 @@ class RunsOfRobot:
         spec = load_simulation(shipped_simulation(self.studied.simulation))
         return np.array([axis.gain_nm_per_a for axis in spec.axes])
 
-    @property
-    def fingerprint(self) -> str:
-        """Digest of what the runs depend on."""
-        moving = digest_of_source("tests.studies.direct_cell", MOVING)
-        return digest(moving, self.studied.fingerprint, self.seed, PAIRS, PAUSE_S, EXCHANGES, CONDITION)
+
+@functools.cache
+def fingerprint_of_runs(task: RunsOfRobot) -> str:
+    """Digest of what the runs of a robot depend on."""
+    moving = digest_of_source("tests.studies.direct_cell", MOVING)
+    return digest(moving, task.studied.fingerprint, task.seed, PAIRS, PAUSE_S, EXCHANGES, CONDITION)
 
 
 def simulate(task: RunsOfRobot) -> tuple[RawRun, ...]:
@@ -102,7 +104,7 @@ def simulate(task: RunsOfRobot) -> tuple[RawRun, ...]:
 
 def make_runs(task: RunsOfRobot) -> None:
     """Simulate the runs of a robot unless the same ones are there."""
-    fingerprint = task.fingerprint
+    fingerprint = fingerprint_of_runs(task)
     if not is_finished(task.path, fingerprint):
         task.path.parent.mkdir(parents=True, exist_ok=True)
         write_runs(task.path, simulate(task))

@@ -122,9 +122,12 @@ def main(arguments: list[str] | None = None) -> int:
     units = units_of(options.only, options.splits, options.seeds)
     source = digest_of_source("tests.studies.real_splits", ("daq.log", "ident", "tests.studies.re"))
 
+    def fingerprint_of(unit: SplitUnit) -> str:
+        return digest(source, unit)
+
     def done(unit: SplitUnit) -> str:
         try:
-            rows = rows_of_unit(options.out, unit, JudgedEffect, digest(source, unit), judge_unit)
+            rows = rows_of_unit(options.out, unit, JudgedEffect, fingerprint_of(unit), judge_unit)
         except IdentificationError as error:
             return f"{unit.name}: the rest is refused: {error}"
         whole = rows[0]
@@ -132,7 +135,7 @@ def main(arguments: list[str] | None = None) -> int:
         return f"{unit.name}: {change}, {', '.join(whole.written) or 'nothing'}, {whole.processor_s:.0f} s"
 
     left = work_off(options.shard.of(units), done, options.minutes, time.monotonic, print_line)
-    rows = finished_rows(options.out, units, JudgedEffect)
+    rows = finished_rows(options.out, units, JudgedEffect, fingerprint_of)
     table = to_csv(JudgedEffect, rows).encode()
     replace_file(options.out.with_suffix(".csv"), table)
     is_all = {unit.name for unit in units_of(list(RECORDINGS), (TODAY, REGION), SEEDS)} <= {unit.name for unit in units}

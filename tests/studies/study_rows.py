@@ -87,12 +87,14 @@ def rows_of_unit(
     return from_csv(kind, path.read_text(encoding="utf-8"))
 
 
-def finished_rows(out: Path, units: Iterable[Unit], kind: type[Row]) -> tuple[Row, ...]:
-    """Rows of all units that have a file."""
-    paths = [rows_path(out, unit) for unit in units]
+def finished_rows(
+    out: Path, units: Iterable[AnyUnit], kind: type[Row], fingerprint_of: Callable[[AnyUnit], str]
+) -> tuple[Row, ...]:
+    """Rows of all units that are done: a file of another fingerprint is of another state of the code."""
     rows: list[Row] = []
-    for path in paths:
-        if path.is_file():
+    for unit in units:
+        path = rows_path(out, unit)
+        if is_finished(path, fingerprint_of(unit)):
             rows += from_csv(kind, path.read_text(encoding="utf-8"))
     return tuple(rows)
 

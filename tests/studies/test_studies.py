@@ -234,7 +234,9 @@ def test_a_unit_is_done_again_only_where_what_it_depends_on_differs(tmp_path: Pa
     for mark in ("a", "a", "b"):
         rows = rows_of_unit(tmp_path, unit, SomeRow, mark, make)
     assert made == ["one", "one"]
-    assert finished_rows(tmp_path, [unit, NamedUnit("another")], SomeRow) == rows
+    units = [unit, NamedUnit("another")]
+    assert finished_rows(tmp_path, units, SomeRow, lambda _: "b") == rows
+    assert finished_rows(tmp_path, units, SomeRow, lambda _: "a") == ()
 
 
 def test_no_unit_is_begun_after_its_minutes() -> None:
