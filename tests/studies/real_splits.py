@@ -131,7 +131,7 @@ def sides_of(unit: SplitUnit) -> tuple[list[Run], list[Run]]:
     # A region leaves whole stretches out, and too few moves of the usual length would be left of a short recording.
     if recording.stretches_are_moves or unit.split == REGION:
         runs = [replace(run, move=stretches(run, recording.stretch_s)) for run in runs]
-    return two_sides(runs, masks, recording.cell.conditioning)
+    return two_sides(runs, masks, model_of(recording.cell), recording.cell.conditioning)
 
 
 def judge_unit(unit: SplitUnit) -> tuple[JudgedEffect, ...]:

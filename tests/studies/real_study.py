@@ -39,6 +39,7 @@ OUT = Path("out/real-study")
 TABLE = Path("docs/evidence/data/real.csv")
 SUMMARY = Path("docs/evidence/data/real-summary.csv")
 SEEDS = (1, 2, 3)
+ROUNDED_POINTS = 0.005  #: Rise of a total that two decimals show [points]
 SEEN_POINTS = 0.1  #: Rise of an axis's error that a report shows [points]
 CLEAR_POINTS = 1.0  #: Rise that is large, noise or not [points]
 
@@ -83,7 +84,7 @@ def _figures(rows: Sequence[JudgedEffect], *, errors: bool = True) -> str:
     raising = [row for row in effects if row.raises]
     seen = sum(row.raised_points >= SEEN_POINTS for row in raising)
     clearly = sum(row.largest_rise_points >= CLEAR_POINTS for row in effects)
-    rising = sum(row.total_rise_points > 0.0 for row in wholes)
+    rising = sum(row.total_rise_points >= ROUNDED_POINTS for row in wholes)
     shown = sum(row.total_raises for row in wholes)
     counts = f"{len(wholes)} | {len(effects)} | {len(raising)} | {seen} | {clearly} | {rising} | {shown}"
     if not errors:  # torques of different robots are not added

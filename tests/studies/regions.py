@@ -17,13 +17,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.special import stdtrit
 
 from ident.arrays import BoolArray, FloatArray, IntArray
-from ident.data.conditioning import Conditioning, decimator
+from ident.data.conditioning import Conditioning
+from ident.data.dataset import differentiate
 from ident.data.run import Run
+from ident.equations.rows import row_masks
+from ident.model.model import Model
 from tests.studies.real_runs import stretches
 
 PARTS = 4
@@ -111,25 +115,33 @@ def split_by_region(runs: Sequence[Run], stretch_s: float, seed: int) -> tuple[I
 
 
 def two_sides(
-    runs: Sequence[Run], left_out: Sequence[BoolArray], conditioning: Conditioning
+    runs: Sequence[Run], left_out: Sequence[BoolArray], model: Model, conditioning: Conditioning
 ) -> tuple[list[Run], list[Run]]:
     """The rest of some runs and what is left out of them; a row whose window touches both sides belongs to neither.
+
+    A run of which a side has no row that counts is none of that side.
 
     Args:
         runs: to split.
         left_out: of each run, shape (k,) each.
-        conditioning: whose row filter it is.
+        model: as declared.
+        conditioning: the filters.
     """
     rest = []
     unseen = []
     for run, mask in zip(runs, left_out, strict=True):
         valid = np.ones(run.position_rad.shape, dtype=np.bool_) if run.valid is None else run.valid
-        window = 2 * decimator(run.rate_hz, conditioning.decimation_cutoff_hz).half + 1
-        if _longest(~mask) > window:
-            rest.append(_side(replace(run, name=f"{run.name}, the rest", valid=valid & ~mask[:, None]), ~mask))
-        if _longest(mask) > window:
-            unseen.append(_side(replace(run, name=f"{run.name}, left out", valid=valid & mask[:, None]), mask))
-    return rest, unseen
+        rest.append(_side(replace(run, name=f"{run.name}, the rest", valid=valid & ~mask[:, None]), ~mask))
+        unseen.append(_side(replace(run, name=f"{run.name}, left out", valid=valid & mask[:, None]), mask))
+    with_rows = partial(_has_rows, model=model, conditioning=conditioning)
+    return list(filter(with_rows, rest)), list(filter(with_rows, unseen))
+
+
+def _has_rows(run: Run, model: Model, conditioning: Conditioning) -> bool:
+    """Whether a row of a run counts: outside standstill, and with its whole window on one side."""
+    data = differentiate(run, model.drive_train, conditioning)
+    use, _ = row_masks(model, data, conditioning)
+    return bool(use.any())
 
 
 def _side(run: Run, own: BoolArray) -> Run:
@@ -137,7 +149,7 @@ def _side(run: Run, own: BoolArray) -> Run:
     first = int(np.argmax(own))
     last = len(own) - int(np.argmax(own[::-1]))
     part = slice(first, last)
-    if not own[part].all() or last - first < OWN_RUN_S * run.rate_hz:
+    if not own.any() or not own[part].all() or last - first < OWN_RUN_S * run.rate_hz:
         return run
     return replace(
         run,
@@ -147,12 +159,6 @@ def _side(run: Run, own: BoolArray) -> Run:
         valid=None if run.valid is None else run.valid[part],
         move=None if run.move is None else run.move[part],
     )
-
-
-def _longest(mask: BoolArray) -> int:
-    """Length of the longest stretch of samples in a row."""
-    edges = np.flatnonzero(np.diff(mask.astype(np.int64), prepend=0, append=0))
-    return int(np.max(edges[1::2] - edges[::2], initial=0))
 
 
 def independent_sums(change: FloatArray, run: IntArray) -> FloatArray:

@@ -13,11 +13,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from drivers.simulation.effects import build_effect
 from drivers.simulation.plant import Plant
-from ident.data.conditioning import Conditioning, decimator
+from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.discovery.evidence import Evidence
 from ident.effects.dictionary import EFFECTS
@@ -267,17 +268,21 @@ def test_regions_are_apart_in_the_workspace_in_any_unit() -> None:
         np.testing.assert_array_equal(part, region_of(position * [1e-3, 1.0], seed))
 
 
-def _circling_run(name: str = "run") -> Run:
+def _circling_run(name: str = "run", axes: int = 2) -> Run:
     time_s = np.arange(4000) / 200.0
-    position = np.stack((np.sin(time_s), np.cos(0.7 * time_s)), axis=1)
-    return Run(name, time_s, position, np.stack((time_s, 2.0 * time_s), axis=1))
+    position = np.stack([np.sin((1.0 + 0.3 * axis) * time_s) for axis in range(axes)], axis=1)
+    current = np.stack([(1.0 + axis) * time_s for axis in range(axes)], axis=1)
+    return Run(name, time_s, position, current)
+
+
+ROWS = Conditioning(decimation_cutoff_hz=20.0, standstill_rad_s=(0.02,) * 6)
 
 
 def test_a_split_by_region_leaves_each_sample_on_one_side() -> None:
-    runs = [_circling_run("a"), _circling_run("b")]
+    runs = [_circling_run("a", 6), _circling_run("b", 6)]
     parts = split_by_region(runs, 0.5, seed=2)
     assert {int(one) for part in parts for one in part} == set(range(PARTS))
-    rest, unseen = two_sides(runs, [part == 1 for part in parts], Conditioning(decimation_cutoff_hz=20.0))
+    rest, unseen = two_sides(runs, [part == 1 for part in parts], model_of(load_cell(CELL)), ROWS)
     assert [run.name for run in rest] == ["a, the rest", "b, the rest"]
     for one, other in zip(rest, unseen, strict=True):
         assert one.valid is not None
@@ -285,15 +290,23 @@ def test_a_split_by_region_leaves_each_sample_on_one_side() -> None:
         assert np.all(one.valid ^ other.valid)
 
 
-def test_a_side_in_one_long_stretch_is_a_run_of_its_own_and_one_without_a_window_is_none() -> None:
-    run = _circling_run()
-    conditioning = Conditioning(decimation_cutoff_hz=20.0)
-    window = 2 * decimator(run.rate_hz, conditioning.decimation_cutoff_hz).half + 1
-    (rest,), (unseen,) = two_sides([run], [np.arange(4000) >= 3000], conditioning)
+def test_a_side_in_one_long_stretch_is_a_run_of_its_own() -> None:
+    run = _circling_run(axes=6)
+    (rest,), (unseen,) = two_sides([run], [np.arange(4000) >= 3000], model_of(load_cell(CELL)), ROWS)
     # 15 s are a run, 5 s are a part of one.
     assert (len(rest.time_s), len(unseen.time_s)) == (3000, 4000)
     assert rest.time_s[-1] == run.time_s[2999]
-    assert two_sides([run], [np.arange(4000) < window], conditioning)[1] == []
+
+
+@pytest.mark.parametrize("samples", [0, 20, 1000])
+def test_a_side_without_a_moving_window_is_no_run(samples: int) -> None:
+    run = _circling_run(axes=6)
+    position = run.position_rad.copy()
+    position[:1100] = position[1100]
+    still = replace(run, position_rad=position)
+    rest, unseen = two_sides([still], [np.arange(4000) < samples], model_of(load_cell(CELL)), ROWS)
+    assert len(rest) == 1
+    assert unseen == []
 
 
 def test_blocks_are_as_long_as_the_change_is_correlated() -> None:
