@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ident.model.bodies import Payload
 from tests.studies.direct_cell import RawRun
 from tests.studies.study_cells import declared_payload
 
 
 def write_runs(path: Path, raw: Sequence[RawRun]) -> None:
-    """Save runs; their payloads are those that `declared_payload` knows by name."""
+    """Save runs; of their payloads the names alone."""
     arrays: dict[str, NDArray[Any]] = {}
     for run in raw:
         # Steps of positions are small numbers, which pack better than positions; the first one is a step from zero.
@@ -31,8 +32,13 @@ def write_runs(path: Path, raw: Sequence[RawRun]) -> None:
         np.savez_compressed(file, runs=np.array(json.dumps(payloads)), **arrays)  # type: ignore[arg-type]
 
 
-def read_runs(path: Path) -> tuple[RawRun, ...]:
-    """The runs of a file that `write_runs` made."""
+def read_runs(path: Path, payload_of: Callable[[str], Payload] = declared_payload) -> tuple[RawRun, ...]:
+    """The runs of a file that `write_runs` made.
+
+    Args:
+        path: of the file.
+        payload_of: a payload, as declared, by its name.
+    """
     raw = []
     with np.load(path) as arrays:
         for name, (payload, began_s) in json.loads(str(arrays["runs"])).items():
@@ -40,7 +46,7 @@ def read_runs(path: Path) -> tuple[RawRun, ...]:
             raw.append(
                 RawRun(
                     name=name,
-                    payload=None if payload is None else declared_payload(payload),
+                    payload=None if payload is None else payload_of(payload),
                     began_s=began_s,
                     position_counts=position,
                     demand_counts=position + arrays[f"{name}.error_counts"].T,

@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from math import radians
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from drivers.simulation.effects import build_effect
 from drivers.simulation.plant import Plant
+from ident.data.conditioning import Conditioning
+from ident.data.run import Run
+from ident.discovery.evidence import Evidence
 from ident.effects.dictionary import EFFECTS
+from ident.effects.effect import PlacedEffect
+from ident.effects.electrical import Lag
+from ident.effects.position import Spring
 from tests.conftest import CHECKOUT
 from tests.studies.any_robot import ROBOTS, StudiedRobot, figures, pooled
 from tests.studies.blind_cells import FAMILIES, NOTHING, blind_cases, confusion
@@ -22,11 +32,14 @@ from tests.studies.chain_effects import PLANTED, PlantedEffect
 from tests.studies.direct_cell import RawRun, demand_rad, run_of
 from tests.studies.fingerprint import made_once
 from tests.studies.followed_cell import follow, without_rest
+from tests.studies.planted_mistakes import Mistake, Planted, judge_mistake, plant, tilted
 from tests.studies.raw_runs import read_runs, write_runs
+from tests.studies.regions import PARTS, independent_sums, judge_rise, region_of, split_by_region, two_sides
 from tests.studies.robot_tables import write_tables
 from tests.studies.side_by_side import Shard
 from tests.studies.study_cells import CORRELATION_S, WORLDS, declared_payload, spec_of, world_cell
 from tests.studies.study_plans import CELL
+from tests.studies.study_rows import finished_rows, from_csv, rows_of_unit, to_csv, work_off
 
 
 @settings(max_examples=25)
@@ -196,3 +209,183 @@ def test_the_confusion_table_counts_every_true_and_every_false_effect_once() -> 
         ("coupling", "stribeck"): 1,
         (NOTHING, "lag"): 2,
     }
+
+
+@dataclass(frozen=True)
+class NamedUnit:
+    name: str
+
+
+@dataclass(frozen=True)
+class SomeRow:
+    text: str
+    number: int
+    size: float
+    flag: bool
+    sizes: tuple[float, ...]
+    flags: tuple[bool, ...]
+    names: tuple[str, ...]
+
+
+ROW = SomeRow('a "quoted" name, with a comma', -3, 0.25, True, (1.5, float("inf")), (True, False), ())
+
+
+def test_the_rows_of_a_study_come_back_from_their_table() -> None:
+    rows = (ROW, replace(ROW, flag=False, sizes=(), names=("lag on J1", "spring on J2")))
+    assert from_csv(SomeRow, to_csv(SomeRow, rows)) == rows
+
+
+def test_a_unit_is_done_again_only_where_what_it_depends_on_differs(tmp_path: Path) -> None:
+    def make(unit: NamedUnit) -> list[SomeRow]:
+        made.append(unit.name)
+        return [replace(ROW, number=len(made))]
+
+    made: list[str] = []
+    unit = NamedUnit("one")
+    for mark in ("a", "a", "b"):
+        rows = rows_of_unit(tmp_path, unit, SomeRow, mark, make)
+    assert made == ["one", "one"]
+    units = [unit, NamedUnit("another")]
+    assert finished_rows(tmp_path, units, SomeRow, lambda _: "b") == rows
+    assert finished_rows(tmp_path, units, SomeRow, lambda _: "a") == ()
+
+
+def test_no_unit_is_begun_after_its_minutes() -> None:
+    lines: list[str] = []
+    units = [NamedUnit(str(number)) for number in range(5)]
+    assert work_off(units, lambda unit: unit.name, 2.0, lambda: 50.0 * len(lines), lines.append) == 2
+    assert lines == ["0", "1", "2"]
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 1000), count=st.integers(12, 60))
+def test_regions_are_of_one_size_and_the_same_for_one_seed(seed: int, count: int) -> None:
+    position = np.random.default_rng(count).normal(size=(count, 6))
+    part = region_of(position, seed)
+    np.testing.assert_array_equal(part, region_of(position, seed))
+    sizes = np.bincount(part, minlength=PARTS)
+    assert len(sizes) == PARTS
+    assert np.ptp(sizes) <= 1
+
+
+def test_regions_are_apart_in_the_workspace_in_any_unit() -> None:
+    corners = np.array([[0.0, 0.0], [0.0, 10.0], [10.0, 0.0], [10.0, 10.0]])
+    place = np.tile(np.arange(4), 10)
+    position = corners[place] + 0.1 * np.random.default_rng(1).normal(size=(40, 2))
+    for seed in range(5):
+        part = region_of(position, seed)
+        assert len({(int(one), int(corner)) for one, corner in zip(part, place, strict=True)}) == 4
+        np.testing.assert_array_equal(part, region_of(position * [1e-3, 1.0], seed))
+
+
+def _circling_run(name: str = "run", axes: int = 2) -> Run:
+    time_s = np.arange(4000) / 200.0
+    position = np.stack([np.sin((1.0 + 0.3 * axis) * time_s) for axis in range(axes)], axis=1)
+    current = np.stack([(1.0 + axis) * time_s for axis in range(axes)], axis=1)
+    return Run(name, time_s, position, current)
+
+
+ROWS = Conditioning(decimation_cutoff_hz=20.0, standstill_rad_s=(0.02,) * 6)
+
+
+def test_a_split_by_region_leaves_each_sample_on_one_side() -> None:
+    runs = [_circling_run("a", 6), _circling_run("b", 6)]
+    parts = split_by_region(runs, 0.5, seed=2)
+    assert {int(one) for part in parts for one in part} == set(range(PARTS))
+    rest, unseen = two_sides(runs, [part == 1 for part in parts], model_of(load_cell(CELL)), ROWS)
+    assert [run.name for run in rest] == ["a, the rest", "b, the rest"]
+    for one, other in zip(rest, unseen, strict=True):
+        assert one.valid is not None
+        assert other.valid is not None
+        assert np.all(one.valid ^ other.valid)
+
+
+def test_a_side_in_one_long_stretch_is_a_run_of_its_own() -> None:
+    run = _circling_run(axes=6)
+    (rest,), (unseen,) = two_sides([run], [np.arange(4000) >= 3000], model_of(load_cell(CELL)), ROWS)
+    # 15 s are a run, 5 s are a part of one.
+    assert (len(rest.time_s), len(unseen.time_s)) == (3000, 4000)
+    assert rest.time_s[-1] == run.time_s[2999]
+
+
+@pytest.mark.parametrize("samples", [0, 20, 1000])
+def test_a_side_without_a_moving_window_is_no_run(samples: int) -> None:
+    run = _circling_run(axes=6)
+    position = run.position_rad.copy()
+    position[:1100] = position[1100]
+    still = replace(run, position_rad=position)
+    rest, unseen = two_sides([still], [np.arange(4000) < samples], model_of(load_cell(CELL)), ROWS)
+    assert len(rest) == 1
+    assert unseen == []
+
+
+def test_blocks_are_as_long_as_the_change_is_correlated() -> None:
+    rng = np.random.default_rng(5)
+    run = np.repeat([0, 1], 512)
+    white = rng.normal(size=1024)
+    slow = np.repeat(rng.normal(size=32), 32)
+    assert len(independent_sums(white, run)) == 256
+    assert len(independent_sums(slow, run)) <= 64
+    assert independent_sums(slow, run).sum() == pytest.approx(slow.sum())
+
+
+def test_noise_makes_a_rise_as_often_as_the_level_says() -> None:
+    rng = np.random.default_rng(7)
+    run = np.zeros(96, dtype=np.int64)
+    noise = [judge_rise(rng.normal(size=96), run, level=0.05).is_shown for _ in range(400)]
+    assert 0.02 <= np.mean(noise) <= 0.09
+    harm = [judge_rise(rng.normal(loc=0.8, size=96), run, level=0.01).is_shown for _ in range(20)]
+    assert all(harm)
+    assert not judge_rise(np.zeros(96), run).is_shown
+    assert not judge_rise(np.ones(3), run[:3]).is_shown
+
+
+def test_a_planted_mistake_changes_what_it_says_alone() -> None:
+    run = _circling_run()
+    cell = load_cell(CELL)
+    ((moved,), same) = plant([run], cell, Planted(Mistake.ZERO, 1, 0.02), seed=1)
+    assert same is cell
+    np.testing.assert_allclose(moved.position_rad - run.position_rad, np.tile([0.0, 0.02], (4000, 1)), atol=1e-15)
+    ((late,), _) = plant([run], cell, Planted(Mistake.ENCODER, 0, 0.005), seed=1)
+    np.testing.assert_allclose(late.position_rad[1:, 0], run.position_rad[:-1, 0], atol=1e-9)
+    np.testing.assert_array_equal(late.position_rad[:, 1], run.position_rad[:, 1])
+    np.testing.assert_array_equal(late.current_a, run.current_a)
+    ((delayed,), _) = plant([run], cell, Planted(Mistake.CURRENT, 1, 0.0025), seed=1)
+    np.testing.assert_allclose(delayed.current_a[1:, 1], run.current_a[1:, 1] - 2.0 * 0.0025, atol=1e-9)
+    np.testing.assert_array_equal(delayed.position_rad, run.position_rad)
+    ((untouched,), tilt) = plant([run], cell, Planted(Mistake.GRAVITY, -1, radians(1.0)), seed=1)
+    assert untouched is run
+    cosine = np.dot(tilt.gravity_m_s2, cell.gravity_m_s2) / 9.81**2
+    assert np.degrees(np.arccos(cosine)) == pytest.approx(1.0, rel=1e-6)
+
+
+@settings(max_examples=25)
+@given(heading=st.floats(0.0, 6.0), angle=st.floats(0.001, 3.0))
+def test_a_tilt_keeps_the_size_of_gravity(heading: float, angle: float) -> None:
+    gravity = np.array([1.0, -2.0, -9.0])
+    turned = np.array(list(tilted(gravity.tolist(), angle, heading)))
+    assert np.linalg.norm(turned) == pytest.approx(np.linalg.norm(gravity))
+    assert turned @ gravity / (gravity @ gravity) == pytest.approx(np.cos(angle))
+
+
+def _evidence_of(effects: tuple[PlacedEffect, ...], values: list[float], std: list[float]) -> Evidence:
+    """What `judge_mistake` reads of an evidence: two fixed gains, and the coefficients of effects."""
+    unknowns = tuple(column for placed in effects for column in placed.columns)
+    covariance = np.diag([0.0, 0.0, *np.square(std)])
+    estimate = SimpleNamespace(unknowns=unknowns, parameters=np.array(values), covariance=covariance, gains=np.ones(2))
+    return cast(Evidence, SimpleNamespace(effects=effects, declared=0, estimate=estimate))
+
+
+def test_a_mistake_is_named_on_its_own_axis_only_and_its_size_is_judged_in_sigmas() -> None:
+    spring = PlacedEffect(Spring(), 0)
+    lag = PlacedEffect(Lag(), 1)
+    evidence = _evidence_of((spring, lag), [1.0, 0.0034], [0.1, 0.0002])
+    found = judge_mistake(evidence, Planted(Mistake.CURRENT, 1, 0.003))
+    assert found.named
+    assert (found.value, found.std) == pytest.approx((0.0034, 0.0002))
+    assert found.z == pytest.approx(2.0)
+    assert found.others == (spring,)
+    elsewhere = judge_mistake(evidence, Planted(Mistake.CURRENT, 0, 0.003))
+    assert not elsewhere.named
+    assert elsewhere.others == (spring, lag)
+    assert not judge_mistake(evidence, Planted(Mistake.CLEAN)).named

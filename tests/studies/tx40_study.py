@@ -8,59 +8,44 @@ touches a block of the other side belongs to neither.
 
 from __future__ import annotations
 
-import os
 import sys
-import tempfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from daq.cli.app import main as drivegain
 from daq.config.cell import model_of
-from daq.environment import shipped_configurations
-from daq.log.conversion import load_run
 from ident.discovery.evidence import gather
 from ident.discovery.loop import find_effects
-from ident.equations.rows import Observation
-from ident.estimators.estimate import Estimate, RelativeError, of_squares
+from ident.estimators.estimate import RelativeError, of_squares
 from ident.estimators.identify import identify
 from ident.estimators.method import Method
-
-FloatArray = NDArray[np.float64]
-
-BLOCK_S = 0.5
-FOLDS = 4
-SHARED = Path(__file__).parents[3] / "shared" / "data"
-
-
-def squares(rows: Observation, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
-    """‖Y_j‖² and ‖ρ_j‖² of each joint [Nm²], shape (n,)."""
-    residual, torque = estimate.residual_torque(rows), rows.torque(estimate.gains)
-    return np.sum(torque**2, axis=1, where=rows.use), np.sum(residual**2, axis=1, where=rows.use)
+from tests.studies.output import print_line
+from tests.studies.real_runs import data_folder, stretches, tx40
+from tests.studies.real_splits import squares
 
 
 def main() -> int:
     """Make the study and print its table."""
-    data = Path(os.environ.get("DRIVEGAIN_DATA", SHARED)) / "tx40"
+    data = data_folder() / "tx40"
     if not data.is_dir():
-        _print_line(
+        print_line(
             f"found no {data}; expected the TX-40's recording there, or DRIVEGAIN_DATA to name the folder above it"
         )
         return 2
-    with tempfile.TemporaryDirectory() as folder:
-        log = Path(folder) / "tx40.mcap"
-        description = shipped_configurations() / "imports" / "tx40.yaml"
-        drivegain(["import", str(description), "--data", str(data), "--out", str(log)])
-        run, cell = load_run(log)
-    block = np.floor(run.time_s / BLOCK_S).astype(np.int64)
+    recording = tx40(data_folder())
+    cell = recording.cell
+    (run,) = recording.runs
+    (fold_of,) = recording.part_of
+    block = stretches(run, recording.stretch_s)
     valid = np.ones_like(run.position_rad, dtype=np.bool_) if run.valid is None else run.valid
-    model, n = model_of(cell), len(cell.axes)
-    gains = np.array([axis.nameplate_gain for axis in cell.axes])
-    size, before, after = np.zeros(n), np.zeros(n), np.zeros(n)
-    for fold in range(FOLDS):
-        left_out = (block % FOLDS == fold)[:, None]
+    model = model_of(cell)
+    n = len(cell.axes)
+    gains = recording.gains
+    size = np.zeros(n)
+    before = np.zeros(n)
+    after = np.zeros(n)
+    for fold in range(recording.parts):
+        left_out = (fold_of == fold)[:, None]
         training = replace(run, name="the rest", move=block, valid=valid & ~left_out)
         unseen = replace(run, name="left out", move=block, valid=valid & left_out)
         found = identify(model, [training], cell.conditioning, method=Method.ML, fixed_gains=gains)
@@ -73,21 +58,16 @@ def main() -> int:
         before += squares(start.holdout, start.estimate)[1]
         after += squares(end.holdout, end.estimate)[1]
         names = ", ".join(f"{placed.effect.name} on {cell.axis_names[placed.axis]}" for placed in end.effects)
-        _print_line(f"fold {fold + 1}: {names or 'nothing'}")
-    _print_line("\n| | " + " | ".join(cell.axis_names) + " | mean | total |\n|" + "---|" * (n + 3))
-    _print_line(_row("nothing added", of_squares(size, before)))
-    _print_line(_row("effects added", of_squares(size, after)))
+        print_line(f"fold {fold + 1}: {names or 'nothing'}")
+    print_line("\n| | " + " | ".join(cell.axis_names) + " | mean | total |\n|" + "---|" * (n + 3))
+    print_line(_row("nothing added", of_squares(size, before)))
+    print_line(_row("effects added", of_squares(size, after)))
     return 0
 
 
 def _row(name: str, error: RelativeError) -> str:
     figures = (*error.axes, float(np.mean(error.axes)), error.total)
     return f"| {name} | " + " | ".join(f"{figure:.2f}" for figure in figures) + " |"
-
-
-def _print_line(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -1,0 +1,125 @@
+"""Runs of the geometry study: of each robot and seed two without load and two with the weighed payload, made once.
+
+Mistakes are planted into their arrays or into the description afterwards (planted_mistakes.py). The robots, their
+times and noise are those of the robot study (any_robot.py), so the relative error without any mistake is the usual
+3 to 4 %. Layout: out/geometry-study/runs/<robot>-<seed>.npz.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from daq.workflow.plan import plan
+from ident.arrays import FloatArray
+from ident.data.run import Run
+from ident.model.bodies import Payload
+from tests.studies.any_robot import ROBOTS, StudiedRobot
+from tests.studies.direct_cell import MOVING, RawRun, run_of, simulate_run
+from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished
+from tests.studies.raw_runs import read_runs, write_runs
+
+STUDIED = ("TX-40", "KR270", "seven-axis", "gantry")
+PAIRS = 2  #: Of runs without and with the payload, each with a plan of its own
+PAUSE_S = 20.0  #: From the end of one run to the beginning of the next
+EXCHANGES = 50
+"""Tries of the planner: what a plan leaves open makes σ larger, and no gain wrong."""
+CONDITION = 1e6  #: The condition number is one of mixed units
+
+
+@dataclass(frozen=True, slots=True)
+class RunsOfRobot:
+    """The runs of one robot and seed.
+
+    Attributes:
+        out: folder of the study.
+        robot: of STUDIED.
+        seed: of plans and noise.
+    """
+
+    out: Path
+    robot: str
+    seed: int
+
+    @property
+    def studied(self) -> StudiedRobot:
+        """Its row of the robot study."""
+        return next(robot for robot in ROBOTS if robot.name == self.robot)
+
+    @property
+    def path(self) -> Path:
+        """File of the runs."""
+        return self.out / "runs" / f"{self.robot}-{self.seed}.npz"
+
+    @property
+    def cell(self) -> Cell:
+        """The cell as declared."""
+        return load_cell(shipped_configurations() / "cells" / f"{self.studied.cell}.yaml")
+
+    @property
+    def true_gains(self) -> FloatArray:
+        """Gains of the plant, shape (m,)."""
+        spec = load_simulation(shipped_simulation(self.studied.simulation))
+        return np.array([axis.gain_nm_per_a for axis in spec.axes])
+
+
+@functools.cache
+def fingerprint_of_runs(task: RunsOfRobot) -> str:
+    """Digest of what the runs of a robot depend on."""
+    moving = digest_of_source("tests.studies.direct_cell", MOVING)
+    return digest(moving, task.studied.fingerprint, task.seed, PAIRS, PAUSE_S, EXCHANGES, CONDITION)
+
+
+def simulate(task: RunsOfRobot) -> tuple[RawRun, ...]:
+    """Plan and make the runs of a robot."""
+    robot = task.studied
+    cell = task.cell
+    body = cell.payloads[0]
+    runs: list[RawRun] = []
+    for pair in range(PAIRS):
+        moves = plan(
+            cell,
+            seed=10 * task.seed + pair,
+            duration_s=robot.seconds,
+            exchanges=EXCHANGES,
+            largest_condition=CONDITION,
+        )
+        for mounted in (None, body.name):
+            spec = load_simulation(shipped_simulation(robot.simulation), mounted)
+            axes = tuple(replace(axis, current_noise_a=robot.noise * axis.current_noise_a) for axis in spec.axes)
+            number = len(runs)
+            spec = replace(spec, axes=axes, seed=100 * task.seed + number)
+            declared = None if mounted is None else body.payload
+            name = f"{mounted or 'bare'}-{pair + 1}"
+            runs.append(simulate_run(cell, spec, moves, name, declared, number * (robot.seconds + PAUSE_S)))
+    return tuple(runs)
+
+
+def make_runs(task: RunsOfRobot) -> None:
+    """Simulate the runs of a robot unless the same ones are there."""
+    fingerprint = fingerprint_of_runs(task)
+    if not is_finished(task.path, fingerprint):
+        task.path.parent.mkdir(parents=True, exist_ok=True)
+        write_runs(task.path, simulate(task))
+        finish(task.path, fingerprint)
+
+
+def load_runs(task: RunsOfRobot) -> tuple[Run, ...]:
+    """The runs of a robot that `make_runs` made.
+
+    Raises:
+        FileNotFoundError: they have not been made.
+    """
+    cell = task.cell
+
+    def payload_of(name: str) -> Payload:
+        return next(body.payload for body in cell.payloads if body.name == name)
+
+    return tuple(run_of(raw, cell) for raw in read_runs(task.path, payload_of))

@@ -1,0 +1,174 @@
+"""Are mistakes of geometry and time named on the right joint, and what are the gains worth then: four robots.
+
+Run by `make geometry-study`. The runs of each robot and seed are simulated once (geometry_runs.py); each mistake is
+planted into their arrays or into the description (planted_mistakes.py), everything is fitted, and the search looks for
+what the model lacks. A zero offset is planted on every joint on which these runs would show it.
+
+    python -m tests.studies.geometry_study --shard 1/2 --minutes 60  every second unit; goes on where it ended
+    python -m tests.studies.geometry_study --only TX-40 --mistakes clean zero-offset --seeds 1
+    python -m tests.studies.geometry_study --minutes 0               nothing is searched: the tables of what is there
+
+Layout: out/geometry-study/<unit>.csv, the row of one unit; out/geometry-study.csv has all. Real recordings whose
+gravity is turned by 90 and by 180 degrees are units of the study, too: their rows say whether the fit is refused, and
+what error it has.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from daq.files import replace_file
+from tests.studies.fingerprint import digest, digest_of_source
+from tests.studies.geometry_runs import STUDIED, RunsOfRobot, fingerprint_of_runs
+from tests.studies.geometry_units import (
+    OBSERVABLE,
+    OFFSETS_DEG,
+    REAL,
+    SIGMAS,
+    TURNED,
+    TURNS_DEG,
+    MistakeRow,
+    MistakeUnit,
+    OffsetRow,
+    observe_offsets,
+    search_unit,
+    turned_unit,
+)
+from tests.studies.output import print_line
+from tests.studies.planted_mistakes import Mistake
+from tests.studies.real_runs import data_folder
+from tests.studies.side_by_side import Shard, shard
+from tests.studies.study_rows import finished_rows, rows_of_unit, to_csv, work_off
+
+OUT = Path("out/geometry-study")
+TABLE = Path("docs/evidence/data/geometry.csv")
+SEEDS = (1, 2, 3, 4)
+
+
+def units_of(out: Path, robots: Sequence[str], seeds: Sequence[int], mistakes: Sequence[str]) -> list[MistakeUnit]:
+    """Units of the study, by seed; delays go round the axes, one axis a size and seed."""
+    units: list[MistakeUnit] = []
+    for seed in seeds:
+        for robot in robots:
+            axes = len(RunsOfRobot(out, robot, seed).cell.axes)
+            own = [MistakeUnit(out, robot, seed, Mistake.CLEAN.value, -1, 0)]
+            for level in range(len(OFFSETS_DEG)):
+                own += [MistakeUnit(out, robot, seed, Mistake.ZERO.value, axis, level) for axis in range(axes)]
+                own.append(MistakeUnit(out, robot, seed, Mistake.GRAVITY.value, -1, level))
+                late = (3 * seed + level) % axes
+                own.append(MistakeUnit(out, robot, seed, Mistake.ENCODER.value, late, level))
+                own.append(MistakeUnit(out, robot, seed, Mistake.CURRENT.value, (late + 1) % axes, level))
+            units += [unit for unit in own if unit.mistake in mistakes]
+    if TURNED in mistakes:
+        for robot in REAL:
+            units += [MistakeUnit(out, robot, 0, TURNED, -1, level) for level in range(len(TURNS_DEG))]
+    return units
+
+
+def summary(rows: Sequence[MistakeRow]) -> str:
+    """A line for each robot, mistake and size."""
+    lines = [
+        "| robot | mistake | size | planted | refused | named | within 3 σ | sense +/− | with others | "
+        "error % | worst gain % |",
+        "|" + "---|" * 11,
+    ]
+    kinds = dict.fromkeys((row.robot, row.mistake, row.size) for row in rows)
+    for robot, mistake, size in sorted(kinds, key=lambda kind: (kind[0], kind[1], kind[2])):
+        own = [row for row in rows if (row.robot, row.mistake, row.size) == (robot, mistake, size) and row.planted]
+        if own:
+            lines.append(f"| {robot} | {mistake} | {size:.4g} | {_figures(own)} |")
+    return "\n".join(lines)
+
+
+def _figures(rows: Sequence[MistakeRow]) -> str:
+    named = [row for row in rows if row.named]
+    within = sum(abs(row.z) <= SIGMAS for row in named)
+    positive = sum(row.value > 0.0 for row in named)
+    counts = f"{len(rows)} | {sum(bool(row.refused) for row in rows)} | {len(named)} | {within}"
+    senses = f"{positive}/{len(named) - positive}"
+    fits = [row for row in rows if not row.refused]
+    if not fits:
+        return f"{counts} | {senses} | 0 | | "
+    others = sum(bool(row.others) for row in fits)
+    errors = f"{_mean(fits, 'error_before_percent')} → {_mean(fits, 'error_after_percent')}"
+    gains = [[getattr(row, f"gain_error_{when}_percent") for row in fits] for when in ("before", "after")]
+    worst = " → ".join(f"{max(column):.2f}" for column in gains)
+    return f"{counts} | {senses} | {others} | {errors} | {worst}"
+
+
+def _mean(rows: Sequence[MistakeRow], field: str) -> str:
+    return f"{np.mean([getattr(row, field) for row in rows]):.2f}"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Simulate and search what is missing, write the table of all rows, and print the summary."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.geometry_study", description=__doc__)
+    kinds = [*(mistake.value for mistake in Mistake), TURNED]
+    parser.add_argument("--only", nargs="+", choices=STUDIED, default=list(STUDIED), metavar="ROBOT")
+    parser.add_argument("--mistakes", nargs="+", choices=kinds, default=kinds)
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
+    parser.add_argument("--shard", type=shard, default=Shard(), help="i/n: every n-th robot and seed from the i-th on")
+    parser.add_argument("--minutes", type=float, default=60.0, help="after which no unit is begun")
+    parser.add_argument("--out", type=Path, default=OUT)
+    options = parser.parse_args(arguments)
+    units = units_of(options.out, options.only, options.seeds, options.mistakes)
+    if not (data_folder() / "tx40").is_dir():
+        units = [unit for unit in units if unit.mistake != TURNED]
+    # A shard has whole robots and seeds: their runs are simulated once.
+    places = list(dict.fromkeys((unit.robot, unit.seed) for unit in units))
+    mine = set(options.shard.of(places))
+    followed = ("daq.config", "daq.workflow", "ident", "tests.studies.planted", "tests.studies.geometry_runs")
+    source = digest_of_source("tests.studies.geometry_units", followed)
+
+    def fingerprint_of(unit: MistakeUnit) -> str:
+        return digest(source, unit.name, "" if unit.mistake == TURNED else fingerprint_of_runs(unit.runs))
+
+    def offsets_of(unit: MistakeUnit) -> OffsetRow:
+        shown = replace(unit, mistake=OBSERVABLE, axis=-1, level=0)
+        (row,) = rows_of_unit(options.out / OBSERVABLE, shown, OffsetRow, fingerprint_of(shown), observe_offsets)
+        return row
+
+    def made(unit: MistakeUnit) -> tuple[MistakeRow, ...]:
+        return turned_unit(unit) if unit.mistake == TURNED else search_unit(unit, offsets_of(unit))
+
+    def done(unit: MistakeUnit) -> str:
+        (row,) = rows_of_unit(options.out, unit, MistakeRow, fingerprint_of(unit), made)
+        return line_of(unit, row)
+
+    own = [unit for unit in units if (unit.robot, unit.seed) in mine]
+    left = work_off(own, done, options.minutes, time.monotonic, print_line)
+    rows = finished_rows(options.out, units, MistakeRow, fingerprint_of)
+    table = to_csv(MistakeRow, rows).encode()
+    options.out.mkdir(parents=True, exist_ok=True)
+    replace_file(options.out.with_suffix(".csv"), table)
+    every = units_of(options.out, STUDIED, SEEDS, kinds)
+    if len(rows) == len(every) and {unit.name for unit in every} == {unit.name for unit in units}:
+        replace_file(TABLE, table)
+    print_line(f"\n{left} units of this piece were not begun\n\n{summary(rows)}")
+    return 0
+
+
+def line_of(unit: MistakeUnit, row: MistakeRow) -> str:
+    """A line about a unit that is done."""
+    if not row.planted:
+        return f"{unit.name}: not planted, its σ would be {row.predicted_std:.2g}"
+    if row.refused:
+        return f"{unit.name}: refused: {row.refused[:100]}"
+    if unit.mistake == TURNED:
+        return f"{unit.name}: fitted with {row.error_before_percent:.2f} %"
+    found = f"{row.value:.4g} ± {row.std:.2g}" if row.named else "not named"
+    gains = f"worst gain {row.gain_error_before_percent:.2f} -> {row.gain_error_after_percent:.2f} %"
+    return (
+        f"{unit.name}: {row.size:.4g}: {found}; {', '.join(row.others) or 'no other'}; {gains}, {row.processor_s:.0f} s"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
