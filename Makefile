@@ -44,7 +44,7 @@ help:
 	@echo "make robot-study  gains and a second payload of every shipped robot (docs/evidence/robots.md); resumable, half an hour"
 	@echo "make effects-study  undeclared effects of every family: named, error before and after (docs/evidence/effects-study.md); hours, resumable"
 	@echo "make tx40-study  the loop closed on a real robot, scored on blocks that were left out (docs/evidence/tx40.md); minutes"
-	@echo "make real-study  effects found on real robots, judged where the arm was elsewhere; needs the recordings; resumable, half an hour"
+	@echo "make real-study  effects found on real robots, judged where the arm was elsewhere (docs/evidence/real.md); needs the recordings; resumable, half an hour"
 	@echo "make geometry-study  wrong zeros, tilted gravity and late signals on four robots: named, and the gains; resumable, hours"
 	@echo "make weigh-study  coverage of the error bars of a weighed payload (docs/evidence/estimators.md); resumable, half an hour"
 	@echo "make words   how much of the old house language is left in code, tests and docs; seconds"
