@@ -229,8 +229,11 @@ def folds_around(model: Model, observation: Observation, estimate: Estimate) -> 
 def _with_friction_of_runs(
     problem: Linearisation, model: Model, observation: Observation, estimate: Estimate
 ) -> Linearisation:
-    """Let viscous and dry friction differ at random from run to run; the same problem of a single run."""
-    if len(np.unique(observation.run)) < 2:
+    """Let viscous and dry friction differ at random from run to run; the same problem of a single run.
+
+    The rows of a redundant drive hold all motors at once, and their derivative to a gain would no longer be exact.
+    """
+    if len(np.unique(observation.run)) < 2 or model.is_redundant:
         return problem
     rubbing = np.flatnonzero(np.isin(observation.base.independent, model.friction_columns))
     deviation = FRICTION_OF_A_RUN * np.abs(estimate.parameters[rubbing])

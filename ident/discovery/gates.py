@@ -250,7 +250,8 @@ class Reduced:
 def own_unknowns(estimate: Estimate, effects: Sequence[PlacedEffect]) -> IntArray:
     """Places of the coefficients of effects among the parameters of an estimate, shape (p,)."""
     names = {column.name for placed in effects for column in placed.columns}
-    return np.array([index for index, column in enumerate(estimate.unknowns) if column.name in names])
+    places = [index for index, column in enumerate(estimate.unknowns) if column.name in names]
+    return np.array(places, dtype=np.int64)
 
 
 def values_of(estimate: Estimate, own: IntArray) -> FloatArray:

@@ -292,6 +292,10 @@ def _with_choice(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
         left += [one.finding for one in last.set_aside if one.moved and is_unnamed(one.finding.effect)]
         left += [found for found in (*last.findings, *last.structures) if is_small(found, gates)]
     choice = choice_covariance(model.search_problem, estimate, tuple(accepted.values()), left)
+    # The coefficient of an effect is that of a model with the effect: another model has none, not another one.
+    own = len(estimate.gains) + own_unknowns(estimate, model.evidence.effects)
+    choice[own, :] = 0.0
+    choice[:, own] = 0.0
     choice_std = np.sqrt(np.diag(choice)[: len(estimate.gains)])
     last = replace(last, after=model.evidence, choice_std=choice_std)
     if not choice.any():

@@ -426,26 +426,35 @@ def test_what_holds_in_one_region_alone_is_refused(small: Evidence) -> None:
     assert differing.refusal(powers)
 
 
-def test_an_effect_that_the_reported_sigma_does_not_show_leaves(
-    sticking: Evidence, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The choice of the effects adds to σ after all gates: what it hides is not reported."""
-    (*_, shown) = find_effects(sticking, np.random.default_rng(0), GATES, (STICKING,))
-    assert [placed.effect for placed in shown.after.effects] == [STICKING[0]]
-    own = len(shown.after.estimate.gains) + own_unknowns(shown.after.estimate, shown.after.effects)
-
-    def wide(_: object, estimate: Estimate, *__: object) -> FloatArray:
-        added = np.zeros_like(estimate.covariance)
-        place = own[own < len(added)]
-        added[place, place] = 1e4
-        return added
-
-    monkeypatch.setattr(loop, "choice_covariance", wide)
-    (*_, last) = find_effects(sticking, np.random.default_rng(0), GATES, (STICKING,))
+def test_an_effect_that_the_reported_sigma_does_not_show_leaves(sticking: Evidence) -> None:
+    """What joined later may have taken its certainty: the σ that is reported decides."""
+    steps = find_effects(sticking, np.random.default_rng(0), GATES, (STICKING,))
+    shown = steps[-1].after
+    assert [placed.effect for placed in shown.effects] == [STICKING[0]]
+    own = len(shown.estimate.gains) + own_unknowns(shown.estimate, shown.effects)
+    covariance = shown.estimate.covariance.copy()
+    covariance[own, own] += 1e4
+    unsure = replace(shown, estimate=replace(shown.estimate, covariance=covariance))
+    last = loop.end_search(steps, joining.linearised(unsure, {}), GATES)
     assert last.after.effects == ()
     assert last.set_aside[-1].finding.effect == STICKING[0]
     assert last.set_aside[-1].words.startswith("by the σ that is reported, its coefficients may all be zero")
     assert last.after.estimate.gains == pytest.approx(sticking.estimate.gains, rel=1e-6)
+
+
+def test_the_choice_of_effects_adds_to_gains_and_not_to_what_only_one_model_has(
+    sticking: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (*_, shown) = find_effects(sticking, np.random.default_rng(0), GATES, (STICKING,))
+
+    def wide(_: object, estimate: Estimate, *__: object) -> FloatArray:
+        return 1e4 * np.eye(len(estimate.covariance))
+
+    monkeypatch.setattr(loop, "choice_covariance", wide)
+    (*_, last) = find_effects(sticking, np.random.default_rng(0), GATES, (STICKING,))
+    own = own_unknowns(last.after.estimate, last.after.effects)
+    assert last.after.estimate.parameters_std[own] == pytest.approx(shown.after.estimate.parameters_std[own])
+    assert np.all(last.after.estimate.gains_std > 99.0)
 
 
 def test_an_impossible_part_leaves_with_its_effect(sticking: Evidence) -> None:
