@@ -19,7 +19,7 @@ from ident.arrays import FloatArray
 from ident.data.run import Run
 from ident.discovery.candidates import prepare_search
 from ident.discovery.evidence import Evidence
-from ident.discovery.gates import own_unknowns
+from ident.discovery.gates import own_unknowns, values_of
 from ident.effects.effect import PlacedEffect
 from ident.equations.rows import observe
 from ident.model.robot import JointKind
@@ -160,7 +160,7 @@ def value_of(evidence: Evidence, placed: PlacedEffect) -> tuple[float, float]:
     if unknown:
         raise ValueError(f"{placed.effect.name} has the unit {unknown[0]!r}; expected one of {', '.join(SI_OF_UNIT)}")
     scale = np.array([SI_OF_UNIT[unit] for unit in units])
-    values = estimate.parameters[own] * scale
+    values = values_of(estimate, own) * scale
     place = len(estimate.gains) + own
     covariance = estimate.covariance[np.ix_(place, place)] * np.outer(scale, scale)
     if len(values) == 1:
