@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.discovery.candidates import SearchProblem, shares_explained
+from ident.discovery.candidates import SearchProblem, Trial, shares_explained
 from ident.discovery.gates import Gates
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.rotor import next_inertia
@@ -68,10 +68,10 @@ def propose_rotors(
             shares = shares_explained(search_problem, [trial for _, trial in tested.members])
             if max(shares) < gates.smallest_share:
                 continue
-            refined = [without_rotor(search_problem, effect, axis) for effect in family]
-            forms = tuple(effect for effect in refined if effect is not None)
-            if forms:
-                found[axis] = (*found.get(axis, ()), (*family, *forms))
+            forms = [without_rotor(search_problem, effect, trial, axis) for effect, trial in tested.members]
+            better = tuple(effect for effect in forms if effect is not None)
+            if better:
+                found[axis] = (*found.get(axis, ()), (*family, *better))
     return found
 
 
@@ -105,8 +105,17 @@ def declared_forms(placed: PlacedEffect, observation: Observation, axes: Sequenc
     return (replace(placed, effect=fitted), placed)
 
 
-def without_rotor(search_problem: SearchProblem, effect: Effect, axis: int) -> Effect | None:
-    """Return the form of a loss that leaves the rotor out, with the inertia that fits best; None where none does."""
+def without_rotor(search_problem: SearchProblem, effect: Effect, plain: Trial, axis: int) -> Effect | None:
+    """Return the form of a loss that leaves the rotor out, with the inertia that fits best; None where none is better.
+
+    Its second coefficient costs certainty: where the moves do not show the rotor, they are predicted worse with it.
+
+    Args:
+        search_problem: around the model.
+        effect: the plain form.
+        plain: its trial.
+        axis: index of its joint.
+    """
     largest_kg_m2 = largest_inertia(search_problem, axis)
     inertia_kg_m2 = search_problem.runs[0].rotor_inertia(axis)
     for _ in range(MOST_STEPS):
@@ -118,7 +127,11 @@ def without_rotor(search_problem: SearchProblem, effect: Effect, axis: int) -> E
         inertia_kg_m2 = next_inertia(before_kg_m2, trial.coefficients, largest_kg_m2)
         if abs(inertia_kg_m2 - before_kg_m2) <= SETTLED_SHARE * largest_kg_m2:
             break
-    return effect.with_settings({"rotor_inertia_kg_m2": inertia_kg_m2})
+    found = effect.with_settings({"rotor_inertia_kg_m2": inertia_kg_m2})
+    (trial,) = search_problem.trials([search_problem.torque_at_rows(found, axis)])
+    if trial is None or trial.held_out.sum() >= plain.held_out.sum():
+        return None
+    return found
 
 
 def refined_rotor(
