@@ -45,7 +45,7 @@ def _run() -> Dataset:
 def _smooth_torque(model: Model, data: Dataset, standard: FloatArray) -> FloatArray:
     """Torque of all joints without dry friction, by the regressor: none of it is used by the effects."""
     dry = np.array([column.name.startswith("fs") for column in model.columns])
-    return np.einsum("jck,c->jk", model.regressor(data.motion()), np.where(dry, 0.0, standard))
+    return np.asarray(np.einsum("jck,c->jk", model.regressor(data.motion()), np.where(dry, 0.0, standard)))
 
 
 @pytest.mark.parametrize(
