@@ -63,7 +63,7 @@ from ident.model.base import BaseParameters
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
 from ident.model.urdf import read_urdf
-from ident.prediction import mounted_parameters, standard_parameters
+from ident.prediction import as_calibrated, mounted_parameters, standard_parameters
 
 if TYPE_CHECKING:  # which asks for these diagnoses
     from daq.workflow.validate import Validation
@@ -149,7 +149,8 @@ def diagnose_run(
     runs = (run.name,)
     axes = [gain.axis for gain in calibration.gains]
     use = validation.use
-    data = differentiate(run, model.drive_train, reduction.conditioning)
+    carried = replace(run, payload=as_calibrated(calibration, run.payload, run.name))
+    data = differentiate(carried, model.drive_train, reduction.conditioning)
     left_nm = validation.measured_nm - validation.predicted_nm
     moved = geometry_drift(calibration, model, data, reduction.conditioning, left_nm, use)
     if moved is not None:

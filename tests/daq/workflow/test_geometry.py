@@ -199,8 +199,7 @@ def test_a_wrong_number_is_named_and_corrected(
 
 
 def test_the_uncertainty_of_the_geometry_reaches_the_gains_beside_effects(clean: Fit) -> None:
-    fitted = replace(clean.final)
-    assert fitted.gathered is None
+    fitted = replace(clean.final, gathered=None)
     with pytest.MonkeyPatch.context() as patch:
         _read(CELL, patch)
         evidence = gather(fitted, _runs())
