@@ -176,7 +176,7 @@ def _scene(**changes: object) -> Callable[[Scene], Scene]:
 
 
 def _effect(scene: Scene) -> Scene:
-    worse = replace(scene.calibration.effects[0], error_after_percent=6.1)
+    worse = replace(scene.calibration.effects[0], error_after_percent=6.3)
     return _calibration(effects=(worse,))(scene)
 
 
