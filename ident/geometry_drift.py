@@ -25,7 +25,8 @@ from ident.equations.rows import at_rows
 from ident.model.model import Model
 from ident.prediction import corrections_of, payload_of, standard_parameters
 
-LEAST_SHARE = 0.3  #: Of the squared error, beyond friction and gains, that a change of the geometry must explain
+LEAST_SHARE = 0.5  #: Of the squared error beyond that of the fit, friction and gains, that it must explain
+SMALLEST_SHARE = 0.03  #: Of the whole squared error that it must explain: less is not worth a word
 CERTAIN_SIGMAS = 6.0  #: By which it must differ from zero: several are tried
 FEWEST_MOVES = 8  #: Of the scatter that σ comes from
 
@@ -37,7 +38,7 @@ class GeometryDrift:
     placed: PlacedEffect  #: the correction, on its axis
     values: FloatArray  #: of its coefficients, shape (p,)
     deviations: FloatArray  #: their σ by the scatter of moves, shape (p,)
-    share: float  #: of the squared error beyond friction and gains that it explains
+    share: float  #: of the squared error that it explains, beyond what the fit leaves and friction and gains explain
 
 
 def geometry_drift(
@@ -75,10 +76,14 @@ def geometry_drift(
         payload_nm = np.moveaxis(model.regressor(slow.motion())[:, model.flange], 1, 0)
     nuisance = _nuisance(signals.geared_torque_nm, signals.velocity_rad_s, payload_nm)
     left = _beyond(nuisance, left_nm[:, None], weight)[:, 0]
+    usual = float(np.sum((_usual_error_nm(calibration, model)[:, None] * weight) ** 2))
+    excess = float(np.sum(left**2)) - usual
+    if not excess > 0.0:
+        return None  # it is predicted as well as what was fitted
     best: GeometryDrift | None = None
     for placed in _candidates(model):
         columns = _beyond(nuisance, placed.effect.columns(signals, placed.axis), weight)
-        found = _fitted(placed, columns, left, move)
+        found = _fitted(placed, columns, left, move, excess)
         if found is not None and (best is None or found.share > best.share):
             best = found
     return best
@@ -115,8 +120,27 @@ def _beyond(nuisance: FloatArray, columns: FloatArray, weight: FloatArray) -> Fl
     return np.moveaxis((flat - solution.T @ basis).reshape(out.shape), 0, 1)
 
 
-def _fitted(placed: PlacedEffect, columns: FloatArray, left: FloatArray, move: IntArray) -> GeometryDrift | None:
-    """Least squares of one correction, with σ by moves; None where it is not certain enough."""
+def _usual_error_nm(calibration: Calibration, model: Model) -> FloatArray:
+    """What the fit has left of each joint's torque [Nm or N], shape (m,); zero where the calibration does not say."""
+    if calibration.current_residual is None:
+        return np.zeros(len(calibration.gains))
+    gains = np.array([gain.value for gain in calibration.gains])
+    of_motors = np.abs(gains) * np.array(calibration.current_residual)
+    return np.asarray(np.sqrt(np.square(model.drive_train.direction.T) @ np.square(of_motors)))
+
+
+def _fitted(
+    placed: PlacedEffect, columns: FloatArray, left: FloatArray, move: IntArray, excess: float
+) -> GeometryDrift | None:
+    """Least squares of one correction, with σ by moves; None where it is not certain enough.
+
+    Args:
+        placed: the correction.
+        columns: its weighted columns, shape (m, p, r).
+        left: the weighted error, shape (m, r).
+        move: number of each row's move, shape (r,).
+        excess: squared error beyond that of the fit.
+    """
     gram = np.einsum("mpr,mqr->pq", columns, columns)
     score = np.einsum("mpr,mr->pr", columns, left)
     if np.linalg.cond(gram) > 1e10 or not np.diag(gram).all():
@@ -132,12 +156,14 @@ def _fitted(placed: PlacedEffect, columns: FloatArray, left: FloatArray, move: I
     spread = by_move @ inverse
     covariance = spread.T @ spread
     wald = float(values @ np.linalg.pinv(covariance) @ values)
-    share = 1.0 - float(np.sum(rest**2) / np.sum(left**2))
-    if share < LEAST_SHARE or wald < CERTAIN_SIGMAS**2:
+    whole = float(np.sum(left**2))
+    explained = whole - float(np.sum(rest**2))
+    if explained < LEAST_SHARE * excess or explained < SMALLEST_SHARE * whole or wald < CERTAIN_SIGMAS**2:
         return None
     bounds = zip(values, placed.effect.coefficients, strict=True)
     if any(not column.least <= value <= column.largest for value, column in bounds):
         return None
+    share = min(1.0, explained / max(excess, explained))
     return GeometryDrift(placed, values, np.sqrt(np.diag(covariance)), share)
 
 

@@ -47,29 +47,27 @@ def geometry_beside(evidence: Evidence, seed: int) -> GeometryCheck | None:
         return None
 
 
-def check_diagnoses(check: GeometryCheck, cell: Cell, model: Model, runs: Sequence[str]) -> tuple[Diagnosis, ...]:
+def check_diagnoses(check: GeometryCheck, cell: Cell, model: Model) -> tuple[Diagnosis, ...]:
     """Diagnoses of a check beside a fit.
 
     Args:
         check: of the fit.
         cell: whose description it is.
         model: as declared.
-        runs: names of the runs of the fit.
     """
     found = check.mistake
     if found is None:
         return ()
     placed = PlacedEffect(found.effect, found.axis)
-    return tuple(_diagnosis(placed, found.coefficients, found.deviations, cell, model, runs))
+    return tuple(_diagnosis(placed, found.coefficients, found.deviations, cell, model))
 
 
-def correction_diagnoses(evidence: Evidence, cell: Cell, runs: Sequence[str]) -> tuple[Diagnosis, ...]:
+def correction_diagnoses(evidence: Evidence, cell: Cell) -> tuple[Diagnosis, ...]:
     """Diagnoses of the corrections that a search has made.
 
     Args:
         evidence: with its effects.
         cell: whose description it is.
-        runs: names of the runs of the fit.
     """
     if evidence.uncorrected is None:
         return ()
@@ -77,7 +75,7 @@ def correction_diagnoses(evidence: Evidence, cell: Cell, runs: Sequence[str]) ->
     for placed in evidence.effects:
         if is_correction(placed):
             values, deviations = coefficients_of(evidence.estimate, placed)
-            found += _diagnosis(placed, values, deviations, cell, evidence.uncorrected.model, runs)
+            found += _diagnosis(placed, values, deviations, cell, evidence.uncorrected.model)
     return tuple(found)
 
 
@@ -94,7 +92,7 @@ def drift_diagnosis(drift: GeometryDrift, model: Model, axes: Sequence[str], run
     name = axes[placed.axis]
     values = drift.values
     deviations = drift.deviations
-    share = f"it explains {100.0 * drift.share:.0f} % of the squared error that friction and gains do not"
+    share = f"it explains {100.0 * drift.share:.0f} % of what the error is larger than in the fit"
     match placed.effect:
         case ZeroOffset():
             unit, scale, _ = _zero_unit(model, placed.axis)
@@ -131,7 +129,7 @@ def drift_diagnosis(drift: GeometryDrift, model: Model, axes: Sequence[str], run
 
 
 def _diagnosis(
-    placed: PlacedEffect, values: FloatArray, deviations: FloatArray, cell: Cell, model: Model, runs: Sequence[str]
+    placed: PlacedEffect, values: FloatArray, deviations: FloatArray, cell: Cell, model: Model
 ) -> list[Diagnosis]:
     """The diagnosis of one correction; none of an effect that is no correction."""
     name = cell.place_names[placed.axis]
@@ -143,7 +141,7 @@ def _diagnosis(
             return [
                 Diagnosis(
                     name="zero-off",
-                    runs=tuple(runs),
+                    runs=(),
                     axes=(name,),
                     found=f"the zero of {name} off by {offset}",
                     expected="positions whose zero is that of the URDF",
@@ -159,7 +157,7 @@ def _diagnosis(
             return [
                 Diagnosis(
                     name="gravity-tilted",
-                    runs=tuple(runs),
+                    runs=(),
                     axes=(),
                     found=f"gravity along {vector_text(turned)}, turned by {angle:.2f} ± {std:.2f}°",
                     expected=f"{vector_text(declared)}, as the cell file says",
@@ -172,7 +170,7 @@ def _diagnosis(
             return [
                 Diagnosis(
                     name="position-late",
-                    runs=tuple(runs),
+                    runs=(),
                     axes=(name,),
                     found=f"the position of {name} {late} by {delay}",
                     expected="positions and currents of one moment",
@@ -201,7 +199,8 @@ def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str]) -> str:
     if check is None or not check.hidden_zeros:
         return ""
     names = [axes[axis] for axis in check.hidden_zeros]
+    subject = "The zeros of" if len(names) > 1 else "The zero of"
     return (
-        f"The zero of {' and '.join(names)} cannot be seen here: about a vertical axis, or behind the last joint, "
+        f"{subject} {' and '.join(names)} cannot be seen here: about a vertical axis, or behind the last joint, "
         "another zero makes the same torques."
     )

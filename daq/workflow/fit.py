@@ -340,7 +340,9 @@ def judged(fitted: Fit) -> Fit:
         fitted.geometry,
         corrected=fitted.is_corrected,
     )
-    if not any(one.name in GEOMETRY for one in of_fit):
+    if any(one.name in GEOMETRY for one in of_fit):
+        fitted = replace(fitted, description=None)  # it rests on a wrong geometry
+    else:
         of_fit = (*of_description, *of_fit)
     calibration = replace(_calibration(fitted), diagnoses=of_fit)
     of_holdout: list[Diagnosis] = []
@@ -360,12 +362,11 @@ def with_description(fitted: Fit) -> Fit:
 
 def description_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
     """What a fit says of the declared geometry: corrections of its search, or else what the test beside it found."""
-    runs = fitted.identification.system.runs
     if fitted.steps:
-        return correction_diagnoses(fitted.steps[-1].after, fitted.cell, runs)
+        return correction_diagnoses(fitted.steps[-1].after, fitted.cell)
     if fitted.description is None:
         return ()
-    return check_diagnoses(fitted.description, fitted.cell, fitted.identification.model, runs)
+    return check_diagnoses(fitted.description, fitted.cell, fitted.identification.model)
 
 
 def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: None) -> Comparison:

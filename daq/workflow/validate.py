@@ -179,6 +179,8 @@ def predicted(
     Raises:
         IdentificationError: the calibration cannot speak of this run.
     """
+    if configuration_sha256 != calibration.configuration_sha256:
+        warn_of_corrections(calibration, run.name)
     run = replace(run, payload=as_calibrated(calibration, run.payload, run.name))
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
@@ -211,6 +213,22 @@ def warn_of_fitted(calibration: Calibration, runs: Sequence[Run], consequence: s
     if seen:
         _LOG.warning("%s %s part of the fit: %s", ", ".join(seen), "were" if len(seen) > 1 else "was", consequence)
     return seen
+
+
+def warn_of_corrections(calibration: Calibration, name: str) -> None:
+    """Warn of a run with another description of the cell than the fit, where the calibration corrects the description.
+
+    A zero that was corrected in the cell file since would be corrected twice.
+    """
+    places = calibration.places
+    corrected = [placed.name_among(places) for placed in corrections_of(calibration)]
+    if corrected:
+        _LOG.warning(
+            "%s has another description of the cell than the fit, which the calibration corrects (%s): if the cell "
+            "file was corrected since, calibrate anew",
+            name,
+            ", ".join(corrected),
+        )
 
 
 def warn_without_temperature(calibration: Calibration, name: str, temperature_c: FloatArray | None) -> None:

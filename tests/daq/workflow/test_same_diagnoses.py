@@ -90,6 +90,16 @@ def reversed_position(run: Run) -> Run:
     return replace(run, position_rad=run.position_rad * np.array([1.0, -1.0, 1.0]))
 
 
+def offset(run: Run, degrees: float = 4.0) -> Run:
+    """A run in which the zero of J2 is off."""
+    return replace(run, position_rad=run.position_rad + np.array([0.0, np.radians(degrees), 0.0]))
+
+
+def without_zero(run: Run) -> Run:
+    """A run after the encoder of J2 has lost its zero."""
+    return offset(run, degrees=10.0)
+
+
 def mounted_on_a_wall(runs: Runs) -> Runs:
     """Recordings of an arm whose base is turned from what the cell says."""
     truth = three_axes_truth()
@@ -121,6 +131,7 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
     "J2 and J3 exchanged": (lambda runs: [exchanged(run) for run in runs], "ChannelsExchanged"),
     "position of J2 reversed": (lambda runs: [reversed_position(run) for run in runs], "position-reversed J2"),
     "mounted on a wall": (mounted_on_a_wall, "GeometryTurned"),
+    "zero of J2 off": (lambda runs: [offset(run) for run in runs], "zero-off J2"),
     "payload turned": (carrying(turned(np.pi)), "payload-differs r3"),
     "payload left off": (carrying(np.zeros(10)), "PayloadUnseen"),
     "noise on J3": (lambda runs: [*map(noisy, runs[:USED]), *runs[USED:]], "axis-error J3"),
@@ -130,6 +141,7 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
     ),
     "held out: exchanged": (in_one(6, exchanged), "channels-exchanged r6 J2 J3"),
     "held out: position of J2 reversed": (in_one(6, reversed_position), "position-reversed r6 J2"),
+    "held out: zero of J2 lost": (in_one(6, without_zero), "zero-off r6 J2"),
     "held out: noise on J3": (in_one(6, noisy), "axis-error r6 J3"),
     "held out: without payload": (in_one(7, forgotten), "payload-differs r7"),
 }  # fmt: skip
