@@ -21,7 +21,7 @@ import scipy  # loads scipy.special when it is first used: a fit needs none of i
 from scipy import linalg
 
 from ident.arrays import FloatArray, IntArray
-from ident.discovery.candidates import UNSEEN, SearchProblem, score_candidates
+from ident.discovery.candidates import UNSEEN, SearchProblem
 from ident.discovery.error_change import ErrorChange, change_of_errors
 from ident.effects.effect import Effect, PlacedEffect
 from ident.equations.linearisation import RIDGE, Folds, cut_into_folds, sum_of_squares
@@ -33,9 +33,6 @@ SIGMAS = 2.0  #: A coefficient outside its possible values by more than this man
 MIN_RUNS = 3  #: With two runs, one left out leaves a fit of the other alone
 REGIONS = 8  #: Of the workspace, that are left out in turn where no run can be
 MOVES_OF_REGION = 2  #: Fewest moves of a region
-AS_EXPLAINED = 0.5
-"""Share of what an effect explains in-sample by which it must lower the error on parts left out, where these are too few
-to prove that it falls: one that is there predicts about as much as it explains, another one loses it."""
 CONFIDENCE = 0.95  #: Of a coefficient that is not zero
 
 
@@ -225,10 +222,6 @@ class PartsLeftOut:
         # Too few blocks show nothing, but forbid nothing either: the folds of moves have judged.
         of_motor = np.bincount(self.search_problem.folds.linearisation.motor, np.sum(columns**2, axis=1))
         if not change.is_enough or change.is_fall(int(np.argmax(of_motor))):
-            return ""
-        # A dozen blocks may be too few for a proof; an effect that is there still predicts what it explains.
-        (trial,) = score_candidates(self.search_problem.folds, columns, (slice(0, columns.shape[1]),))
-        if trial is not None and -change.total.rise >= AS_EXPLAINED * float(trial.fallen.sum()):
             return ""
         size = f"{change.total.rise:.3g} ± {change.total.std:.2g} noise variances"
         return f"the squared error on {data} changes by {size}, which may be noise"
