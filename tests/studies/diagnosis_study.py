@@ -16,13 +16,18 @@ from pathlib import Path
 
 import numpy as np
 
+from daq.workflow.declared_effects import BOOTSTRAP_SEED
+from daq.workflow.description import geometry_beside
 from ident.data.run import Run
 from ident.data.unsigned_current import unsigned_currents
+from ident.discovery.evidence import gather
+from ident.effects.effect import PlacedEffect
+from ident.effects.geometry import rotation_by
 from ident.equations.instants import read_instants
 from ident.errors import CurrentUnsigned, IdentificationError
 from ident.estimators import diagnosis, payload_diagnosis, turned_geometry
 from ident.estimators.diagnosis import diagnose, exchanged_channels, unsigned_channels
-from ident.estimators.identify import identify
+from ident.estimators.identify import Identification, identify
 from ident.estimators.method import Method
 from ident.estimators.turned_geometry import find_turned_geometry, is_confirmed, with_gravity
 from tests.ident.mistaken import AXES, BODY, SMALL, small_recordings, turned, with_currents
@@ -50,6 +55,7 @@ def named(
     """
     gains = truth.gains if nameplate is None else nameplate
     names: list[str] = []
+    described: list[str] = []
     error_percent = None
     try:
         found = identify(
@@ -60,9 +66,11 @@ def named(
             method=Method.WLS if fixed else Method.ML,
             fixed_gains=gains if fixed else None,
             axes=AXES,
+            keep_rows=True,
         )
         error_percent = found.training_error.total
         names += [" ".join((one.name, *one.runs, *one.axes)) for one in diagnose(found, AXES, gains, LIMIT_NM)]
+        described += of_description(found)
     except CurrentUnsigned as error:
         return [" ".join(("CurrentUnsigned", *error.axes))]
     except IdentificationError as error:
@@ -73,6 +81,8 @@ def named(
     ):
         one = turned.diagnosis(AXES)
         return [" ".join((one.name, *one.axes))]
+    if described:
+        return [*described, *names]
     unsigned = unsigned_channels(truth.model, runs, SMALL, AXES)
     if unsigned is not None:
         return [" ".join(("CurrentUnsigned", *unsigned.axes))]
@@ -80,6 +90,28 @@ def named(
     if exchanged is not None:
         return [" ".join(("ChannelsExchanged", *exchanged.axes))]
     return names
+
+
+def of_description(found: Identification) -> list[str]:
+    """What the test of the description beside a fit names: the effect and its axis."""
+    check = geometry_beside(gather(found), BOOTSTRAP_SEED)
+    if check is None or check.mistake is None:
+        return []
+    placed = PlacedEffect(check.mistake.effect, check.mistake.axis)
+    return [placed.name_among(AXES)]
+
+
+def offset(truth: Truth, seed: int, fixed: bool, degrees: float) -> list[str]:
+    """Diagnoses where the zero of J2 is off; NOISES_A in turn."""
+    added = np.array([0.0, np.radians(degrees), 0.0])
+    runs = small_recordings(truth, seed, noise_a=NOISES_A[seed % len(NOISES_A)])
+    return named(truth, [replace(run, position_rad=run.position_rad + added) for run in runs], fixed=fixed)
+
+
+def tilted(truth: Truth, seed: int, fixed: bool, degrees: float) -> list[str]:
+    """Diagnoses of an arm whose base is not level; NOISES_A in turn."""
+    gravity_m_s2 = rotation_by(np.array([np.radians(degrees), 0.0, 0.0])) @ truth.model.robot.gravity_m_s2
+    return mounted(truth, seed, fixed, gravity_m_s2.tolist())
 
 
 def scaled(truth: Truth, seed: int, fixed: bool, factors: FloatArray | float) -> list[str]:
@@ -148,6 +180,8 @@ MISTAKES: dict[str, Callable[[Truth, int, bool], list[str]]] = {
     "gravity turned by 90 degrees about y": lambda t, s, f: mounted(t, s, f, (9.81, 0.0, 0.0)),
     "gravity turned by 90 degrees about x": lambda t, s, f: mounted(t, s, f, (0.0, 9.81, 0.0)),
     "gravity turned by 180 degrees": lambda t, s, f: mounted(t, s, f, (0.0, 0.0, 9.81)),
+    "zero of J2 off by 2 degrees": lambda t, s, f: offset(t, s, f, 2.0),
+    "base tilted by 3 degrees": lambda t, s, f: tilted(t, s, f, 3.0),
     "position of J2 reversed": lambda t, s, f: counted(t, s, f, 1, 1.0),
     "position of J3 reversed": lambda t, s, f: counted(t, s, f, 2, 1.0),
     "position and current of J3 reversed": lambda t, s, f: counted(t, s, f, 2, -1.0),
