@@ -76,7 +76,9 @@ def geometry_drift(
         payload_nm = np.moveaxis(model.regressor(slow.motion())[:, model.flange], 1, 0)
     nuisance = _nuisance(signals.geared_torque_nm, signals.velocity_rad_s, payload_nm)
     left = _beyond(nuisance, left_nm[:, None], weight)[:, 0]
-    usual = float(np.sum((_usual_error_nm(calibration, model)[:, None] * weight) ** 2))
+    torque_nm = model.drive_train.direction.T @ signals.motor_torque_nm
+    usual_nm = _usual_error_nm(calibration, torque_nm, use)
+    usual = float(np.sum((usual_nm[:, None] * weight) ** 2))
     excess = float(np.sum(left**2)) - usual
     if not excess > 0.0:
         return None  # it is predicted as well as what was fitted
@@ -120,13 +122,14 @@ def _beyond(nuisance: FloatArray, columns: FloatArray, weight: FloatArray) -> Fl
     return np.moveaxis((flat - solution.T @ basis).reshape(out.shape), 0, 1)
 
 
-def _usual_error_nm(calibration: Calibration, model: Model) -> FloatArray:
-    """What the fit has left of each joint's torque [Nm or N], shape (m,); zero where the calibration does not say."""
-    if calibration.current_residual is None:
-        return np.zeros(len(calibration.gains))
-    gains = np.array([gain.value for gain in calibration.gains])
-    of_motors = np.abs(gains) * np.array(calibration.current_residual)
-    return np.asarray(np.sqrt(np.square(model.drive_train.direction.T) @ np.square(of_motors)))
+def _usual_error_nm(calibration: Calibration, torque_nm: FloatArray, use: BoolArray) -> FloatArray:
+    """Error that a calibration leaves of such torques if nothing has changed, by the error of its fit, shape (m,).
+
+    Not by the held-out run's: that may be the run that is judged.
+    """
+    share = np.nan_to_num(np.array(calibration.relative_error_percent.axes)) / 100.0
+    size_nm = np.array([_rms(row[used]) for row, used in zip(torque_nm, use, strict=True)])
+    return np.asarray(share * size_nm)
 
 
 def _fitted(

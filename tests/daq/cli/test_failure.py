@@ -144,8 +144,14 @@ def test_an_error_of_a_verb_is_an_object_under_json(tmp_path: Path, capsys: pyte
 
 
 def test_an_interrupt_says_what_was_kept_and_leaves_no_empty_folder(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
 ) -> None:
+    # A job in the background inherits SIGINT ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
     monkeypatch.setattr("daq.workflow.fit.fit", lambda *_, **__: signal.raise_signal(signal.SIGINT))
     (tmp_path / "kept").mkdir()
     for folder, stays in ((tmp_path / "new" / "report", False), (tmp_path / "kept", True)):
