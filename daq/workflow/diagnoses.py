@@ -16,7 +16,9 @@ The order of the judgements, causes before their traces:
 5. Currents without a sign and exchanged ones, where 4. named a trace of them, or the gains are fixed.
 6. Zeros and lengths that the encoders contradict (`daq.workflow.geometry`), where there are more of them than degrees
    of freedom: found before any torque is looked at, and named first.
-7. Each held-out log.
+7. Small mistakes of the description (`daq.workflow.description`): zeros, mounting and late positions, by torque. They
+   are named before 4. to 6., and where they are, no exchange of currents is looked for (`daq.workflow.fit.judged`).
+8. Each held-out log; first whether the geometry has changed since the fit (`ident.geometry_drift`).
 """
 
 from __future__ import annotations
@@ -156,7 +158,7 @@ def diagnose_run(
     if moved is not None:
         return (drift_diagnosis(moved, model, axes, runs),)
     size = _rms(validation.measured_nm, use)
-    left = _rms(validation.measured_nm - validation.predicted_nm, use)
+    left = _rms(left_nm, use)
     idle = idle_joints(model, size, left)
     used = use & ~idle[:, None]
     found = list(scale_diagnoses(validation.measured_nm, validation.predicted_nm, used, axes, runs))

@@ -362,7 +362,8 @@ def with_description(fitted: Fit) -> Fit:
 
 def description_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
     """What a fit says of the declared geometry: corrections of its search, or else what the test beside it found."""
-    if fitted.steps:
+    has_searched = any(not step.declared for step in fitted.steps)
+    if has_searched:
         return correction_diagnoses(fitted.steps[-1].after, fitted.cell)
     if fitted.description is None:
         return ()

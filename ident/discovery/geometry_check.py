@@ -2,7 +2,7 @@
 
 Zeros of joints, the direction of gravity and late positions are tested on the rows of a fit
 (`ident.effects.geometry`). Where one of them passes, it must also explain more of what is left out than each named
-effect of one axis does: a spring that nobody declared looks like a wrong zero if nothing else is asked.
+effect of one axis does: a spring that the model lacks explains a part of what a wrong zero does.
 """
 
 from __future__ import annotations

@@ -20,9 +20,10 @@ from daq.report.certificate_page import certificate_page
 from daq.workflow import fit as fit_module
 from daq.workflow import validate as validate_module
 from daq.workflow.calibration_file import decode, encode
-from daq.workflow.fit import calibration_of, close_loop, fit, fit_logs
+from daq.workflow.fit import calibration_of, close_loop, description_diagnoses, fit, fit_logs
 from daq.workflow.validate import cross_validate
 from ident.data.run import Run
+from ident.discovery.loop import Step
 from ident.errors import Diagnosis, IdentificationError
 from ident.estimators.turned_geometry import with_gravity
 from tests.ident.arms import THREE_AXES
@@ -209,3 +210,17 @@ def test_the_same_is_said_by_every_verb(
     shown = unescape(re.sub(r"<[^>]*>|`", "", page))
     for one in fitted.diagnoses:
         assert f"CHECK {one.text}.".replace("`", "") in shown
+
+
+def test_a_zero_is_named_beside_declared_effects_and_not_after_a_search_without_it(
+    cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = {run.name: offset(run) for run in recorded}
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    fitted = fit([Path(f"r{number}") for number in range(USED)])
+    evidence = fitted.evidence()
+    step = Step((), (), np.zeros(3), None, evidence, declared=True)
+    beside_declared = description_diagnoses(replace(fitted, steps=(step,)))
+    assert said(beside_declared) == {"zero-off J2"}
+    after_search = description_diagnoses(replace(fitted, steps=(replace(step, declared=False),)))
+    assert after_search == ()

@@ -128,7 +128,7 @@ def test_a_clean_recording_names_nothing_and_shows_the_direction_of_gravity() ->
     assert check.gravity.turn_rad < 4.0 * check.gravity.turn_std_rad < np.radians(0.5)
 
 
-def test_a_spring_that_nobody_declared_is_no_wrong_zero() -> None:
+def test_check_geometry_with_an_undeclared_spring_names_no_zero() -> None:
     """A wrong zero explains a part of what it leaves; the spring explains all of it."""
     truth = three_axes_truth()
     runs: list[Run] = []
