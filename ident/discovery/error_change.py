@@ -5,6 +5,11 @@ noise where
 
     |Σ d_b| > t_(p, B − 1) · √(B/(B − 1) Σ (d_b − mean)²).
 
+One block in which an error changes much, either way, makes this σ so large that no change is seen which all other
+blocks share. So a change of the same sign by the trimmed mean counts as well (Yuen 1974: the largest and the smallest
+tenth of the blocks left out, one block each at least): 10 of 11 blocks better prove an effect, although one is worse.
+The reverse is not enough: a fall that two blocks make alone is none.
+
 Blocks are moves, and neighbouring moves of a run are joined in pairs while their changes correlate: an error that
 differs over a region of the workspace differs in a dozen moves at once, which prove no more than one of them. Fewer
 blocks than FEWEST_BLOCKS show nothing, whatever they say: the signs of four agree by chance once in 16 times. One block
@@ -30,6 +35,7 @@ from ident.estimators.estimate import SAME_ERROR
 CONFIDENCE = 0.95  #: One-sided, of a change of the whole squared error by more than noise
 MOTOR_CONFIDENCE = 0.99  #: One-sided, that no motor's error seems to change by more than noise where none does
 FEWEST_BLOCKS = 5  #: 2⁻⁵ < 1 − CONFIDENCE: with fewer, not even equal signs of all blocks are rare
+TRIMMED = 0.1  #: Share of the blocks at either end that a trimmed mean leaves out
 DOUBTFUL = 0.1  #: Share of ‖e‖ of a motor that is no small rise, although it may be noise
 
 
@@ -40,6 +46,7 @@ class PairedChange:
     rise: float  #: Σ ‖e‖² after − before; negative where the error falls
     std: float  #: its σ
     moves: int  #: number of moves with rows, or of independent blocks of them
+    by_block: tuple[float, ...] = ()  #: the change in each of them, the smallest first; empty where it is not known
 
     @property
     def is_rise(self) -> bool:
@@ -53,11 +60,30 @@ class PairedChange:
 
     def rises(self, confidence: float) -> bool:
         """Whether the error rises by more than its noise, at a one-sided confidence."""
-        return self.moves > 1 and self.rise > float(scipy.special.stdtrit(self.moves - 1, confidence)) * self.std
+        if self.moves < 2 or self.rise <= 0.0:
+            return False
+        limit = float(scipy.special.stdtrit(self.moves - 1, confidence))
+        return self.rise > limit * self.std or self._rises_in_most_blocks(confidence)
 
     def falls(self, confidence: float) -> bool:
         """Whether the error falls by more than its noise, at a one-sided confidence."""
-        return PairedChange(-self.rise, self.std, self.moves).rises(confidence)
+        opposite = tuple(-change for change in reversed(self.by_block))
+        return PairedChange(-self.rise, self.std, self.moves, opposite).rises(confidence)
+
+    def _rises_in_most_blocks(self, confidence: float) -> bool:
+        """Whether the trimmed mean of the blocks is larger than zero by more than its noise."""
+        count = len(self.by_block)
+        if count < FEWEST_BLOCKS:
+            return False
+        trimmed = max(1, int(TRIMMED * count))
+        changes = np.array(self.by_block)
+        inner = changes[trimmed:-trimmed]
+        left = len(inner)
+        if left < 2:
+            return False
+        winsorised = np.clip(changes, inner[0], inner[-1])
+        std = float(np.sqrt((count - 1) * np.var(winsorised, ddof=1) / (left * (left - 1))))
+        return float(inner.mean()) > float(scipy.special.stdtrit(left - 1, confidence)) * std
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,4 +215,4 @@ def change_of_errors(
 def _of_blocks(sums: FloatArray) -> PairedChange:
     count = len(sums)
     spread = np.sum((sums - sums.mean()) ** 2) * count / max(count - 1, 1)
-    return PairedChange(float(sums.sum()), float(np.sqrt(spread)), count)
+    return PairedChange(float(sums.sum()), float(np.sqrt(spread)), count, tuple(np.sort(sums).tolist()))

@@ -50,6 +50,48 @@ def test_a_fall_of_the_motor_that_the_effect_names_is_a_fall() -> None:
     assert judge(change, 1)[0] is Judgement.UNDECIDED
 
 
+def test_a_fall_in_all_blocks_but_one_is_a_fall() -> None:
+    """One move that is predicted worse makes the scatter of all so large that the mean shows nothing."""
+    falls = np.array([-30.0, -27.0, -25.0, -24.0, -22.0, -20.0, -19.0, -15.0, -14.0, -3.0])
+    one_rise = compare_by_move(np.append(falls, 76.0), np.arange(11))
+    assert one_rise.rise < 0.0
+    assert abs(one_rise.sigmas) < 1.7  # t(10) at 95 % is 1.8
+    assert one_rise.falls(0.95)
+    assert not one_rise.rises(0.95)
+
+
+def test_a_fall_that_two_blocks_make_alone_is_none() -> None:
+    rest = np.array([-13.0, -9.0, -2.0, -3.0, -1.0, 10.0, -4.0])
+    two_falls = compare_by_move(np.append(rest, [-2747.0, -1627.0]), np.arange(9))
+    assert two_falls.rise < -4000.0
+    assert not two_falls.falls(0.95)
+
+
+def test_a_rise_in_total_is_no_fall_of_most_blocks() -> None:
+    """Nine moves better and one much worse: the error rises, whatever the trimmed mean says."""
+    change = compare_by_move(np.append(np.full(9, -10.0) + np.arange(9), 200.0), np.arange(10))
+    assert change.rise > 0.0
+    assert not change.falls(0.95)
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=30))
+def test_a_fall_is_a_rise_of_the_opposite(changes: list[float]) -> None:
+    move = np.arange(len(changes))
+    found = compare_by_move(np.array(changes), move)
+    opposite = compare_by_move(-np.array(changes), move)
+    assert found.falls(0.95) == opposite.rises(0.95)
+    assert not (found.falls(0.95) and found.rises(0.95))
+
+
+@pytest.mark.parametrize("freedom", [3, 30])
+def test_noise_falls_once_in_twenty_also_with_heavy_tails(freedom: int) -> None:
+    """Two tests are made, which nearly always agree: 5 % of each become some 6 % of both."""
+    rng = np.random.default_rng(11)
+    draws = rng.standard_t(freedom, size=(2000, 12))
+    share = np.mean([compare_by_move(draw, np.arange(12)).falls(0.95) for draw in draws])
+    assert 0.035 <= share <= 0.075
+
+
 def test_a_rise_that_is_more_than_noise_is_refuted() -> None:
     change = _change(np.random.default_rng(0).normal(5.0, 3.0, (20, MOTORS)))
     judgement, reason = judge(change)
