@@ -270,12 +270,22 @@ class DetectionLimit(StrictModel):
     unit: str
 
 
+class SplitNameEntry(StrictModel):
+    """Name that splits of the data choose for what a turn added."""
+
+    effect: str
+    axis: str
+    settings: dict[str, float]
+    splits: int
+
+
 class TurnEntry(StrictModel):
     """One turn of the loop."""
 
     accepted: FindingEntry | None
     added: list[PlacedEffectEntry]
     removed: list[str]
+    names_by_split: list[SplitNameEntry]
     before: ModelErrors | None
     after: ModelErrors | None
     gain_changes: list[ChangedGain] | None

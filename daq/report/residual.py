@@ -15,6 +15,7 @@ from rich.table import Table
 from daq.report.effect_names import effect_text, size_text, variable_text
 from daq.report.fit import coefficients, error_document, error_table, identifiability_notes
 from daq.report.gains import diagnosis_texts, gain_table, partial_note
+from daq.report.split_names import names_by_split
 from daq.report.text import Sentence, picked, plain_table
 from daq.workflow.calibration_file import as_document
 from daq.workflow.fit import Fit
@@ -177,7 +178,7 @@ def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -
     kept = fitted.steps[-1].after.effects
     first = diagnosis_texts(fitted.diagnoses)
     found = tuple(
-        _effect_sentence(fitted, account, turn, placed, step.accepted.share_of_excess)
+        _effect_sentence(fitted, account, turn, placed, step)
         for step, turn in zip(fitted.steps, account.turns, strict=True)
         if step.accepted is not None and turn is not None
         for placed in turn.added
@@ -479,11 +480,13 @@ def error_change_text(before_percent: float, after_percent: float) -> str:
     return f"{change} from {before} to {after} %"
 
 
-def _effect_sentence(
-    fitted: Fit, account: Account, turn: BeforeAfter, placed: PlacedEffect, share_of_excess: float | None
-) -> str:
+def _effect_sentence(fitted: Fit, account: Account, turn: BeforeAfter, placed: PlacedEffect, step: Step) -> str:
     axes = fitted.cell.place_names
     name = axes[placed.axis]
+    share_of_excess = None if step.accepted is None else step.accepted.share_of_excess
+    what = effect_text(placed.effect, axes)
+    if doubt := doubted_name(step, placed, axes):
+        what = f"a torque that depends on {variable_text(placed.effect, axes)} ({doubt})"
     (before, _), (after, where) = _strictest_error(turn.before), _strictest_error(turn.after)
     floor = _floor(account).at(placed.axis)
     floor_text = _floor_text(floor)
@@ -493,14 +496,23 @@ def _effect_sentence(
     if not placed.effect.has_axis:
         before_all, after_all = (_strictest_error(errors)[0].total for errors in (turn.before, turn.after))
         change = error_change_text(before_all, after_all)
-        return f"The recording has {effect_text(placed.effect, axes)}: the error {where} {change}."
+        return f"The recording has {what}: the error {where} {change}."
     if before.at(placed.axis) * (1.0 - SLIGHT) < after.at(placed.axis) <= before.at(placed.axis):
         excess += ", a small effect"
     whose = f" of {name}" if placed.axis < len(fitted.cell.axes) else " of all axes"
     return (
-        f"{name} has {effect_text(placed.effect, axes)}{excess}: the error{whose} {where} "
+        f"{name} has {what}{excess}: the error{whose} {where} "
         f"{error_change_text(before.at(placed.axis), after.at(placed.axis))} ({floor_text})."
     )
+
+
+def doubted_name(step: Step, placed: PlacedEffect, axes: Sequence[str]) -> str:
+    """Say what splits of the data call an effect that a turn added; empty where all of them call it the same."""
+    names = names_by_split(step)
+    if len(names) < 2 or step.accepted is None or placed.axis != step.accepted.axis:
+        return ""
+    counted = [f"{one.placed.name_among(axes)} ({one.splits} of {one.of})" for one in names]
+    return f"parts of the moves call it {' or '.join(counted)}"
 
 
 def _floor(account: Account) -> RelativeError:
@@ -599,6 +611,7 @@ def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> dict[str, Any]:
             for placed in added
         ],
         "removed": [placed.name_among(axes) for placed in removed],
+        "names_by_split": [{**_placed(name.placed, axes), "splits": name.splits} for name in names_by_split(step)],
         **(dict.fromkeys(("before", "after", "gain_changes")) if turn is None else _before_after(fitted, turn)),
         "findings": [_finding(finding, axes) for finding in step.findings],
         "structures": [_finding(finding, axes) for finding in step.structures],

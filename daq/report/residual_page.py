@@ -21,6 +21,7 @@ from daq.report.residual import (
     WHEN,
     candidate_rows,
     declared_sentences,
+    doubted_name,
     effect_sizes,
     error_rows,
     gains_sentence,
@@ -113,10 +114,14 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
     shown_axis = axes[drawn_axis(before, step.after, placed)]
     of_joint = "" if has_motor else f" of {axis}"
     kept = placed in final.effects
+    doubts: list[str] = []
+    if doubt := doubted_name(step, placed, axes):
+        doubts.append(f"Its name is not certain. Chosen without an eighth of the moves, each in turn, {doubt}.")
     rivals = () if step.accepted is None else step.accepted.ambiguity
     ambiguous = "; ".join(f"{axes[one.axis]}: {effect_text(one.effect, axes)}" for one in rivals)
     sentences = (
         f"Name in files and commands: `{placed.name_among(axes)}`.",
+        *doubts,
         f"These data cannot distinguish it from: {ambiguous}."
         if ambiguous
         else "Every other candidate is clearly worse.",

@@ -76,7 +76,7 @@ HOSTILE = '<script>alert("$x$")</script>&<img src=http://example.org/x>'
 VOID = {"meta", "img", "br", "link"}
 
 
-def _finding(placed: PlacedEffect, *, passed: bool = True, rivals: tuple[PlacedEffect, ...] = ()) -> Finding:
+def finding(placed: PlacedEffect, *, passed: bool = True, rivals: tuple[PlacedEffect, ...] = ()) -> Finding:
     return Finding(
         effect=placed.effect,
         axis=placed.axis,
@@ -139,12 +139,12 @@ def closed(shelved: Shelf) -> Closed:
     rival = PlacedEffect(LoadFriction(0), 1)
     limits_nm = np.array([0.5, 1.25, 0.25, 0.1, 0.2, 0.05])
     first = Step(
-        (_finding(SPRING, rivals=(rival,)), _finding(rival, passed=False)), (), limits_nm, _finding(SPRING), after
+        (finding(SPRING, rivals=(rival,)), finding(rival, passed=False)), (), limits_nm, finding(SPRING), after
     )
     first = replace(first, accepted=first.findings[0])
     last = Step(
-        (_finding(rival, passed=False),),
-        (_finding(PlacedEffect(Periodic(0), 3), passed=False),),
+        (finding(rival, passed=False),),
+        (finding(PlacedEffect(Periodic(0), 3), passed=False),),
         limits_nm,
         None,
         after,
@@ -416,9 +416,9 @@ def _with_three_effects(closed: Closed) -> Closed:
     after = replace(first.after, effects=(SPRING, *places))
     (turn, _) = closed.account.turns
     assert turn is not None
-    found = [_finding(place, rivals=(SPRING, places[0])) for place in places]
-    asides = tuple(SetAside(_finding(PlacedEffect(LoadFriction(0), axis)), moved=((3, 2.91),)) for axis in range(6))
-    refused = replace(_finding(PlacedEffect(LoadFriction(0), 3), passed=False), refusals=("coefficient is -1 ± 0.1",))
+    found = [finding(place, rivals=(SPRING, places[0])) for place in places]
+    asides = tuple(SetAside(finding(PlacedEffect(LoadFriction(0), axis)), moved=((3, 2.91),)) for axis in range(6))
+    refused = replace(finding(PlacedEffect(LoadFriction(0), 3), passed=False), refusals=("coefficient is -1 ± 0.1",))
     steps = (
         replace(first, after=after),
         *(replace(first, accepted=one, findings=(one,), after=after) for one in found),
@@ -545,7 +545,7 @@ def test_silence_is_reported_with_its_size(closed: Closed) -> None:
 def test_a_strong_candidate_that_failed_a_check_is_named_with_it(closed: Closed) -> None:
     first, last = closed.fitted.steps
     strong = replace(
-        _finding(PlacedEffect(LoadFriction(0), 1), passed=False), explained=0.4, refusals=("coefficient is -1 ± 0.1",)
+        finding(PlacedEffect(LoadFriction(0), 1), passed=False), explained=0.4, refusals=("coefficient is -1 ± 0.1",)
     )
     weak = replace(strong, axis=2, explained=0.1)
     asked = replace(closed.fitted, steps=(first, replace(last, findings=(weak, strong))))
@@ -560,7 +560,7 @@ def test_a_first_candidate_that_physics_alone_refuses_is_named_however_little_it
     first, last = closed.fitted.steps
     why = "coefficient is -1 ± 0.1 ; physics allows no less than 0"
     refused = replace(
-        _finding(PlacedEffect(LoadFriction(0), 1), passed=False), explained=0.1, refusals=(why,), impossible=why
+        finding(PlacedEffect(LoadFriction(0), 1), passed=False), explained=0.1, refusals=(why,), impossible=why
     )
     second = replace(refused, effect=Spring())
     noise = replace(refused, axis=2, refusals=("noise makes one as strong with p = 0.400", why))
@@ -578,7 +578,7 @@ def test_a_candidate_that_was_not_tested_has_no_probability(closed: Closed) -> N
     first, last = closed.fitted.steps
     why = "it rests on two moves, too few to test it: record more moves with a large current of this axis"
     untested = replace(
-        _finding(PlacedEffect(LoadFriction(0), 1), passed=False), probability=None, explained=0.4, refusals=(why,)
+        finding(PlacedEffect(LoadFriction(0), 1), passed=False), probability=None, explained=0.4, refusals=(why,)
     )
     step = replace(last, findings=(untested,))
     asked = replace(closed.fitted, steps=(first, step))
@@ -591,7 +591,7 @@ def test_a_candidate_that_was_not_tested_has_no_probability(closed: Closed) -> N
 
 def test_a_name_that_structure_refutes_is_reported_with_what_it_depends_on(closed: Closed) -> None:
     first, last = closed.fitted.steps
-    term, name = PlacedEffect(Smooth(Abscissa.POSITION), 1), _finding(PlacedEffect(LoadFriction(0), 1))
+    term, name = PlacedEffect(Smooth(Abscissa.POSITION), 1), finding(PlacedEffect(LoadFriction(0), 1))
     refuted = SetAside(name, "{rival} explains clearly more", term, ((3, 2.91),))
     assert refuted.reason([f"J{axis}" for axis in range(1, 7)]) == (
         "it would move the gain of J4 by 2.9 σ, and smooth-position on J2 explains clearly more"
@@ -606,8 +606,8 @@ def test_a_name_that_structure_refutes_is_reported_with_what_it_depends_on(close
 @pytest.mark.usefixtures("undrawn")
 def test_what_did_not_join_is_reported_with_the_reason(closed: Closed) -> None:
     first, last = closed.fitted.steps
-    aside = SetAside(_finding(PlacedEffect(Smooth(Abscissa.LOAD), 1)), moved=((3, 2.91),))
-    replaced = SetAside(_finding(PlacedEffect(LoadFriction(0), 1)), "{rival} explains more", SPRING)
+    aside = SetAside(finding(PlacedEffect(Smooth(Abscissa.LOAD), 1)), moved=((3, 2.91),))
+    replaced = SetAside(finding(PlacedEffect(LoadFriction(0), 1)), "{rival} explains more", SPRING)
     steps = (replace(first, set_aside=(replaced, aside)), replace(last, set_aside=(aside,)))
     made = Closed(replace(closed.fitted, steps=steps), closed.account)
     sentences = summary(made.fitted, made.account, ())
@@ -687,7 +687,7 @@ def test_a_rise_within_noise_is_said_with_what_apply_will_refuse(closed: Closed)
 
 def test_the_candidate_that_was_added_is_listed_wherever_it_ranks(closed: Closed) -> None:
     first = closed.fitted.steps[0]
-    rivals = tuple(_finding(PlacedEffect(LoadFriction(0), axis), passed=False) for axis in range(6)) * 3
+    rivals = tuple(finding(PlacedEffect(LoadFriction(0), axis), passed=False) for axis in range(6)) * 3
     late = replace(first, findings=(*rivals, first.findings[0]), structures=())
     (table, *_) = turns_view(replace(closed.fitted, steps=(late,)))
     assert isinstance(table, Table)
