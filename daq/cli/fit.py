@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CellOption, JsonOption, Verb, judged_output, print_json, say_next
+from daq.cli.verb import CellOption, JsonOption, Verb, judged_output, print_json, say_correct_first, say_next
 from daq.workflow.choices import Known
 from ident.estimators.method import Method
 
@@ -147,7 +147,17 @@ def fit_verb(
         same += [] if cell is None else ["--cell", cell]
         same += ["--gains", gains.value] if fixed else []
         same += ["--channels-as-wired"] if channels_as_wired else []
-        say_next("drivegain", "residual", *logs, *same, "--out", out or "calibration.yaml", "--report", "report")
+        say_after_fit(calibration, [*logs, *same], out or Path("calibration.yaml"))
+
+
+def say_after_fit(calibration: Calibration, arguments: Sequence[object], out: Path) -> None:
+    """Print the next step: the search for what the model lacks, unless the robot is described wrongly."""
+    from daq.writeback.gates.fit import uncorrected_description
+
+    if uncorrected_description(calibration):
+        say_correct_first()
+    else:
+        say_next("drivegain", "residual", *arguments, "--out", out, "--report", "report")
 
 
 def _fit_cases(

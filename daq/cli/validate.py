@@ -16,6 +16,7 @@ from daq.cli.verb import (
     cells_in,
     judged_output,
     print_json,
+    say_correct_first,
     say_next,
 )
 from daq.errors import CalibrationMissing
@@ -62,6 +63,7 @@ def validate_verb(
         validation_view,
     )
     from daq.workflow.validate import cross_validate
+    from daq.writeback.gates.fit import uncorrected_description
 
     page_file = None if out is None else out / "tables.md"
     check_output(page_file, (calibration, *logs), TABLES)
@@ -82,7 +84,9 @@ def validate_verb(
         print_json({**validation_document(known, found.validations, drawn), **cross_document(found)})
     else:
         print_view(validation_view(known, found), *drawn.values(), page_file)
-        if not known.gains_fixed:  # every gate of such gains is closed
+        if uncorrected_description(known):
+            say_correct_first()
+        elif not known.gains_fixed:  # every gate of such gains is closed
             say_next("drivegain", "apply", cell or cell_of(known, logs), calibration)
 
 

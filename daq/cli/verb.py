@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -228,8 +229,12 @@ _TEMPLATE = Path("press-4/cells/press-4.yaml")  #: What the example of `drivegai
 
 
 def cell_here() -> Path:
-    """Find a cell file in or below this folder, for a command to copy, or the one that `drivegain init` would make."""
-    return next(cells_in(Path()), _TEMPLATE)
+    """The only cell file in or below this folder, for a command to copy; else the one that `drivegain init` would make.
+
+    Of several, one that is copied without a look may be the wrong one.
+    """
+    found = list(islice(cells_in(Path()), 2))
+    return found[0] if len(found) == 1 else _TEMPLATE
 
 
 def cells_in(folder: Path, name: str | None = None) -> Iterator[Path]:
@@ -265,6 +270,11 @@ def say_next(*words: object) -> None:
     """Print the command of the next step on stderr, quoted for a shell; without `--json` only."""
     # Written names of things that the user has to fill in, such as CELL, need no quotes.
     typer.echo("Next: " + " ".join(shlex.quote(str(word)) for word in words), err=True)
+
+
+def say_correct_first() -> None:
+    """Print on stderr that the description comes before every other step."""
+    typer.echo("Next: correct the description as CHECK says, then fit the logs again.", err=True)
 
 
 def print_json(document: Any) -> None:

@@ -30,6 +30,7 @@ from ident.discovery.time_skew import Skew
 from ident.discovery.verdict import Judgement, Verdict
 from ident.drift.change import FALSE_ALARM
 from ident.effects.effect import PlacedEffect
+from ident.effects.geometry import is_correction
 from ident.effects.signals import session_began_s
 from ident.effects.unnamed import is_unnamed
 from ident.estimators.estimate import RelativeError
@@ -176,7 +177,7 @@ def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -
     The arguments are those of `summary`. The diagnoses come first, a sentence each.
     """
     kept = fitted.steps[-1].after.effects
-    first = diagnosis_texts(fitted.diagnoses)
+    first = (*diagnosis_texts(fitted.diagnoses), *_correction_sentence(kept))
     found = tuple(
         _effect_sentence(fitted, account, turn, placed, step)
         for step, turn in zip(fitted.steps, account.turns, strict=True)
@@ -198,6 +199,15 @@ def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -
     return (*first, *found, whole, *judged, *_to_be_refused(effects), *((gains,) if gains else ()), *ending)
 
 
+def _correction_sentence(kept: Sequence[PlacedEffect]) -> Iterator[str]:
+    """Say that the model corrects the description: its gains are right, although the cell file is not yet."""
+    if any(is_correction(placed) for placed in kept):
+        yield (
+            "The model corrects the description of the robot: gains and errors below are those of the corrected one. "
+            "Correct the cell file all the same, and fit again."
+        )
+
+
 def verdict_sentences(fitted: Fit) -> Iterator[str]:
     """Name the effects that were found and that held-out runs do not confirm, with the errors that show it."""
     for verdict in fitted.steps[-1].verdicts:
@@ -208,7 +218,10 @@ def verdict_sentences(fitted: Fit) -> Iterator[str]:
         if verdict.judgement is Judgement.REFUTED:
             yield f"Held-out runs refute {name}: {evidence}. It was found in the runs of the fit, and is not written."
         elif verdict.judgement is Judgement.CONFIRMED:
-            yield f"Held-out runs confirm {name}, but beside the other effects σ no longer shows it: it is not written."
+            yield (
+                f"Held-out runs confirm {name}, but it is not written: after other effects have left, its σ no longer "
+                "shows it, or it left together with them."
+            )
         elif verdict.written:
             yield f"Undecided, and written as asked: {name}: {evidence}."
         else:
@@ -227,7 +240,8 @@ def statistical_sentences(fitted: Fit, account: Account) -> tuple[str, ...]:
     sentences += _refused(fitted)
     sentences += gear_sentences(fitted)
     sentences += floor_sentences(account, fitted.cell.axis_names)
-    if last.after.effects and not runs_to_leave_out(last.after.training):
+    is_judged_on_runs = bool(last.verdicts) or bool(runs_to_leave_out(last.after.training))
+    if last.after.effects and not is_judged_on_runs:
         sentences.append(
             "The effects were tested on moves of the same recordings only, kept out of the fit in turn. Record two "
             "runs without load and two with each payload: whole runs can then be kept out, which is a stricter test."
@@ -364,8 +378,8 @@ def _holdout_verdict(fitted: Fit, account: Account) -> list[str]:
         return []
     if fitted.accept_worse_holdout:
         return [
-            "The effects raise the error of the held-out runs by more than its noise and were accepted all the same: "
-            "these runs have taken part in the choice, and are no proof."
+            "The effects raise the error of the held-out runs by more than its noise. They were accepted all the same, "
+            "because --accept-worse-holdout was given."
         ]
     return ["The effects raise the error of the held-out runs by more than its noise: no calibration was written."]
 

@@ -38,7 +38,10 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
         f"Position filter {filter_.position_cutoff_hz:g} Hz, decimation {filter_.decimation_cutoff_hz:g} Hz, as in the "
         "fit. Compare relative errors only under the same filters."
     )
-    doubts = [*diagnosis_texts(found.diagnoses)]
+    doubts: list[str] = []
+    for diagnosis, text in zip(found.diagnoses, diagnosis_texts(found.diagnoses), strict=True):
+        is_of_fit = diagnosis in calibration.diagnoses
+        doubts.append(f"The fit of this calibration found: {text}" if is_of_fit else text)
     doubts += [
         f"{validation.log} carries another cell configuration than the logs of the fit; check the difference."
         for validation in validations

@@ -161,7 +161,8 @@ def _diagnosis(
                     axes=(),
                     found=f"gravity along {vector_text(turned)}, turned by {angle:.2f} ± {std:.2f}°",
                     expected=f"{vector_text(declared)}, as the cell file says",
-                    remedy=f"level the base, or write `gravity_m_s2: {vector_text(turned)}`, and fit again",
+                    remedy=f"write `gravity_m_s2: {vector_text(turned)}` in the cell file, or level the base and "
+                    "record again; then fit again",
                 )
             ]
         case LatePosition():

@@ -71,7 +71,7 @@ class Fit:
     diagnoses: tuple[Diagnosis, ...] = ()  #: of the fit, with effects of the last one, and of each held-out log
     #: Slope of each axis's own torque over its current, beside the gains; empty where no log has such torques.
     torque_slopes: tuple[TorqueSlope | None, ...] = ()
-    #: The operator takes effects that held-out runs refute: these have then taken part in the choice.
+    #: The operator takes all effects that were found, also what held-out runs would refute: these judge none of them.
     accept_worse_holdout: bool = False
     description: GeometryCheck | None = None  #: zeros, mounting and clocks by torque; None where it was not tested
     channels_as_wired: bool = False  #: the operator says that no currents are exchanged

@@ -18,6 +18,7 @@ from daq.workflow.validate import (
     check_cell,
     conditioning_of,
     unpredictable,
+    warn_of_corrections,
     warn_of_fitted,
     warn_without_temperature,
 )
@@ -147,6 +148,8 @@ class _Logs:
         check_cell(self._calibration, log, described)
         if self._first is None:
             self._first = log, described
+            if described.digest != self._calibration.configuration_sha256:
+                warn_of_corrections(self._calibration, run.name)
         first_log, first = self._first
         if described.recording_digest != first.recording_digest:
             sections = ", ".join(differing_sections(first, described)) or "the files of the cell"

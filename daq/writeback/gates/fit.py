@@ -11,10 +11,17 @@ from collections.abc import Iterator
 from daq.writeback.gates.gate import GateContext
 from daq.writeback.request import GateFinding
 from ident.calibration import Calibration
+from ident.errors import Diagnosis
 
 NOISE, AXIS_NOISE = 1.01, 1.02
 """Share of the nameplate's error that a calibration may have, in total and on an axis: where the nameplate is true, the
 two differ by 0.1 % and 0.3 % (`tests.studies.holdout_study`)."""
+CORRECTED_BY = {"zero-off": "zero-offset", "gravity-tilted": "gravity-direction", "position-late": "late-position"}
+"""Diagnosis of the description, and the effect that corrects it in a calibration."""
+NEVER_CORRECTED = frozenset({"gravity-turned", "position-reversed"})
+"""Diagnoses of a description that is so far off that nothing in a calibration corrects it."""
+BY_ENCODERS = frozenset({"zero-off", "length-off", "geometry-off"})
+"""Diagnoses by encoders that miss the loops of a closed chain."""
 
 
 def cell(context: GateContext) -> Iterator[GateFinding]:
@@ -39,6 +46,45 @@ def configuration(context: GateContext) -> Iterator[GateFinding]:
             f"{expected[:12]}…, the cell's configuration now",
             "record again, or see what changed since and accept it with --configuration-changed",
         )
+
+
+def description(context: GateContext) -> Iterator[GateFinding]:
+    """Refuse gains of a robot that its fit found described wrongly (zero, mounting, time stamps, length of a link).
+
+    A calibration that corrects the description itself, as `drivegain residual` does, has the right gains.
+    """
+    calibration = context.calibration
+    for diagnosis in uncorrected_description(calibration):
+        subject = ", ".join(diagnosis.axes) or "calibration"
+        yield subject, diagnosis.found, diagnosis.expected, diagnosis.remedy
+
+
+def uncorrected_description(calibration: Calibration) -> tuple[Diagnosis, ...]:
+    """Diagnoses of the robot's description that a fit has made and its calibration does not correct."""
+    held_out = {source.name for source in calibration.sources if source.role == "holdout"}
+    found: list[Diagnosis] = []
+    for diagnosis in calibration.diagnoses:
+        # What a held-out run alone shows has changed after the fit: its error is judged by another gate.
+        is_of_holdout = bool(diagnosis.runs) and held_out.issuperset(diagnosis.runs)
+        if not is_of_holdout and _is_uncorrected(diagnosis, calibration):
+            found.append(diagnosis)
+    return tuple(found)
+
+
+def _is_uncorrected(diagnosis: Diagnosis, calibration: Calibration) -> bool:
+    """Whether a diagnosis says that the description is wrong, and nothing in the calibration corrects that."""
+    if diagnosis.name in NEVER_CORRECTED:
+        return True
+    misfit = calibration.encoder_misfit
+    if misfit is not None and diagnosis.name in BY_ENCODERS:
+        return bool(misfit.corrections) and not misfit.applied
+    if diagnosis.name not in CORRECTED_BY:
+        return False
+    for effect in calibration.effects:
+        is_of_axis = not diagnosis.axes or effect.axis in diagnosis.axes
+        if effect.name == CORRECTED_BY[diagnosis.name] and is_of_axis:
+            return False
+    return True
 
 
 def finite_errors(context: GateContext) -> Iterator[GateFinding]:

@@ -23,6 +23,7 @@ class Gate(Enum):
     UNCERTAINTY = "uncertainty"
     CELL = "cell"
     CONFIGURATION = "configuration"
+    DESCRIPTION = "description of the robot"
     ERROR = "error"
     HOLDOUT = "hold-out error"
     HOLDOUT_STILL = "axis at rest in the hold-out"

@@ -35,6 +35,11 @@ GATES: tuple[GateRow, ...] = (
     GateRow(Gate.NOT_IDENTIFIED, (target.identified,), "fit with a loaded run and free gains"),
     GateRow(Gate.CELL, (fit.cell,), "use its own `--cell`"),
     GateRow(Gate.CONFIGURATION, (fit.configuration,), "record again, or review and pass `--configuration-changed`"),
+    GateRow(
+        Gate.DESCRIPTION,
+        (fit.description,),
+        "correct the cell file and fit again, or let `drivegain residual` correct it",
+    ),
     GateRow(Gate.NOT_FINITE, (fit.finite_errors, target.finite_gains), "fit again"),
     GateRow(Gate.HOLDOUT_STILL, (fit.holdout_motion,), "hold out a run in which all axes move"),
     GateRow(

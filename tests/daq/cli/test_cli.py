@@ -73,6 +73,15 @@ def test_every_job_of_the_help_has_its_verbs(capsys: pytest.CaptureFixture[str])
         assert named == [listed.name for listed in BY_JOB[job]]
 
 
+def test_an_example_chooses_none_of_several_cell_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would be the first by name, and a copied `apply` would write to that one."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("lathe", "saw"):
+        assert main(["init", f"{name}"]) == 0
+    assert len([*cells_in(Path())]) == 2
+    assert cell_here() == Path("press-4/cells/press-4.yaml")
+
+
 def test_an_example_uses_the_cell_file_of_the_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -7,21 +7,26 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 from html import unescape
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from daq.cli.fit import say_after_fit
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.log.reader import LossyLogs
 from daq.report.certificate import certify, without_controller
 from daq.report.certificate_page import certificate_page
+from daq.report.validation import validation_view
 from daq.workflow import fit as fit_module
 from daq.workflow import validate as validate_module
 from daq.workflow.calibration_file import decode, encode
 from daq.workflow.fit import calibration_of, close_loop, description_diagnoses, fit, fit_logs
 from daq.workflow.validate import cross_validate
+from daq.writeback.gates.fit import uncorrected_description
 from ident.data.run import Run
 from ident.discovery.loop import Step
 from ident.errors import Diagnosis, IdentificationError
@@ -210,6 +215,29 @@ def test_the_same_is_said_by_every_verb(
     shown = unescape(re.sub(r"<[^>]*>|`", "", page))
     for one in fitted.diagnoses:
         assert f"CHECK {one.text}.".replace("`", "") in shown
+
+
+@pytest.mark.parametrize(("degrees", "next_step"), [(4.0, "correct the description"), (0.0, "drivegain residual")])
+def test_a_wrong_description_is_corrected_before_the_next_step(
+    cell: Cell,
+    recorded: Runs,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    degrees: float,
+    next_step: str,
+) -> None:
+    runs = {run.name: replace(offset(run, degrees), digest=f"{int(run.name[1:]):064x}") for run in recorded}
+    for module in (fit_module, validate_module):
+        monkeypatch.setattr(module, "load_run", lambda path, *_: (runs[path.name], cell))
+    paths = [Path(f"r{number}") for number in range(RUNS)]
+    calibration = calibration_of(fit(paths[:USED], holdout=paths[USED:]), WHEN)
+    say_after_fit(calibration, paths[:USED], Path("fit.yaml"))
+    assert f"Next: {next_step}" in capsys.readouterr().err
+    assert bool(uncorrected_description(calibration)) == bool(degrees)
+    console = Console(width=400, file=StringIO())
+    console.print(*validation_view(calibration, cross_validate({"one": calibration}, paths[USED:])))
+    said_of_fit = "The fit of this calibration found: CHECK J2" in console.file.getvalue()  # type: ignore[attr-defined]
+    assert said_of_fit == bool(degrees)
 
 
 def test_a_zero_is_named_beside_declared_effects_and_not_after_a_search_without_it(

@@ -23,6 +23,7 @@ from daq.report.weighing import contact_document, contact_view, weighed_document
 from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.validate import warn_of_fitted
 from daq.workflow.weigh import Weighed
+from ident.calibration import AcceptedEffect, Parameter
 from ident.contact import Band, ExternalTorque
 from ident.data.run import Run
 from ident.estimators.estimate import RelativeError
@@ -75,6 +76,26 @@ def test_a_real_flange_without_a_body_weighs_nothing(
     assert caplog.messages[0].startswith("tx40 was part of the fit: the agreement proves nothing")
     assert main(["weigh", str(log), "--calibration", str(file), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["part_of_the_fit"] == ["tx40"]
+
+
+@pytest.mark.parametrize("verb", ["weigh", "contact"])
+def test_a_cell_that_was_corrected_since_is_not_corrected_twice_unsaid(
+    real: tuple[Path, Path], tmp_path: Path, verb: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    file, log = real
+    calibration = load_calibration(file)
+    zero = Parameter("zero-offset offset 2", 0.001, 0.0002, "rad")
+    axis = calibration.gains[1].axis
+    corrected = AcceptedEffect("zero-offset", axis, {}, (zero,), 6.1, 3.4)
+    for digest, warned in ((calibration.configuration_sha256, 0), ("e" * 64, 1)):
+        changed = replace(calibration, effects=(corrected,), configuration_sha256=digest)
+        known = tmp_path / f"{digest[:4]}.yaml"
+        save_calibration(changed, known)
+        caplog.clear()
+        assert main([verb, str(log), "--calibration", str(known)]) == ExitCode.OK
+        texts = [text for text in caplog.messages if "another description of the cell than the fit" in text]
+        assert len(texts) == warned
+        assert all(f"zero-offset on {axis}" in text for text in texts)
 
 
 def test_a_calibration_comes_first_or_as_an_option(real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:

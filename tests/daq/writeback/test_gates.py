@@ -27,7 +27,8 @@ from daq.writeback.gates.table import GATES
 from daq.writeback.request import Request
 from daq.writeback.signature import generate, sign
 from daq.writeback.target import Proposal, apply, propose
-from ident.calibration import Calibration, Gain, Source
+from ident.calibration import Calibration, EncoderMisfit, Gain, GeometryCorrection, Source
+from ident.errors import Diagnosis
 from ident.estimators.estimate import RelativeError
 from tests.daq.calibrations import AXES, KEYS, RECORDED, demo_calibration, demo_recording, recorded, with_recordings
 
@@ -158,6 +159,34 @@ def _source(index: int, **changes: object) -> Callable[[Scene], Scene]:
 
 
 _RECORDING = set(type(demo_recording()).__slots__)
+
+
+def diagnosis_named(name: str, *axes: str, runs: tuple[str, ...] = ()) -> Diagnosis:
+    """What a fit says of a description that is wrong."""
+    return Diagnosis(
+        name, runs, axes, "the zero of J2 off by +2.00 ± 0.05 °", "the URDF's", "correct it, and fit again"
+    )
+
+
+def _corrected(effect: str, diagnosis: Diagnosis) -> Callable[[Scene], Scene]:
+    """An effect on J3, in the place of the load friction there, and what the fit has said without it."""
+
+    def broken(scene: Scene) -> Scene:
+        correction = replace(scene.calibration.effects[0], name=effect)
+        return _calibration(effects=(correction,), diagnoses=(diagnosis,))(scene)
+
+    return broken
+
+
+def _by_encoders(*, applied: bool) -> Callable[[Scene], Scene]:
+    """Encoders of a closed chain that find the zero of J2 off."""
+    correction = GeometryCorrection("zero", "J2", "", 0.0, 0.0349, 0.0002, "rad")
+    misfit = EncoderMisfit(0.01, 0.0001, "rad", True, (correction,), applied)
+    return _calibration(encoder_misfit=misfit, diagnoses=(diagnosis_named("zero-off", "J2"),))
+
+
+def _diagnosed(*diagnoses: Diagnosis) -> Callable[[Scene], Scene]:
+    return _calibration(diagnoses=diagnoses)
 
 
 def _only(*indices: int) -> Callable[[Scene], Scene]:
@@ -319,6 +348,13 @@ CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
     (Gate.HOLDOUT, "calibration", _calibration(nameplate_holdout_error_percent=None)),
     (Gate.HOLDOUT, "calibration", _calibration(holdout_error_percent=None)),
     (Gate.HOLDOUT, "calibration", lambda scene: _calibration(sources=scene.calibration.sources[:2])(scene)),
+    (Gate.DESCRIPTION, "J2", _diagnosed(diagnosis_named("zero-off", "J2"))),
+    (Gate.DESCRIPTION, "J2", _corrected("zero-offset", diagnosis_named("zero-off", "J2"))),  # corrects that of J3
+    (Gate.DESCRIPTION, "J2", _by_encoders(applied=False)),
+    (Gate.DESCRIPTION, "calibration", _diagnosed(diagnosis_named("gravity-tilted"))),
+    (Gate.DESCRIPTION, "calibration", _diagnosed(diagnosis_named("gravity-turned"))),
+    (Gate.DESCRIPTION, "J3", _diagnosed(diagnosis_named("position-late", "J3"))),
+    (Gate.DESCRIPTION, "J3", _diagnosed(diagnosis_named("position-reversed", "J3"))),
     (
         Gate.HOLDOUT_STILL,
         "J2",
@@ -440,6 +476,12 @@ def test_the_table_lists_every_gate_once_with_its_description() -> None:
             nameplate_holdout_error_percent=RelativeError((*HELD[:5], 49.9), 3.3),
         ),
         _calibration(effects=()),
+        _corrected("zero-offset", diagnosis_named("zero-off", "J3")),
+        _corrected("gravity-direction", diagnosis_named("gravity-tilted")),
+        _corrected("late-position", diagnosis_named("position-late", "J3")),
+        _diagnosed(diagnosis_named("zero-off", "J2", runs=("held-out",))),
+        _diagnosed(diagnosis_named("gain-off-nameplate", "J2")),
+        _by_encoders(applied=True),
         _source(0, recorded_s=(NOW - 29.9 * DAY).timestamp()),
         _source(0, recorded_s=(NOW + 0.9 * DAY).timestamp()),
         _logs(saturated_percent=(2.0,) * 6),
