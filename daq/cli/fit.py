@@ -107,7 +107,7 @@ def fit_verb(
     check_folder(out)
     check_output(out, (*logs, *(holdout or ()), cell), CALIBRATION)
     require_different(out, report=report, pictures=pictures)
-    check_report(report)
+    check_report(report, out)
     with status("identifying"):
         described = None if cell is None else load_cell(cell)
         fixed = gains is Gains.FIXED
@@ -241,7 +241,7 @@ def residual_verb(
     from dataclasses import replace
     from datetime import UTC, datetime
 
-    from daq.cli.terminal import check_folder, check_output, print_view, require_different, status
+    from daq.cli.terminal import check_folder, check_output, print_view, require_different, status, write_output
     from daq.config.cell_file import load_cell
     from daq.errors import OutputFailed
     from daq.log.reader import LossyLogs
@@ -255,7 +255,7 @@ def residual_verb(
     check_folder(out)
     check_output(out, (*logs, *(holdout or ()), cell), CALIBRATION)
     require_different(out, report=report, pictures=pictures)
-    check_report(report)
+    check_report(report, out)
     with status("identifying") as report_step:
         fitted = fit(
             logs,
@@ -282,7 +282,7 @@ def residual_verb(
 
     try:
         if report is not None:
-            with status("drawing the report"):
+            with status("drawing the report"), write_output(report):
                 save_report(closed, changed, calibration, report)
         check_holdout(closed)
         _save(closed, calibration, out, pictures)
@@ -309,7 +309,7 @@ def residual_verb(
     say_next("drivegain", "residual", *logs, *same, "--out", "calibration.yaml", "--report", report or "report")
 
 
-def check_report(folder: Path | None) -> None:
+def check_report(folder: Path | None, out: Path | None = None) -> None:
     """Create the folder of a report before any long work, and refuse one with other files of the same names.
 
     A folder in which nothing is written in the end is removed again.
@@ -317,11 +317,18 @@ def check_report(folder: Path | None) -> None:
     from tempfile import TemporaryFile
 
     from daq.cli.terminal import check_replaceable, make_folder
-    from daq.errors import writing
+    from daq.errors import UsageError, writing
     from daq.report.residual_page import MARKS
 
     if folder is None:
         return
+    if out is not None and out.resolve() in {folder.resolve() / name for name in MARKS}:
+        raise UsageError(
+            str(out),
+            found="a file of the report as --out",
+            expected="another name than " + " and ".join(MARKS),
+            remedy=f"choose another name for --out, as {folder / 'calibration.yaml'}",
+        )
     with writing(folder):
         make_folder(folder)
         with TemporaryFile(dir=folder):

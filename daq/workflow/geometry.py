@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from daq.config.cell import Cell, model_of
 from ident.calibration import Calibration, EncoderMisfit, GeometryCorrection
-from ident.errors import Diagnosis
+from ident.errors import Diagnosis, ModelError
 from ident.model.geometry import GeometryChange, GeometryKind, GeometryParameter, described_length
 from ident.model.geometry_derivatives import corrected_model
 from ident.model.model import Model
@@ -89,7 +89,18 @@ def _axes_of(corrections: Sequence[GeometryEstimate], cell: Cell) -> Iterator[st
 
 
 def _axis_of(parameter: GeometryParameter, model: Model) -> int:
-    return [joint.name for joint in model.robot.axes].index(parameter.joint)
+    """Axis of a zero.
+
+    Raises:
+        ModelError: no axis has a joint of this name.
+    """
+    names = [joint.name for joint in model.robot.axes]
+    if parameter.joint not in names:
+        raise ModelError(
+            f"a zero of joint {parameter.joint!r} was corrected, and no axis of the robot has it: "
+            f"{', '.join(names)}; give the cell file of the fit, or calibrate anew"
+        )
+    return names.index(parameter.joint)
 
 
 def _explanation_text(corrections: Sequence[GeometryEstimate], cell: Cell) -> str:

@@ -168,6 +168,20 @@ def test_an_unwritable_standard_output_is_no_traceback(
 
 
 @pytest.mark.parametrize("verb", ["fit", "residual"])
+@pytest.mark.parametrize("name", ["report.html", "residual.json"])
+def test_a_calibration_is_no_file_of_the_report(
+    verb: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The one that is written last would replace the other."""
+    folder = tmp_path / "report"
+    folder.mkdir()
+    words = [verb, str(tmp_path / "no.mcap"), "--out", str(folder / name), "--report", str(folder)]
+    assert main(words) == ExitCode.USAGE
+    assert "a file of the report as --out" in capsys.readouterr().err
+    assert not list(folder.iterdir())
+
+
+@pytest.mark.parametrize("verb", ["fit", "residual"])
 @pytest.mark.parametrize("other", ["--report", "--pictures"])
 def test_one_name_for_two_outputs_is_refused_before_any_log_is_read(
     verb: str, other: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -28,6 +28,7 @@ from ident.discovery.evidence import gather, with_effects
 from ident.discovery.geometry import evidence_with_geometry
 from ident.effects.effect import PlacedEffect
 from ident.effects.position import Spring
+from ident.errors import ModelError
 from ident.estimators.geometry import GeometryEstimate, GeometryFinding
 from ident.model.closed_chain import positions, reach
 from ident.model.geometry import GeometryKind, GeometryParameter, described_length
@@ -191,6 +192,12 @@ def test_a_wrong_number_is_named_and_corrected(
             offset, abs=2e-5
         )
         assert described_length(robot, ROD) == pytest.approx(0.28, abs=2e-6)
+    if parameter is ZERO:
+        assert calibration.encoder_misfit is not None
+        correction_of_another = replace(calibration.encoder_misfit.corrections[0], joint="motor-2")
+        misfit = replace(calibration.encoder_misfit, corrections=(correction_of_another,))
+        with pytest.raises(ModelError, match="'motor-2' was corrected, and no axis"):
+            calibrated_model(replace(read, encoder_misfit=misfit), cell)
     certificate = certify(read, without_controller(read, "not read", RECORDED))
     document = certificate_document(certificate)
     CertificateReport.model_validate_json(json_text(document))
