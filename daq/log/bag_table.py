@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from array import array
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -165,14 +165,15 @@ def read_bag(path: Path, wanted: ImportDescription, columns: tuple[Column, ...],
     topics: dict[str, bool] = {}
     for file in files:
         bag = BagFile(file)
-        for offset, channel, message in bag.messages(bag):
-            chosen = wanted.topic in {None, channel.topic} and bag.is_joint_state(channel)
-            topics[channel.topic] = chosen
-            if chosen:
-                try:
-                    rows.add(joint_state_from_cdr(message.data), message.log_time)
-                except ValueError as error:
-                    raise bag.corrupt(offset, f"{channel.topic} with {error}", JOINTS_SCHEMA) from error
+        with closing(iter(bag)) as records:
+            for offset, channel, message in bag.messages(records):
+                chosen = wanted.topic in {None, channel.topic} and bag.is_joint_state(channel)
+                topics[channel.topic] = chosen
+                if chosen:
+                    try:
+                        rows.add(joint_state_from_cdr(message.data), message.log_time)
+                    except ValueError as error:
+                        raise bag.corrupt(offset, f"{channel.topic} with {error}", JOINTS_SCHEMA) from error
     used = [topic for topic, chosen in topics.items() if chosen]
     if not used:
         found = f"topics {', '.join(topics)}" if topics else "no message"
@@ -329,8 +330,8 @@ def foreign_recording(path: Path) -> LogForeign | None:
     """Return the error for an MCAP file of another program; None if it may be a log of ours, or no MCAP file."""
     bag = BagFile(path)
     joints: tuple[str, ...] = ()
-    with suppress(LogUnreadable, ValueError):
-        for _, channel, message in islice(bag.messages(bag.unfinished()), EXAMINED):
+    with suppress(LogUnreadable, ValueError), closing(bag.unfinished()) as records:
+        for _, channel, message in islice(bag.messages(records), EXAMINED):
             if bag.is_joint_state(channel):
                 joints = joints or joint_state_from_cdr(message.data).names
     topics = {channel.topic: bag.is_joint_state(channel) for channel in bag.channels.values()}

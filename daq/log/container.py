@@ -11,7 +11,7 @@ import hashlib
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, TypeVar
@@ -81,11 +81,15 @@ class RecordFile:
         self._allowance = self._records_left = 0
         self._zstd = zstandard.ZstdDecompressor()
 
-    def __iter__(self) -> Iterator[tuple[int, McapRecord]]:
-        """Yield offset and record, without the records that only index others."""
+    def __iter__(self) -> Generator[tuple[int, McapRecord], None, None]:
+        """Yield offset and record, without the records that only index others.
+
+        The file is open until the last record, or until the generator is closed: who may stop before the end, as at an
+        error, closes it. An error that is kept would otherwise keep the file open.
+        """
         yield from self._opened(self._records)
 
-    def unfinished(self) -> Iterator[tuple[int, McapRecord]]:
+    def unfinished(self) -> Generator[tuple[int, McapRecord], None, None]:
         """Yield the records before the damage of a file without a valid end, then raise an error with its place.
 
         Such a file has only the checksums of chunks and attachments, so an unknown kind of record counts as damage. A
@@ -95,7 +99,7 @@ class RecordFile:
 
     def _opened(
         self, records: Callable[[BinaryIO, int], Iterator[tuple[int, McapRecord]]]
-    ) -> Iterator[tuple[int, McapRecord]]:
+    ) -> Generator[tuple[int, McapRecord], None, None]:
         try:
             with open_regular(self.path) as stream:
                 size = os.fstat(stream.fileno()).st_size

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -216,7 +217,8 @@ class LogReader:
     def __iter__(self) -> Iterator[SampleBlock]:
         """Yield blocks of samples; events are collected meanwhile."""
         try:
-            yield from self._blocks(self._file)
+            with closing(iter(self._file)) as records:
+                yield from self._blocks(records)
             contradiction = self.contradiction
             if contradiction is not None:
                 raise contradiction
@@ -233,7 +235,8 @@ class LogReader:
             LogMissing: the file does not exist.
         """
         try:
-            yield from self._blocks(self._checked(self._file.unfinished()))
+            with closing(self._file.unfinished()) as records:
+                yield from self._blocks(self._checked(records))
         except LogMissing:
             raise
         except LogUnreadable as damage:

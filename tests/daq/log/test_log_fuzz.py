@@ -7,6 +7,7 @@ messages inside. Bounded in time by the number of examples; derandomised, so tha
 from __future__ import annotations
 
 import struct
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
+from mcap.writer import Writer as McapWriter
 
 from daq.errors import LogUnreadable
 from daq.log.message import sample_dtype
@@ -201,6 +203,32 @@ def test_the_made_up_files_are_ones_that_a_reader_takes(good: Path, tmp_path: Pa
     before = [HEADER, attachment_record(READBACK, readback), metadata_record(RUN, sealed(run_record(start.run)))]
     made = [*before, chunk_record(TOPICS + record.tobytes()), metadata_record(STATISTICS, statistics)]
     assert len(read_log(finished_file(tmp_path / "made.mcap", made)).samples.cycle) == 1
+
+
+def _is_open(path: Path) -> bool:
+    """Whether this process holds a file open."""
+    held: list[str] = []
+    for entry in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):  # that of the listing itself is closed
+            held.append(str(entry.readlink()))
+    return str(path) in held
+
+
+def test_a_log_is_closed_although_its_error_is_kept(tmp_path: Path) -> None:
+    """The error's traceback holds the frames, and these hold what was read half."""
+    path = tmp_path / "foreign.mcap"
+    with path.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start(profile="of another program")
+        writer.finish()
+    with pytest.raises(LogUnreadable) as kept:
+        read_log(path)
+    assert not _is_open(path)
+    reader = LogReader(path)
+    assert [*reader.until_damage()] == []
+    assert reader.damage is not None
+    assert not _is_open(path)
+    assert kept.value is not None
 
 
 def test_a_small_file_cannot_take_much_memory(tmp_path: Path) -> None:
