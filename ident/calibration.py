@@ -173,7 +173,8 @@ class Calibration:
     parameters: tuple[Parameter, ...]
     effects: tuple[AcceptedEffect, ...]  #: accepted effects
     relative_error_percent: RelativeError  #: on the data of the fit
-    #: On a run that was used for nothing else, None where there was none; NaN for an axis that did not move in it.
+    #: On a run that no fit has seen, None where there was none; NaN for an axis that did not move in it. It has judged
+    #: the effects that a search found.
     holdout_error_percent: RelativeError | None
     condition: float  #: of the weighted observation matrix
     rows: int  #: of the observation after masks and decimation

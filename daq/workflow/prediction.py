@@ -170,7 +170,8 @@ class Predictor:
         smooth = low_pass(raw, rate_hz, settings.position_cutoff_hz, settings.position_order)
         position, velocity, acceleration = central_differences(smooth, rate_hz)
         motion = Motion(position.T, velocity.T, acceleration.T)
-        data = planned(motion, rate_hz, self._payload)
+        # A recorded motion: what the calibration corrects of recordings, as a late position, is wrong with it too.
+        data = replace(planned(motion, rate_hz, self._payload), is_planned=False)
         predicted = self._filter(predict_current(self._calibration, self._model, data).T)
         measured = self._filter(measured_current(self._calibration, self._model, self._current[1:-1], motion).T)
         centres = self._filter.centres(position.shape[1])
