@@ -20,7 +20,7 @@ from ident.discovery.gates import Gates
 from ident.discovery.search import Finding, rank_families
 from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import Effect, is_placeable
-from ident.effects.geometry import LARGEST_ZERO, GravityDirection, ZeroOffset, turned_gravity
+from ident.effects.geometry import GravityDirection, ZeroOffset, turned_gravity
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.rows import at_rows
 
@@ -28,6 +28,7 @@ AT_ROWS = frozenset(
     {Abscissa.VELOCITY, Abscissa.POSITION, Abscissa.LOAD, Abscissa.TIME, Abscissa.SESSION, Abscissa.CURRENT}
 )
 """Variables of the effects that a correction competes with: they change slowly enough to be built at the rows."""
+SEEN_ZERO = 0.02  #: Largest σ of a zero that the data show, 1.1° or 20 mm; usual are some hundredths of a degree
 OWN_SHARE = 0.5  #: Of what a correction explains alone, that it must explain beside the best effect of one axis
 
 
@@ -47,7 +48,7 @@ class GeometryCheck:
 
     gravity: Gravity | None  #: None where the data do not show it, as in a plane that is level
     mistake: Finding | None  #: the correction that the data ask for; None where they ask for none
-    hidden_zeros: tuple[int, ...]  #: axes whose zero the data cannot show: another one makes the same torques
+    hidden_zeros: tuple[int, ...]  #: axes whose zero the data cannot show: another one makes nearly the same torques
 
 
 def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | None = None) -> GeometryCheck:
@@ -74,7 +75,7 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
         if not is_best and not _explains_beside(problem, mistake, best):
             mistake = None
     zeros = [found for found in findings if isinstance(found.effect, ZeroOffset)]
-    shown = {found.axis for found in zeros if found.deviations[0] < LARGEST_ZERO}
+    shown = {found.axis for found in zeros if found.deviations[0] < SEEN_ZERO}
     robot = evidence.model.robot
     can_be_wrong = [axis for axis in range(robot.axis_count) if is_placeable(ZeroOffset(), axis, robot)]
     return GeometryCheck(
