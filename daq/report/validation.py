@@ -39,8 +39,10 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
         "fit. Compare relative errors only under the same filters."
     )
     doubts: list[str] = []
+    names = {validation.run for validation in validations}
     for diagnosis, text in zip(found.diagnoses, diagnosis_texts(found.diagnoses), strict=True):
-        is_of_fit = diagnosis in calibration.diagnoses
+        # What these runs show again is theirs.
+        is_of_fit = diagnosis in calibration.diagnoses and names.isdisjoint(diagnosis.runs)
         doubts.append(f"The fit of this calibration found: {text}" if is_of_fit else text)
     doubts += [
         f"{validation.log} carries another cell configuration than the logs of the fit; check the difference."

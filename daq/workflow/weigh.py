@@ -77,6 +77,7 @@ def weigh_logs(
     _require_once((*logs, *bare), (*loaded, *without))
     fitted = warn_of_fitted(calibration, loaded, "the agreement proves nothing; weigh a log that the fit has not seen")
     described = reading.described
+    _warn_of_corrections(calibration, described, loaded[0])
     model = calibrated_model(calibration, described)
     body = weigh(calibration, model, loaded, conditioning_of(calibration), bare=without)
     help_: tuple[Help, ...] = ()
@@ -103,6 +104,7 @@ def contact_in(
     reading = _Logs(calibration, cell)
     run = reading.load(log)
     described = reading.described
+    _warn_of_corrections(calibration, described, run)
     model = calibrated_model(calibration, described)
     band = None
     if quiet:
@@ -112,6 +114,12 @@ def contact_in(
         known = (_predictable(calibration, one, other) for one, other in zip(quiet, calm, strict=True))
         band = prediction_band(calibration, model, known, conditioning)
     return external_torque(calibration, model, _predictable(calibration, log, run), conditioning, band), described
+
+
+def _warn_of_corrections(calibration: Calibration, described: Cell, run: Run) -> None:
+    """Warn of a description that may have been corrected since the fit, which the calibration corrects as well."""
+    if described.digest != calibration.configuration_sha256:
+        warn_of_corrections(calibration, run.name)
 
 
 def _require_once(logs: Sequence[Path], runs: Sequence[Run]) -> None:
@@ -148,8 +156,6 @@ class _Logs:
         check_cell(self._calibration, log, described)
         if self._first is None:
             self._first = log, described
-            if described.digest != self._calibration.configuration_sha256:
-                warn_of_corrections(self._calibration, run.name)
         first_log, first = self._first
         if described.recording_digest != first.recording_digest:
             sections = ", ".join(differing_sections(first, described)) or "the files of the cell"
