@@ -134,16 +134,17 @@ class ErrorChange:
         is_large = _is_beyond(self.total, float(self.before.sum()), SAME_ERROR)
         return self.is_enough and is_large and self.total.rises(CONFIDENCE)
 
-    def is_fall(self, motor: int | None = None) -> bool:
+    def is_fall(self, motor: int | None = None, each: float = CONFIDENCE) -> bool:
         """Whether the error falls by more than noise, in total, or of the motor that a model claims to know better.
 
-        Two errors are judged at half the level each.
+        Args:
+            motor: that one; None where the total alone is judged.
+            each: one-sided confidence of either error. Two of them are asked, so noise falls more often than one is.
         """
         if not self.is_enough:
             return False
         if motor is None:
-            return self.total.falls(CONFIDENCE)
-        each = 0.5 * (1.0 + CONFIDENCE)
+            return self.total.falls(each)
         own = self.motors[motor]
         return self.total.falls(each) or (own.moves >= FEWEST_BLOCKS and own.falls(each))
 
