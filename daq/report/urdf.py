@@ -55,8 +55,13 @@ def urdf_view(
     left_out = ["rotor inertias", "offsets"]
     left_out += ["friction of coupled motors"] if robot.parameters.model.drive_train.coupled else []
     corrections = {family[0].name for family in GEOMETRY}
-    corrected = [f"{effect.name} on {effect.axis}" for effect in calibration.effects if effect.name in corrections]
-    left_out += [f"{effect.name} on {effect.axis}" for effect in calibration.effects if effect.name not in corrections]
+    corrected: list[str] = []
+    for effect in calibration.effects:
+        name = f"{effect.name} on {effect.axis}"
+        if effect.name not in corrections:
+            left_out.append(name)
+        elif any(one.value != 0.0 for one in effect.coefficients):
+            corrected.append(name)
     yield printable(f"A URDF cannot hold: {', '.join(left_out)} (see --json).")
     if corrected:
         text = (

@@ -22,8 +22,8 @@ import numpy as np
 
 from daq.config.cell import Cell
 from daq.errors import DaqError
+from daq.workflow.described import on_cell
 from daq.workflow.feed import RunFacts
-from daq.workflow.geometry import calibrated_model
 from daq.workflow.validate import check_cell, conditioning_of, unpredictable, warn_without_temperature
 from ident.arrays import FloatArray, IntArray
 from ident.calibration import Calibration
@@ -117,7 +117,7 @@ class Predictor:
         self.problem = unpredictable(calibration, payload)  #: Why nothing is predicted, empty if it is
         self._payload = as_calibrated(calibration, payload, LIVE)
         warn_without_temperature(calibration, LIVE, None)
-        self._calibration, self._model = calibration, calibrated_model(calibration, cell)
+        self._calibration, self._model = on_cell(calibration, cell)
         self._conditioning, self._rate_hz = conditioning_of(calibration), rate_hz
         self._filter = decimator(rate_hz, self._conditioning.decimation_cutoff_hz)
         edge = round(EDGE_S * rate_hz)
