@@ -79,6 +79,10 @@ class AcceptedEffect:
     #: prediction takes no more than EXTRAPOLATED times as much. None of an effect whose torque is a rate, which is far
     #: larger in a sample than in a filtered row, and in calibrations of earlier versions.
     largest_torque: tuple[float, ...] | None = None
+    #: Of a correction of the robot's description: the number that it corrects, as the fit found it described (the zero
+    #: offset of the axis [rad; m], or gravity [m/s²]). None of other effects, where nothing in the description is
+    #: corrected, and in calibrations of earlier versions.
+    described: tuple[float, ...] | None = None
 
     @property
     def is_confirmed(self) -> bool:
@@ -173,7 +177,8 @@ class Calibration:
     parameters: tuple[Parameter, ...]
     effects: tuple[AcceptedEffect, ...]  #: accepted effects
     relative_error_percent: RelativeError  #: on the data of the fit
-    #: On a run that was used for nothing else, None where there was none; NaN for an axis that did not move in it.
+    #: On a run that no fit has seen, None where there was none; NaN for an axis that did not move in it. It has judged
+    #: the effects that a search found.
     holdout_error_percent: RelativeError | None
     condition: float  #: of the weighted observation matrix
     rows: int  #: of the observation after masks and decimation

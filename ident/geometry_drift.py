@@ -9,7 +9,7 @@ constant. So is what another payload, or another way of mounting it, explains.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -62,7 +62,9 @@ def geometry_drift(
     if model.is_redundant:
         return None  # internal preload hides a part of the torque
     corrections = corrections_of(calibration)
-    model = corrected_model(model, corrections)
+    # What has changed since is counted from the corrected gravity, not from the declared one.
+    corrected = corrected_model(model, corrections)
+    model = Model(replace(corrected.robot, declared_gravity_m_s2=None), model.drive_train)
     slow = at_rows(corrected_dataset(data, corrections), conditioning)
     move = data.move[np.searchsorted(data.time_s, slow.time_s).clip(0, len(data.move) - 1)]
     standard = standard_parameters(calibration, model)

@@ -102,12 +102,12 @@ def export_urdf_verb(
     chains are refused.
     """
     from daq.cli.terminal import check_output, print_view, status
-    from daq.config.cell import model_of
     from daq.config.cell_file import URDF, bundle
     from daq.config.yaml_file import read_bytes
     from daq.environment import software
     from daq.report.urdf import urdf_document, urdf_view
     from daq.workflow.calibration_file import load_calibration
+    from daq.workflow.described import on_cell
     from daq.workflow.fit import DOUBTFUL_PERCENT
     from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, require_solver, update_urdf
     from ident.errors import ModelContradicted
@@ -144,7 +144,9 @@ def export_urdf_verb(
                 remedy="no URDF is written; `drivegain validate`, `weigh` and `contact` predict with the calibration "
                 "itself",
             )
-        model, limits, same = model_of(declared), cell_limits(declared), declared.digest == known.configuration_sha256
+        known, model = on_cell(known, declared)
+        limits = cell_limits(declared)
+        same = declared.digest == known.configuration_sha256
         content = declared.urdf.encode()  # held joints are fixed in it
     else:
         model, limits, same = *_plain(content.decode("utf-8")), None

@@ -474,9 +474,14 @@ def error_rows(account: Account) -> tuple[ErrorRow, ...]:
     )
 
 
-def _strictest_error(errors: Errors) -> tuple[RelativeError, str]:
-    """Return the most independent error, and the data it is measured on."""
-    if errors.holdout is not None:
+def _strictest_error(errors: Errors, place: int | None = None) -> tuple[RelativeError, str]:
+    """Return the most independent error, and the data it is measured on.
+
+    Args:
+        errors: of one model.
+        place: of the axis that the error must be known of: one that rests in the held-out runs has none there.
+    """
+    if errors.holdout is not None and (place is None or math.isfinite(errors.holdout.at(place))):
         return errors.holdout, "on held-out runs"
     if errors.left_out_runs is not None and errors.left_out_runs.together is not None:
         return errors.left_out_runs.together, "on runs left out in turn"
@@ -501,7 +506,8 @@ def _effect_sentence(fitted: Fit, account: Account, turn: BeforeAfter, placed: P
     what = effect_text(placed.effect, axes)
     if doubt := doubted_name(step, placed, axes):
         what = f"a torque that depends on {variable_text(placed.effect, axes)} ({doubt})"
-    (before, _), (after, where) = _strictest_error(turn.before), _strictest_error(turn.after)
+    before, where = _strictest_error(turn.before, placed.axis)
+    after, _ = _strictest_error(turn.after, placed.axis)
     floor = _floor(account).at(placed.axis)
     floor_text = _floor_text(floor)
     excess = ""
@@ -690,7 +696,8 @@ def _verdict(verdict: Verdict, axes: tuple[str, ...]) -> dict[str, Any]:
 
 def _placed(placed: PlacedEffect | Finding, axes: tuple[str, ...]) -> dict[str, Any]:
     settings = {name: float(value) for name, value in placed.effect.settings.items()}
-    return {"effect": placed.effect.name, "axis": axes[placed.axis], "settings": settings}
+    place = PlacedEffect(placed.effect, placed.axis)
+    return {"effect": placed.effect.name, "axis": place.axis_name(axes), "settings": settings}
 
 
 def _finding(finding: Finding, axes: tuple[str, ...]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from rich.text import Text
 from daq.report.text import plain_table, printable, terminal_text
 from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
 from ident.calibration import Calibration
+from ident.effects.dictionary import GEOMETRY
 from ident.physical.physical import MARGIN
 
 _SHOWN_SHIFTS = 5
@@ -53,8 +54,21 @@ def urdf_view(
         yield printable(f"Merged into the moving link that carries them: {', '.join(updated.merged)}.")
     left_out = ["rotor inertias", "offsets"]
     left_out += ["friction of coupled motors"] if robot.parameters.model.drive_train.coupled else []
-    left_out += [f"{effect.name} on {effect.axis}" for effect in calibration.effects]
+    corrections = {family[0].name for family in GEOMETRY}
+    corrected: list[str] = []
+    for effect in calibration.effects:
+        name = f"{effect.name} on {effect.axis}"
+        if effect.name not in corrections:
+            left_out.append(name)
+        elif any(one.value != 0.0 for one in effect.coefficients):
+            corrected.append(name)
     yield printable(f"A URDF cannot hold: {', '.join(left_out)} (see --json).")
+    if corrected:
+        text = (
+            f"CHECK the description: the bodies are those of the robot as corrected by {', '.join(corrected)}, and the "
+            "joints of this URDF are as they were described. Correct the cell file, fit the logs again, then export."
+        )
+        yield Text(printable(text), style="bold")
     if same_configuration is False:
         yield Text("The cell's configuration has changed since the fit; check the difference.", style="bold")
 

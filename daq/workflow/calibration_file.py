@@ -96,6 +96,7 @@ class EffectEntry(StrictModel):
     error_after_percent: _Positive
     ambiguity: tuple[str, ...]
     largest_torque: tuple[_Positive, ...] | None = None  # files of earlier versions lack it
+    described: tuple[_Number, ...] | None = None  # likewise
 
 
 class MassInfluenceEntry(StrictModel):

@@ -203,5 +203,5 @@ def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str]) -> str:
     subject = "The zeros of" if len(names) > 1 else "The zero of"
     return (
         f"{subject} {' and '.join(names)} cannot be seen here: about a vertical axis, or behind the last joint, "
-        "another zero makes the same torques."
+        "another zero makes nearly the same torques."
     )

@@ -26,6 +26,7 @@ from daq.workflow.declared_effects import (
     with_declared_again,
     with_effects_of_cell,
 )
+from daq.workflow.described import with_described
 from daq.workflow.description import check_diagnoses, correction_diagnoses, geometry_beside, is_checked
 from daq.workflow.diagnoses import Recordings, diagnose_fit, named_causes
 from daq.workflow.geometry import encoder_misfit_of
@@ -546,7 +547,7 @@ def _calibration(fitted: Fit) -> Calibration:
         steps=fitted.steps,
     )
     return replace(
-        found,
+        with_described(found, cell),
         sources=fitted.sources,
         configuration_sha256=cell.digest,
         recording_configuration_sha256=cell.recording_digest,

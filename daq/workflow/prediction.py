@@ -22,8 +22,8 @@ import numpy as np
 
 from daq.config.cell import Cell
 from daq.errors import DaqError
+from daq.workflow.described import on_cell
 from daq.workflow.feed import RunFacts
-from daq.workflow.geometry import calibrated_model
 from daq.workflow.validate import check_cell, conditioning_of, unpredictable, warn_without_temperature
 from ident.arrays import FloatArray, IntArray
 from ident.calibration import Calibration
@@ -117,7 +117,7 @@ class Predictor:
         self.problem = unpredictable(calibration, payload)  #: Why nothing is predicted, empty if it is
         self._payload = as_calibrated(calibration, payload, LIVE)
         warn_without_temperature(calibration, LIVE, None)
-        self._calibration, self._model = calibration, calibrated_model(calibration, cell)
+        self._calibration, self._model = on_cell(calibration, cell)
         self._conditioning, self._rate_hz = conditioning_of(calibration), rate_hz
         self._filter = decimator(rate_hz, self._conditioning.decimation_cutoff_hz)
         edge = round(EDGE_S * rate_hz)
@@ -170,7 +170,8 @@ class Predictor:
         smooth = low_pass(raw, rate_hz, settings.position_cutoff_hz, settings.position_order)
         position, velocity, acceleration = central_differences(smooth, rate_hz)
         motion = Motion(position.T, velocity.T, acceleration.T)
-        data = planned(motion, rate_hz, self._payload)
+        # A recorded motion: what the calibration corrects of recordings, as a late position, is wrong with it too.
+        data = replace(planned(motion, rate_hz, self._payload), is_planned=False)
         predicted = self._filter(predict_current(self._calibration, self._model, data).T)
         measured = self._filter(measured_current(self._calibration, self._model, self._current[1:-1], motion).T)
         centres = self._filter.centres(position.shape[1])

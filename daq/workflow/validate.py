@@ -20,8 +20,8 @@ from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationUnreadable, LogsDiffer
 from daq.log.conversion import load_run
 from daq.workflow.corrections import Corrections
+from daq.workflow.described import CORRECTIONS, on_cell
 from daq.workflow.diagnoses import diagnose_run, not_repeated
-from daq.workflow.geometry import calibrated_model
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
@@ -110,8 +110,8 @@ def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None =
         corrections.note(log, run)
         check_cell(calibration, log, described)
         warn_without_temperature(calibration, run.name, run.temperature_c)
-        model = calibrated_model(calibration, described)
-        validations.append(predicted(calibration, conditioning, model, log, run, described.digest))
+        own, model = on_cell(calibration, described)
+        validations.append(predicted(own, conditioning, model, log, run, described.digest))
     return tuple(validations)
 
 
@@ -220,8 +220,9 @@ def warn_of_corrections(calibration: Calibration, name: str) -> None:
 
     A zero that was corrected in the cell file since would be corrected twice.
     """
-    places = calibration.places
-    corrected = [placed.name_among(places) for placed in corrections_of(calibration)]
+    # What a calibration knows of the description of its fit, `on_cell` has compared.
+    unknown = [one for one in calibration.effects if one.name in CORRECTIONS and one.described is None]
+    corrected = [f"{one.name} on {one.axis}" for one in unknown]
     if corrected:
         _LOG.warning(
             "%s has another description of the cell than the fit, which the calibration corrects (%s): if the cell "
@@ -326,7 +327,7 @@ def cross_validate(
     for log in logs:
         run, described = load_run(log, cell)
         corrections.note(log, run)
-        model = calibrated_model(calibrations[first], described)
+        first_own, model = on_cell(calibrations[first], described)
         found: dict[str, Validation] = {}
         reasons: dict[str, list[str]] = {}
         for label, calibration in calibrations.items():
@@ -336,19 +337,19 @@ def cross_validate(
             if reason:
                 reasons.setdefault(reason, []).append(label)
             else:
-                own = calibrated_model(calibration, described)
-                found[label] = predicted(calibration, conditioning, own, log, run, described.digest)
+                own, own_model = on_cell(calibration, described)
+                found[label] = predicted(own, conditioning, own_model, log, run, described.digest)
         if first in found:
             validations.append(found[first])
         condition, reduction = None, None
         with suppress(IdentificationError):
-            corrected = corrected_model(model, corrections_of(calibrations[first]))
+            corrected = corrected_model(model, corrections_of(first_own))
             reduction = reduce_runs(corrected, (run,), conditioning)
             # A payload without columns of its own is part of the link that carries it.
             system = reduction.system(reduction.base(), ((),) * len(reduction.payloads))
             condition = wls(system, _gains(calibrations[first])).condition
         if reduction is not None and first in found and not found[first].is_judged:
-            diagnoses += diagnose_run(calibrations[first], found[first], model, run, reduction)
+            diagnoses += diagnose_run(first_own, found[first], model, run, reduction)
         if run.payload is not None:
             # From the log, else from the cell, since a body weighs the same anywhere.
             of_cell = (body.mass_kg for body in described.payloads if body.name == run.payload.name)
@@ -369,6 +370,7 @@ def cross_validate(
                 seen_by=tuple(label for label, v in found.items() if v.data_use is DataUse.FIT),
             )
         )
+    of_cell_now = {label: on_cell(calibration, described)[0] for label, calibration in calibrations.items()}
     weighed = []
     for log, run, payload, kg in loaded:
         rows: RowsToWeigh | str
@@ -376,7 +378,7 @@ def cross_validate(
             rows = rows_to_weigh(model, (run,), conditioning, bare=bare)
         except IdentificationError as error:
             rows = str(error)
-        weighed.append(WeighedRun(log, log.stem, payload, kg, _masses(calibrations, rows, kg)))
+        weighed.append(WeighedRun(log, log.stem, payload, kg, _masses(of_cell_now, rows, kg)))
     stored = not_repeated(calibrations[first].diagnoses, diagnoses)
     return CrossValidation(
         axes=tuple(gain.axis for gain in calibrations[first].gains),
@@ -400,7 +402,7 @@ def diagnose_log(calibration: Calibration, log: Path, run: Run, described: Cell)
     """
     if unpredictable(calibration, run.payload):
         return ()
-    model = calibrated_model(calibration, described)
+    calibration, model = on_cell(calibration, described)
     conditioning = conditioning_of(calibration)
     validation = predicted(calibration, conditioning, model, log, run, described.digest)
     with suppress(IdentificationError):

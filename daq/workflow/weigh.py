@@ -12,8 +12,8 @@ from daq.config.same_cell import differing_sections
 from daq.errors import ConfigurationError, LogRepeated, LogsDiffer
 from daq.log.conversion import load_run
 from daq.workflow.corrections import Corrections
+from daq.workflow.described import on_cell
 from daq.workflow.experiment import experiment_of, extra_moves
-from daq.workflow.geometry import calibrated_model
 from daq.workflow.validate import (
     check_cell,
     conditioning_of,
@@ -78,7 +78,7 @@ def weigh_logs(
     fitted = warn_of_fitted(calibration, loaded, "the agreement proves nothing; weigh a log that the fit has not seen")
     described = reading.described
     _warn_of_corrections(calibration, described, loaded[0])
-    model = calibrated_model(calibration, described)
+    calibration, model = on_cell(calibration, described)
     body = weigh(calibration, model, loaded, conditioning_of(calibration), bare=without)
     help_: tuple[Help, ...] = ()
     if not body.identifiable.all():
@@ -105,7 +105,7 @@ def contact_in(
     run = reading.load(log)
     described = reading.described
     _warn_of_corrections(calibration, described, run)
-    model = calibrated_model(calibration, described)
+    calibration, model = on_cell(calibration, described)
     band = None
     if quiet:
         calm = [reading.load(one) for one in quiet]

@@ -68,6 +68,36 @@ def accept_on_holdout(
         return tuple(steps)
     names = axes or [joint.name for joint in start.model.robot.places]
     verdicts: dict[PlacedEffect, Verdict] = {}
+    judged_model = found
+    last = steps[-1]
+    while True:
+        left = _judged(start, judged_model, verdicts, write_undecided=write_undecided, progress=progress, names=names)
+        if left.effects != last.after.effects:
+            refitted = start
+            if left is not start:
+                refitted = replace(with_effects(found, left.effects), declared=found.declared)
+            last = end_search(steps, linearised(refitted, ColumnCache()), gates or Gates())
+        # An effect that the σ of this fit no longer shows has left: those beside it are judged again without it.
+        if len(last.after.effects) >= len(left.effects):
+            break
+        judged_model = last.after
+    written = last.after.effects
+    ordered = tuple(
+        replace(verdicts[placed], written=placed in written) for placed in found.effects if placed in verdicts
+    )
+    return (*steps[:-1], replace(last, verdicts=ordered))
+
+
+def _judged(
+    start: Evidence,
+    found: Evidence,
+    verdicts: dict[PlacedEffect, Verdict],
+    *,
+    write_undecided: bool,
+    progress: Callable[[str], None],
+    names: Sequence[str],
+) -> Evidence:
+    """The model with those effects that held-out runs confirm; `verdicts` is given what they say of each."""
     current = found
     while len(current.effects) > current.declared:
         progress(f"judging {len(current.effects) - current.declared} effects on held-out runs")
@@ -77,26 +107,21 @@ def accept_on_holdout(
         if leaving is None:
             break
         progress(f"{leaving.placed.name_among(names)} leaves: {leaving.reason}")
-        current = start if leaving.is_needed else _without(current, leaving.placed)
+        if leaving.is_needed:
+            reason = f"nothing can be fitted without {leaving.placed.name_among(names)}, which leaves: {leaving.reason}"
+            for one in judged:
+                if one.placed != leaving.placed:
+                    verdicts[one.placed] = replace(one, judgement=Judgement.UNDECIDED, reason=reason)
+            return start
+        current = _without(current, leaving.placed)
     kept = current.effects[current.declared :]
     if kept and (why := _loses(start, current)):
         progress(f"the effects together leave: {why}")
         reason = f"together with the other effects: {why}"
         for placed in kept:
             verdicts[placed] = replace(verdicts[placed], judgement=Judgement.REFUTED, reason=reason)
-        current = start
-    last = steps[-1]
-    if current.effects != found.effects:
-        refitted = start
-        if current is not start:
-            refitted = replace(with_effects(found, current.effects), declared=found.declared)
-        model = linearised(refitted, ColumnCache())
-        last = end_search((*steps[:-1], last), model, gates or Gates())
-    written = last.after.effects
-    ordered = tuple(
-        replace(verdicts[placed], written=placed in written) for placed in found.effects if placed in verdicts
-    )
-    return (*steps[:-1], replace(last, verdicts=ordered))
+        return start
+    return current
 
 
 def compare_on_holdout(start: Evidence, before: Evidence, after: Evidence) -> ErrorChange:
@@ -134,7 +159,8 @@ def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> Verdic
         without = start
         is_needed = True
     change = compare_on_holdout(start, without, current)
-    has_motor = placed.axis < len(change.motors) and placed.effect.has_axis
+    # A correction of the description changes all motors: that its own falls is no more than friction there does.
+    has_motor = placed.axis < len(change.motors) and placed.effect.has_axis and not is_correction(placed)
     judgement, reason = judge(change, placed.axis if has_motor else None)
     return Verdict(
         placed=placed,
@@ -151,10 +177,10 @@ def _leaving(judged: Sequence[Verdict], *, write_undecided: bool) -> Verdict | N
     """The worst of what is refuted; then the least certain of what is undecided, unless that is to be written."""
     refuted = [one for one in judged if one.judgement is Judgement.REFUTED]
     if refuted:
-        return max(refuted, key=lambda one: one.change.total.rise)
+        return max(refuted, key=lambda one: one.change.largest_sigmas)
     undecided = [one for one in judged if one.judgement is Judgement.UNDECIDED]
     if undecided and not write_undecided:
-        return max(undecided, key=lambda one: one.change.total.rise)
+        return max(undecided, key=lambda one: one.change.total.sigmas)
     return None
 
 

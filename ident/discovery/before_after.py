@@ -19,7 +19,8 @@ affected. The four ways differ in the data that the model has seen:
   the estimate, gains included); the choice of the effects has seen all moves, so the error is optimistic;
 - left-out runs: all runs but the one predicted, everything refitted, load and current of the effects' columns too; the
   choice and the settings of the effects have seen the run;
-- hold-out: neither fit nor choice has seen these runs.
+- hold-out: no fit and no search has seen these runs; they judge what was found, one effect at a time
+  (`ident.discovery.acceptance`), so the error of what is left is optimistic by that choice alone.
 
 Estimates before and after share their noise, so the σ of a change is neither one's σ nor the root of both squared. It
 is the jackknife of the change itself: leaving out block c of moves shifts g by d_c = −(H − G_c)⁻¹ s_c
@@ -226,7 +227,7 @@ class Errors:
     in_sample: RelativeError  #: on the rows of the fit
     cross_validated: RelativeError  #: on moves left out of one step of the fit
     left_out_runs: LeftOutRuns | None  #: on runs left out of a fit of their own
-    holdout: RelativeError | None  #: on runs that neither fit nor choice has seen
+    holdout: RelativeError | None  #: on runs that no fit and no search has seen
 
 
 @dataclass(frozen=True, slots=True)

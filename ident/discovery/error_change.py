@@ -3,7 +3,7 @@
 Two models predict the same rows. With d_b the rise of a squared error in block b of B, the errors differ by more than
 noise where
 
-    |Σ d_b| > t_(p, B − 1) · √(B/(B − 1) Σ (d_b − mean)²).
+    Σ d_b > t_(p, B − 1) · √(B/(B − 1) Σ (d_b − mean)²).
 
 One block in which an error changes much, either way, makes this σ so large that no change is seen which all other
 blocks share. So a change of the same sign by the trimmed mean counts as well (Yuen 1974: the largest and the smallest
@@ -12,8 +12,8 @@ The reverse is not enough: a fall that two blocks make alone is none.
 
 Blocks are moves, and neighbouring moves of a run are joined in pairs while their changes correlate: an error that
 differs over a region of the workspace differs in a dozen moves at once, which prove no more than one of them. Fewer
-blocks than FEWEST_BLOCKS show nothing, whatever they say: the signs of four agree by chance once in 16 times. One block
-that outweighs all others does not either: t is then near one.
+blocks than FEWEST_BLOCKS show nothing, whatever they say: four fall by chance once in 16 times. One block that
+outweighs all others does not either: t is then near one.
 
 A model can be worse on one motor and better in total. So the total is judged at CONFIDENCE, and a rise of any motor at
 MOTOR_CONFIDENCE, one-sided, for all motors together. A fall of the motor on which an effect acts counts as one, too:
@@ -100,6 +100,11 @@ class ErrorChange:
         return 1.0 - (1.0 - MOTOR_CONFIDENCE) / len(self.motors)
 
     @property
+    def largest_sigmas(self) -> float:
+        """The largest rise in units of its σ, of the whole error or of a motor's."""
+        return max(self.total.sigmas, *(motor.sigmas for motor in self.motors))
+
+    @property
     def worse_motors(self) -> tuple[int, ...]:
         """Motors whose error rises by more than noise, and by more than the tolerance."""
         found: list[int] = []
@@ -129,13 +134,19 @@ class ErrorChange:
         is_large = _is_beyond(self.total, float(self.before.sum()), SAME_ERROR)
         return self.is_enough and is_large and self.total.rises(CONFIDENCE)
 
-    def is_fall(self, motor: int | None = None) -> bool:
-        """Whether the error falls by more than noise, in total, or of the motor that a model claims to know better."""
+    def is_fall(self, motor: int | None = None, each: float = CONFIDENCE) -> bool:
+        """Whether the error falls by more than noise, in total, or of the motor that a model claims to know better.
+
+        Args:
+            motor: that one; None where the total alone is judged.
+            each: one-sided confidence of either error. Two of them are asked, so noise falls more often than one is.
+        """
         if not self.is_enough:
             return False
-        if self.total.falls(CONFIDENCE):
-            return True
-        return motor is not None and self.motors[motor].moves >= FEWEST_BLOCKS and self.motors[motor].falls(CONFIDENCE)
+        if motor is None:
+            return self.total.falls(each)
+        own = self.motors[motor]
+        return self.total.falls(each) or (own.moves >= FEWEST_BLOCKS and own.falls(each))
 
     def harm(self, data: str) -> str:
         """Say where the error on some data rises by more than noise; empty where it does nowhere."""
@@ -175,7 +186,7 @@ def compare_by_block(change: FloatArray, move: IntArray, run: IntArray) -> Paire
     _, first, move_of_row = np.unique(move, return_index=True, return_inverse=True)
     sums = np.asarray(np.bincount(move_of_row, change), dtype=np.float64)
     runs = run[first]
-    while len(sums) > FEWEST_BLOCKS:
+    while len(sums) >= 2 * FEWEST_BLOCKS:  # fewer blocks than FEWEST_BLOCKS would judge nothing
         centred = sums - sums.mean()
         products = (centred[1:] * centred[:-1])[runs[1:] == runs[:-1]]
         if float(products.sum()) <= CORRELATED * float(np.linalg.norm(products)):

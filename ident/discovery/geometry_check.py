@@ -2,7 +2,8 @@
 
 Zeros of joints, the direction of gravity and late positions are tested on the rows of a fit
 (`ident.effects.geometry`). Where one of them passes, it must also explain more of what is left out than each named
-effect of one axis does: a spring that the model lacks explains a part of what a wrong zero does.
+effect of one axis does, or most of it beside the best of these: a spring that the model lacks explains a part of what a
+wrong zero does, and friction that it lacks on another axis does not.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from ident.discovery.gates import Gates
 from ident.discovery.search import Finding, rank_families
 from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import Effect, is_placeable
-from ident.effects.geometry import LARGEST_ZERO, GravityDirection, ZeroOffset, turned_gravity
+from ident.effects.geometry import GravityDirection, ZeroOffset, turned_gravity
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.rows import at_rows
 
@@ -27,6 +28,8 @@ AT_ROWS = frozenset(
     {Abscissa.VELOCITY, Abscissa.POSITION, Abscissa.LOAD, Abscissa.TIME, Abscissa.SESSION, Abscissa.CURRENT}
 )
 """Variables of the effects that a correction competes with: they change slowly enough to be built at the rows."""
+SEEN_ZERO = 0.02  #: Largest σ of a zero that the data show, 1.1° or 20 mm; usual are some hundredths of a degree
+OWN_SHARE = 0.5  #: Of what a correction explains alone, that it must explain beside the best effect of one axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +48,7 @@ class GeometryCheck:
 
     gravity: Gravity | None  #: None where the data do not show it, as in a plane that is level
     mistake: Finding | None  #: the correction that the data ask for; None where they ask for none
-    hidden_zeros: tuple[int, ...]  #: axes whose zero the data cannot show: another one makes the same torques
+    hidden_zeros: tuple[int, ...]  #: axes whose zero the data cannot show: another one makes nearly the same torques
 
 
 def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | None = None) -> GeometryCheck:
@@ -68,10 +71,11 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
     if mistake is not None:
         rivals = rank_families(problem, (*tested, *_tested(problem, _slow(EFFECTS))), rng, gates)
         best = max(rivals, key=lambda found: found.held_out_fall)
-        if (best.effect, best.axis) != (mistake.effect, mistake.axis):
+        is_best = (best.effect, best.axis) == (mistake.effect, mistake.axis)
+        if not is_best and not _explains_beside(problem, mistake, best):
             mistake = None
     zeros = [found for found in findings if isinstance(found.effect, ZeroOffset)]
-    shown = {found.axis for found in zeros if found.deviations[0] < LARGEST_ZERO}
+    shown = {found.axis for found in zeros if found.deviations[0] < SEEN_ZERO}
     robot = evidence.model.robot
     can_be_wrong = [axis for axis in range(robot.axis_count) if is_placeable(ZeroOffset(), axis, robot)]
     return GeometryCheck(
@@ -81,14 +85,25 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
     )
 
 
+def _explains_beside(problem: SearchProblem, correction: Finding, rival: Finding) -> bool:
+    """Whether a correction explains most of what it does beside an effect of one axis, too."""
+    of_rival = problem.torque_at_rows(rival.effect, rival.axis)
+    of_correction = problem.torque_at_rows(correction.effect, correction.axis)
+    alone, both = problem.trials([of_rival, np.concatenate((of_rival, of_correction), axis=1)])
+    if alone is None or both is None:
+        return False
+    fall = float(alone.held_out.sum() - both.held_out.sum())
+    return fall >= OWN_SHARE * correction.held_out_fall
+
+
 def _gravity(findings: Sequence[Finding], declared_m_s2: FloatArray) -> Gravity | None:
     """The direction of gravity among findings."""
     for found in findings:
         if isinstance(found.effect, GravityDirection):
             turn = found.coefficients
             angle = float(np.linalg.norm(turn))
-            # σ along the turn that was found; of no turn at all, the larger one.
-            along = turn / angle if angle > 0.0 else np.ones(2)
+            # σ along the turn that was found, its two components taken as independent; of no turn at all, any.
+            along = turn / angle if angle > 0.0 else np.array([1.0, 0.0])
             return Gravity(
                 declared_m_s2=declared_m_s2,
                 found_m_s2=turned_gravity(declared_m_s2, turn.tolist()),

@@ -227,10 +227,12 @@ def end_search(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
         gates: limits of the search.
     """
     aside: list[SetAside] = []
+    needed: set[PlacedEffect] = set()
     while True:
         last = _with_choice(steps, model, gates)
         last = replace(last, set_aside=(*last.set_aside, *aside))
         failing = _unshown(last.after)
+        failing = [one for one in failing if one[0] not in needed]
         if not failing:
             return last
         worst, why, _ = max(failing, key=lambda one: one[2])
@@ -240,7 +242,8 @@ def end_search(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
             rest = with_effects(evidence, kept, model.search_problem.runs)
             model = linearised_after(replace(rest, declared=evidence.declared), model)
         except UNFITTED:
-            return last  # the data cannot be fitted without it
+            needed.add(worst)  # the data cannot be fitted without it
+            continue
         found = _finding_of(steps, worst)
         if found is not None:
             aside.append(SetAside(found, f"by the σ that is reported, {why}"))
@@ -287,7 +290,8 @@ def _with_choice(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
         if found is not None and (placed := PlacedEffect(found.effect, found.axis)) in model.evidence.effects:
             accepted[placed] = found, (*step.findings, *step.structures)
     last, left = steps[-1], list[Finding]()
-    if last.accepted is None:  # its findings are of the last model
+    is_model_of_search = model.evidence.effects == steps[-1].after.effects
+    if last.accepted is None and is_model_of_search:  # its findings are of this model
         # A name that structure refutes is no model that could be true.
         left += [one.finding for one in last.set_aside if one.moved and is_unnamed(one.finding.effect)]
         left += [found for found in (*last.findings, *last.structures) if is_small(found, gates)]

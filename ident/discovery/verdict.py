@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from ident.discovery.error_change import FEWEST_BLOCKS, ErrorChange
+from ident.discovery.error_change import CONFIDENCE, FEWEST_BLOCKS, ErrorChange
 from ident.effects.effect import PlacedEffect
 from ident.estimators.estimate import RelativeError
 
@@ -49,7 +49,9 @@ def judge(change: ErrorChange, motor: int | None = None) -> tuple[Judgement, str
     if blocks < FEWEST_BLOCKS:
         few = f"held-out runs have {blocks} independent blocks of moves, and fewer than {FEWEST_BLOCKS} show nothing"
         return Judgement.UNDECIDED, few
-    if not change.is_fall(motor):
+    # Of two errors that are asked, each has half the level: a search has gates before this one, a verdict has none.
+    each = CONFIDENCE if motor is None else 0.5 * (1.0 + CONFIDENCE)
+    if not change.is_fall(motor, each):
         size = f"{change.total.rise:.3g} ± {change.total.std:.2g} noise variances"
         return Judgement.UNDECIDED, f"the squared error on held-out runs changes by {size}, which may be noise"
     if doubtful := change.doubtful_motors:

@@ -287,6 +287,17 @@ def turned_gravity(declared_m_s2: FloatArray, turn_rad: Sequence[float]) -> Floa
     return rotation_by(turn_rad[0] * first + turn_rad[1] * second) @ declared_m_s2
 
 
+def turn_between(declared_m_s2: FloatArray, found_m_s2: FloatArray) -> FloatArray:
+    """The two components of the turn from one direction of gravity to another, as of `turned_gravity`, shape (2,)."""
+    axis = np.cross(declared_m_s2, found_m_s2)
+    sine = float(np.linalg.norm(axis))
+    if sine == 0.0:
+        return np.zeros(2)
+    angle = float(np.arctan2(sine, float(declared_m_s2 @ found_m_s2)))
+    first, second = across(declared_m_s2)
+    return angle / sine * np.array([axis @ first, axis @ second])
+
+
 def rotation_by(vector_rad: FloatArray) -> FloatArray:
     """Rotation about a vector by its length (Rodrigues), shape (3, 3)."""
     angle = float(np.linalg.norm(vector_rad))

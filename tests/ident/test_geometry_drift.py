@@ -13,7 +13,9 @@ from ident.calibration import Calibration, calibration_of
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.discovery.evidence import Evidence
-from ident.effects.geometry import rotation_by
+from ident.discovery.loop import with_declared
+from ident.effects.effect import PlacedEffect
+from ident.effects.geometry import GravityDirection, rotation_by
 from ident.equations.rows import decimate_rows, row_masks
 from ident.geometry_drift import GeometryDrift, geometry_drift
 from ident.model.model import Model
@@ -32,18 +34,23 @@ def _new_run() -> Run:
 
 
 @cache
-def _fitted() -> tuple[Evidence, Calibration]:
+def _fitted_runs() -> tuple[Run, ...]:
     rng = np.random.default_rng(5)
-    runs = tuple(
+    return tuple(
         record(tx40_truth(), f"run {number}", rng, payload, seconds=15.0, rate_hz=500.0, noise_a=NOISE_A)
         for number, payload in enumerate((None, MOUNTED))
     )
-    evidence = gathered(tx40_truth(), runs)
+
+
+@cache
+def _fitted() -> tuple[Evidence, Calibration]:
+    evidence = gathered(tx40_truth(), _fitted_runs())
     return evidence, calibration_of(evidence.identification, AXES, (1.0,) * 6)
 
 
-def _drift(run: Run, model: Model) -> GeometryDrift | None:
+def _drift(run: Run, model: Model, known: Calibration | None = None) -> GeometryDrift | None:
     evidence, calibration = _fitted()
+    calibration = known or calibration
     data = differentiate(run, model.drive_train, evidence.conditioning)
     use, _ = row_masks(model, data, evidence.conditioning)
     left = measured_torque(calibration, model, data.current_a) - predict_torque(calibration, model, data)
@@ -65,6 +72,26 @@ def test_a_moved_base_is_named() -> None:
     truth = tx40_truth().model
     turned = rotation_by(np.array([0.0, np.radians(4.0), 0.0])) @ truth.robot.gravity_m_s2
     found = _drift(_new_run(), Model(replace(truth.robot, gravity_m_s2=turned), truth.drive_train))
+    assert found is not None
+    assert found.placed.effect.name == "gravity-direction"
+    assert np.degrees(np.linalg.norm(found.values)) == pytest.approx(4.0, abs=0.5)
+
+
+def test_a_base_that_moved_after_gravity_was_corrected_is_named_with_its_size() -> None:
+    """What has changed is counted from the gravity of the calibration, not from the declared one."""
+    truth = tx40_truth()
+
+    def tilted(degrees: float) -> Model:
+        turned = rotation_by(np.array([0.0, np.radians(degrees), 0.0])) @ truth.model.robot.gravity_m_s2
+        return Model(replace(truth.model.robot, gravity_m_s2=turned), truth.model.drive_train)
+
+    runs = _fitted_runs()
+    start = gathered(replace(truth, model=tilted(5.0)), runs)
+    steps = with_declared(start, (PlacedEffect(GravityDirection(), 0),), np.random.default_rng(0))
+    calibration = calibration_of(start.identification, AXES, (1.0,) * 6, steps=steps)
+    assert _drift(_new_run(), tilted(5.0), calibration) is None
+    # The description now says 9°, of which 5° are corrected: 4° are new.
+    found = _drift(_new_run(), tilted(9.0), calibration)
     assert found is not None
     assert found.placed.effect.name == "gravity-direction"
     assert np.degrees(np.linalg.norm(found.values)) == pytest.approx(4.0, abs=0.5)

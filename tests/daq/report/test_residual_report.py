@@ -49,7 +49,7 @@ from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.fit import Fit, calibration_of, fit
 from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.discovery import before_after as before_after_module
-from ident.discovery.before_after import Account, account
+from ident.discovery.before_after import Account, Errors, account
 from ident.discovery.error_change import PairedChange
 from ident.discovery.evidence import with_effects
 from ident.discovery.gear_loss import GearLoss
@@ -61,11 +61,12 @@ from ident.discovery.time_skew import Skew
 from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import Coupling, LoadFriction
-from ident.effects.geometry import ZeroOffset
+from ident.effects.geometry import GravityDirection, ZeroOffset
 from ident.effects.position import Spring
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Periodic, Smooth
 from ident.errors import Diagnosis
+from ident.estimators.estimate import RelativeError
 from tests.daq.workflow.test_fit import Shelf
 from tests.ident.recordings import GAINS, MOUNTED, record, tx40_truth
 
@@ -151,6 +152,31 @@ def closed(shelved: Shelf) -> Closed:
     )
     steps = (first, last)
     return Closed(replace(fitted, steps=steps), account(start, steps))
+
+
+def test_an_axis_that_rests_in_the_held_out_runs_has_the_error_of_moves_left_out(closed: Closed) -> None:
+    """‖e‖/‖v‖ of nothing is no number."""
+
+    def resting(errors: Errors) -> Errors:
+        assert errors.holdout is not None
+        axes = tuple(math.nan if axis == SPRING.axis else error for axis, error in enumerate(errors.holdout.axes))
+        return replace(errors, holdout=RelativeError(axes, errors.holdout.total))
+
+    turns = tuple(
+        None if turn is None else replace(turn, before=resting(turn.before), after=resting(turn.after))
+        for turn in closed.account.turns
+    )
+    (found,) = (text for text in headline(closed.fitted, replace(closed.account, turns=turns), ()) if "J3 has" in text)
+    assert "nan" not in found
+    assert "on moves left out in turn" in found
+
+
+def test_gravity_is_placed_on_all_axes_in_the_document(closed: Closed) -> None:
+    first, last = closed.fitted.steps
+    tried = replace(first, findings=(*first.findings, finding(PlacedEffect(GravityDirection(), 0), passed=False)))
+    document = replace(closed, fitted=replace(closed.fitted, steps=(tried, last))).document()
+    found = document["turns"][0]["findings"][-1]
+    assert (found["effect"], found["axis"]) == ("gravity-direction", "all axes")
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from daq.cli.app import main
 from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from daq.errors import SchemaMismatch
-from daq.workflow.calibration_file import save_calibration
+from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.urdf_export import JointUpdate, cell_limits, update_urdf
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter
 from ident.estimators.estimate import RelativeError
@@ -116,6 +116,23 @@ def test_pinocchio_with_the_exported_urdf_gives_the_identified_torque(
         rest |= {f"fv{number}": joint["damping"], f"fs{number}": joint["friction"]}
     drive = np.array([rest.get(column.name, 0.0) for column in model.columns])
     _compare(model, out.read_text(), drive, standard)
+
+
+def test_a_corrected_description_is_said_beside_the_bodies(
+    tx40: tuple[Path, Path, FloatArray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The joints of the file are as they were described, and its bodies are not."""
+    cell, file, _ = tx40
+    calibration = load_calibration(file)
+    offset = Parameter("zero-offset offset 2", 1e-4, 1e-5, "rad")
+    zero = AcceptedEffect("zero-offset", calibration.gains[1].axis, {}, (offset,), 6.0, 3.0)
+    save_calibration(replace(calibration, effects=(*calibration.effects, zero)), tmp_path / "zero.yaml")
+    for known, corrected in ((file, False), (tmp_path / "zero.yaml", True)):
+        assert _export(cell, known, "--out", tmp_path / "out.urdf") == 0
+        printed = " ".join(capsys.readouterr().out.split())
+        assert ("CHECK the description: the bodies are those" in printed) == corrected
+        assert ("corrected by zero-offset on J2" in printed) == corrected
+        assert "load-friction on J3 (see --json)" in printed
 
 
 def test_a_gantry_without_a_cell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

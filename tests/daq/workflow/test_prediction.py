@@ -13,7 +13,7 @@ from daq.config.cell_file import load_cell
 from daq.errors import LogsDiffer
 from daq.workflow.prediction import LEAST_S, RECENT_S, Predictor, Recent, Rows, predictor_of
 from daq.workflow.validate import conditioning_of
-from ident.calibration import Parameter
+from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.equations.rows import row_filter, row_masks
@@ -40,9 +40,17 @@ def _motion(cell: Cell) -> tuple[np.ndarray, np.ndarray]:
     return 0.5 * position, np.random.default_rng(1).normal(0.0, 1.0, position.shape)
 
 
-@pytest.mark.parametrize("block", [1, 10, 997])
-def test_rows_are_those_of_the_whole_run(cell: Cell, block: int) -> None:
+def _with_late_position(calibration: Calibration) -> Calibration:
+    late = Parameter("late-position time 3", 0.012, 0.001, "s")
+    effect = AcceptedEffect("late-position", "J3", {}, (late,), 6.0, 3.0)
+    return replace(calibration, effects=(effect,), parameters=(*calibration.parameters, late))
+
+
+@pytest.mark.parametrize(("block", "is_late"), [(1, False), (10, False), (997, False), (10, True)])
+def test_rows_are_those_of_the_whole_run(cell: Cell, block: int, *, is_late: bool) -> None:
     calibration, model = predicting_calibration(), model_of(cell)
+    if is_late:
+        calibration = _with_late_position(calibration)
     position, current = _motion(cell)
     predictor = Predictor(calibration, cell, None, RATE_HZ)
     blocks = [slice(at, at + block) for at in range(0, SAMPLES, block)]

@@ -92,6 +92,21 @@ def test_noise_falls_once_in_twenty_also_with_heavy_tails(freedom: int) -> None:
     assert 0.035 <= share <= 0.075
 
 
+def test_noise_is_confirmed_once_in_ten_at_most() -> None:
+    """The total and the motor that an effect names are judged at half the level each, by means that mostly agree."""
+    rng = np.random.default_rng(12)
+    found = [judge(_change(rng.normal(0.0, 0.05, (8, MOTORS))), 0)[0] for _ in range(600)]
+    assert 0.02 <= np.mean([judgement is Judgement.CONFIRMED for judgement in found]) <= 0.10
+
+
+@given(st.integers(5, 40), st.integers(0, 9))
+def test_joined_blocks_are_enough_to_judge_by(moves: int, seed: int) -> None:
+    """However strongly neighbours follow each other: else a gate would be open where it was not tested."""
+    change = np.cumsum(np.random.default_rng(seed).normal(size=moves))
+    found = compare_by_block(change, np.arange(moves), np.zeros(moves, dtype=np.int64))
+    assert found.moves >= FEWEST_BLOCKS
+
+
 def test_a_rise_that_is_more_than_noise_is_refuted() -> None:
     change = _change(np.random.default_rng(0).normal(5.0, 3.0, (20, MOTORS)))
     judgement, reason = judge(change)

@@ -140,6 +140,21 @@ def test_check_geometry_with_an_undeclared_spring_names_no_zero() -> None:
     assert found.mistake is None
 
 
+def test_check_geometry_names_a_small_zero_beside_a_large_spring_of_another_axis() -> None:
+    """The spring explains more, but nothing of what the zero does to the arm."""
+    mistake = replace(MISTAKES[0], zero_rad=0.5 * ZERO_RAD)
+    truth = three_axes_truth()
+    runs: list[Run] = []
+    for run in _runs()[:4]:
+        current = run.current_a.copy()
+        current[:, 2] += 2.0 * run.position_rad[:, 2] / truth.gains[2]
+        runs.append(replace(_with_mistake(run, mistake), current_a=current))
+    found = check_geometry(gathered(truth, tuple(runs)), np.random.default_rng(0), GATES).mistake
+    assert found is not None
+    assert (found.effect.name, found.axis) == ("zero-offset", 1)
+    assert np.degrees(found.coefficients[0]) == pytest.approx(-1.0, abs=0.3)
+
+
 def test_the_correction_is_in_the_prediction_of_a_calibration() -> None:
     mistake = MISTAKES[0]
     start, steps = _fitted(mistake), _searched(mistake)
