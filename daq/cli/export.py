@@ -107,8 +107,8 @@ def export_urdf_verb(
     from daq.environment import software
     from daq.report.urdf import urdf_document, urdf_view
     from daq.workflow.calibration_file import load_calibration
-    from daq.workflow.described import on_cell
     from daq.workflow.fit import DOUBTFUL_PERCENT
+    from daq.workflow.remaining_corrections import on_cell
     from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, require_solver, update_urdf
     from ident.errors import ModelContradicted
 

@@ -506,16 +506,16 @@ def _effect_sentence(fitted: Fit, account: Account, turn: BeforeAfter, placed: P
     what = effect_text(placed.effect, axes)
     if doubt := doubted_name(step, placed, axes):
         what = f"a torque that depends on {variable_text(placed.effect, axes)} ({doubt})"
-    before, where = _strictest_error(turn.before, placed.axis)
-    after, _ = _strictest_error(turn.after, placed.axis)
+    place = placed.axis if placed.effect.has_axis else None
+    before, where = _strictest_error(turn.before, place)
+    after, _ = _strictest_error(turn.after, place)
     floor = _floor(account).at(placed.axis)
     floor_text = _floor_text(floor)
     excess = ""
     if is_unnamed(placed.effect) and share_of_excess is not None:
         excess = f" (about {100.0 * share_of_excess:.0f} % of the residual beyond noise)"
     if not placed.effect.has_axis:
-        before_all, after_all = (_strictest_error(errors)[0].total for errors in (turn.before, turn.after))
-        change = error_change_text(before_all, after_all)
+        change = error_change_text(before.total, after.total)
         return f"The recording has {what}: the error {where} {change}."
     if before.at(placed.axis) * (1.0 - SLIGHT) < after.at(placed.axis) <= before.at(placed.axis):
         excess += ", a small effect"

@@ -1,7 +1,8 @@
 """Whether splits of the data give one residual the same name.
 
-An effect is chosen on all folds of moves together. Left out of the choice in turn, the folds show whether the name
-depends on a few moves: then the residual is a torque that depends on some variable, and its names are candidates.
+An effect is chosen by its errors on all folds of moves together. With one fold left out of that comparison, each in
+turn, they show whether the name depends on a few moves: then the residual is a torque that depends on some variable,
+and its names are candidates. Nothing is fitted again.
 """
 
 from __future__ import annotations
@@ -53,8 +54,11 @@ def names_by_split(step: Step) -> tuple[SplitName, ...]:
     for left_out in range(folds):
         split = np.delete(squares, left_out, axis=1)
         is_clearly_better = is_better(split, split[0])
-        total = np.where(is_clearly_better, split.sum(axis=1), np.inf)
-        best.append(int(np.argmin(total)) if is_clearly_better.any() else 0)
+        chosen = 0  # what was added
+        if is_clearly_better.any():
+            total = np.where(is_clearly_better, split.sum(axis=1), np.inf)
+            chosen = int(np.argmin(total))
+        best.append(chosen)
     count = np.bincount(best, minlength=len(candidates))
     # Of equals, what was added comes first.
     order = np.argsort(-count, kind="stable")

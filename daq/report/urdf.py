@@ -10,9 +10,9 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from daq.report.text import plain_table, printable, terminal_text
+from daq.workflow.remaining_corrections import CORRECTIONS
 from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
 from ident.calibration import Calibration
-from ident.effects.dictionary import GEOMETRY
 from ident.physical.physical import MARGIN
 
 _SHOWN_SHIFTS = 5
@@ -54,11 +54,10 @@ def urdf_view(
         yield printable(f"Merged into the moving link that carries them: {', '.join(updated.merged)}.")
     left_out = ["rotor inertias", "offsets"]
     left_out += ["friction of coupled motors"] if robot.parameters.model.drive_train.coupled else []
-    corrections = {family[0].name for family in GEOMETRY}
     corrected: list[str] = []
     for effect in calibration.effects:
         name = f"{effect.name} on {effect.axis}"
-        if effect.name not in corrections:
+        if effect.name not in CORRECTIONS:
             left_out.append(name)
         elif any(one.value != 0.0 for one in effect.coefficients):
             corrected.append(name)

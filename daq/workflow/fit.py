@@ -26,10 +26,10 @@ from daq.workflow.declared_effects import (
     with_declared_again,
     with_effects_of_cell,
 )
-from daq.workflow.described import with_described
 from daq.workflow.description import check_diagnoses, correction_diagnoses, geometry_beside, is_checked
 from daq.workflow.diagnoses import Recordings, diagnose_fit, named_causes
 from daq.workflow.geometry import encoder_misfit_of
+from daq.workflow.remaining_corrections import with_described
 from daq.workflow.validate import diagnose_log
 from ident.arrays import FloatArray
 from ident.calibration import Calibration, PayloadMass, Source

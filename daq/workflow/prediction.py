@@ -22,8 +22,8 @@ import numpy as np
 
 from daq.config.cell import Cell
 from daq.errors import DaqError
-from daq.workflow.described import on_cell
 from daq.workflow.feed import RunFacts
+from daq.workflow.remaining_corrections import on_cell
 from daq.workflow.validate import check_cell, conditioning_of, unpredictable, warn_without_temperature
 from ident.arrays import FloatArray, IntArray
 from ident.calibration import Calibration

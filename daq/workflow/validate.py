@@ -20,8 +20,8 @@ from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationUnreadable, LogsDiffer
 from daq.log.conversion import load_run
 from daq.workflow.corrections import Corrections
-from daq.workflow.described import CORRECTIONS, on_cell
 from daq.workflow.diagnoses import diagnose_run, not_repeated
+from daq.workflow.remaining_corrections import CORRECTIONS, on_cell
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
@@ -179,8 +179,7 @@ def predicted(
     Raises:
         IdentificationError: the calibration cannot speak of this run.
     """
-    if configuration_sha256 != calibration.configuration_sha256:
-        warn_of_corrections(calibration, run.name)
+    warn_of_corrections(calibration, run.name, configuration_sha256)
     run = replace(run, payload=as_calibrated(calibration, run.payload, run.name))
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
@@ -215,11 +214,13 @@ def warn_of_fitted(calibration: Calibration, runs: Sequence[Run], consequence: s
     return seen
 
 
-def warn_of_corrections(calibration: Calibration, name: str) -> None:
+def warn_of_corrections(calibration: Calibration, name: str, configuration_sha256: str) -> None:
     """Warn of a run with another description of the cell than the fit, where the calibration corrects the description.
 
     A zero that was corrected in the cell file since would be corrected twice.
     """
+    if configuration_sha256 == calibration.configuration_sha256:
+        return
     # What a calibration knows of the description of its fit, `on_cell` has compared.
     unknown = [one for one in calibration.effects if one.name in CORRECTIONS and one.described is None]
     corrected = [f"{one.name} on {one.axis}" for one in unknown]

@@ -12,8 +12,8 @@ from daq.config.same_cell import differing_sections
 from daq.errors import ConfigurationError, LogRepeated, LogsDiffer
 from daq.log.conversion import load_run
 from daq.workflow.corrections import Corrections
-from daq.workflow.described import on_cell
 from daq.workflow.experiment import experiment_of, extra_moves
+from daq.workflow.remaining_corrections import on_cell
 from daq.workflow.validate import (
     check_cell,
     conditioning_of,
@@ -77,7 +77,7 @@ def weigh_logs(
     _require_once((*logs, *bare), (*loaded, *without))
     fitted = warn_of_fitted(calibration, loaded, "the agreement proves nothing; weigh a log that the fit has not seen")
     described = reading.described
-    _warn_of_corrections(calibration, described, loaded[0])
+    warn_of_corrections(calibration, loaded[0].name, described.digest)
     calibration, model = on_cell(calibration, described)
     body = weigh(calibration, model, loaded, conditioning_of(calibration), bare=without)
     help_: tuple[Help, ...] = ()
@@ -104,7 +104,7 @@ def contact_in(
     reading = _Logs(calibration, cell)
     run = reading.load(log)
     described = reading.described
-    _warn_of_corrections(calibration, described, run)
+    warn_of_corrections(calibration, run.name, described.digest)
     calibration, model = on_cell(calibration, described)
     band = None
     if quiet:
@@ -114,12 +114,6 @@ def contact_in(
         known = (_predictable(calibration, one, other) for one, other in zip(quiet, calm, strict=True))
         band = prediction_band(calibration, model, known, conditioning)
     return external_torque(calibration, model, _predictable(calibration, log, run), conditioning, band), described
-
-
-def _warn_of_corrections(calibration: Calibration, described: Cell, run: Run) -> None:
-    """Warn of a description that may have been corrected since the fit, which the calibration corrects as well."""
-    if described.digest != calibration.configuration_sha256:
-        warn_of_corrections(calibration, run.name)
 
 
 def _require_once(logs: Sequence[Path], runs: Sequence[Run]) -> None:

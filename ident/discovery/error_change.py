@@ -79,8 +79,6 @@ class PairedChange:
         changes = np.array(self.by_block)
         inner = changes[trimmed:-trimmed]
         left = len(inner)
-        if left < 2:
-            return False
         winsorised = np.clip(changes, inner[0], inner[-1])
         std = float(np.sqrt((count - 1) * np.var(winsorised, ddof=1) / (left * (left - 1))))
         return float(inner.mean()) > float(scipy.special.stdtrit(left - 1, confidence)) * std

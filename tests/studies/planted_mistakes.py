@@ -1,8 +1,8 @@
 """Mistakes of geometry and time that are planted into runs or into the description, and whether a search names them.
 
 A zero offset is added to the recorded positions of one joint; a late encoder reads them, and a late current those of a
-motor, where they were a while before; a tilt turns the gravity that the identification is given. It
-is given nothing else of the mistake.
+motor, where they were a while before; a tilt turns the gravity that the identification is given. It is given nothing
+else of the mistake.
 """
 
 from __future__ import annotations

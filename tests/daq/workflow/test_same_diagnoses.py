@@ -234,9 +234,10 @@ def test_a_wrong_description_is_corrected_before_the_next_step(
     say_after_fit(calibration, paths[:USED], Path("fit.yaml"))
     assert f"Next: {next_step}" in capsys.readouterr().err
     assert bool(uncorrected_description(calibration)) == bool(degrees)
-    console = Console(width=400, file=StringIO())
+    screen = StringIO()
+    console = Console(width=400, file=screen)
     console.print(*validation_view(calibration, cross_validate({"one": calibration}, paths[USED:])))
-    said_of_fit = "The fit of this calibration found: CHECK J2" in console.file.getvalue()  # type: ignore[attr-defined]
+    said_of_fit = "The fit of this calibration found: CHECK J2" in screen.getvalue()
     assert said_of_fit == bool(degrees)
 
 
