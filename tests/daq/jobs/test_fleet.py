@@ -122,6 +122,7 @@ def test_threads_give_each_cell_what_a_single_fit_gives(
         assert load_calibration(Path(row["calibration"])).cell == row["cell"]
 
 
+@pytest.mark.processes
 def test_processes_give_the_same(fleet: Path, single: dict[str, dict[str, Any]], tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = ["fleet", str(fleet), "--scheduler", "processes", "--workers", "2", "--out", str(out)]
@@ -129,6 +130,7 @@ def test_processes_give_the_same(fleet: Path, single: dict[str, dict[str, Any]],
     assert _files(out) == single
 
 
+@pytest.mark.processes
 def test_a_scheduler_that_runs_already_gives_the_same(
     few: Path, single: dict[str, dict[str, Any]], tmp_path: Path
 ) -> None:
@@ -317,6 +319,7 @@ with worker_pool("threads", 2) as pool:
 """
 
 
+@pytest.mark.processes
 def test_killed_in_the_middle_and_started_again_it_gives_the_same(
     fleet: Path, single: dict[str, dict[str, Any]], tmp_path: Path
 ) -> None:

@@ -26,6 +26,8 @@ from daq.writeback.target import rollback
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import Rig
 
+pytestmark = pytest.mark.processes
+
 CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "plan"})
 """What a job hands its work to: between two of these calls it reads and writes its own files."""
 

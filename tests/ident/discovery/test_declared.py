@@ -80,7 +80,7 @@ def test_declared_it_is_fitted_from_a_rough_geometry(balanced: Evidence, declare
 
 
 def test_left_out_it_is_found_on_its_joint(balanced: Evidence) -> None:
-    steps = find_effects(balanced, np.random.default_rng(0), GATES, LIKE_IT)
+    steps = find_effects(balanced, np.random.default_rng(0), GATES, LIKE_IT, geometry=())
     found = [(step.accepted.effect.name, step.accepted.axis) for step in steps if step.accepted is not None]
     assert found == [("counterbalance", AXIS)]
     _assert_known(steps[-1].after)
@@ -88,14 +88,14 @@ def test_left_out_it_is_found_on_its_joint(balanced: Evidence) -> None:
 
 def test_a_search_keeps_what_is_declared_and_finds_nothing_beside_it(declared: tuple[Step, ...]) -> None:
     start = declared[-1].after
-    steps = find_effects(start, np.random.default_rng(0), GATES, LIKE_IT)
+    steps = find_effects(start, np.random.default_rng(0), GATES, LIKE_IT, geometry=())
     assert [step.accepted for step in steps] == [None]
     assert steps[-1].after.effects == start.effects
     assert steps[-1].after.estimate.gains == pytest.approx(start.estimate.gains)
 
 
 def test_no_balancer_is_found_where_there_is_none(unbalanced: Evidence) -> None:
-    steps = find_effects(unbalanced, np.random.default_rng(0), GATES, LIKE_IT)
+    steps = find_effects(unbalanced, np.random.default_rng(0), GATES, LIKE_IT, geometry=())
     assert [step.accepted for step in steps] == [None]
 
 

@@ -39,7 +39,7 @@ from ident.discovery.search import (
     rank_effects,
     rank_families,
 )
-from ident.effects.dictionary import EFFECTS
+from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.electrical import Lag
 from ident.effects.friction import NonlinearViscous, Stribeck, TemperatureFriction, WarmUp
@@ -355,14 +355,16 @@ def test_a_disturbance_in_the_loop_is_no_effect(
     if not has_gate:
         monkeypatch.setattr(joining, "by_instruments", lambda _: None)
     families = tuple(family for family in EFFECTS if family[0].name == "time-skew")
-    first, *_ = find_effects(disturbed, np.random.default_rng(0), GATES, families)
+    geometry = GEOMETRY if has_gate else ()
+    first, *_ = find_effects(disturbed, np.random.default_rng(0), GATES, families, geometry=geometry)
     assert (first.accepted is None) == has_gate
     refused = [one.finding.effect.name for one in first.set_aside if "instruments from the demanded" in one.words]
     assert ("time-skew" in refused) == has_gate
 
 
 def test_an_effect_joins_beside_a_disturbance_in_the_loop(disturbed: Evidence, small_truth: Truth) -> None:
-    first, *_ = find_effects(_sticking(disturbed, small_truth, 12.0), np.random.default_rng(0), GATES, (STICKING,))
+    bent_by_friction = _sticking(disturbed, small_truth, 12.0)
+    first, *_ = find_effects(bent_by_friction, np.random.default_rng(0), GATES, (STICKING,), geometry=())
     assert first.accepted is not None
     assert first.after.effects == (PlacedEffect(STICKING[0], 1),)
 

@@ -341,7 +341,7 @@ def _is_named(arm: Arm, planted: Planted) -> None:
 def _gain_errors(arm: Arm, planted: Planted, first_order: Effect) -> tuple[Effect, float, float]:
     """Effect that is found, and errors of its gain by a first-order form of it and by what was found."""
     start = _with(arm, planted)
-    first, last = find_effects(start, np.random.default_rng(0), GATES, (_family(planted.family),))
+    first, last = find_effects(start, np.random.default_rng(0), GATES, (_family(planted.family),), geometry=())
     assert first.accepted is not None
     assert first.accepted.axis == planted.axis
     assert last.accepted is None

@@ -65,7 +65,7 @@ def _on_a_spring(small: Evidence, truth: Truth, compliance: float, half_gap: flo
 
 def _found(start: Evidence) -> Evidence:
     families = tuple(family for family in EFFECTS if family[0].name in NEAR)
-    return find_effects(start, np.random.default_rng(0), GATES, families)[-1].after
+    return find_effects(start, np.random.default_rng(0), GATES, families, geometry=())[-1].after
 
 
 def test_one_effect_explains_a_resonance_in_the_band_and_none_joins(small: Evidence, small_truth: Truth) -> None:

@@ -42,7 +42,7 @@ def _rippling(small: Evidence, truth: Truth, axis: int, order: float, size_nm: f
 )
 def test_an_order_between_the_whole_ones_is_named(small: Evidence, small_truth: Truth, axis: int, order: float) -> None:
     start = _rippling(small, small_truth, axis, order, 4.0)
-    last = find_effects(start, np.random.default_rng(0), GATES, RIPPLES)[-1].after
+    last = find_effects(start, np.random.default_rng(0), GATES, RIPPLES, geometry=())[-1].after
     ((placed, effect),) = [(placed.axis, placed.effect) for placed in last.effects]
     assert isinstance(effect, Ripple)
     assert placed == axis
@@ -65,7 +65,9 @@ def test_an_order_that_may_not_join_is_tried_once(
         return SetAside(found, "refused")
 
     monkeypatch.setattr(loop, "join", refuse)
-    (step,) = find_effects(_rippling(small, small_truth, 0, 0.37, 4.0), np.random.default_rng(0), GATES, RIPPLES)
+    (step,) = find_effects(
+        _rippling(small, small_truth, 0, 0.37, 4.0), np.random.default_rng(0), GATES, RIPPLES, geometry=()
+    )
     assert step.accepted is None
     assert len(refused) == len(step.set_aside)
 

@@ -36,7 +36,7 @@ def _needing(small: Evidence, truth: Truth, axis: int, torque: Torque) -> Eviden
 
 
 def _loop(start: Evidence, families: tuple[tuple[Effect, ...], ...] = EFFECTS) -> Sequence[Step]:
-    return find_effects(start, np.random.default_rng(0), GATES, families)
+    return find_effects(start, np.random.default_rng(0), GATES, families, geometry=())
 
 
 def _low_speed(axis: int) -> Torque:
