@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from daq.config.cell import Cell as Cell
     from daq.config.cell_file import load_cell as load_cell
     from daq.config.controller import ControllerFormat as ControllerFormat
+    from daq.documents.calibration_file import load_calibration as load_calibration
+    from daq.documents.calibration_file import save_calibration as save_calibration
     from daq.errors import CalibrationRefused as CalibrationRefused
     from daq.errors import ConfigurationError as ConfigurationError
     from daq.errors import ControllerChanged as ControllerChanged
@@ -52,15 +54,13 @@ if TYPE_CHECKING:
     from daq.log.reader import Log as Log
     from daq.log.reader import LossyLogs as LossyLogs
     from daq.log.reader import read_log as read_log
-    from daq.workflow.calibration_file import load_calibration as load_calibration
-    from daq.workflow.calibration_file import save_calibration as save_calibration
     from daq.workflow.fit import Fit as Fit
     from daq.workflow.fit import calibration_of as calibration_of
     from daq.workflow.fit import close_loop as close_loop
     from daq.workflow.fit import fit as fit
     from daq.workflow.fit import fit_logs as fit_logs
-    from daq.workflow.validate import Validation as Validation
     from daq.workflow.validate import validate as validate
+    from daq.workflow.validation import Validation as Validation
     from daq.writeback.drive_target import DriveTarget as DriveTarget
     from daq.writeback.file_target import FileTarget as FileTarget
     from daq.writeback.request import Request as Request
@@ -79,7 +79,7 @@ _HOMES = {
     "LogUnreadable OutputFailed UsageError",
     "daq.log.conversion": "load_run",
     "daq.log.reader": "Log LossyLogs read_log",
-    "daq.workflow.calibration_file": "load_calibration save_calibration",
+    "daq.documents.calibration_file": "load_calibration save_calibration",
     "daq.workflow.fit": "Fit calibration_of close_loop fit fit_logs",
     "daq.workflow.validate": "Validation validate",
     "daq.writeback.drive_target": "DriveTarget",

@@ -23,10 +23,10 @@ from daq.cli.verb import help_record
 from daq.config.cell_schema import CellModel
 from daq.config.drive import DriveModel
 from daq.config.import_description import ImportDescription
+from daq.documents.calibration_file import CalibrationDocument
 from daq.errors import DaqError, exit_code
 from daq.report.schemas import REPORTS, ErrorReport
 from daq.simulation.simulation_file import SimulationModel
-from daq.workflow.calibration_file import CalibrationDocument
 from daq.writeback.gates.table import GATES
 from drivers.errors import DriverError
 from ident.effects.dictionary import EFFECTS

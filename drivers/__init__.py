@@ -48,11 +48,14 @@ if TYPE_CHECKING:
     from drivers.errors import SampleLost as SampleLost
     from drivers.errors import SetupRefused as SetupRefused
     from drivers.errors import StateRefused as StateRefused
+    from drivers.messages import CellEvent as CellEvent
+    from drivers.messages import EventKind as EventKind
+    from drivers.messages import Sample as Sample
     from drivers.motion.execute import execute as execute
-    from drivers.motion.move import AxisLimits as AxisLimits
-    from drivers.motion.move import MotionPermission as MotionPermission
-    from drivers.motion.move import Move as Move
-    from drivers.motion.move import synchronised_move as synchronised_move
+    from drivers.move import AxisLimits as AxisLimits
+    from drivers.move import MotionPermission as MotionPermission
+    from drivers.move import Move as Move
+    from drivers.move import synchronised_move as synchronised_move
     from drivers.profiles.cia402 import State as State
     from drivers.profiles.cia402 import decode as decode
     from drivers.profiles.profile import CIA402 as CIA402
@@ -64,9 +67,6 @@ if TYPE_CHECKING:
     from drivers.profiles.profile import ObjectEntry as ObjectEntry
     from drivers.profiles.profile import TapPoint as TapPoint
     from drivers.stream.answers import StreamStatistics as StreamStatistics
-    from drivers.stream.sample import CellEvent as CellEvent
-    from drivers.stream.sample import EventKind as EventKind
-    from drivers.stream.sample import Sample as Sample
     from drivers.stream.stream import SyncStream as SyncStream
     from drivers.stream.sync import FollowedSync as FollowedSync
     from drivers.stream.sync import LockstepSync as LockstepSync

@@ -56,8 +56,8 @@ if TYPE_CHECKING:
     from ident.estimators.diagnosis import diagnose as diagnose
     from ident.estimators.diagnosis import exchanged_channels as exchanged_channels
     from ident.estimators.estimate import Estimate as Estimate
+    from ident.estimators.estimate import Identification as Identification
     from ident.estimators.estimate import RelativeError as RelativeError
-    from ident.estimators.identify import Identification as Identification
     from ident.estimators.identify import identify as identify
     from ident.estimators.method import Method as Method
     from ident.estimators.turned_geometry import find_turned_geometry as find_turned_geometry

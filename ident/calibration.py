@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # reading a calibration needs no estimator
     from ident.discovery.evidence import Evidence
     from ident.discovery.loop import Step
     from ident.effects.effect import PlacedEffect
-    from ident.estimators.identify import Identification
+    from ident.estimators.estimate import Identification
 
 EXTRAPOLATED = 1.5
 """Times the largest torque of an effect in the fit that it may have in a prediction: a power of the speed or of the

@@ -83,7 +83,7 @@ def apply_verb(
     The bounds of the gates are in the cell's `policy: {apply: ...}`; see docs/reference/gates.md.
     """
     from daq.config.cell_file import load_cell
-    from daq.workflow.calibration_file import decode, read
+    from daq.documents.calibration_file import decode, read
     from daq.writeback.file_target import FileTarget
     from daq.writeback.request import Request
 
@@ -132,8 +132,8 @@ def apply_to(
     The write, its audit and its entry in the history are done within `whole`.
     """
     from daq.files import sha256
-    from daq.ledger.judgement import query_history
     from daq.report.proposal import describe, show
+    from daq.writeback.judgement import query_history
     from daq.writeback.target import apply, propose
 
     written: Written | None = None

@@ -41,7 +41,7 @@ def console_verb(
     from daq.console.live import Live
     from daq.console.results import Results
     from daq.console.server import Page, listen, new_token, server_of
-    from daq.workflow.calibration_file import load_calibration
+    from daq.documents.calibration_file import load_calibration
 
     declared = load_cell(cell)
     if report is not None and not report.is_dir():

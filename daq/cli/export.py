@@ -71,8 +71,8 @@ def export_bag_verb(
     Joint states are at the full rate, with the names of the URDF's joints; effort only with --calibration.
     """
     from daq.cli.terminal import print_view, status
+    from daq.documents.calibration_file import load_calibration
     from daq.log.bag_writer import export_bag
-    from daq.workflow.calibration_file import load_calibration
 
     known = None if calibration is None else load_calibration(calibration)
     with status("writing the bag"):
@@ -104,9 +104,9 @@ def export_urdf_verb(
     from daq.cli.terminal import check_output, print_view, status
     from daq.config.cell_file import URDF, bundle
     from daq.config.yaml_file import read_bytes
+    from daq.documents.calibration_file import load_calibration
     from daq.environment import software
     from daq.report.urdf import urdf_document, urdf_view
-    from daq.workflow.calibration_file import load_calibration
     from daq.workflow.fit import DOUBTFUL_PERCENT
     from daq.workflow.remaining_corrections import on_cell
     from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, require_solver, update_urdf

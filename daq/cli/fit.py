@@ -167,10 +167,10 @@ def _fit_cases(
     from datetime import UTC, datetime
 
     from daq.cli.terminal import check_output, print_view, status, write_output
+    from daq.documents.calibration_file import save_calibration
     from daq.files import replace_file
     from daq.report.fit import cases_document, cases_view
     from daq.report.paper_tables import case_tables, page
-    from daq.workflow.calibration_file import save_calibration
     from daq.workflow.cases import CASES, CaseFit, calibration_of_case, fit_case, reduce_logs
 
     created = datetime.now(UTC)
@@ -359,8 +359,8 @@ def _save_certificate(fitted: Fit, calibration: Calibration, folder: Path) -> No
 
 def _save(fitted: Fit, calibration: Calibration, out: Path | None, pictures: Path | None) -> None:
     from daq.cli.terminal import write_output
+    from daq.documents.calibration_file import save_calibration
     from daq.report.plots import draw_fit
-    from daq.workflow.calibration_file import save_calibration
 
     if out is not None:
         with write_output(out):

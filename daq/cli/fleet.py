@@ -49,8 +49,8 @@ def fleet_verb(
     from daq.files import replace_file
     from daq.jobs.cell_fit import Loop, open_cache
     from daq.jobs.fleet import fit_fleet, worker_pool
+    from daq.jobs.fleet_report import FIRST_COLUMNS, fleet_csv, fleet_document, fleet_view
     from daq.jobs.fleet_survey import list_logs
-    from daq.report.fleet import FIRST_COLUMNS, fleet_csv, fleet_document, fleet_view
 
     loop = Loop.CLOSED if residual else Loop.OPEN
     if csv is not None:

@@ -209,7 +209,7 @@ def _acknowledge(ledger: Ledger, series: Series, why: str | None, since: str | N
 
 
 def _add(ledger: Ledger, file: Path, now: datetime) -> None:
-    from daq.workflow.calibration_file import decode, read
+    from daq.documents.calibration_file import decode, read
 
     content = read(file)
     calibration = decode(content, str(file))

@@ -19,8 +19,8 @@ NewLogOption = Annotated[
 def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: JsonOption = False) -> None:
     """Show what is in a log: role and payload, duration, losses, moves, validity."""
     from daq.cli.terminal import output_console, print_view
+    from daq.documents.calibration_file import load_calibration
     from daq.report.log import describe_log, log_lines
-    from daq.workflow.calibration_file import load_calibration
 
     try:
         description = describe_log(log)

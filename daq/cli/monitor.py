@@ -34,9 +34,9 @@ def monitor_verb(
     from daq.cli.terminal import interruptible
     from daq.config.bus import cell_address, drive_axes
     from daq.config.cell_file import load_cell
+    from daq.documents.calibration_file import load_calibration
+    from daq.log.feed import Feed
     from daq.report.bus import monitor_document, monitor_view
-    from daq.workflow.calibration_file import load_calibration
-    from daq.workflow.feed import Feed
     from daq.workflow.monitor import CellWatch
     from daq.workflow.validate import check_cell
     from drivers.canopen.network import CanopenNetwork

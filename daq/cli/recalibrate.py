@@ -71,10 +71,10 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
     from daq.jobs.job import preview, recalibrate
     from daq.jobs.reporting import document, text
     from daq.jobs.session import CALIBRATION
+    from daq.log.feed import Feed
     from daq.report.certificate import compare
     from daq.report.residual_page import save_report
     from daq.report.text import printable
-    from daq.workflow.feed import Feed
     from daq.workflow.record import record
     from daq.writeback.request import Request
 

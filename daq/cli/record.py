@@ -50,9 +50,9 @@ def record_verb(
     from daq.config.bus import bus_loads
     from daq.config.cell_file import load_cell
     from daq.environment import login
+    from daq.log.feed import Feed
     from daq.report.text import picked
     from daq.workflow.bus_lock import bus_lock
-    from daq.workflow.feed import Feed
     from daq.workflow.plan import slowed
     from daq.workflow.plan_file import load_plan
     from daq.workflow.record import record

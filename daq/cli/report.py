@@ -34,11 +34,11 @@ def report_verb(
 
     from daq.cli.terminal import check_folder, check_replaceable, print_view, write_output
     from daq.config.cell_file import load_cell
+    from daq.documents.calibration_file import decode, load_calibration, read
     from daq.files import replace_file
     from daq.report.certificate import certificate_document, certify, compare, without_controller
     from daq.report.certificate_page import certificate_page
     from daq.report.html import MARK
-    from daq.workflow.calibration_file import decode, load_calibration, read
     from daq.writeback.request import Request
 
     page = out or calibration.with_suffix(".html")

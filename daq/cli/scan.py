@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from daq.config.cell import Cell
     from drivers.canopen.bus import BusAddress
     from drivers.canopen.network import CanopenNetwork
+    from drivers.canopen.scale import ScaleReading
     from drivers.canopen.scan import FoundNode
     from drivers.profiles.profile import Axis
-    from drivers.profiles.scale import ScaleReading
 
 
 def scan_verb(
@@ -146,8 +146,8 @@ def no_answer(cell: Cell, missing: Sequence[Axis], answered: tuple[int, ...], wa
 
 def _scale_of(network: CanopenNetwork, axis: Axis) -> ScaleReading | None:
     """Read the scale of a drive's current; None where it cannot be read, which `record` reports."""
+    from drivers.canopen.scale import read_scale
     from drivers.errors import DriverError
-    from drivers.profiles.scale import read_scale
 
     try:
         return read_scale(network.link.objects(axis.node_id), axis.profile)

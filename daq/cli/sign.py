@@ -61,8 +61,8 @@ def sign_calibration_verb(
     from datetime import UTC, datetime
 
     from daq.cli.terminal import print_view
+    from daq.documents.calibration_file import load_calibration
     from daq.report.gains import gain_table
-    from daq.workflow.calibration_file import load_calibration
     from daq.writeback.signature import needs_password, sign
 
     known = load_calibration(calibration)

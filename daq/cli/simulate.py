@@ -58,8 +58,8 @@ def simulate(
     from daq.simulation.simulation_file import load_scenario, load_simulation, require_simulator, shipped_simulation
     from daq.workflow.bus_lock import require_untaken
     from drivers.canopen.bus import BusAddress, bus_errors, open_bus
-    from drivers.canopen.hub import Hub
     from drivers.canopen.split_bus import BusPart, SplitAddress, open_cell_bus
+    from drivers.simulation.hub import Hub
 
     require_simulator()
     from daq.errors import ConfigurationInconsistent

@@ -117,7 +117,7 @@ def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]
     """Load calibrations by label, the one to validate first; a file that is named twice counts once."""
     from collections import Counter
 
-    from daq.workflow.calibration_file import load_calibration
+    from daq.documents.calibration_file import load_calibration
 
     files = [calibration]
     for place in beside:

@@ -27,8 +27,8 @@ def weigh_verb(
     """
     from daq.cli.terminal import print_view, status
     from daq.config.cell_file import load_cell
+    from daq.documents.calibration_file import load_calibration
     from daq.report.weighing import weighed_document, weighed_view
-    from daq.workflow.calibration_file import load_calibration
     from daq.workflow.weigh import weigh_logs
 
     with status("weighing"):
@@ -62,8 +62,8 @@ def contact_verb(
     """
     from daq.cli.terminal import print_view, status, write_output
     from daq.config.cell_file import load_cell
+    from daq.documents.calibration_file import load_calibration
     from daq.report.weighing import contact_document, contact_view, draw_contact
-    from daq.workflow.calibration_file import load_calibration
     from daq.workflow.weigh import contact_in
 
     picture = None

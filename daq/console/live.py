@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from daq.config.cell import Cell, PacingMode
-from daq.workflow.events import event_document
-from daq.workflow.feed import (
+from daq.log.feed import (
     ACCEPTED,
     LARGEST_PACKET,
     STOP,
@@ -31,9 +30,10 @@ from daq.workflow.feed import (
     read_packet,
     socket_names,
 )
+from daq.workflow.events import event_document
 from daq.workflow.prediction import Predictor, predictor_of
+from drivers.messages import CellEvent, EventKind
 from drivers.profiles.cia402 import ENABLED, FAULTY, decode
-from drivers.stream.sample import CellEvent, EventKind
 from ident.arrays import FloatArray
 from ident.calibration import Calibration
 from ident.errors import IdentificationError

@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from daq.config.cell import Cell
+from daq.documents.calibration_file import load_calibration
+from daq.documents.session_state import Outcome
 from daq.errors import DaqError, ExitCode
 from daq.jobs.reporting import Conclusion, to_do
-from daq.jobs.session import CALIBRATION, REPORT, Outcome, Session, sessions
+from daq.jobs.session import CALIBRATION, REPORT, Session, sessions
 from daq.ledger.store import HistoryStore
 from daq.ledger.watch import alarm_text, watch
 from daq.report.residual_page import PAGE
-from daq.workflow.calibration_file import load_calibration
 from ident.calibration import Calibration
 from ident.errors import IdentificationError
 

@@ -34,7 +34,7 @@ from daq.log.message import (
     joint_state_prefix,
     text_bytes,
 )
-from drivers.stream.sample import CellEvent, EventKind
+from drivers.messages import CellEvent, EventKind
 from ident.arrays import FloatArray
 
 PREDICTED_TOPIC, RESIDUAL_TOPIC = "/cell/predicted", "/cell/residual"

@@ -17,6 +17,7 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from daq.config.yaml_file import MAX_BYTES
+from daq.documents.calibration_file import as_document, decode, encode
 from daq.environment import software
 from daq.errors import (
     CalibrationUnreadable,
@@ -30,7 +31,6 @@ from daq.errors import (
 )
 from daq.files import judge_target, read_regular, replace_file
 from daq.jobs.fleet_survey import CellLogs, StoredLog, at_hand, fingerprint
-from daq.workflow.calibration_file import as_document, decode, encode
 from daq.workflow.declared_effects import BOOTSTRAP_SEED
 from daq.workflow.fit import calibration_of, check_holdout, close_loop, fit
 from drivers.errors import DriverError

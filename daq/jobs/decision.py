@@ -6,20 +6,21 @@ import math
 from datetime import datetime
 
 from daq.config.policy import AppliedBy
+from daq.documents.calibration_file import read
+from daq.documents.session_state import Decision, JudgedGain, Outcome, Target
 from daq.errors import DaqError, evidence, writing
 from daq.files import replace_file, sha256, sha256_of
 from daq.jobs.context import JobContext
 from daq.jobs.journal import Level
-from daq.jobs.session import CALIBRATION, Decision, JudgedGain, Outcome, Session, Target
+from daq.jobs.session import CALIBRATION, Session
 from daq.ledger.audit import AuditAction, append
 from daq.ledger.audit import read as read_audit
-from daq.ledger.judgement import Spread, judge, known_of
 from daq.ledger.ledger import Ledger
 from daq.report.text import json_text, picked
-from daq.workflow.calibration_file import read
 from daq.writeback.file_access import resolve_links
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.gates.gate import Gate
+from daq.writeback.judgement import Spread, judge, known_of
 from daq.writeback.request import Request
 from daq.writeback.target import Proposal, Written
 from ident.calibration import Calibration
@@ -115,7 +116,7 @@ def _note_applied(context: JobContext, ledger: Ledger, digest: str, after_sha256
 
 
 def decision_of(proposal: Proposal[FileEdit], known: Spread) -> Decision:
-    """Judge which gains differ significantly from the controller's (`daq.ledger.judgement`), each among all axes."""
+    """Judge which gains differ significantly from the controller's (`daq.writeback.judgement`), each among all axes."""
     judged, words = judge(proposal.edit.changes, known)
     gains = tuple(
         JudgedGain(

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from daq.config.cell import Cell
 from daq.config.recalibration import Recalibration
+from daq.documents.session_state import Outcome, WatchedGain
 from daq.errors import ExitCode
 from daq.files import sha256_of
 from daq.jobs import session as sessions
@@ -18,7 +19,7 @@ from daq.jobs.decision import decide_outcome
 from daq.jobs.journal import Journal, Level
 from daq.jobs.recording import basis_of, calibration_of_session, fit_session, record_runs, verified_runs
 from daq.jobs.reporting import Conclusion, audit_entry, report_failure, report_success
-from daq.jobs.session import Outcome, Session, WatchedGain
+from daq.jobs.session import Session
 from daq.jobs.time_bound import time_bound
 from daq.ledger.audit import AuditAction
 from daq.ledger.ledger import Ledger

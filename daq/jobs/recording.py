@@ -13,6 +13,8 @@ from pathlib import Path
 from daq.config.cell import Cell
 from daq.config.policy import Permission
 from daq.config.recalibration import PlannedRun, Recalibration
+from daq.documents.calibration_file import load_calibration, save_calibration
+from daq.documents.session_state import Fitted, Outcome, RecordedRun
 from daq.errors import (
     CalibrationMissing,
     CalibrationRefused,
@@ -27,12 +29,11 @@ from daq.errors import (
 from daq.files import sha256_of
 from daq.jobs.context import JobContext
 from daq.jobs.journal import Journal, Level
-from daq.jobs.session import CALIBRATION, REPORT, Basis, Fitted, Outcome, RecordedRun, Session
+from daq.jobs.session import CALIBRATION, REPORT, Basis, Session
 from daq.log.container import UNFINISHED
 from daq.log.salvage import salvage
 from daq.report.fit import start_of
 from daq.report.residual import summary
-from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.fit import check_holdout
 from daq.workflow.interlock import Runner, release_check
 from daq.workflow.plan import Plan

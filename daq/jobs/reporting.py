@@ -13,13 +13,14 @@ from typing import Any
 
 from prometheus_client import CollectorRegistry, Gauge, write_to_textfile
 
+from daq.documents.session_state import Outcome, SessionState
 from daq.errors import AuditUnusable, DaqError, ExitCode, HistoryUnreadable, OutputFailed, exit_code, writing
 from daq.files import replace_file
 from daq.jobs import session as sessions
 from daq.jobs.context import JobContext
 from daq.jobs.journal import Level
 from daq.jobs.recording import calibration_of_session
-from daq.jobs.session import CALIBRATION, REPORT, Outcome, Session, SessionState
+from daq.jobs.session import CALIBRATION, REPORT, Session
 from daq.ledger.audit import AuditAction, AuditEntry, append
 from daq.ledger.store import HistoryStore
 from daq.report.text import json_text, picked

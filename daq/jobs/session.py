@@ -12,130 +12,20 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime, timedelta
-from enum import Enum
 from pathlib import Path
-from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
-from daq.config.yaml_file import StrictModel
+from daq.documents.session_state import SessionState
 from daq.errors import ConfigurationInconsistent, writing
 from daq.files import read_regular, replace_file
 
 STATE, CALIBRATION, REPORT = "state.json", "calibration.yaml", "report"
 LARGEST_STATE_BYTES = 4 << 20  # a job writes a few kilobytes
 _STAMP = "%Y%m%dT%H%M%SZ"
-_Count = Annotated[int, Field(ge=0, le=2**53)]  #: Exact in a metric, which is a float
 _NAME = re.compile(r"[0-9]{8}T[0-9]{6}Z(?:-[0-9]{2})?")
 _REMOVED = re.compile(rf"\.{_NAME.pattern}\.removed")  #: A session that is being removed
 _UNWRITTEN = f".{STATE}."  #: First part of the name of a state that is being written (`daq.files.replace_file`)
-
-
-class Outcome(Enum):
-    """How a job ended."""
-
-    NOT_DUE = "not due"  #: The last good calibration is recent enough; no session was begun
-    APPLIED = "applied"
-    UNCHANGED = "unchanged"  #: No gain differs significantly from the controller's
-    PROPOSED = "proposed"  #: An operator has to apply it
-    REFUSED = "refused"  #: A check of the write-back failed
-    UNFIT = "unfit"  #: The recordings cannot be used
-    STOPPED = "stopped"  #: An error ended the job; the next job resumes the session
-    INTERRUPTED = "interrupted"  #: Like STOPPED, by a signal
-
-    @property
-    def good(self) -> bool:
-        """Whether the calibration is valid."""
-        return self in (Outcome.APPLIED, Outcome.UNCHANGED, Outcome.PROPOSED)
-
-    @property
-    def concluded(self) -> bool:
-        """Whether the session is over: the same logs would end the same way."""
-        return self not in (Outcome.STOPPED, Outcome.INTERRUPTED)
-
-
-class RecordedRun(StrictModel):
-    """A finished log: its digest, the number of recordings it took, and the losses of all of them."""
-
-    name: str
-    sha256: str
-    attempts: _Count
-    samples: _Count
-    lost_cycles: _Count
-    missing: tuple[_Count, ...]
-
-
-class Fitted(StrictModel):
-    """Digest of the calibration file, and the residual in words."""
-
-    calibration_sha256: str
-    sentences: tuple[str, ...]
-
-
-class JudgedGain(StrictModel):
-    """A gain beside the one in the controller, with their σ, and whether they differ significantly."""
-
-    axis: str
-    unit: str
-    old: float
-    old_std: float
-    new: float
-    new_std: float
-    change_percent: float | None  #: None where the number in the controller is 0
-    drift_sigma: float | None  #: difference in σ of the difference, None where both σ are 0; an unknown σ is 0
-    differs: bool
-
-
-class Decision(StrictModel):
-    """The decision, with the gains it rests on."""
-
-    gains: tuple[JudgedGain, ...]
-    remark: str
-
-
-class Target(StrictModel):
-    """The planned write, saved before it is made: after a kill, the file's digest shows whether it was made."""
-
-    file: str
-    base_sha256: str
-    after_sha256: str
-    looked_at: str = ""  #: value for `apply --base`
-    unsigned: bool = False  #: required signatures are missing
-
-
-class WatchedGain(StrictModel):
-    """Alarm of the drift chart of a gain (`daq.ledger.watch`), empty where there is none."""
-
-    axis: str
-    alarm: str
-
-
-class SessionState(StrictModel):
-    """`state.json`; results of steps that are not done yet are None or missing from the list."""
-
-    format: Literal["drivegain-recalibration"] = "drivegain-recalibration"
-    version: Literal[1] = 1
-    session: str
-    cell: str
-    configuration_sha256: str
-    plans_sha256: str = ""  #: of the approved plans that the runs name
-    began: str
-    attempt: _Count = 1
-    attempt_began: str
-    runs: tuple[RecordedRun, ...] = ()
-    fitted: Fitted | None = None
-    watched: tuple[WatchedGain, ...] = ()
-    decision: Decision | None = None
-    target: Target | None = None
-    outcome: Outcome | None = None
-    exit_code: _Count | None = None
-    problem: str = ""
-    ended: str | None = None
-    audit_sha256: str | None = None  #: of the audit entry about the end of the session
-
-    def with_(self, **changed: object) -> SessionState:
-        """A copy with other values."""
-        return self.model_copy(update=changed)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from daq.config.cell import Cell
 from daq.config.policy import HistoryPlace
+from daq.documents.calibration_file import decode, encode
 from daq.errors import AuditUnusable, DataError, HistoryUnreadable, OutputFailed, evidence
 from daq.files import fsync_folder
 from daq.ledger.audit import AuditAction, AuditEntry, AuditVerdict, append, read, verify
@@ -30,7 +31,6 @@ from daq.ledger.verify import (
     unknown_writes,
     writes_to,
 )
-from daq.workflow.calibration_file import decode, encode
 from ident.calibration import Calibration
 
 _LOG = logging.getLogger("drivegain")

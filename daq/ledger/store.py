@@ -23,9 +23,9 @@ from typing import Any, Self
 from urllib.parse import quote
 
 from daq.config import yaml_file
+from daq.documents.calibration_file import decode, encode
 from daq.errors import DaqError, DataError, HistoryUnreadable, OutputFailed
 from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, differences, iso, listed, row_of, zoned
-from daq.workflow.calibration_file import decode, encode
 from ident.calibration import Calibration, Gain
 
 BUSY_S = 5.0  #: How long to wait for another process' transaction: each is a few rows

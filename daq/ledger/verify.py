@@ -10,11 +10,11 @@ from datetime import UTC, datetime
 
 from daq.config.cell import Cell
 from daq.config.policy import HistoryPlace
+from daq.documents.calibration_file import decode
 from daq.errors import DataError
 from daq.ledger.audit import AuditAction, AuditEntry, AuditVerdict, Content, verify
 from daq.ledger.entry import Acknowledgement, Event, WriteAction, differences, drives_of, iso, utc
 from daq.ledger.store import HistoryStore
-from daq.workflow.calibration_file import decode
 
 _ENDS = {AuditAction.APPLIED: WriteAction.APPLIED, AuditAction.ROLLED_BACK: WriteAction.ROLLED_BACK}
 _BEGINS = {AuditAction.APPLY_BEGUN: WriteAction.APPLIED, AuditAction.ROLLBACK_BEGUN: WriteAction.ROLLED_BACK}

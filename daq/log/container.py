@@ -39,7 +39,7 @@ from daq.log.message import (
     reading_from_bytes,
     sample_dtype,
 )
-from drivers.stream.sample import CellEvent, SlowReading
+from drivers.messages import CellEvent, SlowReading
 
 MAGIC = b"\x89MCAP0\r\n"
 UNFINISHED = ".part"  #: Suffix of a log that is being written, or whose recorder has died

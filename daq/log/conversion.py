@@ -19,7 +19,7 @@ from daq.errors import CurrentSaturated, LogIncomplete, LogsDiffer, PositionImpl
 from daq.log.impossible import motion_fault
 from daq.log.metadata import Readback, reports_only_losses
 from daq.log.reader import Log, LossyLogs, SampleChecks, read_log
-from drivers.stream.sample import CellEvent, EventKind, Quantity
+from drivers.messages import CellEvent, EventKind, Quantity
 from ident.arrays import BoolArray, FloatArray
 from ident.data.run import Recording, Run
 from ident.data.torque_channel import TorqueChannel

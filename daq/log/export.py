@@ -23,7 +23,7 @@ from daq.errors import ConfigurationMissing, OutputFailed, UsageError
 from daq.log.conversion import moves, scaling, unwrapped
 from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import LogReader, SampleBlock
-from drivers.stream.sample import CellEvent, Quantity, SlowReading
+from drivers.messages import CellEvent, Quantity, SlowReading
 
 Columns = dict[str, NDArray[Any]]  #: Columns of equal length by name, in order
 Write = Callable[[Columns], None]

@@ -43,7 +43,7 @@ from daq.log.plausibility import (
 from daq.log.resampling import Clock, clock_of, on_clock
 from daq.log.table import Table
 from daq.log.writer import NOTHING_KEPT, LogContent, LogWriter
-from drivers.stream.sample import Quantity, Sample, SlowReading
+from drivers.messages import Quantity, Sample, SlowReading
 from ident.arrays import FloatArray, IntArray
 from ident.model.bodies import Payload
 

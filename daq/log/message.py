@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drivers.stream.sample import CellEvent, EventKind, Quantity, Sample, SlowReading
+from drivers.messages import CellEvent, EventKind, Quantity, Sample, SlowReading
 
 SAMPLES_TOPIC, EVENTS_TOPIC, JOINTS_TOPIC = "/cell/samples", "/cell/events", "/joint_states"
 SAMPLES_SCHEMA, EVENTS_SCHEMA = "drivegain_msgs/msg/AxisSamples", "drivegain_msgs/msg/CellEvent"

@@ -17,7 +17,7 @@ from daq.log.conversion import answers, continuous_counts, scaling
 from daq.log.impossible import LARGEST_OUTLIER, SPEED_MARGIN, motion_fault
 from daq.log.metadata import Readback, RunStatistics
 from daq.log.reader import LogHead, SampleBlock, SampleChecks, joined
-from drivers.stream.sample import Sample
+from drivers.messages import Sample
 
 
 def motion_reason(

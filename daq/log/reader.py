@@ -30,7 +30,7 @@ from daq.log.metadata import (
     statistics_from_record,
     unsealed,
 )
-from drivers.stream.sample import CellEvent, SlowReading
+from drivers.messages import CellEvent, SlowReading
 
 BLOCK_SAMPLES = 4096  #: Samples of a block; at most these and one chunk are in memory
 LARGEST_ENTRIES = 1000  #: Attachments and metadata of a log; those of the shipped cells are a dozen

@@ -19,7 +19,7 @@ from daq.log.metadata import RunStatistics
 from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import LogReader, SampleBlock
 from daq.log.writer import NOTHING_KEPT, LogContent, LogWriter
-from drivers.stream.sample import EventKind, Sample
+from drivers.messages import EventKind, Sample
 
 _HARMLESS = (
     EventKind.EMCY_RESET,

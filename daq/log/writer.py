@@ -48,7 +48,7 @@ from daq.log.metadata import (
     sealed,
     statistics_record,
 )
-from drivers.stream.sample import CellEvent, Quantity, Sample, SlowReading
+from drivers.messages import CellEvent, Quantity, Sample, SlowReading
 
 FLUSH_NS = 150_000_000
 """Time between two flushes, recorded or wall time, whichever ends first [ns]. A kill may cost 200 ms: the rest is

@@ -16,7 +16,6 @@ from daq.config.cell import Cell
 from daq.config.policy import ApplyPolicy
 from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationRefused, DaqError
-from daq.ledger.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, judge, noise_note, query_history
 from daq.report.effect_names import accepted_text, size_text
 from daq.report.fit import error_document
 from daq.report.gains import encoder_text, mass_texts
@@ -25,6 +24,7 @@ from daq.report.text import picked
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.gates.gate import Gate, GateContext, Refusal
 from daq.writeback.gates.table import check_gates
+from daq.writeback.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, judge, noise_note, query_history
 from daq.writeback.request import Edit, GainChange, Request
 from daq.writeback.target import Proposal, propose
 from ident.calibration import Calibration

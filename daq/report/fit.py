@@ -9,6 +9,7 @@ import numpy as np
 from rich.console import RenderableType
 from rich.table import Table
 
+from daq.documents.calibration_file import as_document
 from daq.report import paper_tables
 from daq.report.effect_names import size_text
 from daq.report.gains import (
@@ -21,7 +22,6 @@ from daq.report.gains import (
     torque_table,
 )
 from daq.report.text import Sentence, percent_text, picked, plain_table
-from daq.workflow.calibration_file import as_document
 from daq.workflow.cases import CASES, CaseFit
 from daq.workflow.description import hidden_zeros_text
 from daq.workflow.fit import DOUBTFUL_PERCENT, Fit

@@ -10,7 +10,7 @@ from typing import Literal
 from pydantic import Field
 
 from daq.config.yaml_file import StrictModel
-from daq.workflow.calibration_file import CalibrationBody
+from daq.documents.calibration_file import CalibrationBody
 from ident.calibration import PayloadMass
 from ident.errors import Diagnosis
 

@@ -14,6 +14,8 @@ from rich.table import Table
 
 from daq.config.cell import Cell
 from daq.errors import ControllerUnfit
+from daq.formats.document import decode, read_bytes
+from daq.formats.scalar import Scalar, rewrite_gain
 from daq.ledger.audit import AuditEntry
 from daq.ledger.entry import Entry, Event, WriteAction, drives_of
 from daq.ledger.ledger import Verification
@@ -23,8 +25,6 @@ from daq.report.gains import with_deviation
 from daq.report.picture import BLUE, GREY, ORANGE, PURPLE, SKY, legend_below, panels, render, unformatted
 from daq.report.text import SHOWN_SIGMAS, inert_row, picked, plain_table, printable
 from daq.writeback.file_access import resolve_links
-from daq.writeback.formats.document import decode, read_bytes
-from daq.writeback.formats.scalar import Scalar, rewrite_gain
 from ident.drift.change import CHART
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import LogReader
 from daq.report.bus import current_signals
 from daq.report.text import entry_lines, picked, printable
-from drivers.stream.sample import EventKind
+from drivers.messages import EventKind
 
 _ROUTINE = {EventKind.MOVE_START, EventKind.MOVE_END, EventKind.NMT, EventKind.STATE}
 """Events of every run; all others are shown."""

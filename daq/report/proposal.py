@@ -11,12 +11,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from daq.ledger.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, judge, noise_note
 from daq.report.gains import with_deviation
 from daq.report.text import picked, plain_table, terminal_lines, terminal_text
 from daq.writeback.drive_target import DriveEdit
 from daq.writeback.file_target import FileEdit
 from daq.writeback.gates.gate import Refusal
+from daq.writeback.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, judge, noise_note
 from daq.writeback.request import Edit, GainChange
 from daq.writeback.target import E, Proposal, Written
 

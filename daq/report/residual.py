@@ -12,12 +12,12 @@ from typing import Any
 from rich.console import RenderableType
 from rich.table import Table
 
+from daq.documents.calibration_file import as_document
 from daq.report.effect_names import effect_text, size_text, variable_text
 from daq.report.fit import coefficients, error_document, error_table, identifiability_notes
 from daq.report.gains import diagnosis_texts, gain_table, partial_note
 from daq.report.split_names import names_by_split
 from daq.report.text import Sentence, picked, plain_table
-from daq.workflow.calibration_file import as_document
 from daq.workflow.fit import Fit
 from ident.calibration import AcceptedEffect, Calibration
 from ident.discovery.before_after import Account, BeforeAfter, Errors

@@ -13,7 +13,8 @@ from typing import Any, Literal
 from pydantic import Field
 
 from daq.config.yaml_file import StrictModel
-from daq.jobs.session import SessionState
+from daq.documents.calibration_file import EffectEntry
+from daq.documents.session_state import SessionState
 from daq.report.bus_schemas import ErrorCodeReport, MonitorReport
 from daq.report.controller_schemas import (
     CertificateReport,
@@ -35,7 +36,6 @@ from daq.report.fit_schemas import (
     ValidateReport,
     WeighReport,
 )
-from daq.workflow.calibration_file import EffectEntry
 
 
 class ErrorReport(StrictModel):

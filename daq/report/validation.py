@@ -19,7 +19,8 @@ from daq.report.plots import plot_torques
 from daq.report.svg import sheet
 from daq.report.text import Sentence, percent_text, picked, plain_table, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
-from daq.workflow.validate import CrossValidation, DataUse, Validation, WeighedRun, conditioning_of, together
+from daq.workflow.validate import CrossValidation, WeighedRun, conditioning_of, together
+from daq.workflow.validation import DataUse, Validation
 from ident.calibration import Calibration
 
 

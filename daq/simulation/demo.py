@@ -16,6 +16,7 @@ from typing import Any
 from daq.config.bus import bus_address
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
+from daq.documents.calibration_file import as_document, save_calibration
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
 from daq.files import replace_file
@@ -25,7 +26,6 @@ from daq.report.plots import draw_fit
 from daq.report.residual_page import save_report
 from daq.report.text import picked
 from daq.simulation.simulation_file import load_simulation, require_simulator
-from daq.workflow.calibration_file import as_document, save_calibration
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.plan import Plan, plan
 from daq.workflow.plan_file import save_plan

@@ -19,8 +19,9 @@ from ident.calibration import Calibration, Parameter, Source, factor_of
 from ident.equations.reduction import Reduction, reduce_runs
 from ident.equations.system import require_distinct
 from ident.estimators.comparison import Essential, essential
+from ident.estimators.estimate import Identification
 from ident.estimators.geometry import GeometryFinding
-from ident.estimators.identify import Identification, each_run, estimate_with
+from ident.estimators.identify import each_run, estimate_with
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, Payload

@@ -14,8 +14,8 @@ from daq.errors import ConfigurationInconsistent, UsageError
 from ident.discovery.evidence import Evidence, gather, with_effects, without_effects
 from ident.discovery.loop import Step, with_declared
 from ident.effects.effect import PlacedEffect
-from ident.estimators.estimate import Estimate
-from ident.estimators.identify import Identification, estimate_with
+from ident.estimators.estimate import Estimate, Identification
+from ident.estimators.identify import estimate_with
 from ident.estimators.method import Method
 from ident.estimators.refusals import require_plausible
 

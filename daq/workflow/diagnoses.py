@@ -35,6 +35,7 @@ import numpy as np
 from daq.config.cell import Cell, model_of, robot_of
 from daq.workflow.description import drift_diagnosis
 from daq.workflow.geometry import geometry_diagnoses
+from daq.workflow.validation import Validation
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import Calibration
 from ident.data.dataset import differentiate
@@ -56,7 +57,7 @@ from ident.estimators.diagnosis import (
     scale_diagnoses,
     unsigned_channels,
 )
-from ident.estimators.identify import Identification
+from ident.estimators.estimate import Identification
 from ident.estimators.payload_diagnosis import payload_diagnoses
 from ident.estimators.refusals import idle_joints
 from ident.estimators.turned_geometry import GEOMETRY, find_turned_geometry, is_confirmed
@@ -68,7 +69,6 @@ from ident.model.urdf import read_urdf
 from ident.prediction import as_calibrated, mounted_parameters, standard_parameters
 
 if TYPE_CHECKING:  # which asks for these diagnoses
-    from daq.workflow.validate import Validation
     from ident.estimators.geometry import GeometryFinding
 
 ReadLog = Callable[[Path], tuple[Run, Cell]]  #: Reads a log, and the description of its cell

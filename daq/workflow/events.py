@@ -6,7 +6,7 @@ import re
 from typing import Any
 
 from drivers.canopen.emcy import remedy_of
-from drivers.stream.sample import EventKind
+from drivers.messages import EventKind
 
 REMEDIES = {
     EventKind.HEARTBEAT_LOST: "check the drive's power and its cable; `drivegain scan` shows which nodes answer",

@@ -11,7 +11,7 @@ import numpy as np
 from daq.config.cell import Cell, WeighedPayload, model_of
 from daq.config.clearance import DEFAULT_MINIMUM_M, Clearance
 from daq.errors import ConfigurationInconsistent
-from drivers.motion.move import Trapezoid, synchronised
+from drivers.move import Trapezoid, synchronised
 from ident.arrays import BoolArray, FloatArray
 from ident.data.conditioning import decimator
 from ident.model.robot import JointKind, Motion, Robot, poses

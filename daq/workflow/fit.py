@@ -45,9 +45,9 @@ from ident.discovery.loop import Step, find_effects
 from ident.effects.friction import TemperatureFriction
 from ident.errors import Diagnosis, IdentificationError, PayloadUnseen
 from ident.estimators.comparison import Comparison, compare
-from ident.estimators.estimate import Estimate, RelativeError, of_squares
+from ident.estimators.estimate import Estimate, Identification, RelativeError, of_squares
 from ident.estimators.geometry import GeometryFinding, Positions, estimate_geometry, thinned
-from ident.estimators.identify import Identification, estimate_with, identify
+from ident.estimators.identify import estimate_with, identify
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
 from ident.estimators.turned_geometry import GEOMETRY

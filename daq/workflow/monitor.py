@@ -21,18 +21,18 @@ from daq.config.bus import bus_loads_percent
 from daq.config.cell import Cell, PacingMode
 from daq.errors import LogIncomplete
 from daq.log.conversion import SiScaling, scaling
+from daq.log.feed import Feed, RunFacts, facts_of_recorder
 from daq.log.metadata import AxisReadback, Readback, RunStatistics
 from daq.workflow.bus_lock import bus_taken
 from daq.workflow.events import ALARMING
-from daq.workflow.feed import Feed, RunFacts, facts_of_recorder
 from daq.workflow.prediction import Predictor, Recent, predictor_of
 from drivers.canopen.emcy import ErrorCode, explain, read_error_code
 from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.scale import read_scale
 from drivers.errors import DriverError
+from drivers.messages import CellEvent, EventKind, Sample
 from drivers.profiles.cia402 import FAULTY, decode
-from drivers.profiles.scale import read_scale
 from drivers.stream.monitor import READING_S, AxisReading, CellMonitor, CellReading, ReadingSource
-from drivers.stream.sample import CellEvent, EventKind, Sample
 from ident.calibration import Calibration
 from ident.errors import IdentificationError
 

@@ -12,9 +12,9 @@ from daq.config.cell import Axis, Cell
 from daq.config.yaml_file import Fault, describe, parse_yaml
 from daq.config.yaml_file import read_bytes as read_configuration
 from daq.errors import ConfigurationInconsistent, ControllerUnfit
-from daq.writeback.formats.document import decode, read_bytes
+from daq.formats.document import decode, read_bytes
+from drivers.canopen.scale import ScaleReading, check_name_plate
 from drivers.profiles.profile import TapPoint
-from drivers.profiles.scale import ScaleReading, check_name_plate
 from ident.model.model import DriveTrain
 from ident.plausible import NAMEPLATE_RATIO
 

@@ -27,7 +27,7 @@ from daq.workflow.experiment import (
     path_of,
     towards,
 )
-from drivers.motion.move import Trapezoid
+from drivers.move import Trapezoid
 from ident.arrays import FloatArray
 from ident.planning.verdict import verdicts
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from daq.config.cell import Cell
 from daq.errors import DaqError
-from daq.workflow.feed import RunFacts
+from daq.log.feed import RunFacts
 from daq.workflow.remaining_corrections import on_cell
 from daq.workflow.validate import check_cell, conditioning_of, unpredictable, warn_without_temperature
 from ident.arrays import FloatArray, IntArray

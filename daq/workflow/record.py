@@ -20,12 +20,13 @@ from daq.config.drive import shipped_profiles
 from daq.environment import software
 from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
 from daq.files import sha256
+from daq.formats.document import read_bytes
 from daq.log.conversion import SiScaling, scaling
+from daq.log.feed import Feed, RunFacts
 from daq.log.metadata import Loss, RunInfo, RunStatistics, loss_reason, readback_of_drives
 from daq.log.motion import RecordedMotion
 from daq.log.writer import LogContent, LogWriter
 from daq.workflow.experiment import path_of
-from daq.workflow.feed import Feed, RunFacts
 from daq.workflow.interlock import release_check
 from daq.workflow.nameplates import check_nameplates, nameplate_warnings
 from daq.workflow.plan import Plan
@@ -39,15 +40,14 @@ from daq.workflow.safeguards import (
     free_bytes,
     largest_log_bytes,
 )
-from daq.writeback.formats.document import read_bytes
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.network import CanopenNetwork, SignalBlocker
 from drivers.errors import BusError, MotionRefused
+from drivers.messages import CellEvent, EventKind, Sample
 from drivers.motion.execute import execute
-from drivers.motion.move import AxisLimits, MotionPermission, Move, check_moves, synchronised_move
+from drivers.move import AxisLimits, MotionPermission, Move, check_moves, synchronised_move
 from drivers.stream.answers import StreamStatistics
 from drivers.stream.polling import Polling
-from drivers.stream.sample import CellEvent, EventKind, Sample
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import (
     DriveProducer,

@@ -19,7 +19,7 @@ from daq.workflow.plan_file import check_way
 from drivers.canopen.network import CanopenNetwork
 from drivers.errors import MotionRefused
 from drivers.motion.execute import execute
-from drivers.motion.move import AxisLimits, MotionPermission, Move, synchronised_move
+from drivers.move import AxisLimits, MotionPermission, Move, synchronised_move
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import Pacing
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from daq.config.cell import Cell
 from daq.errors import ConfigurationMissing, ControllerUnfit, SchemaMismatch
-from daq.writeback.formats.xml_document import Element, parse
+from daq.formats.xml_document import Element, parse
 from ident.arrays import FloatArray
 from ident.calibration import Calibration
 from ident.effects.effect import Property

@@ -9,7 +9,6 @@ import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,8 @@ from daq.log.conversion import load_run
 from daq.workflow.corrections import Corrections
 from daq.workflow.diagnoses import diagnose_run, not_repeated
 from daq.workflow.remaining_corrections import CORRECTIONS, on_cell
-from ident.arrays import BoolArray, FloatArray
+from daq.workflow.validation import DataUse, Validation
+from ident.arrays import FloatArray
 from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
@@ -47,45 +47,6 @@ from ident.prediction import (
 from ident.weighing import RowsToWeigh, rows_to_weigh, weigh_rows
 
 _LOG = logging.getLogger("drivegain")
-
-
-class DataUse(Enum):
-    """Whether a calibration has met a log, by the log's digest."""
-
-    FIT = "seen by the fit"
-    HOLDOUT = "held out"
-    NEW = "not seen"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Validation:
-    """One run under a calibration; arrays are joint-first, decimated rows last."""
-
-    log: Path  #: where the run was read
-    run: str  #: its name
-    digest: str  #: of the log (sha256, hex)
-    data_use: DataUse  #: whether the fit has seen it
-    same_configuration: bool  #: the log carries the cell configuration that the calibration was made with
-    partial: bool  #: the log was salvaged from a recording that never finished
-    time_s: FloatArray  #: of each row, since the start of the run, shape (r,)
-    measured_nm: FloatArray  #: V g with the calibration's gains, shape (n, r)
-    predicted_nm: FloatArray  #: what the calibration says the joints need, shape (n, r)
-    use: BoolArray  #: rows of each joint that count, shape (n, r)
-
-    @property
-    def error(self) -> RelativeError:
-        """‖ρ‖/‖Y‖ of each axis and in total [%]."""
-        return relative_error(self.measured_nm, self.predicted_nm, self.use)
-
-    @property
-    def is_judged(self) -> bool:
-        """Whether the fit has used the run and judged it, all of its runs together."""
-        return self.data_use is DataUse.FIT and self.same_configuration
-
-    @property
-    def rows(self) -> int:
-        """Equations that count, of all joints."""
-        return int(np.count_nonzero(self.use))
 
 
 def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None = None) -> tuple[Validation, ...]:

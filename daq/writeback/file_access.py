@@ -18,7 +18,7 @@ from pathlib import Path
 
 from daq.errors import CalibrationRefused, ControllerUnfit, OutputFailed
 from daq.files import follow_links, hold_lock, open_folder, replace_file
-from daq.writeback.formats.document import read_bytes
+from daq.formats.document import read_bytes
 from daq.writeback.request import short_digest
 
 

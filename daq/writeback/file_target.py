@@ -20,9 +20,9 @@ from daq.config.cell import Cell
 from daq.config.controller import ControllerFormat
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
 from daq.files import fsync_folder, replace_file, sha256
+from daq.formats.document import decode, read_bytes
+from daq.formats.scalar import ControllerDocument, rewrite_gain
 from daq.writeback.file_access import back_up, backups, exclusive_writer, require_existing, resolve_links
-from daq.writeback.formats.document import decode, read_bytes
-from daq.writeback.formats.scalar import ControllerDocument, rewrite_gain
 from daq.writeback.request import Edit, GainChange, GateFinding, is_writable, require_axes, short_digest
 from daq.writeback.target import Written
 from ident.calibration import Calibration

@@ -14,9 +14,9 @@ from datetime import datetime
 from pathlib import Path
 
 from daq.config.policy import ApplyPolicy
+from daq.documents.calibration_file import encode
 from daq.errors import CalibrationRefused, UsageError
 from daq.files import sha256
-from daq.workflow.calibration_file import encode
 from ident.calibration import Calibration, Gain
 
 _DIGITS = 12

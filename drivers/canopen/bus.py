@@ -1,6 +1,6 @@
 """Open a CAN bus by its address, with one kind of error for everything that can go wrong.
 
-A bus between processes of one machine is a socketcand hub (drivers/canopen/hub.py). Its client here notices when the
+A bus between processes of one machine is a socketcand hub (drivers/simulation/hub.py). Its client here notices when the
 server is gone, and handles frames in bursts. Protocol: github.com/linux-can/socketcand, doc/protocol.md (raw mode).
 Frames to the bus are ``< send ID DLC B0 B1 ... >``, frames from the bus ``< frame ID SECONDS HEX >``; an identifier of
 three hexadecimal digits is a base one, of eight an extended one. There are neither remote frames nor CAN FD.

@@ -21,7 +21,7 @@ from drivers.canopen.sdo import SDO_ANSWER, SDO_REQUEST, Clock, ObjectAccess, Sd
 from drivers.canopen.socketcan import CapturedMessage, receive_only
 from drivers.canopen.split_bus import BUS_OFF, BUS_OFF_REASON, CellAddress, open_cell_bus
 from drivers.errors import BusBusy, BusError, StateRefused, node_label
-from drivers.stream.sample import CellEvent, EventKind
+from drivers.messages import CellEvent, EventKind
 
 SYNC_COB_ID = 0x080
 NMT_COB_ID = 0x000

@@ -16,6 +16,7 @@ from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import HEARTBEAT, LISTEN_S, LSS, Link, NmtCommand, NmtState, command_name, never
 from drivers.canopen.needs import Profiles
 from drivers.canopen.pdo import CONTROLWORD, HEARTBEAT_MS, STATUSWORD, AxisPdos, wanted_pdos
+from drivers.canopen.scale import ScaleReading, read_scale
 from drivers.canopen.scan import FoundNode, answering, free_ids, read_identity, scan_link
 from drivers.canopen.sdo import SDO_REQUEST, Clock, SdoPolicy
 from drivers.canopen.setup import AxisSetup, Guard, producer_of, read_consumers
@@ -32,10 +33,9 @@ from drivers.errors import (
     StateRefused,
     node_label,
 )
+from drivers.messages import Sample
 from drivers.profiles.cia402 import FAULT_RESET_SEQUENCE, POWERLESS, Goal, State, decode, next_command
 from drivers.profiles.profile import Axis, Identity
-from drivers.profiles.scale import ScaleReading, read_scale
-from drivers.stream.sample import Sample
 
 ASKED_AT_ONCE = 8  #: Candidates for the recorder's node id that are tried together
 LOWEST_USUAL_ID = 112  #: The recorder takes the highest free id: this one or a higher one on any usual bus
@@ -419,7 +419,7 @@ class CanopenNetwork:
         """Return the current scale and motor name plate in each drive, read once.
 
         Raises:
-            ObjectAccessError, SetupRefused: as `drivers.profiles.scale.read_scale`.
+            ObjectAccessError, SetupRefused: as `drivers.canopen.scale.read_scale`.
         """
         if not self._scales:
             self._scales = tuple(read_scale(self.link.objects(axis.node_id), axis.profile) for axis in self.axes)

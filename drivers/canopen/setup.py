@@ -35,10 +35,10 @@ from drivers.canopen.pdo import (
     wanted_pdos,
     write_record,
 )
+from drivers.canopen.scale import ScaleReading
 from drivers.canopen.sdo import ObjectAccess
 from drivers.errors import DriverError, ObjectAccessError, SetupRefused, StateRefused
 from drivers.profiles.profile import Axis, Identity, ObjectEntry
-from drivers.profiles.scale import ScaleReading
 
 PROFILE_POSITION_MODE = 1
 CONSUMERS = ObjectEntry(0x1016, 0, 8, signed=False)

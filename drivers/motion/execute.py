@@ -29,8 +29,8 @@ from drivers.errors import (
     node_label,
     text_of,
 )
-from drivers.motion.move import MotionPermission, Move, check_moves
-from drivers.motion.watch import FrozenData
+from drivers.messages import CellEvent, EventKind, Sample
+from drivers.move import MotionPermission, Move, check_moves
 from drivers.profiles.cia402 import (
     CONTROL_CHANGE_IMMEDIATELY,
     CONTROL_NEW_SETPOINT,
@@ -44,9 +44,9 @@ from drivers.profiles.cia402 import (
     next_command,
 )
 from drivers.profiles.profile import ObjectEntry
-from drivers.stream.sample import CellEvent, EventKind, Sample
 from drivers.stream.stream import LARGEST_LAG_NS, MAX_MISSING_CYCLES, SyncStream, nothing_to_send
 from drivers.stream.sync import LockstepSync
+from drivers.stream.watch import FrozenData
 
 _NEW_SETPOINT = Command.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
 

@@ -157,7 +157,7 @@ class DriveProfile:
     rated: RatedMotor | None = None  #: the motor's name plate in the drive, None where it has none
     save: Save | None = None  #: command that saves, None where there is none or it is unknown
     #: Bit of statusword 6041h that the drive inverts whenever it refreshes its PDO, None when it has none: then frozen
-    #: data show as values that do not change in a move (drivers/motion/watch.py).
+    #: data show as values that do not change in a move (drivers/stream/watch.py).
     toggle_bit: int | None = None
     #: Torque actual value [per mille of the rated torque], None where the drive has none. It is compared with the
     #: identified gain, and no fit uses it.

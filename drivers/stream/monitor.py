@@ -19,9 +19,9 @@ from drivers.canopen.link import EMCY, HEARTBEAT, SYNC_COB_ID, Link
 from drivers.canopen.pdo import feedback_entries
 from drivers.canopen.sdo import SDO_ANSWER, SDO_REQUEST, upload_answer, upload_request
 from drivers.canopen.split_bus import SplitAddress
+from drivers.messages import CellEvent, Sample
 from drivers.profiles.profile import Axis, ObjectEntry
 from drivers.stream.answers import slots_of
-from drivers.stream.sample import CellEvent, Sample
 
 QUIET_S = 2.0  #: Silence of other masters after which the axes are read by SDO
 ANSWER_S = 0.3  #: Time allowed for an answer; CiA 301 sets no limit, and drives answer within milliseconds

@@ -15,11 +15,11 @@ from contextlib import suppress
 import can
 
 from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.scale import ScaleReading
 from drivers.canopen.sdo import NO_SUCH_OBJECT, UploadAnswer, upload_answer, upload_request
 from drivers.errors import BusError, ObjectAccessError
+from drivers.messages import CellEvent, EventKind, Quantity, SlowReading
 from drivers.profiles.profile import Axis, ObjectEntry
-from drivers.profiles.scale import ScaleReading
-from drivers.stream.sample import CellEvent, EventKind, Quantity, SlowReading
 from drivers.stream.stream import SyncStream
 
 PERIOD_NS = {Quantity.TORQUE: 200_000_000, Quantity.TEMPERATURE: 1_000_000_000}

@@ -19,10 +19,10 @@ from drivers.canopen.link import SYNC_COB_ID
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.socketcan import CapturedMessage, Losses, lags_behind, losses_of, read_until_ns, remarks_of
 from drivers.errors import BusError, DriveFault, NodeMisplaced, SampleLost, node_label
-from drivers.motion.watch import Watch
+from drivers.messages import CellEvent, EventKind, EventSink, Sample
 from drivers.stream.answers import Answers, Slot, StreamStatistics
-from drivers.stream.sample import CellEvent, EventKind, EventSink, Sample
 from drivers.stream.sync import FollowedSync, LockstepSync, Pacing, SyncRate, TimedSync
+from drivers.stream.watch import Watch
 
 SHORTENED, STRAGGLING = 16, 4
 """Divisors of a lockstep time-out: if no axis answered the last SYNC, and once another axis has answered this one."""

@@ -23,8 +23,8 @@ from ident.effects.signals import Signals, fitted_signals, session_began_s
 from ident.equations.reduction import reduce_runs
 from ident.equations.rows import Observation, RunRows, observe, on_demanded_motion, rows_of
 from ident.equations.system import System
-from ident.estimators.estimate import Estimate, RelativeError
-from ident.estimators.identify import Identification, estimate_with
+from ident.estimators.estimate import Estimate, Identification, RelativeError
+from ident.estimators.identify import estimate_with
 from ident.estimators.method import Method
 from ident.model.model import Model
 

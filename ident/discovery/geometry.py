@@ -15,9 +15,9 @@ from ident.arrays import FloatArray
 from ident.discovery.evidence import Evidence, with_covariance
 from ident.equations.rows import observe
 from ident.errors import IdentificationError
-from ident.estimators.estimate import Estimate
+from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.geometry import GeometryFinding
-from ident.estimators.identify import Identification, estimate_with
+from ident.estimators.identify import estimate_with
 from ident.model.geometry import GeometryChange
 from ident.model.geometry_derivatives import corrected_model
 from ident.model.model import Model

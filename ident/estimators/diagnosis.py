@@ -44,7 +44,7 @@ from ident.model.model import Model
 from ident.plausible import CURRENT_RANGE, GAIN_RANGE, TORQUE_RATIO, WEIGHT_RATIO, range_text
 
 if TYPE_CHECKING:  # which refuses a fit by the same checks
-    from ident.estimators.identify import Identification
+    from ident.estimators.estimate import Identification
 
 LARGEST_AXIS_ERROR_PERCENT = 20.0  #: Clean recordings stay below 15, with every effect undeclared below 40
 LARGEST_CONDITION = 1e6

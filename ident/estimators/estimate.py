@@ -10,10 +10,13 @@ import numpy as np
 from ident.arrays import BoolArray, FloatArray
 
 if TYPE_CHECKING:  # a calibration has relative errors, and reading one needs no LAPACK
+    from ident.data.conditioning import Conditioning
+    from ident.data.dataset import Dataset
+    from ident.equations.instants import Instants
     from ident.equations.rows import Observation
     from ident.equations.system import System
     from ident.estimators.method import Method
-    from ident.model.model import Column
+    from ident.model.model import Column, Model
 
 SAME_ERROR = 0.01
 """Share of an error by which another one may be larger and still be the same: 5.76 % and 5.76 % differ by chance."""
@@ -91,3 +94,41 @@ class Estimate:
         rest = np.zeros(len(self.parameters))
         left = system.joints.square_sum(np.concatenate((self.gains, self.parameters, [1.0])))
         return of_squares(system.joints.square_sum(np.concatenate((self.gains, rest, [0.0]))), left)
+
+
+@dataclass(frozen=True, slots=True)
+class Identification:
+    """An estimate with the equations it rests on, and those that it has not seen."""
+
+    model: Model  #: the declared model
+    conditioning: Conditioning  #: the filters
+    system: System  #: of the fit
+    holdout: System | None  #: of the runs that were held out, with the unknowns of the fit; None without any
+    estimate: Estimate  #: from ``system`` alone
+    #: All runs, held-out runs last, and their rows; none unless they were asked for.
+    gathered: tuple[tuple[Dataset, ...], Observation] | None = None
+    instants: tuple[Instants, ...] = ()  #: a few rows of each run of the fit, for `ident.estimators.turned_geometry`
+
+    @property
+    def training_error(self) -> RelativeError:
+        """Relative error on the rows of the fit [%]."""
+        return self.estimate.relative_error(self.system)
+
+    @property
+    def holdout_error(self) -> RelativeError | None:
+        """Relative error on held-out rows [%]; None without any."""
+        return None if self.holdout is None else self.estimate.relative_error(self.holdout)
+
+    @property
+    def current_residual(self) -> tuple[float, ...] | None:
+        """Root mean square of what is left of each motor's current, as `Calibration.current_residual`.
+
+        None where a motor has no rows.
+        """
+        left = np.full(len(self.estimate.gains), np.nan)
+        for system in (self.system, self.holdout):
+            if system is not None:
+                seen = system.motors.rows > 0
+                size = system.currents.noise(self.estimate.gains, self.estimate.parameters)
+                left[seen] = size[seen]
+        return tuple(float(f"{one:.6g}") for one in left) if np.isfinite(left).all() else None

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from ident.arrays import FloatArray, as_array, require_kind
 from ident.data.conditioning import Conditioning
-from ident.data.dataset import Dataset
 from ident.data.run import Run
-from ident.equations.instants import Instants
 from ident.equations.reduction import reduce_runs
-from ident.equations.rows import Observation, observe
+from ident.equations.rows import observe
 from ident.equations.system import System, require_distinct
 from ident.errors import DataUnfit, IdentificationError, ModelError
 from ident.estimators.diagnosis import require_explained_currents
-from ident.estimators.estimate import Estimate, RelativeError
+from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.least_squares import ls, tls, wls
 from ident.estimators.maximum_likelihood import iv, ml
 from ident.estimators.method import Method
@@ -32,44 +30,6 @@ from ident.estimators.refusals import (
 )
 from ident.model.bodies import Payload
 from ident.model.model import Model
-
-
-@dataclass(frozen=True, slots=True)
-class Identification:
-    """An estimate with the equations it rests on, and those that it has not seen."""
-
-    model: Model  #: the declared model
-    conditioning: Conditioning  #: the filters
-    system: System  #: of the fit
-    holdout: System | None  #: of the runs that were held out, with the unknowns of the fit; None without any
-    estimate: Estimate  #: from ``system`` alone
-    #: All runs, held-out runs last, and their rows; none unless they were asked for.
-    gathered: tuple[tuple[Dataset, ...], Observation] | None = None
-    instants: tuple[Instants, ...] = ()  #: a few rows of each run of the fit, for `ident.estimators.turned_geometry`
-
-    @property
-    def training_error(self) -> RelativeError:
-        """Relative error on the rows of the fit [%]."""
-        return self.estimate.relative_error(self.system)
-
-    @property
-    def holdout_error(self) -> RelativeError | None:
-        """Relative error on held-out rows [%]; None without any."""
-        return None if self.holdout is None else self.estimate.relative_error(self.holdout)
-
-    @property
-    def current_residual(self) -> tuple[float, ...] | None:
-        """Root mean square of what is left of each motor's current, as `Calibration.current_residual`.
-
-        None where a motor has no rows.
-        """
-        left = np.full(len(self.estimate.gains), np.nan)
-        for system in (self.system, self.holdout):
-            if system is not None:
-                seen = system.motors.rows > 0
-                size = system.currents.noise(self.estimate.gains, self.estimate.parameters)
-                left[seen] = size[seen]
-        return tuple(float(f"{one:.6g}") for one in left) if np.isfinite(left).all() else None
 
 
 def identify(

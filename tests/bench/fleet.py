@@ -21,7 +21,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from daq.workflow.calibration_file import as_document, load_calibration
+from daq.documents.calibration_file import as_document, load_calibration
 from daq.workflow.fit import calibration_of, fit
 from tests.bench.fleet_cells import CELLS, FleetCell, make_fleet, print_line
 

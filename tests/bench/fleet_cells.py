@@ -22,8 +22,8 @@ from daq.log.conversion import scaling
 from daq.log.metadata import AxisReadback, Readback, RunInfo
 from daq.log.writer import LogContent, LogWriter
 from daq.workflow.plan import Plan, plan
+from drivers.messages import CellEvent, EventKind, Sample
 from drivers.simulation.spec import Body
-from drivers.stream.sample import CellEvent, EventKind, Sample
 from ident.model.bodies import Payload
 from tests.studies.direct_cell import RawRun, simulate_run
 from tests.studies.side_by_side import side_by_side

@@ -28,7 +28,7 @@ from mcap_ros2.decoder import DecoderFactory
 from daq.log.message import SAMPLES_TOPIC, sample_struct
 from daq.log.reader import LogReader, read_log
 from daq.log.writer import LogWriter
-from drivers.stream.sample import Sample
+from drivers.messages import Sample
 from tests.daq.logs import START_NS, content, joints
 
 AXES, RATE_HZ = 6, 1000

@@ -34,9 +34,9 @@ import numpy as np
 
 from daq.config.cell_file import load_cell
 from daq.log.conversion import scaling
+from daq.log.feed import Feed
 from daq.log.motion import RecordedMotion
 from daq.log.writer import LogWriter
-from daq.workflow.feed import Feed
 from daq.workflow.record import SPACE_CHECK_S, Kept, _facts
 from daq.workflow.safeguards import DiskRoom, free_bytes
 from drivers.canopen.bus import BusAddress

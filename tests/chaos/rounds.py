@@ -23,8 +23,8 @@ from random import Random
 
 from daq.errors import ExitCode
 from daq.workflow.record import SPACE_CHECK_S
-from drivers.motion.watch import LIMIT_S
 from drivers.simulation.faults import FaultKind
+from drivers.stream.watch import LIMIT_S
 from tests.chaos.faults import MOTION_S, NODES, Act, Fault
 from tests.chaos.processes import FRAME, Objects, Verb, frame, raw
 from tests.vcan.judgement import FEEDBACK, SYNC, TPDO1, compare, read_recorded

@@ -10,7 +10,7 @@ from typing import Any
 from hypothesis import strategies as st
 
 from daq.config.cell_file import load_cell
-from daq.workflow.calibration_file import save_calibration
+from daq.documents.calibration_file import save_calibration
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
 from ident.data.run import Recording
 from ident.estimators.estimate import RelativeError

@@ -17,8 +17,8 @@ from daq.config.cell import Bus, Cell
 from daq.config.cell_file import load_cell
 from daq.config.controller import Controller, GainObject
 from daq.config.policy import HistoryPlace
+from daq.documents.calibration_file import encode
 from daq.simulation.simulation_file import load_simulation
-from daq.workflow.calibration_file import encode
 from daq.writeback.request import Request
 from drivers.canopen.bus import BusAddress, open_bus
 from drivers.canopen.network import Bounds, CanopenNetwork

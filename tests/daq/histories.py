@@ -9,8 +9,8 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
+from daq.documents.calibration_file import encode
 from daq.ledger.store import HistoryStore
-from daq.workflow.calibration_file import encode
 from ident.calibration import Calibration
 from tests.daq.calibrations import demo_calibration, recorded
 

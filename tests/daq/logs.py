@@ -10,7 +10,7 @@ from pathlib import Path
 from daq.config.cell_file import bundle, load_cell
 from daq.log.metadata import AxisReadback, Readback, RunInfo
 from daq.log.writer import LogContent, LogWriter
-from drivers.stream.sample import CellEvent, Sample
+from drivers.messages import CellEvent, Sample
 from ident.model.bodies import Payload
 
 START_NS = 1_700_000_000_123_456_789

@@ -10,7 +10,7 @@ import daq
 import drivers
 import ident
 from daq.errors import CalibrationRefused, DaqError, OutputFailed, SchemaMismatch, UsageError, exit_code
-from daq.workflow.feed import FeedUnfit
+from daq.log.feed import FeedUnfit
 from drivers.canopen.sdo import TransferUnboundedError
 from drivers.errors import DriverError, SetupRefused
 from drivers.simulation.spec import SdoAbort

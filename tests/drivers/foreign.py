@@ -21,7 +21,7 @@ from daq.environment import shipped_configurations
 from drivers.canopen.needs import Profiles
 from drivers.canopen.network import Bounds, CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
-from drivers.motion.move import Move
+from drivers.move import Move
 from drivers.profiles.profile import Axis, DriveProfile
 from tests.daq.config.data_sheet import data_sheet
 from tests.drivers.scripted import ADDRESS, FakeClock, ScriptedBus, ScriptedNode

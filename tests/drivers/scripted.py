@@ -16,7 +16,7 @@ from drivers.canopen.bus import BusAddress
 from drivers.canopen.network import Bounds, CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
 from drivers.canopen.socketcan import NO_LOSSES
-from drivers.motion.move import AxisLimits, MotionPermission
+from drivers.move import AxisLimits, MotionPermission
 from drivers.profiles.profile import Amplitude, Axis, CurrentScale, DriveProfile, Identity, ObjectEntry, TapPoint
 
 PERIOD_NS = 1_000_000

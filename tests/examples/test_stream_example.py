@@ -14,8 +14,8 @@ from daq.config.bus import drive_axes
 from daq.config.cell_file import load_cell
 from daq.simulation.simulation_file import load_simulation
 from drivers.canopen.bus import open_bus
-from drivers.canopen.hub import Hub
 from drivers.simulation.cell import SimulatedCell
+from drivers.simulation.hub import Hub
 
 SAMPLES = 50
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable
 
+from drivers.messages import EventKind
 from drivers.simulation.faults import FaultKind, FaultSpec
-from drivers.stream.sample import EventKind
 from tests.faults.cells import STRIKE, Outcome, run
 from tests.faults.test_at_start import REFUSALS
 from tests.faults.test_in_motion import GUARD_MS, STOPS, at

@@ -16,15 +16,15 @@ from drivers.canopen.bus import BusAddress, open_bus
 from drivers.canopen.network import Bounds, CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
 from drivers.errors import DriverError
+from drivers.messages import CellEvent, EventKind
 from drivers.motion.execute import execute
-from drivers.motion.move import AxisLimits, MotionPermission, synchronised_move
+from drivers.move import AxisLimits, MotionPermission, synchronised_move
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultSpec
 from drivers.simulation.node import Node
 from drivers.simulation.spec import SdoAbort, ToggleBit
 from drivers.stream.answers import StreamStatistics
-from drivers.stream.sample import CellEvent, EventKind
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync
 

@@ -11,9 +11,9 @@ from drivers.errors import (
     SetupRefused,
     StateRefused,
 )
+from drivers.messages import EventKind
 from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultKind, FaultSpec
-from drivers.stream.sample import EventKind
 from tests.faults.cells import run
 
 REFUSALS: dict[FaultKind, tuple[type[DriverError], str]] = {

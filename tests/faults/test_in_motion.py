@@ -13,10 +13,10 @@ from drivers.errors import (
     DriverError,
     SampleLost,
 )
+from drivers.messages import EventKind
 from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultKind, FaultSpec
 from drivers.simulation.spec import ToggleBit
-from drivers.stream.sample import EventKind
 from tests.faults.cells import STRIKE, Outcome, run
 
 AXIS = 2

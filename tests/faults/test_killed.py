@@ -30,15 +30,15 @@ from daq.config.bus import drive_axes
 from daq.config.cell_file import load_cell
 from daq.simulation.simulation_file import load_simulation
 from drivers.canopen.bus import BusAddress, open_bus
-from drivers.canopen.hub import HOST, Hub
 from drivers.canopen.network import CanopenNetwork
 from drivers.errors import DriverError
+from drivers.messages import Sample
 from drivers.motion.execute import execute
-from drivers.motion.move import MotionPermission, synchronised_move
+from drivers.move import MotionPermission, synchronised_move
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultKind
-from drivers.stream.sample import Sample
+from drivers.simulation.hub import HOST, Hub
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync
 from tests.faults.cells import CONFIGS, PERIOD_NS, ROOM, let_pass

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivers.stream.sample import EventKind
+from drivers.messages import EventKind
 from tests.faults.cells import STRIKE, run
 
 INCIDENTS = {

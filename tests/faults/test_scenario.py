@@ -15,16 +15,16 @@ from daq.cli.app import main
 from daq.config.bus import bus_address
 from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent, ConfigurationMissing, ExitCode, SchemaMismatch
+from daq.log.feed import LARGEST_PACKET, Feed, ProgramEnd, connected, read_packet
 from daq.log.reader import read_log
 from daq.simulation.simulation_file import load_scenario, load_simulation, shipped_simulation
-from daq.workflow.feed import LARGEST_PACKET, Feed, ProgramEnd, connected, read_packet
 from drivers.canopen.bus import open_bus
-from drivers.canopen.hub import Hub
+from drivers.messages import EventKind
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultKind, FaultSpec
+from drivers.simulation.hub import Hub
 from drivers.simulation.spec import CellSpec, SpecInvalid
-from drivers.stream.sample import EventKind
 from tests.daq.console.feeds import arrivals
 from tests.faults.cells import CONFIGS
 
@@ -91,7 +91,7 @@ def test_a_drive_that_refuses_its_mapping_ends_a_recording_with_its_error_and_co
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """An SDO abort of the library is behind that error, and cannot be compared with other errors."""
-    monkeypatch.setattr("daq.workflow.feed.Feed", WatchedFeed)
+    monkeypatch.setattr("daq.log.feed.Feed", WatchedFeed)
     spec = load_simulation(scenario(tmp_path, "  - {fault: refuses-mapping, axis: J2}\n"))
     cell_file, plan, out = CONFIGS / "cells" / "demo.yaml", tmp_path / "plan.yaml", tmp_path / "a.mcap"
     plan.write_text(PLAN, encoding="utf-8")

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from daq.config.drive import drive_from_text
 from daq.errors import SchemaMismatch
-from drivers.motion.watch import ToggleBits
 from drivers.profiles.profile import Axis
+from drivers.stream.watch import ToggleBits
 from tests.drivers.scripted import PROFILE
 from tests.faults.cells import CONFIGS
 

@@ -7,7 +7,8 @@ import pytest
 
 from ident.data.run import Run
 from ident.discovery.evidence import Evidence, gather
-from ident.estimators.identify import Identification, identify
+from ident.estimators.estimate import Identification
+from ident.estimators.identify import identify
 from tests.ident.recordings import CONDITIONING, MOUNTED, Truth, gathered, record, three_axes_truth, tx40_truth
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from daq.cli.app import main
+from daq.documents.calibration_file import load_calibration
 from daq.errors import ExitCode
-from daq.workflow.calibration_file import load_calibration
 from tests.pipeline.next_step import next_step
 
 

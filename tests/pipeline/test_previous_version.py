@@ -17,12 +17,12 @@ import pytest
 from daq.cli.app import main
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
+from daq.documents.calibration_file import load_calibration
 from daq.ledger.audit import read as read_audit
 from daq.ledger.audit import verify
 from daq.ledger.store import HistoryStore
 from daq.ledger.verify import writes_to
 from daq.log.reader import read_log
-from daq.workflow.calibration_file import load_calibration
 
 FILES = Path(__file__).parents[1] / "data" / "previous_version"
 J4 = {"wls": -9.0029, "ml": -9.6291, "tls": -9.507}

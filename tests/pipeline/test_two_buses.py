@@ -24,7 +24,7 @@ from drivers.canopen.network import Bounds, CanopenNetwork
 from drivers.canopen.split_bus import CellAddress, SplitAddress, SplitBus, open_cell_bus
 from drivers.errors import BusError
 from drivers.motion.execute import execute
-from drivers.motion.move import AxisLimits, MotionPermission, synchronised_move
+from drivers.move import AxisLimits, MotionPermission, synchronised_move
 from drivers.simulation.cell import SimulatedCell
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync

@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 
 from daq.config.cell_file import load_cell
+from daq.documents.calibration_file import load_calibration
 from daq.environment import shipped_configurations
 from daq.files import replace_file
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
-from daq.workflow.calibration_file import load_calibration
 from daq.workflow.weigh import weigh_logs
 from ident.arrays import BoolArray, FloatArray
 from tests.pipeline.cells import fit_job, make_plan, record_job, record_run

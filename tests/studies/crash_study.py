@@ -34,8 +34,8 @@ from daq.errors import ExitCode, LogUnreadable
 from daq.log.reader import Log, LogReader, SampleBlock, read_log
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from drivers.canopen.bus import BusAddress, open_bus
-from drivers.canopen.hub import Hub
 from drivers.simulation.cell import SYNC_ID, SimulatedCell
+from drivers.simulation.hub import Hub
 from tests.studies.output import print_line
 
 OUT = Path("out/crash-study.json")

@@ -27,7 +27,8 @@ from ident.equations.instants import read_instants
 from ident.errors import CurrentUnsigned, IdentificationError
 from ident.estimators import diagnosis, payload_diagnosis, turned_geometry
 from ident.estimators.diagnosis import diagnose, exchanged_channels, unsigned_channels
-from ident.estimators.identify import Identification, identify
+from ident.estimators.estimate import Identification
+from ident.estimators.identify import identify
 from ident.estimators.method import Method
 from ident.estimators.turned_geometry import find_turned_geometry, is_confirmed, with_gravity
 from tests.ident.mistaken import AXES, BODY, SMALL, small_recordings, turned, with_currents

@@ -31,13 +31,13 @@ from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.pdo import SETPOINT_PDOS, Direction, records, wanted_pdos, write_record
 from drivers.canopen.sdo import ObjectAccess
 from drivers.canopen.setup import PROFILE_POSITION_MODE
+from drivers.messages import CellEvent, Sample
 from drivers.motion.execute import execute
-from drivers.motion.move import MotionPermission
+from drivers.move import MotionPermission
 from drivers.profiles.profile import ObjectEntry
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.node import NmtCommand, Node
 from drivers.simulation.spec import CellSpec
-from drivers.stream.sample import CellEvent, Sample
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync
 from ident.data.run import Run

@@ -25,8 +25,8 @@ from daq.cli.app import main
 from daq.errors import ExitCode
 from daq.log.metadata import reports_only_losses
 from daq.log.reader import Log, read_log
+from drivers.messages import EventKind
 from drivers.profiles.cia402 import State, decode
-from drivers.stream.sample import EventKind
 from tests.faults.test_scenario import PLAN
 from tests.vcan.cells import simulated, write_cell, write_simulation
 from tests.vcan.run import INTERFACE, SECOND_INTERFACE

@@ -24,14 +24,14 @@ from daq.cli.app import main
 from daq.cli.apply import entered_masses, tightened
 from daq.config.cell_file import load_cell
 from daq.config.policy import ApplyPolicy
+from daq.documents.calibration_file import decode, encode, save_calibration
 from daq.environment import login
 from daq.errors import ExitCode, UsageError
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, read, verify
-from daq.ledger.judgement import NOTHING, Spread
 from daq.ledger.store import HistoryStore
 from daq.report.proposal import change_table
-from daq.workflow.calibration_file import decode, encode, save_calibration
+from daq.writeback.judgement import NOTHING, Spread
 from daq.writeback.request import GainChange
 from ident.drift.change import DISPERSION
 from tests.daq.calibrations import AXES, demo_calibration, recorded, with_recordings

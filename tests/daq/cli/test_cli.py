@@ -25,9 +25,9 @@ from daq.cli.verb import Job, Listed, cell_here, cells_in, continued
 from daq.config.cell import PacingMode
 from daq.config.cell_file import load_cell
 from daq.config.import_description import load_import
+from daq.documents.calibration_file import save_calibration
 from daq.errors import ExitCode
-from daq.workflow.calibration_file import save_calibration
-from drivers.stream.sample import CellEvent, EventKind
+from drivers.messages import CellEvent, EventKind
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import DISC, START_NS, demo_content, samples, write
 from tests.pipeline.next_step import next_step

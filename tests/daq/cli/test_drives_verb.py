@@ -13,12 +13,12 @@ import typer
 
 from daq.cli.apply import rollback_drives, saving_of
 from daq.config.cell import Cell
+from daq.documents.calibration_file import encode
 from daq.errors import BusTaken, CalibrationRefused, UsageError
 from daq.ledger.audit import AuditAction, read
 from daq.ledger.store import HistoryStore
 from daq.report.controller_schemas import DriveChange, DriveRollback
 from daq.workflow.bus_lock import bus_lock
-from daq.workflow.calibration_file import encode
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.parameters import Saving
 from drivers.canopen.sdo import ObjectAccess

@@ -11,8 +11,8 @@ import pytest
 
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
+from daq.documents.calibration_file import encode
 from daq.errors import ExitCode
-from daq.workflow.calibration_file import encode
 from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
 from ident.estimators.estimate import RelativeError

@@ -13,12 +13,12 @@ import pytest
 
 from daq.cli.app import VERBS, main
 from daq.config.cell_file import load_cell
+from daq.documents.calibration_file import save_calibration
 from daq.errors import ConfigurationError, ExitCode, UsageError
 from daq.files import follow_links, replace_file
 from daq.jobs.cell_fit import _check_replaceable
 from daq.ledger.audit import AuditAction, append
 from daq.simulation.demo import MARK, make_room
-from daq.workflow.calibration_file import save_calibration
 from tests.daq.calibrations import calibration_for, demo_calibration
 from tests.daq.cli.test_no_regular_file import WRITTEN, arguments
 from tests.daq.histories import RECALIBRATION

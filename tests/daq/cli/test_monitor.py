@@ -24,18 +24,19 @@ from daq.config.bus import answer_us, bus_loads_percent, drive_axes
 from daq.config.cell import Cell, PacingMode, model_of
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
+from daq.log.feed import Feed, RunFacts
 from daq.report.bus import monitor_document, monitor_view, prediction_view
 from daq.report.bus_schemas import MonitorReport
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.bus_lock import bus_lock, bus_taken
 from daq.workflow.events import event_document
-from daq.workflow.feed import Feed, RunFacts
 from daq.workflow.monitor import CellWatch, WatchedCell, joint_positions
 from drivers.canopen.bus import BusAddress, open_bus
 from drivers.canopen.emcy import explain, remedy_of
 from drivers.canopen.link import Link
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
+from drivers.messages import CellEvent, EventKind, Sample
 from drivers.profiles.profile import Axis
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.spec import SdoAbort
@@ -48,7 +49,6 @@ from drivers.stream.monitor import (
     CellReading,
     ReadingSource,
 )
-from drivers.stream.sample import CellEvent, EventKind, Sample
 from ident.arrays import FloatArray
 from ident.calibration import Calibration
 from ident.data.dataset import planned

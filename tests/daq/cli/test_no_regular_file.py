@@ -16,8 +16,8 @@ import pytest
 
 from daq.cli.app import VERBS, main
 from daq.cli.verb import Verb
+from daq.documents.calibration_file import save_calibration
 from daq.errors import ExitCode
-from daq.workflow.calibration_file import save_calibration
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import demo_content, samples, write
 

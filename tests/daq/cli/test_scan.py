@@ -31,11 +31,11 @@ from drivers.canopen.bus import open_bus
 from drivers.canopen.link import BEATS_KEPT, Link
 from drivers.canopen.scan import FoundNode
 from drivers.canopen.sdo import SdoPolicy
+from drivers.messages import EventKind
 from drivers.profiles.profile import Identity
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import ErrorCode, PowerState
 from drivers.simulation.spec import SdoAbort
-from drivers.stream.sample import EventKind
 from ident.model.model import DriveTrain
 from tests.faults.test_scenario import PLAN
 from tests.two_buses import on_two_buses

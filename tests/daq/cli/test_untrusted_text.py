@@ -16,9 +16,9 @@ from rich.console import Console
 
 from daq.jobs.cell_fit import Failure, Summary
 from daq.jobs.fleet import FleetRow
+from daq.jobs.fleet_report import FIRST_COLUMNS, fleet_csv, fleet_document
 from daq.ledger.store import HistoryStore
 from daq.ledger.watch import Series, watch
-from daq.report.fleet import FIRST_COLUMNS, fleet_csv, fleet_document
 from daq.report.history import csv_text, plot_history
 from daq.report.proposal import show
 from daq.report.text import inert, printable, terminal_lines, terminal_text

@@ -31,7 +31,7 @@ from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.environment import shipped_configurations
 from daq.report.bus import load_lines
 from drivers.motion.execute import execute
-from drivers.motion.move import Move
+from drivers.move import Move
 from drivers.profiles.profile import DriveProfile, ObjectEntry
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync

@@ -13,9 +13,9 @@ from daq.cli.app import main
 from daq.config.cell import Cell
 from daq.config.cell_file import bundle, load_cell
 from daq.config.same_cell import correction_of, differing_sections, mismatch
+from daq.documents.calibration_file import decode, encode, save_calibration
 from daq.errors import ExitCode, LogsDiffer
 from daq.log.conversion import load_run
-from daq.workflow.calibration_file import decode, encode, save_calibration
 from daq.workflow.fit import Reading
 from daq.workflow.weigh import weigh_logs
 from ident.calibration import Calibration, Source

@@ -17,9 +17,9 @@ from daq.config.cell import Cell
 from daq.console.live import Live
 from daq.console.results import Results
 from daq.console.server import Page, listen, server_of
+from daq.log.feed import Feed, FeedUnfit, ProgramEnd, RunFacts
 from daq.log.metadata import RunStatistics
-from daq.workflow.feed import Feed, FeedUnfit, ProgramEnd, RunFacts
-from drivers.stream.sample import Sample
+from drivers.messages import Sample
 from ident.calibration import Calibration, Parameter
 from ident.data.conditioning import Conditioning
 from tests.daq.calibrations import demo_calibration

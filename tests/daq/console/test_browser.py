@@ -19,12 +19,12 @@ from playwright.sync_api import Browser, FloatRect, Page, Request, sync_playwrig
 
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
+from daq.documents.calibration_file import save_calibration
 from daq.errors import ExitCode
 from daq.log.conversion import scaling
 from daq.log.reader import Log, read_log
 from daq.log.salvage import salvage
-from daq.workflow.calibration_file import save_calibration
-from drivers.stream.sample import EventKind
+from drivers.messages import EventKind
 from tests.daq.console.feeds import predicting_calibration
 
 CHROMIUM = os.environ.get("DRIVEGAIN_CHROMIUM", "")

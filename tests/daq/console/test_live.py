@@ -19,7 +19,7 @@ from daq.config.cell import Cell, PacingMode
 from daq.console.live import Live
 from daq.console.results import Results
 from daq.console.server import Page
-from daq.workflow.feed import HEAD, SAMPLES, TEXT, Feed, FeedUnfit, facts_of_recorder, packet_struct, socket_names
+from daq.log.feed import HEAD, SAMPLES, TEXT, Feed, FeedUnfit, facts_of_recorder, packet_struct, socket_names
 from tests.daq.console.feeds import TOKEN, Recording, arrivals, facts, served
 
 EVENT = {"time_ns": 0, "axis": 2, "kind": "emcy", "code": 0x7305, "text": "EMCY 7305h"}

@@ -19,9 +19,9 @@ from daq.console.live import Live
 from daq.console.results import Results
 from daq.console.server import CONNECTIONS, LARGEST_READERS, Page
 from daq.errors import ExitCode
-from daq.workflow.feed import Feed
+from daq.log.feed import Feed
 from drivers.canopen.emcy import remedy_of
-from drivers.stream.sample import CellEvent, EventKind
+from drivers.messages import CellEvent, EventKind
 from ident.calibration import Calibration
 from tests.daq.calibrations import demo_calibration
 from tests.daq.console.feeds import TOKEN, Recording, Served, arrivals, served

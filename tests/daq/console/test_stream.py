@@ -24,7 +24,7 @@ from daq.config.cell import Cell, joint_names
 from daq.console.live import Live
 from daq.errors import ExitCode
 from daq.log.bag_writer import joint_effort
-from daq.workflow.feed import HEAD, SAMPLES, TEXT, packet_struct
+from daq.log.feed import HEAD, SAMPLES, TEXT, packet_struct
 from tests.daq.calibrations import demo_calibration
 from tests.daq.console.feeds import facts
 

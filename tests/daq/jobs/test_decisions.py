@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from daq.cli.app import main
+from daq.documents.session_state import Outcome
 from daq.errors import CalibrationRefused, ExitCode, HistoryUnreadable
-from daq.jobs.session import Outcome
 from daq.ledger.audit import AuditAction
 from daq.ledger.store import HistoryStore
 from daq.writeback.signature import generate

@@ -11,9 +11,9 @@ import yaml
 
 import daq.workflow.record
 from daq.cli.app import main
+from daq.documents.session_state import Outcome
 from daq.environment import shipped_configurations
 from daq.errors import ExitCode, JobHeld, RunInvalid, exit_code
-from daq.jobs.session import Outcome
 from daq.ledger.audit import AuditAction
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from drivers.errors import BusError, DriveFault, MotionRefused, SampleLost, StateRefused

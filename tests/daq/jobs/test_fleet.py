@@ -28,12 +28,12 @@ from hypothesis import strategies as st
 
 from daq.cli import main
 from daq.config.cell_file import bundle
+from daq.documents.calibration_file import as_document, load_calibration
 from daq.errors import ConfigurationMissing, DaqError, ExitCode, LogMissing, OutputFailed, UsageError, WorkersLost
 from daq.jobs import fleet as fleet_module
 from daq.jobs.cell_fit import Failure, Fitted, Loop, fit_cell, open_cache
 from daq.jobs.fleet import FleetRow, WorkerPool, each, fit_fleet, worker_pool
 from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, UnknownLog, at_hand, by_cell, list_logs, survey
-from daq.workflow.calibration_file import as_document, load_calibration
 from daq.workflow.fit import calibration_of, fit
 from tests.bench.fleet_cells import FleetCell, make_cell, plans_of
 from tests.daq.logs import content, samples, write

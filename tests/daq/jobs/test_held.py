@@ -18,6 +18,7 @@ import pytest
 
 from daq.cli.terminal import interruptible
 from daq.config.recalibration import Command, Interlock
+from daq.documents.session_state import Outcome
 from daq.errors import (
     BusTaken,
     ConfigurationInconsistent,
@@ -33,7 +34,6 @@ from daq.errors import (
 from daq.jobs.context import section_of
 from daq.jobs.job import preview
 from daq.jobs.journal import Form, Journal
-from daq.jobs.session import Outcome
 from daq.jobs.time_bound import time_bound
 from daq.ledger.audit import AuditAction
 from daq.workflow.bus_lock import bus_lock, lock_name

@@ -9,10 +9,10 @@ import pytest
 import yaml
 
 from daq.cli.app import main
+from daq.documents.session_state import Outcome
 from daq.errors import ExitCode
 from daq.jobs import session as sessions
 from daq.jobs.recording import basis_of
-from daq.jobs.session import Outcome
 from daq.ledger.audit import AuditAction
 from daq.ledger.store import HistoryStore
 from daq.report.schemas import JobReport

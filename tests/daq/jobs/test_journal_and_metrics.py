@@ -15,11 +15,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from prometheus_client.parser import text_string_to_metric_families
 
+from daq.documents.session_state import Outcome
 from daq.errors import OutputFailed
 from daq.jobs.context import JobContext
 from daq.jobs.journal import Form, Journal, Level, form_of
 from daq.jobs.reporting import Conclusion, report_failure, write_metrics
-from daq.jobs.session import Outcome
 from drivers.errors import DriveFault
 
 AT = datetime(2026, 1, 5, 3, 0, tzinfo=UTC)

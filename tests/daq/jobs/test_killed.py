@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 
+from daq.documents.session_state import Outcome
 from daq.errors import ExitCode
 from daq.jobs.context import Tools
-from daq.jobs.session import Outcome
 from daq.ledger.audit import AuditAction
 from daq.ledger.ledger import Ledger, Verification
 from daq.ledger.store import HistoryStore

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from daq.jobs.session import Outcome
+from daq.documents.session_state import Outcome
 from daq.log.container import UNFINISHED
 from tests.daq.jobs.made import Made
 from tests.daq.jobs.rig import Rig, make_rig

@@ -15,8 +15,9 @@ from pydantic import TypeAdapter
 
 from daq.config.cell_file import load_cell
 from daq.config.recalibration import PlannedRun, RecalibrationSection, SeededPlan
+from daq.documents.session_state import Fitted, Outcome
 from daq.errors import SchemaMismatch
-from daq.jobs.session import Basis, Fitted, Outcome, begin, last_good, remove_old, resumable_session, save, sessions
+from daq.jobs.session import Basis, begin, last_good, remove_old, resumable_session, save, sessions
 from tests.daq.jobs.rig import BEGAN, make_rig
 
 DOCUMENT = Path(__file__).parents[3] / "docs" / "how-to" / "schedule-recalibration.md"

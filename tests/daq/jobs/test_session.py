@@ -15,11 +15,12 @@ from hypothesis import strategies as st
 
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
+from daq.documents.session_state import Outcome, SessionState, Target
 from daq.errors import ExitCode, JobHeld
 from daq.jobs.context import CLOCK_SLACK, require_clock
 from daq.jobs.recording import calibration_of_session
 from daq.jobs.reporting import Conclusion, file_stem, to_do
-from daq.jobs.session import STATE, Basis, Outcome, Session, SessionState, Target, begin, remove_old, save, sessions
+from daq.jobs.session import STATE, Basis, Session, begin, remove_old, save, sessions
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import BEGAN, make_rig
 

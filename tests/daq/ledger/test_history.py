@@ -22,20 +22,20 @@ import pytest
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
 from daq.config.policy import HistoryPlace
+from daq.documents.calibration_file import save_calibration
 from daq.files import sha256_of
+from daq.formats.document import decode as read_controller
+from daq.formats.scalar import rewrite_gain
 from daq.jobs.session import Basis, begin
 from daq.jobs.session import save as save_session
 from daq.ledger.audit import AuditAction, AuditEntry, append, read
 from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, drives_of, logs_of, recorded_at
-from daq.ledger.judgement import known_of
 from daq.ledger.ledger import Ledger
 from daq.ledger.store import HistoryStore
 from daq.ledger.watch import Series, alarm_text, dispersions_of, questions, watch
 from daq.report.history import COLUMNS, describe_actions
-from daq.workflow.calibration_file import save_calibration
 from daq.writeback.file_access import resolve_links
-from daq.writeback.formats.document import decode as read_controller
-from daq.writeback.formats.scalar import rewrite_gain
+from daq.writeback.judgement import known_of
 from daq.writeback.request import GainChange
 from ident.calibration import Calibration, Gain
 from ident.drift.change import DISPERSION, dispersions

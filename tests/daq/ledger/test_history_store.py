@@ -19,10 +19,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daq.documents.calibration_file import decode, encode
 from daq.errors import DataError, HistoryUnreadable, OutputFailed, exit_code
 from daq.ledger.entry import Acknowledgement, WriteAction, iso, utc
 from daq.ledger.store import VERSION, HistoryStore
-from daq.workflow.calibration_file import decode, encode
 from tests.daq.calibrations import AXES, demo_calibration
 from tests.daq.histories import BEGIN, calibration_of, digest_of, enter
 

@@ -18,7 +18,7 @@ from daq.errors import ConfigurationInconsistent, ExitCode, UsageError
 from daq.log.bag_writer import export_bag, joint_effort, mean_velocity
 from daq.log.conversion import load_run
 from daq.log.writer import LogWriter
-from drivers.stream.sample import CellEvent, EventKind, Quantity, SlowReading
+from drivers.messages import CellEvent, EventKind, Quantity, SlowReading
 from ident.calibration import Calibration
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import START_NS, demo_content, joints, samples

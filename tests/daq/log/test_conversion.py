@@ -25,7 +25,7 @@ from daq.errors import (
 from daq.log.conversion import load_run, run_from_log, scaling, unwrapped
 from daq.log.metadata import AxisReadback, Readback, readback_of_drives
 from daq.log.reader import read_log
-from drivers.stream.sample import CellEvent, EventKind, Sample
+from drivers.messages import CellEvent, EventKind, Sample
 from ident.errors import CurrentUnsigned
 from tests.conftest import CHECKOUT
 from tests.daq.logs import DISC, START_NS, content, demo_content, samples, write

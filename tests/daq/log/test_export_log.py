@@ -19,7 +19,7 @@ from daq.log.conversion import load_run
 from daq.log.export import TableFormat, export_log
 from daq.log.reader import BLOCK_SAMPLES
 from daq.log.writer import LogWriter
-from drivers.stream.sample import CellEvent, EventKind, Quantity, Sample, SlowReading
+from drivers.messages import CellEvent, EventKind, Quantity, Sample, SlowReading
 from tests.daq.logs import START_NS, demo_content, joints, samples, write
 
 ROWS = 2 * BLOCK_SAMPLES + 100

@@ -20,7 +20,7 @@ from daq.errors import LogIncomplete, OutputFailed, UsageError
 from daq.log.container import RecordFile
 from daq.log.reader import LogReader, read_log
 from daq.log.writer import LogWriter
-from drivers.stream.sample import CellEvent, EventKind, Quantity, Sample, SlowReading
+from drivers.messages import CellEvent, EventKind, Quantity, Sample, SlowReading
 from tests.daq.logs import DISC, START_NS, content, joints, samples, write
 
 I32 = st.integers(-(2**31), 2**31 - 1)

@@ -21,7 +21,7 @@ from daq.errors import LogUnreadable
 from daq.log.message import sample_dtype
 from daq.log.metadata import READBACK, RUN, STATISTICS, run_record, sealed, statistics_record
 from daq.log.reader import Log, LogReader, SampleBlock, read_log
-from drivers.stream.sample import CellEvent, EventKind
+from drivers.messages import CellEvent, EventKind
 from tests.daq.log.records import (
     HEADER,
     TOPICS,

@@ -13,6 +13,7 @@ import pytest
 
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
+from daq.documents.calibration_file import save_calibration
 from daq.errors import CurrentImplausible, DataError, ExitCode, PositionImplausible
 from daq.log.bag_writer import export_bag
 from daq.log.conversion import load_run
@@ -23,8 +24,7 @@ from daq.log.motion import RecordedMotion
 from daq.log.reader import LossyLogs
 from daq.log.salvage import salvage
 from daq.report.log import describe_log
-from daq.workflow.calibration_file import save_calibration
-from drivers.stream.sample import Sample
+from drivers.messages import Sample
 from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from tests.conftest import CHECKOUT

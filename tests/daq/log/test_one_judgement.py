@@ -34,7 +34,7 @@ from daq.log.metadata import (
 from daq.log.reader import BLOCK_SAMPLES, LARGEST_ENTRIES, LogReader, read_log
 from daq.log.salvage import salvage
 from daq.report.log import describe_log
-from drivers.stream.sample import CellEvent, EventKind
+from drivers.messages import CellEvent, EventKind
 from tests.daq.log.records import (
     HEADER,
     TOPICS,

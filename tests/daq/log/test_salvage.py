@@ -19,6 +19,7 @@ import pytest
 import yaml
 
 from daq.cli.app import main
+from daq.documents.calibration_file import as_document, decode, encode, save_calibration
 from daq.errors import (
     ExitCode,
     LogCorrupt,
@@ -34,12 +35,11 @@ from daq.log.metadata import SEAL, sealed, unsealed
 from daq.log.reader import LogReader, SampleBlock, read_log
 from daq.log.salvage import salvage
 from daq.log.writer import LogWriter
-from daq.workflow.calibration_file import as_document, decode, encode, save_calibration
 from daq.workflow.fit import Reading
 from daq.writeback.gates.gate import Gate, GateContext
 from daq.writeback.gates.table import check_gates
 from daq.writeback.request import Edit, Request
-from drivers.stream.sample import CellEvent, EventKind, Quantity, SlowReading
+from drivers.messages import CellEvent, EventKind, Quantity, SlowReading
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import DISC, START_NS, demo_content, joints, samples, write
 

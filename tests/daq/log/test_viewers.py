@@ -13,7 +13,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from drivers.stream.sample import CellEvent, EventKind
+from drivers.messages import CellEvent, EventKind
 from tests.daq.logs import START_NS, demo_content, samples, write
 
 VIEWERS = Path(__file__).parents[3] / "configs" / "viewers"

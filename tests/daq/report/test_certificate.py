@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from daq.cli.app import main
+from daq.documents.calibration_file import save_calibration
 from daq.errors import CalibrationRefused, ExitCode
 from daq.report.certificate import Verdict, certificate_document, certify, without_controller
 from daq.report.certificate_page import certificate_page
@@ -19,7 +20,6 @@ from daq.report.controller_schemas import CertificateReport
 from daq.report.effect_names import curve_of, named_size, size_text
 from daq.report.gains import with_deviation
 from daq.report.text import json_text
-from daq.workflow.calibration_file import save_calibration
 from daq.writeback.gates.gate import Gate
 from ident.calibration import AcceptedEffect, Calibration, Parameter, PayloadMass
 from ident.effects.effect import PlacedEffect

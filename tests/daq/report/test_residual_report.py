@@ -24,6 +24,7 @@ from rich.table import Table
 from daq.cli.app import main
 from daq.cli.fit import check_report
 from daq.config.cell_file import load_cell
+from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.environment import shipped_configurations
 from daq.errors import EffectsRefuted, ExitCode, OutputFailed, UsageError
 from daq.report import residual_page as residual_page_module
@@ -45,7 +46,6 @@ from daq.report.residual import (
 from daq.report.residual_page import DOCUMENT, PAGE, residual_page, save_report
 from daq.report.text import Sentence, json_text
 from daq.workflow import fit as fit_module
-from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.fit import Fit, calibration_of, fit
 from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.discovery import before_after as before_after_module

@@ -22,14 +22,14 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.jobs.cell_fit import Failure, Summary
 from daq.jobs.fleet import FleetRow
-from daq.ledger.judgement import NOTHING
 from daq.ledger.store import HistoryStore
 from daq.ledger.watch import Series, watch
 from daq.report import bus, fit, fleet, gains, history, paper_tables, proposal, residual, urdf, validation, weighing
 from daq.report.log import log_lines
 from daq.report.text import WholeTable
 from daq.workflow.prediction import RecentCurrent
-from daq.workflow.validate import DataUse
+from daq.workflow.validation import DataUse
+from daq.writeback.judgement import NOTHING
 from daq.writeback.request import GainChange
 from ident.calibration import Gain
 from ident.data.conditioning import Conditioning

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from daq.documents.calibration_file import save_calibration
 from daq.log.importing import import_recording
-from daq.workflow.calibration_file import save_calibration
 from daq.workflow.fit import calibration_of, fit
 
 

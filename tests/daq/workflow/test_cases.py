@@ -14,13 +14,13 @@ import pytest
 from daq.cli import main
 from daq.config.cell import Cell, WeighedPayload
 from daq.config.cell_file import load_cell
+from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.environment import shipped_configurations
 from daq.errors import LogsDiffer
 from daq.log.reader import LossyLogs
 from daq.report.paper_tables import condition_table, error_table, gain_table, mass_tables, parameter_table
 from daq.workflow import fit as fit_module
 from daq.workflow import validate as validate_module
-from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.cases import CASES, ReducedLogs, calibration_of_case, essential_fit, fit_case, reduce_logs
 from daq.workflow.choices import Known
 from daq.workflow.fit import fit

@@ -14,8 +14,8 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent
 from daq.workflow.nameplates import check_controller, check_nameplates, nameplate_warnings
+from drivers.canopen.scale import ScaleReading
 from drivers.profiles.profile import TapPoint
-from drivers.profiles.scale import ScaleReading
 from ident.model.model import DriveTrain
 
 

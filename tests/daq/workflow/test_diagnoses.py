@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from daq.config.cell_file import load_cell
+from daq.documents.calibration_file import decode, encode
 from daq.environment import shipped_configurations
 from daq.report.validation import cross_document, validation_view
 from daq.workflow import fit as fit_module
 from daq.workflow import validate as validate_module
-from daq.workflow.calibration_file import decode, encode
 from daq.workflow.fit import calibration_of, fit
 from daq.workflow.validate import cross_validate
 from ident.calibration import Calibration

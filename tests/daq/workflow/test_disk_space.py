@@ -17,8 +17,8 @@ from daq.log.conversion import load_run
 from daq.log.reader import read_log
 from daq.log.writer import LogWriter
 from daq.workflow.safeguards import RESERVE_BYTES, DiskRoom, free_bytes, largest_log_bytes
+from drivers.messages import EventKind, Sample
 from drivers.profiles.cia402 import POWERLESS, decode
-from drivers.stream.sample import EventKind, Sample
 from tests.daq.logs import START_NS, content, write
 from tests.daq.workflow.test_record import Rig
 

@@ -17,13 +17,13 @@ from hypothesis import strategies as st
 from daq.cli.app import main
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
+from daq.documents.calibration_file import as_document, decode, encode
 from daq.environment import shipped_configurations
 from daq.errors import ExitCode, UsageError
 from daq.log.conversion import load_run
 from daq.log.metadata import run_from_record, run_record
 from daq.log.reader import LossyLogs, read_log
 from daq.workflow import fit as fit_module
-from daq.workflow.calibration_file import as_document, decode, encode
 from daq.workflow.fit import Fit, Reading, calibration_of, close_loop, fit
 from daq.workflow.plan_file import load_plan
 from daq.workflow.record import Clocks, record

@@ -20,8 +20,8 @@ import daq.workflow.urdf_export
 from daq.cli.app import main
 from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
+from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.errors import SchemaMismatch
-from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.urdf_export import JointUpdate, cell_limits, update_urdf
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter
 from ident.estimators.estimate import RelativeError

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from daq.config.cell import Cell, model_of
 from daq.config.cell_file import load_cell
+from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.log.reader import LossyLogs
 from daq.report.certificate import certificate_document, certify, without_controller
 from daq.report.controller_schemas import CertificateReport
 from daq.report.text import json_text
 from daq.workflow import fit as fitting
-from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.fit import Fit, calibration_of, fit, with_corrected_geometry
 from daq.workflow.geometry import calibrated_model, encoder_misfit_of, geometry_diagnoses
 from ident.data.dataset import differentiate

@@ -17,7 +17,7 @@ from daq.config.clearance import Clearance
 from daq.errors import ConfigurationInconsistent, UsageError
 from daq.workflow.experiment import Experiment, experiment_of, paths_of
 from daq.workflow.plan import Plan, plan, slowed
-from drivers.motion.move import Trapezoid
+from drivers.move import Trapezoid
 from ident.planning.clearance import Box
 from ident.planning.excitation import Design
 

@@ -25,7 +25,7 @@ from daq.workflow.safeguards import NEVER
 from drivers.canopen.network import CanopenNetwork, SignalBlocker
 from drivers.canopen.socketcan import Losses
 from drivers.errors import MotionRefused, NodeMisplaced, SampleLost
-from drivers.stream.sample import EventKind
+from drivers.messages import EventKind
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell
 
 WALL_NS = 1_700_000_000_000_000_000

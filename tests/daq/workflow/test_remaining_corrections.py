@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from daq.config.cell import Cell, model_of
 from daq.config.cell_file import load_cell
-from daq.workflow.calibration_file import decode, encode
+from daq.documents.calibration_file import decode, encode
 from daq.workflow.remaining_corrections import on_cell, with_described
 from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.effects.geometry import corrected_model, turn_between, turned_gravity

@@ -18,13 +18,13 @@ from rich.console import Console
 from daq.cli.fit import say_after_fit
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
+from daq.documents.calibration_file import decode, encode
 from daq.log.reader import LossyLogs
 from daq.report.certificate import certify, without_controller
 from daq.report.certificate_page import certificate_page
 from daq.report.validation import validation_view
 from daq.workflow import fit as fit_module
 from daq.workflow import validate as validate_module
-from daq.workflow.calibration_file import decode, encode
 from daq.workflow.fit import calibration_of, close_loop, description_diagnoses, fit, fit_logs
 from daq.workflow.validate import cross_validate
 from daq.writeback.gates.fit import uncorrected_description

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
 from daq.errors import ControllerUnfit
+from daq.formats.document import decode
+from daq.formats.scalar import spell
+from daq.formats.yaml_document import YamlDocument
 from daq.ledger.audit import AuditAction, read
 from daq.writeback.file_target import FileTarget
-from daq.writeback.formats.document import decode
-from daq.writeback.formats.scalar import spell
-from daq.writeback.formats.yaml_document import YamlDocument
 from daq.writeback.request import Request
 from daq.writeback.target import apply, propose
 from ident.calibration import Gain

@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 
 from daq.config.controller import ControllerFormat
 from daq.errors import ControllerUnfit
-from daq.writeback.formats.dcf_document import DcfDocument
-from daq.writeback.formats.document import FORMATS, MAX_BYTES, decode, format_of, read_bytes
-from daq.writeback.formats.json_document import JsonDocument
-from daq.writeback.formats.scalar import ControllerDocument, rewrite_gain
-from daq.writeback.formats.xml_document import XmlDocument
-from daq.writeback.formats.yaml_document import YamlDocument
+from daq.formats.dcf_document import DcfDocument
+from daq.formats.document import FORMATS, MAX_BYTES, decode, format_of, read_bytes
+from daq.formats.json_document import JsonDocument
+from daq.formats.scalar import ControllerDocument, rewrite_gain
+from daq.formats.xml_document import XmlDocument
+from daq.formats.yaml_document import YamlDocument
 
 EXAMPLES = settings(max_examples=80)
 _numbers = st.sampled_from(["32.96", "-11.52", "7", "0", "1e3", "2.5E-3", "0.10", "-0.0", "123456789.125"])

@@ -22,7 +22,6 @@ from daq.writeback.gates.gate import Gate
 from daq.writeback.request import Request
 from daq.writeback.target import Proposal, Written, apply, propose, rollback
 from drivers.canopen.bus import BusAddress
-from drivers.canopen.hub import Hub
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.parameters import Saving
 from drivers.canopen.pdo import CONTROLWORD
@@ -38,6 +37,7 @@ from drivers.errors import (
 from drivers.profiles.profile import Mapping, ObjectEntry, ParameterKind
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.faults import FaultKind, FaultSpec
+from drivers.simulation.hub import Hub
 from drivers.simulation.node import NmtCommand, NmtState
 from ident.calibration import Calibration
 from tests.daq.calibrations import AXES, IDENTIFIED, NAMEPLATE, demo_calibration, of_first_axes

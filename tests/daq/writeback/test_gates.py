@@ -16,10 +16,10 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.config.cell_schema import PolicyModel
 from daq.config.policy import AppliedBy, ApplyPolicy, HoldOut
+from daq.documents.calibration_file import encode
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, exit_code
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, read
-from daq.workflow.calibration_file import encode
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.gates import fit as fit_gates
 from daq.writeback.gates.gate import Gate

@@ -23,11 +23,11 @@ from pathlib import Path
 
 import pytest
 
+from daq.documents.calibration_file import encode
+from daq.formats.document import decode
 from daq.ledger.audit import AuditAction, AuditVerdict, Content, verify
-from daq.workflow.calibration_file import encode
 from daq.writeback.file_access import backups
 from daq.writeback.file_target import FileTarget
-from daq.writeback.formats.document import decode
 from daq.writeback.request import Request
 from daq.writeback.target import apply, propose, rollback
 from ident.estimators.estimate import RelativeError

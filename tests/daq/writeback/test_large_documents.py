@@ -9,8 +9,8 @@ import pytest
 from daq.config.yaml_file import MAX_BYTES as MAX_CELL_BYTES
 from daq.config.yaml_file import parse_yaml
 from daq.errors import ControllerUnfit, YamlInvalid
-from daq.writeback.formats import yaml_document as limits
-from daq.writeback.formats.document import decode
+from daq.formats import yaml_document as limits
+from daq.formats.document import decode
 
 GAIN = "drives: {J1: {gain: 32.96}}\n"
 LARGE = {

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from daq.cli.app import main
 from daq.config import signers
 from daq.config.signers import parse_public_key
+from daq.documents.calibration_file import save_calibration
 from daq.errors import (
     CalibrationMissing,
     CalibrationRefused,
@@ -28,7 +29,6 @@ from daq.errors import (
     UsageError,
     exit_code,
 )
-from daq.workflow.calibration_file import save_calibration
 from daq.writeback import minisign
 from daq.writeback.signature import generate, needs_password, sign, signature_path, signers_of
 from tests.daq.calibrations import demo_calibration

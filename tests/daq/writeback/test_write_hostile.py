@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from daq.documents import calibration_file
 from daq.errors import CalibrationMissing, ControllerUnfit, OutputFailed
 from daq.ledger.audit import AuditAction, Content, append, read, verify
-from daq.workflow import calibration_file
 from daq.writeback.file_target import FileTarget
 from daq.writeback.request import Request
 from daq.writeback.target import apply, propose, rollback

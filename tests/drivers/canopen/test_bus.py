@@ -15,10 +15,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.canopen.bus import BusAddress, SocketcandBus, VirtualEnd, open_bus
-from drivers.canopen.hub import HOST, Hub
 from drivers.canopen.link import Link
 from drivers.canopen.sdo import SdoPolicy
 from drivers.errors import BusError
+from drivers.simulation.hub import HOST, Hub
 from tests.drivers.bus_contract import WAIT_S, BusContract, Ends, same
 from tests.drivers.scripted import FakeClock
 

@@ -25,9 +25,9 @@ from drivers.errors import (
     SetupRefused,
     StateRefused,
 )
+from drivers.messages import EventKind
 from drivers.profiles.cia402 import State
 from drivers.profiles.profile import Axis, Identity, ObjectEntry
-from drivers.stream.sample import EventKind
 from tests.drivers.scripted import ADDRESS, PROFILE, FakeClock, ScriptedBus, ScriptedNode, cell, lose_first_answer
 
 

@@ -32,7 +32,7 @@ from drivers.canopen.socketcan import (
     remarks_of,
 )
 from drivers.errors import BusError
-from drivers.stream.sample import EventKind
+from drivers.messages import EventKind
 from tests.drivers.scripted import FakeClock, cell
 
 ADDRESS = BusAddress("socketcan", "pair")

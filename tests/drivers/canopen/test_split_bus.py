@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.canopen.bus import BusAddress, open_bus, send_burst
-from drivers.canopen.hub import Hub
 from drivers.canopen.link import Link, NmtCommand
 from drivers.canopen.sdo import SdoPolicy
 from drivers.canopen.socketcan import CapturedMessage, Losses, losses_of, remarks_of
 from drivers.canopen.split_bus import BUS_OFF, LARGEST_RUN, BusPart, SplitAddress, SplitBus, open_cell_bus
 from drivers.errors import BusError, NodeMisplaced
+from drivers.simulation.hub import Hub
 from tests.drivers.bus_contract import WAIT_S, BusContract, Ends
 from tests.drivers.scripted import FakeClock
 

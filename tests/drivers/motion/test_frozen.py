@@ -5,9 +5,9 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.motion.move import Move
-from drivers.motion.watch import FROZEN_S, FrozenData
-from drivers.stream.sample import Sample
+from drivers.messages import Sample
+from drivers.move import Move
+from drivers.stream.watch import FROZEN_S, FrozenData
 
 PERIOD_NS = 1_000_000
 MOVE = Move((50_000, 0), (100_000, 1), (1_000_000, 1))

@@ -8,9 +8,9 @@ import can
 import pytest
 
 from drivers.errors import BusBusy, MotionTimeout, SetupRefused
+from drivers.messages import CellEvent, EventKind
 from drivers.motion.execute import execute
-from drivers.motion.move import Move
-from drivers.stream.sample import CellEvent, EventKind
+from drivers.move import Move
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, ScriptedNode, cell, permission

@@ -20,10 +20,10 @@ from drivers.errors import (
     SampleLost,
     StateRefused,
 )
+from drivers.messages import CellEvent, EventKind, Sample
 from drivers.motion.execute import MotionBounds, execute
-from drivers.motion.move import AxisLimits, Move, synchronised_move
+from drivers.move import AxisLimits, Move, synchronised_move
 from drivers.profiles.profile import Axis
-from drivers.stream.sample import CellEvent, EventKind, Sample
 from drivers.stream.stream import MAX_MISSING_CYCLES, SyncStream
 from drivers.stream.sync import LockstepSync
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell, permission

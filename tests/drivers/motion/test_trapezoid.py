@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import MotionRefused
-from drivers.motion.move import (
+from drivers.move import (
     AxisLimits,
     MotionPermission,
     Move,

@@ -13,15 +13,15 @@ from daq.config.bus import drive_axes
 from daq.config.cell_file import load_cell
 from daq.simulation.simulation_file import load_simulation
 from drivers.canopen.bus import BusAddress, open_bus
-from drivers.canopen.hub import Hub
 from drivers.canopen.network import Bounds, CanopenNetwork
 from drivers.errors import DriveFault
+from drivers.messages import CellEvent, EventKind
 from drivers.motion.execute import execute
-from drivers.motion.move import AxisLimits, MotionPermission, synchronised_move
+from drivers.move import AxisLimits, MotionPermission, synchronised_move
 from drivers.profiles.cia402 import State
 from drivers.profiles.profile import Axis
 from drivers.simulation.cell import SimulatedCell
-from drivers.stream.sample import CellEvent, EventKind
+from drivers.simulation.hub import Hub
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync
 

@@ -10,11 +10,11 @@ import can
 import pytest
 
 from drivers.canopen.network import CanopenNetwork
+from drivers.messages import CellEvent, EventKind, Quantity, SlowReading
 from drivers.motion.execute import execute
-from drivers.motion.move import Move
+from drivers.move import Move
 from drivers.profiles.profile import ObjectEntry, RatedMotor, Thermometer
 from drivers.stream.polling import GIVEN_UP_NS, PERIOD_NS, Polling
-from drivers.stream.sample import CellEvent, EventKind, Quantity, SlowReading
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync
 from tests.drivers import scripted

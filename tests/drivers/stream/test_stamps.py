@@ -15,8 +15,8 @@ from drivers.canopen.bus import BusAddress
 from drivers.canopen.socketcan import CapturedMessage
 from drivers.canopen.split_bus import BusPart, SplitAddress, SplitBus
 from drivers.errors import BusError, DriverError, SampleLost
+from drivers.messages import Sample
 from drivers.stream.answers import StreamStatistics
-from drivers.stream.sample import Sample
 from drivers.stream.stream import MAX_MISSING_CYCLES, SyncStream
 from drivers.stream.sync import FollowedSync, TimedSync
 from tests.drivers.scripted import PERIOD_NS, FakeClock, cell

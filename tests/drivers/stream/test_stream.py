@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from drivers.canopen.socketcan import CapturedMessage, Losses
 from drivers.errors import BusBusy, BusError, DriveFault, DriverError, SampleLost
+from drivers.messages import CellEvent, EventKind
 from drivers.stream.answers import StreamStatistics
-from drivers.stream.sample import CellEvent, EventKind
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import FollowedSync, LockstepSync, SyncRate, TimedSync, steered_us
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell

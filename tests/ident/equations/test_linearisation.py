@@ -18,7 +18,7 @@ from ident.equations.linearisation import (
     linearise,
     motor_jacobian,
 )
-from ident.estimators.identify import Identification
+from ident.estimators.estimate import Identification
 from tests.ident.recordings import Truth
 
 

@@ -14,7 +14,8 @@ from ident.equations.currents import PreloadedCurrents, whitening_transform
 from ident.equations.linearisation import linearise
 from ident.equations.rows import decimate_rows, observe
 from ident.errors import DataUnfit
-from ident.estimators.identify import Identification, identify
+from ident.estimators.estimate import Identification
+from ident.estimators.identify import identify
 from ident.estimators.least_squares import Scaling, tls
 from ident.estimators.maximum_likelihood import iv
 from ident.estimators.method import Method

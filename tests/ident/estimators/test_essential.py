@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from ident.equations.system import System
 from ident.estimators.comparison import Essential, essential, relative_std_percent
-from ident.estimators.estimate import Estimate
-from ident.estimators.identify import Identification
+from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.least_squares import tls, wls
 from ident.estimators.maximum_likelihood import ml
 from tests.ident.recordings import GAINS

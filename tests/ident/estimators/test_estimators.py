@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ident.data.run import Run
 from ident.equations.system import require_distinct
 from ident.errors import DataUnfit, PayloadMissing, RankDeficient
-from ident.estimators.estimate import Estimate
-from ident.estimators.identify import Identification, estimate_with, identify
+from ident.estimators.estimate import Estimate, Identification
+from ident.estimators.identify import estimate_with, identify
 from ident.estimators.least_squares import Scaling, tls, wls
 from ident.estimators.maximum_likelihood import ml
 from ident.estimators.method import Method

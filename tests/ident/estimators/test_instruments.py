@@ -11,7 +11,8 @@ from ident.discovery.evidence import by_instruments, gather, with_effects
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import LoadFriction
 from ident.errors import DataUnfit
-from ident.estimators.identify import Identification, identify
+from ident.estimators.estimate import Identification
+from ident.estimators.identify import identify
 from ident.estimators.method import Method
 from tests.ident.loops import record_in_loop
 from tests.ident.recordings import CONDITIONING, MOUNTED, Truth, record

@@ -13,7 +13,7 @@ from ident.discovery.evidence import Evidence
 from ident.equations.reduction import reduce_runs
 from ident.equations.system import System
 from ident.equations.triangles import Triangles, triangle
-from ident.estimators.identify import Identification
+from ident.estimators.estimate import Identification
 from ident.estimators.least_squares import Scaling, joint_data_std, joint_error_std, ls, misjudged_joints, tls, wls
 from ident.estimators.maximum_likelihood import ml
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, Truth, record

@@ -13,8 +13,8 @@ from ident.discovery.evidence import gather, with_effects
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import LoadFriction
 from ident.equations.system import System
-from ident.estimators.estimate import Estimate
-from ident.estimators.identify import Identification, identify
+from ident.estimators.estimate import Estimate, Identification
+from ident.estimators.identify import identify
 from ident.estimators.payload_mass import mass_responses
 from ident.model.bodies import Payload
 from tests.ident.recordings import CONDITIONING, MOUNTED, PAYLOAD_TRUTH, Truth, record

@@ -9,7 +9,8 @@ import pytest
 
 from ident.data.run import Run
 from ident.equations.reduction import reduce_runs
-from ident.estimators.identify import Identification, estimate_with, identify
+from ident.estimators.estimate import Identification
+from ident.estimators.identify import estimate_with, identify
 from ident.estimators.maximum_likelihood import ml
 from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS, Payload

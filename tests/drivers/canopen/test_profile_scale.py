@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.canopen.scale import FINE, ScaleReading, check_name_plate, read_scale
 from drivers.canopen.sdo import ObjectAccess
 from drivers.errors import ObjectAccessError, SetupRefused
 from drivers.profiles.profile import Amplitude, CurrentScale, ObjectEntry, RatedMotor, ScaleForm, TapPoint
-from drivers.profiles.scale import FINE, ScaleReading, check_name_plate, read_scale
 from tests.drivers.scripted import PROFILE, ScriptedNode, cell
 
 RATED_CURRENT = ObjectEntry(0x6075, 0, 32, signed=False)

@@ -33,7 +33,7 @@ from pydantic import TypeAdapter
 from daq.log.conversion import SiScaling
 from daq.log.metadata import RunStatistics
 from drivers.errors import POWERED, WHILE, stop_notes, text_of
-from drivers.stream.sample import CellEvent, Sample
+from drivers.messages import CellEvent, Sample
 
 BATCH_S = 0.02  #: Time of the samples in one packet
 SEND_BUFFER_BYTES = 1 << 20  #: Asked of the kernel, which may give less: seconds of samples for a console that pauses

@@ -15,10 +15,10 @@ from drivers.canopen.link import LSS, NmtState, command_name, nmt_name
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.sdo import SDO_REQUEST
 from drivers.errors import BusBusy, DriveFault, DriverError, node_label
-from drivers.motion.move import Move
+from drivers.messages import CellEvent, EventKind, EventSink, Sample
+from drivers.move import Move
 from drivers.profiles.cia402 import STATE_BITS, STATUS_FAULT, STATUS_FOLLOWING_ERROR, State, decode
 from drivers.profiles.profile import Axis
-from drivers.stream.sample import CellEvent, EventKind, EventSink, Sample
 
 FROZEN_S = 0.05
 """Duration of exactly equal values, in the time of the samples. A loop that fights friction changes its current at

@@ -20,8 +20,8 @@ from canopen.sdo.exceptions import SdoAbortedError
 
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
-from daq.workflow import feed as feeds
-from daq.workflow.feed import (
+from daq.log import feed as feeds
+from daq.log.feed import (
     ACCEPTED,
     HEAD,
     LARGEST_CONSOLES,
@@ -37,7 +37,7 @@ from daq.workflow.feed import (
     socket_names,
 )
 from drivers.errors import SetupRefused
-from drivers.stream.sample import CellEvent, EventKind
+from drivers.messages import CellEvent, EventKind
 from tests.daq.console.feeds import Recording, arrivals, facts
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from daq.errors import ControllerUnfit
-from daq.writeback.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPath, Leaves, Scalar, unfit, utf8
+from daq.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPath, Leaves, Scalar, unfit, utf8
 
 MAX_DEPTH = 100
 _BYTE_ORDER_MARK = "\ufeff"

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 
+from daq.documents import calibration_file
+from daq.documents.calibration_file import as_document, decode, encode, load_calibration, save_calibration
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, exit_code
-from daq.workflow import calibration_file
-from daq.workflow.calibration_file import as_document, decode, encode, load_calibration, save_calibration
 from ident.calibration import Calibration, PayloadMass
 from tests.daq.calibrations import calibrations, demo_calibration
 

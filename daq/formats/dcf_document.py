@@ -14,7 +14,7 @@ import re
 from dataclasses import dataclass, field
 
 from daq.errors import ControllerUnfit
-from daq.writeback.formats.scalar import CORRECT_KEY, ControllerDocument, IntegerStyle, KeyPath, Leaves, Scalar, unfit
+from daq.formats.scalar import CORRECT_KEY, ControllerDocument, IntegerStyle, KeyPath, Leaves, Scalar, unfit
 
 _LINE = re.compile(r"([^\r\n]*)(?:\r\n|\r|\n|\Z)")
 _SECTION = re.compile(r"\s*\[([^\]]*)\]\s*")

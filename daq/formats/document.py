@@ -23,11 +23,11 @@ from pathlib import Path
 from daq.config.controller import ControllerFormat
 from daq.errors import ControllerUnfit
 from daq.files import read_regular
-from daq.writeback.formats.dcf_document import dcf_document
-from daq.writeback.formats.json_document import json_document
-from daq.writeback.formats.scalar import ControllerDocument
-from daq.writeback.formats.xml_document import xml_document
-from daq.writeback.formats.yaml_document import yaml_document
+from daq.formats.dcf_document import dcf_document
+from daq.formats.json_document import json_document
+from daq.formats.scalar import ControllerDocument
+from daq.formats.xml_document import xml_document
+from daq.formats.yaml_document import yaml_document
 
 MAX_BYTES = 4 * 2**20  #: No controller's parameter file is larger; a file that is must be something else
 

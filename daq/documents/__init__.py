@@ -1,0 +1,1 @@
+"""Documents that are kept or printed: one frozen type each, read and written here."""
