@@ -48,16 +48,9 @@ from drivers.motion.execute import execute
 from drivers.move import AxisLimits, MotionPermission, Move, check_moves, synchronised_move
 from drivers.stream.answers import StreamStatistics
 from drivers.stream.polling import Polling
+from drivers.stream.producers import DriveProducer, KernelProducer, SyncProducer
 from drivers.stream.stream import SyncStream
-from drivers.stream.sync import (
-    DriveProducer,
-    FollowedSync,
-    KernelProducer,
-    LockstepSync,
-    Pacing,
-    SyncProducer,
-    TimedSync,
-)
+from drivers.stream.sync import LockstepSync, Pacing, TimedSync
 from ident.model.bodies import Payload
 
 LOCKSTEP_TIMEOUT_S = 3.0  #: Time for all answers to a SYNC; a simulated cell on a busy machine may be that late
@@ -540,13 +533,12 @@ def _started(cell: Cell, producer: SyncProducer | None) -> tuple[SyncProducer | 
 
 def _pacing(cell: Cell, start_ns: int, clocks: Clocks, producer: SyncProducer | None) -> Pacing:
     sync = _sync(cell)
-    period_ns, clock = sync.period_us * 1000, clocks.monotonic_ns
+    period_ns = sync.period_us * 1000
+    clock = clocks.monotonic_ns
     if producer is not None:
         producer.start()  # again: it may have ended while nothing was recorded
-        seen = producer.seen if isinstance(producer, KernelProducer) else None  # a drive keeps its period by itself
         silence_s = max(SYNC_SILENCE_S, SYNC_SILENCE_PERIODS * period_ns * 1e-9)
-        stop = producer.pause
-        return FollowedSync(period_ns, producer.name, seen is not None, silence_s, seen, stop, start_ns, clock)
+        return producer.pacing(silence_s, start_ns, clock)
     if sync.pacing is declared.PacingMode.LOCKSTEP:
         return LockstepSync(period_ns, timeout_s=LOCKSTEP_TIMEOUT_S, start_ns=start_ns, clock=clock)
     return TimedSync(period_ns, start_ns=start_ns, clock=clock)

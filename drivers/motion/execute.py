@@ -44,8 +44,8 @@ from drivers.profiles.cia402 import (
     next_command,
 )
 from drivers.profiles.profile import ObjectEntry
-from drivers.stream.stream import LARGEST_LAG_NS, MAX_MISSING_CYCLES, SyncStream, nothing_to_send
-from drivers.stream.sync import LockstepSync
+from drivers.stream.cycles import LARGEST_LAG_NS, nothing_to_send
+from drivers.stream.stream import MAX_MISSING_CYCLES, SyncStream
 from drivers.stream.watch import FrozenData
 
 _NEW_SETPOINT = Command.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
@@ -356,7 +356,9 @@ class _Execution:
             missing = self._sample.missing
             powered = [axis for axis in self._axes if missing >> axis & 1 or self._state(axis) not in POWERLESS]
             self._network.powered -= {self._nodes[axis].node_id for axis in self._axes if axis not in powered}
-            lockstep_silent = self._stream.silent and isinstance(self._stream.pacing, LockstepSync)
-            if not powered or silent > (0 if lockstep_silent else MAX_MISSING_CYCLES):
+            # A stream that waits for answers has waited long enough in one cycle.
+            waited = self._stream.silent and self._stream.pacing.waits_for_answers
+            tolerated = 0 if waited else MAX_MISSING_CYCLES
+            if not powered or silent > tolerated:
                 break
         return tuple(powered)
