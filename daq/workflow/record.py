@@ -107,46 +107,48 @@ def network_of(cell: Cell, block_signals: SignalBlocker = nullcontext) -> Canope
     )
 
 
+@dataclass(frozen=True, slots=True)
+class RecordingRequest:
+    """A recording to make: its moves, its log, what the robot carries, and who permits the motion."""
+
+    cell_file: Path  #: file of the cell; the log gets it with all files that it names
+    cell: Cell  #: content of this file
+    plan: Plan  #: moves to make
+    out: Path  #: log to write; must not exist
+    payload: Payload | None  #: mounted payload; None without load
+    operator: str  #: person or job responsible for the recording
+    granted_by: str | None  #: operator who permits the motion; None refuses it
+    run_id: str  #: identity of the run in its log
+    speed: float = (
+        1.0  #: share of the planned speed at which the moves are made (`daq.workflow.plan.slowed`), for the log
+    )
+    entered_kg: float | None = None  #: mass of the payload that was weighed for this recording [kg]; None if it was not
+    unguarded: bool = False  #: whether axes may move that go on moving when this program is killed
+
+
 def record(
-    cell_file: Path,
-    cell: Cell,
-    plan: Plan,
-    out: Path,
+    request: RecordingRequest,
     *,
-    payload: Payload | None,
-    operator: str,
-    granted_by: str | None,
-    run_id: str,
-    speed: float = 1.0,
-    entered_kg: float | None = None,
     clocks: Clocks | None = None,
     free: FreeBytes = free_bytes,
     block_signals: SignalBlocker = nullcontext,
     progress: Callable[[int, int], None] = lambda _move, _moves: None,
     require_released: Callable[[], None] | None = None,
     feed: Feed | None = None,
-    unguarded: bool = False,
 ) -> Recorded:
     """Make a plan's moves and log every sample.
 
     Args:
-        cell_file: file of the cell; the log gets it with all files that it names.
-        cell: content of this file.
-        plan: moves to make.
-        out: log to write; must not exist.
-        payload: mounted payload; None without load.
-        operator: person or job responsible for the recording.
-        granted_by: operator who permits the motion; None refuses it.
-        speed: share of the planned speed at which the moves are made (`daq.workflow.plan.slowed`), for the log.
-        entered_kg: mass of the payload that was weighed for this recording [kg]; None if it was not.
+        request: the recording to make.
+        clocks: those of this computer, if None.
+        free: returns the free bytes of a folder's disk.
         block_signals: blocks signals while the axes are stopped.
         progress: receives the number of finished moves and of all moves.
         require_released: check that the robot may move, before the drives are used and again before they get power; if
             it raises, no file is made. By default the interlock of the cell file decides, where it declares one.
         feed: gets what the log gets, for consoles.
-        unguarded: whether axes may move that go on moving when this program is killed.
 
-    The cell's `policy` permits nothing here: it is for jobs, which pass its permissions as arguments.
+    The cell's `policy` permits nothing here: it is for jobs, which put its permissions into the request.
 
     Raises:
         UsageError: the weighed mass is not the payload's, or a file of that name exists; no file was made.
@@ -160,53 +162,44 @@ def record(
             No fit reads it; `daq.log.salvage` converts it to a partial log.
     """
     clocks = clocks or Clocks()
-    granted_by = _permission(granted_by)
-    check_entered_mass(cell, payload, entered_kg)
+    cell = request.cell
+    out = request.out
+    granted_by = _permission(request.granted_by)
+    check_entered_mass(cell, request.payload, request.entered_kg)
     require_released = require_released or release_check(cell, partial(_wall_time, clocks))
     require_released()
     with defer_full_gc(), network_of(cell, block_signals) as network, _sync_producer(cell, network) as wanted:
         network.prepare()
-        _require_guarded(network, unguarded)
+        _require_guarded(network, request.unguarded)
         polling = Polling.found(network, beside_stream=polling_fits(cell))
         scales = network.scales()
-        check_nameplates(cell_file, cell, scales)
-        warnings = (
-            *(*load_warnings(cell), *nameplate_warnings(cell, scales), *network.unguarded()),
-            *(polling_warnings(cell) if polling else ()),
-        )
+        check_nameplates(request.cell_file, cell, scales)
+        warnings = [*load_warnings(cell), *nameplate_warnings(cell, scales), *network.unguarded()]
+        warnings += polling_warnings(cell) if polling else ()
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
         scale = scaling(cell, readback)
-        rate_hz, files = 1e6 / _sync(cell).period_us, bundle(cell_file)
+        rate_hz = 1e6 / _sync(cell).period_us
+        files = bundle(request.cell_file)
         # Read the positions first, so that a refusal comes before a file exists. This takes a stream of its own: the
         # checks below last many periods, and the schedule of the recording does not wait.
         producer, remarks = _started(cell, wanted)
         permission = MotionPermission(granted_by, motor_limits(cell, scale))
         pacing = partial(_pacing, cell, clocks.wall_ns(), clocks, producer)
         start_counts, recovered = _start(cell, network, scale, permission, pacing, require_released)
-        moves = _checked_moves(cell, plan, scale, start_counts, permission)
+        moves = _checked_moves(cell, request.plan, scale, start_counts, permission)
         room = DiskRoom(out, free)
         room.require(_log_bytes(cell, moves, start_counts, files))
-        short: DiskSpaceShort | None = None
         temperatures = polling.temperatures(clocks.wall_ns())
         # Before the first SYNC of the recording's stream, whose schedule does not wait either.
         require_released()
-        started_ns = clocks.monotonic_ns()
-        run = RunInfo(
-            run_id=run_id,
-            rate_hz=rate_hz,
-            payload=payload,
-            operator=operator,
-            software=software(),
-            started_wall_ns=started_ns + clocks.wall_minus_monotonic_ns(),
-            started_monotonic_ns=started_ns,
-            speed=speed,
-            entered_kg=entered_kg,
-            controller_sha256=controller_digest(cell),
-        )
+        run = _run_info(request, rate_hz, clocks)
         content = LogContent.of(cell, run, files, readback)
         with LogWriter(out, content, scale.joint_position_of, clocks.monotonic_ns) as log:
             kept = Kept(
-                log, feed or Feed(cell_file), lambda done: progress(done, len(moves)), RecordedMotion(len(cell.axes))
+                log,
+                feed or Feed(request.cell_file),
+                lambda done: progress(done, len(moves)),
+                RecordedMotion(len(cell.axes)),
             )
             kept.feed.begin(_facts(cell, scale, run, out, len(moves)), lambda: log.statistics)
             log.readings(temperatures)
@@ -214,25 +207,40 @@ def record(
             polling.begin(stream, log.reading)
             for sample in until_complete(stream):
                 kept.sample(sample)
-            with closing(execute(network, stream, moves, permission)) as samples:
-                try:
-                    keep_samples(samples, kept, room, max(1, round(SPACE_CHECK_S * rate_hz)))
-                except DiskSpaceShort as error:
-                    short = error
+            samples = execute(network, stream, moves, permission)
+            short = _keep_motion(samples, kept, room, max(1, round(SPACE_CHECK_S * rate_hz)))
             stream.read_on(LATE_LOSSES_S)
             log.readings(polling.temperatures(stream.time_ns))
-            verdict = _judged(
+            valid, reason = _judged(
                 stream.statistics,
                 _stopped(short, kept, len(moves)),
                 impossible=partial(kept.motion.reason, cell, readback, rate_hz),
             )
-            log.conclude(*verdict, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns())
+            log.conclude(valid, reason, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns())
         kept.feed.finish()
         if short is not None:
             raise short
         if other := network.other_master():
-            warnings = (*warnings, f"{other}; it only read, but end that program before the next run")
-        return Recorded(out, log.statistics, stream.statistics, (*warnings, *remarks, *recovered, *polling.remarks))
+            warnings.append(f"{other}; it only read, but end that program before the next run")
+        warnings += (*remarks, *recovered, *polling.remarks)
+        return Recorded(out, log.statistics, stream.statistics, tuple(warnings))
+
+
+def _run_info(request: RecordingRequest, rate_hz: float, clocks: Clocks) -> RunInfo:
+    """Return what the log says of a run that starts now."""
+    started_ns = clocks.monotonic_ns()
+    return RunInfo(
+        run_id=request.run_id,
+        rate_hz=rate_hz,
+        payload=request.payload,
+        operator=request.operator,
+        software=software(),
+        started_wall_ns=started_ns + clocks.wall_minus_monotonic_ns(),
+        started_monotonic_ns=started_ns,
+        speed=request.speed,
+        entered_kg=request.entered_kg,
+        controller_sha256=controller_digest(request.cell),
+    )
 
 
 def controller_digest(cell: Cell) -> str | None:
@@ -303,6 +311,18 @@ def keep_samples(samples: Generator[Sample, None, None], kept: Kept, room: DiskR
         except BaseException as error:
             samples.throw(error)
             raise
+
+
+def _keep_motion(
+    samples: Generator[Sample, None, None], kept: Kept, room: DiskRoom, check_every: int
+) -> DiskSpaceShort | None:
+    """Log a motion to its end; returns the error of a disk that became full, after which the axes were stopped."""
+    with closing(samples):
+        try:
+            keep_samples(samples, kept, room, check_every)
+        except DiskSpaceShort as error:
+            return error
+    return None
 
 
 def duration_of(moves: Sequence[Move], start_counts: Sequence[int], rate_hz: float) -> float:
