@@ -11,6 +11,7 @@ A pacing is frozen data; `cycles` returns what a stream runs on. Cycles end by t
 from __future__ import annotations
 
 import time
+from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -107,6 +108,16 @@ class _CyclesByClock(Cycles):
         super().__init__(bus)
         self._deadline_ns = 0
 
+    def _read_the_rest(self) -> int:
+        """Process what has arrived since the last cycle; returns the time by the clock [ns]."""
+        bus = self.bus
+        bus.link.beat()
+        bus.read_waiting()
+        now_ns = bus.clock()
+        if bus.cycles == 0:
+            bus.answered_ns = now_ns
+        return now_ns
+
     def next_frame(self) -> can.Message | None:
         bus = self.bus
         recv = bus.link.bus.recv
@@ -129,11 +140,7 @@ class LockstepCycles(_CyclesByClock):
     def open(self) -> None:
         bus = self.bus
         pacing = self._pacing
-        bus.link.beat()
-        bus.read_waiting()
-        now_ns = bus.clock()
-        if bus.cycles == 0:
-            bus.answered_ns = now_ns
+        now_ns = self._read_the_rest()
         bus.time_ns = pacing.start_ns + bus.cycles * pacing.period_ns
         # A cell that was silent for the whole time gets less the next time: the stop must not take minutes.
         bound_s = pacing.timeout_s / SHORTENED if bus.silent else pacing.timeout_s
@@ -168,12 +175,9 @@ class TimedCycles(_CyclesByClock):
 
     def open(self) -> None:
         bus = self.bus
-        bus.link.beat()
-        bus.read_waiting()
-        now_ns = bus.clock()
+        now_ns = self._read_the_rest()
         if bus.cycles == 0:
             self._due_ns = now_ns
-            bus.answered_ns = now_ns
         while (left_ns := self._due_ns - now_ns) > 0:
             message = bus.link.bus.recv(left_ns * 1e-9)
             if message is not None:
@@ -189,8 +193,37 @@ class TimedCycles(_CyclesByClock):
         bus.cycles += 1
 
 
-class EchoedCycles(Cycles):
-    """A cycle lasts from our SYNC to the next one, which come back among the frames of a bus with stamps.
+class _CyclesByOrder(Cycles):
+    """Cycles that end with the next SYNC, in the order of the frames on the bus."""
+
+    @abstractmethod
+    def _read(self) -> can.Message | None:
+        """Return the next frame; None if none comes in time."""
+
+    def _next_sync(self) -> can.Message | None:
+        """Process the frames before the next SYNC, and return it; None if it does not come."""
+        sync = self.early_sync
+        self.early_sync = None
+        while sync is None:
+            message = self._read()
+            if message is None:
+                return None
+            if self.is_next_sync(message):
+                sync = message
+            else:
+                self.bus.between(message)
+        return sync
+
+    def next_frame(self) -> can.Message | None:
+        message = self._read()
+        if message is None or not self.is_next_sync(message):
+            return message
+        self.early_sync = message
+        return None
+
+
+class EchoedCycles(_CyclesByOrder):
+    """A cycle lasts from our SYNC to our next one: both come back among the frames of a bus with stamps.
 
     SYNC is sent on schedule while frames are waited for.
 
@@ -212,16 +245,9 @@ class EchoedCycles(Cycles):
         if bus.cycles == 0:
             self._due_ns = bus.clock()
             bus.answered_ns = self._due_ns
-        sync = self.early_sync
-        self.early_sync = None
-        while sync is None:
-            message = self._read_and_send()
-            if message is None:
-                return TimedCycles(bus, self._period_ns, self._due_ns)
-            if self.is_next_sync(message):
-                sync = message
-            else:
-                bus.between(message)
+        sync = self._next_sync()
+        if sync is None:
+            return TimedCycles(bus, self._period_ns, self._due_ns)
         now_ns = bus.clock()
         at_ns = arrived_ns(sync, now_ns)
         bus.too_late(now_ns - at_ns)
@@ -232,14 +258,7 @@ class EchoedCycles(Cycles):
         bus.cycles += 1
         return None
 
-    def next_frame(self) -> can.Message | None:
-        message = self._read_and_send()
-        if message is None or not self.is_next_sync(message):
-            return message
-        self.early_sync = message
-        return None
-
-    def _read_and_send(self) -> can.Message | None:
+    def _read(self) -> can.Message | None:
         """Return the next frame, and send SYNC when it is due; None once SYNC does not come back."""
         bus = self.bus
         if self._comes_back and (taken := bus.batched()) is not None:
@@ -262,7 +281,7 @@ class EchoedCycles(Cycles):
         return None
 
 
-class FollowedCycles(Cycles):
+class FollowedCycles(_CyclesByOrder):
     """A cycle lasts from one SYNC of a producer to the next, in the order of the frames."""
 
     def __init__(self, bus: CycleBus, pacing: FollowedSync) -> None:
@@ -291,19 +310,12 @@ class FollowedCycles(Cycles):
         if outgoing := bus.take_outgoing():
             # As early in the period as possible: all of it should arrive before the next SYNC.
             bus.link.send(outgoing)
-        sync = self.early_sync
-        self.early_sync = None
         # A cycle that waited in vain for answers waited for this SYNC too: half of the time-out is enough.
-        waited = self._timeout_ns // 2 if self._waited else self._timeout_ns
-        end_ns = bus.clock() + waited
-        while sync is None:
-            message = self._next_arrived(end_ns)
-            if message is None:
-                return self._lose_sync()
-            if is_sync(message):
-                sync = message
-            else:
-                bus.between(message)
+        bound_ns = self._timeout_ns // 2 if self._waited else self._timeout_ns
+        self._deadline_ns = bus.clock() + bound_ns
+        sync = self._next_sync()
+        if sync is None:
+            return self._lose_sync()
         self._take_sync(sync)
         return None
 
@@ -353,17 +365,17 @@ class FollowedCycles(Cycles):
         return TimedCycles(bus, pacing.period_ns, due_ns)
 
     def next_frame(self) -> can.Message | None:
-        # Only the order on the bus counts: frames that have arrived are read first, whatever the clock shows.
-        message = self._next_arrived(self._deadline_ns)
-        self._waited = message is None
-        if message is None or not is_sync(message):
-            return message
-        self.early_sync = message
-        return None
+        message = super().next_frame()
+        self._waited = message is None and self.early_sync is None
+        return message
 
-    def _next_arrived(self, end_ns: int) -> can.Message | None:
-        """Return the next frame that arrived before a deadline, even if it is read late; None without any."""
+    def _read(self) -> can.Message | None:
+        """Return the next frame that arrived before the deadline, even if it is read late; None without any.
+
+        Only the order on the bus counts: frames that have arrived are read first, whatever the clock shows.
+        """
         bus = self.bus
+        end_ns = self._deadline_ns
         if (taken := bus.batched()) is not None:
             return taken
         recv = bus.link.bus.recv
