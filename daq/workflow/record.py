@@ -75,8 +75,10 @@ class Clocks:
 
     def wall_minus_monotonic_ns(self) -> int:
         """Return the present offset of the two [ns]; the monotonic clock is read before and after the other."""
-        before, wall, after = self.monotonic_ns(), self.wall_ns(), self.monotonic_ns()
-        return wall - (before + after) // 2
+        before_ns = self.monotonic_ns()
+        wall_ns = self.wall_ns()
+        after_ns = self.monotonic_ns()
+        return wall_ns - (before_ns + after_ns) // 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,9 +97,10 @@ def network_of(cell: Cell, block_signals: SignalBlocker = nullcontext) -> Canope
     Raises:
         ConfigurationInconsistent: the cell file has no bus, or an axis without amplifier.
     """
-    pacing, period_us = (declared.PacingMode.TIMED, 0) if cell.sync is None else (cell.sync.pacing, cell.sync.period_us)
-    # The heartbeat is sent with SYNC: a long period must not stop the axes.
-    guard_ms = max(GUARD_MS[pacing], 3 * period_us // 1000)
+    guard_ms = GUARD_MS[declared.PacingMode.TIMED]
+    if cell.sync is not None:
+        # The heartbeat is sent with SYNC: a long period must not stop the axes.
+        guard_ms = max(GUARD_MS[cell.sync.pacing], 3 * cell.sync.period_us // 1000)
     return CanopenNetwork(
         cell_address(cell),
         drive_axes(cell),
@@ -327,7 +330,8 @@ def _keep_motion(
 
 def duration_of(moves: Sequence[Move], start_counts: Sequence[int], rate_hz: float) -> float:
     """Return the duration of moves of the motors from given positions, dwells included [s]."""
-    total_s, here = 0.0, tuple(start_counts)
+    total_s = 0.0
+    here = tuple(start_counts)
     for move in moves:
         total_s += max(move.duration_s(here)) + move.dwell_cycles / rate_hz
         here = move.target_counts
@@ -370,7 +374,8 @@ def motor_limits(cell: Cell, scale: SiScaling) -> tuple[AxisLimits, ...]:
     checked in the plan.
     """
     lower, upper = np.array([axis.limits.position for axis in cell.axes]).T - scale.offset_rad
-    forwards, backwards = np.maximum(cell.ratio, 0.0), np.minimum(cell.ratio, 0.0)
+    forwards = np.maximum(cell.ratio, 0.0)
+    backwards = np.minimum(cell.ratio, 0.0)
     low = (forwards @ lower + backwards @ upper) / scale.rad_per_count
     high = (forwards @ upper + backwards @ lower) / scale.rad_per_count
     turns = np.abs(cell.ratio) * ROUNDING / scale.rad_per_count[:, None]
@@ -385,7 +390,8 @@ def motor_limits(cell: Cell, scale: SiScaling) -> tuple[AxisLimits, ...]:
 def motor_moves(cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence[int]) -> tuple[Move, ...]:
     """Convert the joint trapezoids of a plan to motor moves [counts]: R is linear, and all axes share the ramps."""
     moves = []
-    here_rad, here = scale.joint_position(np.array(start_counts)), tuple(start_counts)
+    here_rad = scale.joint_position(np.array(start_counts))
+    here = tuple(start_counts)
     for planned in plan.moves:
         path = path_of(cell, here_rad, planned)
         target_rad = np.array(planned.target_rad)
@@ -398,7 +404,8 @@ def motor_moves(cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence
         exact = [AxisLimits(0, 0, max(v, 2.0) + 1.0, max(a, 2.0) + 1.0) for v, a in zip(speed, ramp, strict=True)]
         dwell = round(planned.dwell_s * 1e6 / _sync(cell).period_us)
         moves.append(synchronised_move(here, target, exact, dwell))
-        here_rad, here = target_rad, target
+        here_rad = target_rad
+        here = target
     return tuple(moves)
 
 
@@ -527,7 +534,8 @@ def _sync_producer(cell: Cell, network: CanopenNetwork) -> AbstractContextManage
 
     On one SocketCAN bus the kernel sends it for this program, which a busy computer delays.
     """
-    sync, address = cell.sync, network.link.address
+    sync = cell.sync
+    address = network.link.address
     if sync is None:
         return nullcontext()
     timed = sync.pacing is declared.PacingMode.TIMED
