@@ -79,12 +79,12 @@ _HOMES = {
     "canopen.split_bus": "BusPart SplitAddress",
     "errors": "BusBusy BusError DriveFault DriverError MotionRefused MotionTimeout NodeError NodeMisplaced NodeMissing "
     "ObjectAccessError ParameterRefused ParametersMixed SampleLost SetupRefused StateRefused",
+    "messages": "CellEvent EventKind Sample",
     "motion.execute": "execute",
-    "motion.move": "AxisLimits MotionPermission Move synchronised_move",
+    "move": "AxisLimits MotionPermission Move synchronised_move",
     "profiles.cia402": "State decode",
     "profiles.profile": "CIA402 Amplitude Axis CurrentScale DriveProfile Identity ObjectEntry TapPoint",
     "stream.answers": "StreamStatistics",
-    "stream.sample": "CellEvent EventKind Sample",
     "stream.stream": "SyncStream",
     "stream.sync": "FollowedSync LockstepSync TimedSync",
 }

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CellOption, JsonOption, Verb, judged_output, print_json, say_correct_first, say_next
+from daq.cli.verb import CellOption, JsonOption, Verb, judged_output, print_json, say_correct_first, say_next, taking
 from daq.workflow.choices import Known
 from ident.estimators.method import Method
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
+    from daq.log.reader import LossyLogs
+    from daq.workflow.cases import CaseFit
     from daq.workflow.fit import Fit
     from ident.calibration import Calibration
 
@@ -63,91 +66,136 @@ CompareOption = Annotated[
 ]
 
 
-def fit_verb(
-    logs: LogsArgument,
+@dataclass(frozen=True, slots=True)
+class FitRequest:
+    """A fit of logs, as the command line asks for it."""
+
+    logs: LogsArgument
     method: Annotated[
         Method | None,
         typer.Option(
             help="ls, wls, tls of the paper; ml (default; wls with fixed gains); iv: instruments of the demand."
         ),
-    ] = None,
-    gains: GainsOption = Gains.FREE,
-    known: KnownOption = Known.MASS,
-    essential: EssentialOption = None,
-    cases: CasesOption = None,
-    compare: CompareOption = False,
-    holdout: HoldoutOption = None,
-    out: OutOption = None,
+    ] = None
+    gains: GainsOption = Gains.FREE
+    known: KnownOption = Known.MASS
+    essential: EssentialOption = None
+    cases: CasesOption = None
+    compare: CompareOption = False
+    holdout: HoldoutOption = None
+    out: OutOption = None
     report: Annotated[
         Path | None, typer.Option("--report", help="Folder for report.html, the certificate.", callback=judged_output)
-    ] = None,
-    pictures: PicturesOption = None,
-    cell: CellOption = None,
-    accept_losses: AcceptLossesOption = False,
-    channels_as_wired: AsWiredOption = False,
-    json: JsonOption = False,
-) -> None:
+    ] = None
+    pictures: PicturesOption = None
+    cell: CellOption = None
+    accept_losses: AcceptLossesOption = False
+    channels_as_wired: AsWiredOption = False
+    json: JsonOption = False
+
+    @property
+    def gains_fixed(self) -> bool:
+        """Whether the nameplate gains are held."""
+        return self.gains is Gains.FIXED
+
+
+@taking(FitRequest)
+def fit_verb(request: FitRequest) -> None:
     """Identify all drive gains and dynamic parameters from runs without load and with a weighed payload."""
-    from dataclasses import replace
     from datetime import UTC, datetime
 
-    from daq.cli.terminal import at_most_one, check_folder, check_output, print_view, require_different, status
-    from daq.config.cell_file import load_cell
-    from daq.log.reader import LossyLogs
+    from daq.cli.terminal import print_view, status
     from daq.report.fit import fit_document, fit_view
-    from daq.workflow.cases import CaseFit, calibration_of_case, essential_fit, fit_case, reduce_logs
-    from daq.workflow.fit import compare_estimators, fit
-    from ident.estimators.refusals import require_plausible
+    from daq.workflow.cases import calibration_of_case
+    from daq.workflow.fit import compare_estimators
 
-    if cases is not None:
-        other = {"known": known is not Known.MASS, "gains": gains is not Gains.FREE}  # every case has its own
-        at_most_one(cases=cases, method=method, **other, out=out, report=report, pictures=pictures)
-        _fit_cases(logs, holdout or (), None if cell is None else load_cell(cell), essential, cases, json=json)
+    if request.cases is not None:
+        _fit_cases(request, request.cases)
         return
-    check_folder(out)
-    check_output(out, (*logs, *(holdout or ()), cell), CALIBRATION)
-    require_different(out, report=report, pictures=pictures)
-    check_report(report, out)
+    _check_places(request)
     with status("identifying"):
-        described = None if cell is None else load_cell(cell)
-        fixed = gains is Gains.FIXED
-        if known is Known.MASS:
-            lossy = LossyLogs.ACCEPTED if accept_losses else LossyLogs.REFUSED
-            fitted = fit(
-                logs,
-                holdout=holdout or (),
-                method=method,
-                gains_fixed=fixed,
-                cell=described,
-                lossy=lossy,
-                channels_as_wired=channels_as_wired,
-            )
-            found = CaseFit(fitted, (), None)
-        else:
-            chosen = method or (Method.WLS if fixed else Method.ML)
-            reduced = reduce_logs(logs, holdout or (), described, instruments=chosen is Method.IV)
-            found = fit_case(reduced, chosen, known, gains_fixed=fixed)
-            one = found.fitted.identification
-            require_plausible(one.estimate, one.training_error, found.fitted.cell.axis_names)
-        if essential is not None:
-            found = replace(essential_fit(found.fitted, essential), payloads=found.payloads)
+        found = _fit(request)
         calibration = calibration_of_case(found, datetime.now(UTC))
-    _save(found.fitted, calibration, out, pictures)
-    if report is not None:
-        _save_certificate(found.fitted, calibration, report)
+    _save(found.fitted, calibration, request.out, request.pictures)
+    if request.report is not None:
+        _save_certificate(found.fitted, calibration, request.report)
     comparison = None
-    if compare:
+    if request.compare:
         with status("comparing estimators") as report_step:
             comparison = compare_estimators(found.fitted, report_step)
-    if json:
+    if request.json:
         print_json(fit_document(found, calibration, comparison))
+        return
+    print_view(fit_view(found, calibration, comparison), request.out, request.report, request.pictures)
+    same = _holdout_words(request)
+    if request.cell is not None:
+        same += ["--cell", request.cell]
+    if request.gains_fixed:
+        same += ["--gains", request.gains.value]
+    if request.channels_as_wired:
+        same += ["--channels-as-wired"]
+    say_after_fit(calibration, [*request.logs, *same], request.out or Path("calibration.yaml"))
+
+
+def _check_places(request: FitRequest | ResidualRequest) -> None:
+    """Refuse places of the output that cannot be written, before any long work."""
+    from daq.cli.terminal import check_folder, check_output, require_different
+
+    check_folder(request.out)
+    inputs = (*request.logs, *(request.holdout or ()), request.cell)
+    check_output(request.out, inputs, CALIBRATION)
+    require_different(request.out, report=request.report, pictures=request.pictures)
+    check_report(request.report, request.out)
+
+
+def _cell_of(request: FitRequest | ResidualRequest) -> Cell | None:
+    """Load the corrected cell file; None where the one in the logs is used."""
+    from daq.config.cell_file import load_cell
+
+    return None if request.cell is None else load_cell(request.cell)
+
+
+def _holdout_words(request: FitRequest | ResidualRequest) -> list[object]:
+    """Return the held-out logs as words of a command."""
+    return [word for log in request.holdout or () for word in ("--holdout", log)]
+
+
+def _losses_of(request: FitRequest | ResidualRequest) -> LossyLogs:
+    from daq.log.reader import LossyLogs
+
+    return LossyLogs.ACCEPTED if request.accept_losses else LossyLogs.REFUSED
+
+
+def _fit(request: FitRequest) -> CaseFit:
+    """Fit the logs with what is known of the payload, and keep the essential parameters alone if that is wanted."""
+    from dataclasses import replace
+
+    from daq.workflow.cases import CaseFit, essential_fit, fit_case, reduce_logs
+    from daq.workflow.fit import fit
+    from ident.estimators.refusals import require_plausible
+
+    holdout = request.holdout or ()
+    cell = _cell_of(request)
+    if request.known is Known.MASS:
+        fitted = fit(
+            request.logs,
+            holdout=holdout,
+            method=request.method,
+            gains_fixed=request.gains_fixed,
+            cell=cell,
+            lossy=_losses_of(request),
+            channels_as_wired=request.channels_as_wired,
+        )
+        found = CaseFit(fitted, (), None)
     else:
-        print_view(fit_view(found, calibration, comparison), out, report, pictures)
-        same = [word for log in holdout or () for word in ("--holdout", log)]
-        same += [] if cell is None else ["--cell", cell]
-        same += ["--gains", gains.value] if fixed else []
-        same += ["--channels-as-wired"] if channels_as_wired else []
-        say_after_fit(calibration, [*logs, *same], out or Path("calibration.yaml"))
+        method = request.method or (Method.WLS if request.gains_fixed else Method.ML)
+        reduced = reduce_logs(request.logs, holdout, cell, instruments=method is Method.IV)
+        found = fit_case(reduced, method, request.known, gains_fixed=request.gains_fixed)
+        one = found.fitted.identification
+        require_plausible(one.estimate, one.training_error, found.fitted.cell.axis_names)
+    if request.essential is None:
+        return found
+    return replace(essential_fit(found.fitted, request.essential), payloads=found.payloads)
 
 
 def say_after_fit(calibration: Calibration, arguments: Sequence[object], out: Path) -> None:
@@ -160,31 +208,43 @@ def say_after_fit(calibration: Calibration, arguments: Sequence[object], out: Pa
         say_next("drivegain", "residual", *arguments, "--out", out, "--report", "report")
 
 
-def _fit_cases(
-    logs: Sequence[Path], holdout: Sequence[Path], cell: Cell | None, ratio: float | None, folder: Path, *, json: bool
-) -> None:
+def _fit_cases(request: FitRequest, folder: Path) -> None:
     """Fit the paper's cases and ours, write a calibration of each, and tabulate them as Tables 1 to 4."""
     from datetime import UTC, datetime
 
-    from daq.cli.terminal import check_output, print_view, status, write_output
+    from daq.cli.terminal import at_most_one, check_output, print_view, status, write_output
     from daq.documents.calibration_file import save_calibration
     from daq.files import replace_file
     from daq.report.fit import cases_document, cases_view
     from daq.report.paper_tables import case_tables, page
-    from daq.workflow.cases import CASES, CaseFit, calibration_of_case, fit_case, reduce_logs
+    from daq.workflow.cases import CASES, calibration_of_case, fit_case, reduce_logs
 
+    at_most_one(
+        cases=folder,
+        method=request.method,
+        known=request.known is not Known.MASS,  # every case has its own
+        gains=request.gains is not Gains.FREE,  # likewise
+        out=request.out,
+        report=request.report,
+        pictures=request.pictures,
+    )
+    cell = _cell_of(request)
+    holdout = request.holdout or ()
+    inputs = (*request.logs, *holdout)
     created = datetime.now(UTC)
     files = {case.name: folder / f"{case.name}.yaml" for case in CASES}
     page_file = folder / "tables.md"
-    check_output(page_file, (*logs, *holdout), TABLES)
+    check_output(page_file, inputs, TABLES)
     for file in files.values():
-        check_output(file, (*logs, *holdout), CALIBRATION)
+        check_output(file, inputs, CALIBRATION)
     with status("identifying") as report_step:
-        reduced = reduce_logs(logs, holdout, cell)
+        reduced = reduce_logs(request.logs, holdout, cell)
         fits: dict[str, CaseFit] = {}
         for case in CASES:
             report_step(case.title)
-            fits[case.name] = fit_case(reduced, case.method, case.known, gains_fixed=case.gains_fixed, ratio=ratio)
+            fits[case.name] = fit_case(
+                reduced, case.method, case.known, gains_fixed=case.gains_fixed, ratio=request.essential
+            )
         calibrations = {name: calibration_of_case(found, created) for name, found in fits.items()}
     tables = case_tables(calibrations)
     with write_output(folder):
@@ -192,7 +252,7 @@ def _fit_cases(
         for name, file in files.items():
             save_calibration(calibrations[name], file)
         replace_file(page_file, page(f"Identification of {reduced.cell.name}", tables, marker=TABLES).encode())
-    if json:
+    if request.json:
         print_json(cases_document(fits, calibrations))
     else:
         print_view(cases_view(fits, tables), *files.values(), page_file)
@@ -201,112 +261,127 @@ def _fit_cases(
 FIT = Verb("fit", fit_verb, "drivegain fit unloaded.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml")
 
 
-def residual_verb(
-    logs: LogsArgument,
-    gains: GainsOption = Gains.FREE,
-    holdout: HoldoutOption = None,
-    seed: Annotated[int, typer.Option(help="Seed of the significance test, which fixes its verdict.", min=0)] = 0,
-    out: OutOption = None,
+@dataclass(frozen=True, slots=True)
+class ResidualRequest:
+    """A search for what the model lacks, as the command line asks for it."""
+
+    logs: LogsArgument
+    gains: GainsOption = Gains.FREE
+    holdout: HoldoutOption = None
+    seed: Annotated[int, typer.Option(help="Seed of the significance test, which fixes its verdict.", min=0)] = 0
+    out: OutOption = None
     report: Annotated[
         Path | None, typer.Option("--report", help="Folder for report.html and residual.json.", callback=judged_output)
-    ] = None,
-    pictures: PicturesOption = None,
+    ] = None
+    pictures: PicturesOption = None
     leave_out_runs: Annotated[
         bool, typer.Option("--leave-out-runs", help="Also predict each run from a fit of the others: slow.")
-    ] = False,
-    cell: CellOption = None,
-    accept_losses: AcceptLossesOption = False,
-    channels_as_wired: AsWiredOption = False,
+    ] = False
+    cell: CellOption = None
+    accept_losses: AcceptLossesOption = False
+    channels_as_wired: AsWiredOption = False
     accept_worse_holdout: Annotated[
         bool,
         typer.Option(
             "--accept-worse-holdout",
             help="Write every effect that was found, whatever held-out logs say.",
         ),
-    ] = False,
+    ] = False
     write_undecided: Annotated[
         bool,
         typer.Option(
             "--write-undecided",
             help="Write effects that held-out logs neither confirm nor refute, too.",
         ),
-    ] = False,
+    ] = False
     verbose: Annotated[
         bool,
         typer.Option("--verbose", help="Also print the search, all errors and what these data cannot show."),
-    ] = False,
-    json: JsonOption = False,
-) -> None:
+    ] = False
+    json: JsonOption = False
+
+
+@taking(ResidualRequest)
+def residual_verb(request: ResidualRequest) -> None:
     """Fit, then detect the effect that explains the residual, add it, refit everything, and repeat."""
-    from dataclasses import replace
     from datetime import UTC, datetime
 
-    from daq.cli.terminal import check_folder, check_output, print_view, require_different, status, write_output
-    from daq.config.cell_file import load_cell
+    from daq.cli.terminal import print_view, status, write_output
     from daq.errors import OutputFailed
-    from daq.log.reader import LossyLogs
     from daq.report.fit import start_of
     from daq.report.residual import residual_document, residual_view
     from daq.report.residual_page import save_report
-    from daq.workflow.fit import Undecided, calibration_of, check_holdout, close_loop, fit
+    from daq.workflow.fit import calibration_of, check_holdout
     from ident.discovery.before_after import account
-    from ident.estimators.method import Method
 
-    check_folder(out)
-    check_output(out, (*logs, *(holdout or ()), cell), CALIBRATION)
-    require_different(out, report=report, pictures=pictures)
-    check_report(report, out)
+    _check_places(request)
     with status("identifying") as report_step:
-        fitted = fit(
-            logs,
-            holdout=holdout or (),
-            method=Method.ML,
-            gains_fixed=gains is Gains.FIXED,
-            cell=None if cell is None else load_cell(cell),
-            lossy=LossyLogs.ACCEPTED if accept_losses else LossyLogs.REFUSED,
-            keep_rows=True,
-            channels_as_wired=channels_as_wired,
-        )
-        undecided = Undecided.of(write=write_undecided, ignore_holdout=accept_worse_holdout)
-        found = close_loop(fitted, seed, report_step, undecided)
-        closed = replace(found, accept_worse_holdout=accept_worse_holdout)
+        closed = _search(request, report_step)
         calibration = calibration_of(closed, datetime.now(UTC))
         report_step("computing the errors before and after")
-        changed = account(start_of(closed), closed.steps, leave_out_runs=leave_out_runs, progress=report_step)
+        changed = account(start_of(closed), closed.steps, leave_out_runs=request.leave_out_runs, progress=report_step)
 
     def show(*written: Path | None) -> None:
-        if json:
+        if request.json:
             print_json(residual_document(closed, changed, calibration))
         else:
-            print_view(residual_view(closed, changed, calibration, verbose=verbose), *written)
+            print_view(residual_view(closed, changed, calibration, verbose=request.verbose), *written)
 
     try:
-        if report is not None:
-            with status("drawing the report"), write_output(report):
-                save_report(closed, changed, calibration, report)
+        if request.report is not None:
+            with status("drawing the report"), write_output(request.report):
+                save_report(closed, changed, calibration, request.report)
         check_holdout(closed)
-        _save(closed, calibration, out, pictures)
+        _save(closed, calibration, request.out, request.pictures)
     except OutputFailed:
         show()  # what took minutes to find is not lost with the disk
         raise
-    show(out, report, pictures)
-    if json:
+    show(request.out, request.report, request.pictures)
+    if not request.json:
+        _say_after_search(request)
+
+
+def _search(request: ResidualRequest, report_step: Callable[[str], None]) -> Fit:
+    """Fit the logs, and add the effects that the model lacks."""
+    from dataclasses import replace
+
+    from daq.workflow.fit import Undecided, close_loop, fit
+
+    fitted = fit(
+        request.logs,
+        holdout=request.holdout or (),
+        method=Method.ML,
+        gains_fixed=request.gains is Gains.FIXED,
+        cell=_cell_of(request),
+        lossy=_losses_of(request),
+        keep_rows=True,
+        channels_as_wired=request.channels_as_wired,
+    )
+    undecided = Undecided.of(write=request.write_undecided, ignore_holdout=request.accept_worse_holdout)
+    found = close_loop(fitted, request.seed, report_step, undecided)
+    return replace(found, accept_worse_holdout=request.accept_worse_holdout)
+
+
+def _say_after_search(request: ResidualRequest) -> None:
+    """Print the next step: the calibration tested on other logs, or the same search with a calibration to write."""
+    same: list[object] = [] if request.cell is None else ["--cell", request.cell]
+    if request.out is not None:
+        say_next("drivegain", "validate", request.out, *(request.holdout or request.logs), *same)
         return
-    same: list[object] = [] if cell is None else ["--cell", cell]
-    if out is not None:
-        say_next("drivegain", "validate", out, *(holdout or logs), *same)
-        return
-    same += [word for log in holdout or () for word in ("--holdout", log)]
-    same += ["--gains", gains.value] if gains is Gains.FIXED else []
-    same += ["--seed", str(seed)] if seed else []
+    same += _holdout_words(request)
+    if request.gains is Gains.FIXED:
+        same += ["--gains", request.gains.value]
+    if request.seed:
+        same += ["--seed", str(request.seed)]
     switches = {
-        "--accept-losses": accept_losses,
-        "--channels-as-wired": channels_as_wired,
-        "--accept-worse-holdout": accept_worse_holdout,
-        "--write-undecided": write_undecided,
+        "--accept-losses": request.accept_losses,
+        "--channels-as-wired": request.channels_as_wired,
+        "--accept-worse-holdout": request.accept_worse_holdout,
+        "--write-undecided": request.write_undecided,
     }
     same += [name for name, given in switches.items() if given]
-    say_next("drivegain", "residual", *logs, *same, "--out", "calibration.yaml", "--report", report or "report")
+    report = request.report or "report"
+    say_next("drivegain", "residual", *request.logs, *same, "--out", "calibration.yaml", "--report", report)
 
 
 def check_report(folder: Path | None, out: Path | None = None) -> None:

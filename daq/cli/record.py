@@ -55,7 +55,7 @@ def record_verb(
     from daq.workflow.bus_lock import bus_lock
     from daq.workflow.plan import slowed
     from daq.workflow.plan_file import load_plan
-    from daq.workflow.record import record
+    from daq.workflow.record import RecordingRequest, record
     from daq.workflow.safeguards import check_entered_mass
 
     declared = load_cell(cell)
@@ -67,6 +67,19 @@ def record_verb(
     not_weighed = carried is not None and mass is None
     for line in _before_motion(declared, plan, not_weighed):
         typer.echo(line, err=True)
+    request = RecordingRequest(
+        cell,
+        declared,
+        moves,
+        out,
+        payload=carried,
+        operator=who,
+        granted_by=who if enable_motion else None,
+        run_id=str(uuid.uuid4()),
+        speed=speed,
+        entered_kg=mass,
+        unguarded=unguarded,
+    )
     try:
         with (
             bus_lock(declared),
@@ -77,20 +90,10 @@ def record_verb(
             if feed.remark:
                 typer.echo(feed.remark, err=True)
             done = record(
-                cell,
-                declared,
-                moves,
-                out,
-                payload=carried,
-                operator=who,
-                granted_by=who if enable_motion else None,
-                run_id=str(uuid.uuid4()),
-                speed=speed,
-                entered_kg=mass,
+                request,
                 block_signals=block_signals,
                 progress=lambda count, total: report_progress(count, total, "moves"),
                 feed=feed,
-                unguarded=unguarded,
             )
     except KeyboardInterrupt as interrupt:
         made = next((path for path in (out, part) if path.exists()), None)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from enum import Enum
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -32,6 +32,9 @@ CellOption = Annotated[
     Path | None, typer.Option("--cell", help="Corrected file of the same cell, in place of the one in the logs.")
 ]
 CalibrationArgument = Annotated[Path, typer.Argument(help="calibration.yaml written by `drivegain fit`.")]
+
+
+RequestT = TypeVar("RequestT")
 
 
 def judged_output(path: Path | None) -> Path | None:
@@ -54,6 +57,24 @@ def judged_output(path: Path | None) -> Path | None:
             remedy="choose another name, or name the place itself",
         ) from error
     return path
+
+
+def taking(request: type[RequestT]) -> Callable[[Callable[[RequestT], None]], Callable[..., None]]:
+    """Let a verb take one frozen object in place of its arguments and options.
+
+    Args:
+        request: dataclass whose fields declare them, as the parameters of other verbs do.
+    """
+
+    def decorate(verb: Callable[[RequestT], None]) -> Callable[..., None]:
+        def parsed(**given: Any) -> None:
+            verb(request(**given))
+
+        parsed.__doc__ = verb.__doc__
+        parsed.__signature__ = inspect.signature(request, eval_str=True)  # type: ignore[attr-defined]
+        return parsed
+
+    return decorate
 
 
 HELP_NAMES = ["-h", "--help"]

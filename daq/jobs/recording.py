@@ -38,7 +38,7 @@ from daq.workflow.fit import check_holdout
 from daq.workflow.interlock import Runner, release_check
 from daq.workflow.plan import Plan
 from daq.workflow.plan_file import load_plan, save_plan
-from daq.workflow.record import Recorded
+from daq.workflow.record import Recorded, RecordingRequest
 from ident.calibration import Calibration
 from ident.errors import IdentificationError
 
@@ -168,20 +168,23 @@ def _record(context: JobContext, planned: PlannedRun, plan: Plan, out: Path) -> 
     """
     # `section_of` has checked that the cell has it.
     payload = next((one.payload for one in context.cell.payloads if one.name == planned.payload), None)
-    return context.tools.record(
+    request = RecordingRequest(
         context.file,
         context.cell,
         plan,
         out,
         payload=payload,
-        entered_kg=planned.mass_kg,
         operator=context.who,
         granted_by=f"the policy of cell {context.cell.name} and its interlock, for {context.who}",
         run_id=str(uuid.uuid4()),
+        entered_kg=planned.mass_kg,
+        unguarded=context.cell.unguarded is Permission.ALLOWED,
+    )
+    return context.tools.record(
+        request,
         free=context.tools.free,
         block_signals=context.block_signals,
         require_released=release_check(context.cell, context.tools.now, context.tools.run),
-        unguarded=context.cell.unguarded is Permission.ALLOWED,
     )
 
 

@@ -29,7 +29,7 @@ from daq.simulation.simulation_file import load_simulation, require_simulator
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.plan import Plan, plan
 from daq.workflow.plan_file import save_plan
-from daq.workflow.record import Recorded, network_of, record
+from daq.workflow.record import Recorded, RecordingRequest, network_of, record
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.request import Request
 from daq.writeback.target import Proposal, Written, apply, propose
@@ -239,17 +239,17 @@ def _record(
     spec = load_simulation(settings.simulation, payload)
     declared = {candidate.name: candidate for candidate in cell.payloads}
     mounted = None if payload is None else declared[payload]
+    request = RecordingRequest(
+        cell_file,
+        cell,
+        moves,
+        settings.out / f"{name}.mcap",
+        payload=None if mounted is None else mounted.payload,
+        operator="demo",
+        granted_by="the demonstration: a simulated cell",
+        run_id=f"demo-{settings.seed}-{name}",
+        entered_kg=None if mounted is None else mounted.mass_kg,  # the simulated disc is what it is called
+    )
     # Another noise in every run, as another day would bring; the plant is the same.
     with _simulated(cell, replace(spec, seed=spec.seed + 100 * settings.seed + index)):
-        return record(
-            cell_file,
-            cell,
-            moves,
-            settings.out / f"{name}.mcap",
-            payload=None if mounted is None else mounted.payload,
-            entered_kg=None if mounted is None else mounted.mass_kg,  # the simulated disc is what it is called
-            operator="demo",
-            granted_by="the demonstration: a simulated cell",
-            run_id=f"demo-{settings.seed}-{name}",
-            progress=lambda done, total: reporter.progress(done, total, "moves"),
-        )
+        return record(request, progress=lambda done, total: reporter.progress(done, total, "moves"))

@@ -48,16 +48,9 @@ from drivers.motion.execute import execute
 from drivers.move import AxisLimits, MotionPermission, Move, check_moves, synchronised_move
 from drivers.stream.answers import StreamStatistics
 from drivers.stream.polling import Polling
+from drivers.stream.producers import DriveProducer, KernelProducer, SyncProducer
 from drivers.stream.stream import SyncStream
-from drivers.stream.sync import (
-    DriveProducer,
-    FollowedSync,
-    KernelProducer,
-    LockstepSync,
-    Pacing,
-    SyncProducer,
-    TimedSync,
-)
+from drivers.stream.sync import LockstepSync, Pacing, TimedSync
 from ident.model.bodies import Payload
 
 LOCKSTEP_TIMEOUT_S = 3.0  #: Time for all answers to a SYNC; a simulated cell on a busy machine may be that late
@@ -82,8 +75,10 @@ class Clocks:
 
     def wall_minus_monotonic_ns(self) -> int:
         """Return the present offset of the two [ns]; the monotonic clock is read before and after the other."""
-        before, wall, after = self.monotonic_ns(), self.wall_ns(), self.monotonic_ns()
-        return wall - (before + after) // 2
+        before_ns = self.monotonic_ns()
+        wall_ns = self.wall_ns()
+        after_ns = self.monotonic_ns()
+        return wall_ns - (before_ns + after_ns) // 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,9 +97,10 @@ def network_of(cell: Cell, block_signals: SignalBlocker = nullcontext) -> Canope
     Raises:
         ConfigurationInconsistent: the cell file has no bus, or an axis without amplifier.
     """
-    pacing, period_us = (declared.PacingMode.TIMED, 0) if cell.sync is None else (cell.sync.pacing, cell.sync.period_us)
-    # The heartbeat is sent with SYNC: a long period must not stop the axes.
-    guard_ms = max(GUARD_MS[pacing], 3 * period_us // 1000)
+    guard_ms = GUARD_MS[declared.PacingMode.TIMED]
+    if cell.sync is not None:
+        # The heartbeat is sent with SYNC: a long period must not stop the axes.
+        guard_ms = max(GUARD_MS[cell.sync.pacing], 3 * cell.sync.period_us // 1000)
     return CanopenNetwork(
         cell_address(cell),
         drive_axes(cell),
@@ -114,46 +110,48 @@ def network_of(cell: Cell, block_signals: SignalBlocker = nullcontext) -> Canope
     )
 
 
+@dataclass(frozen=True, slots=True)
+class RecordingRequest:
+    """A recording to make: its moves, its log, what the robot carries, and who permits the motion."""
+
+    cell_file: Path  #: file of the cell; the log gets it with all files that it names
+    cell: Cell  #: content of this file
+    plan: Plan  #: moves to make
+    out: Path  #: log to write; must not exist
+    payload: Payload | None  #: mounted payload; None without load
+    operator: str  #: person or job responsible for the recording
+    granted_by: str | None  #: operator who permits the motion; None refuses it
+    run_id: str  #: identity of the run in its log
+    speed: float = (
+        1.0  #: share of the planned speed at which the moves are made (`daq.workflow.plan.slowed`), for the log
+    )
+    entered_kg: float | None = None  #: mass of the payload that was weighed for this recording [kg]; None if it was not
+    unguarded: bool = False  #: whether axes may move that go on moving when this program is killed
+
+
 def record(
-    cell_file: Path,
-    cell: Cell,
-    plan: Plan,
-    out: Path,
+    request: RecordingRequest,
     *,
-    payload: Payload | None,
-    operator: str,
-    granted_by: str | None,
-    run_id: str,
-    speed: float = 1.0,
-    entered_kg: float | None = None,
     clocks: Clocks | None = None,
     free: FreeBytes = free_bytes,
     block_signals: SignalBlocker = nullcontext,
     progress: Callable[[int, int], None] = lambda _move, _moves: None,
     require_released: Callable[[], None] | None = None,
     feed: Feed | None = None,
-    unguarded: bool = False,
 ) -> Recorded:
     """Make a plan's moves and log every sample.
 
     Args:
-        cell_file: file of the cell; the log gets it with all files that it names.
-        cell: content of this file.
-        plan: moves to make.
-        out: log to write; must not exist.
-        payload: mounted payload; None without load.
-        operator: person or job responsible for the recording.
-        granted_by: operator who permits the motion; None refuses it.
-        speed: share of the planned speed at which the moves are made (`daq.workflow.plan.slowed`), for the log.
-        entered_kg: mass of the payload that was weighed for this recording [kg]; None if it was not.
+        request: the recording to make.
+        clocks: those of this computer, if None.
+        free: returns the free bytes of a folder's disk.
         block_signals: blocks signals while the axes are stopped.
         progress: receives the number of finished moves and of all moves.
         require_released: check that the robot may move, before the drives are used and again before they get power; if
             it raises, no file is made. By default the interlock of the cell file decides, where it declares one.
         feed: gets what the log gets, for consoles.
-        unguarded: whether axes may move that go on moving when this program is killed.
 
-    The cell's `policy` permits nothing here: it is for jobs, which pass its permissions as arguments.
+    The cell's `policy` permits nothing here: it is for jobs, which put its permissions into the request.
 
     Raises:
         UsageError: the weighed mass is not the payload's, or a file of that name exists; no file was made.
@@ -167,53 +165,44 @@ def record(
             No fit reads it; `daq.log.salvage` converts it to a partial log.
     """
     clocks = clocks or Clocks()
-    granted_by = _permission(granted_by)
-    check_entered_mass(cell, payload, entered_kg)
+    cell = request.cell
+    out = request.out
+    granted_by = _permission(request.granted_by)
+    check_entered_mass(cell, request.payload, request.entered_kg)
     require_released = require_released or release_check(cell, partial(_wall_time, clocks))
     require_released()
     with defer_full_gc(), network_of(cell, block_signals) as network, _sync_producer(cell, network) as wanted:
         network.prepare()
-        _require_guarded(network, unguarded)
+        _require_guarded(network, request.unguarded)
         polling = Polling.found(network, beside_stream=polling_fits(cell))
         scales = network.scales()
-        check_nameplates(cell_file, cell, scales)
-        warnings = (
-            *(*load_warnings(cell), *nameplate_warnings(cell, scales), *network.unguarded()),
-            *(polling_warnings(cell) if polling else ()),
-        )
+        check_nameplates(request.cell_file, cell, scales)
+        warnings = [*load_warnings(cell), *nameplate_warnings(cell, scales), *network.unguarded()]
+        warnings += polling_warnings(cell) if polling else ()
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
         scale = scaling(cell, readback)
-        rate_hz, files = 1e6 / _sync(cell).period_us, bundle(cell_file)
+        rate_hz = 1e6 / _sync(cell).period_us
+        files = bundle(request.cell_file)
         # Read the positions first, so that a refusal comes before a file exists. This takes a stream of its own: the
         # checks below last many periods, and the schedule of the recording does not wait.
         producer, remarks = _started(cell, wanted)
         permission = MotionPermission(granted_by, motor_limits(cell, scale))
         pacing = partial(_pacing, cell, clocks.wall_ns(), clocks, producer)
         start_counts, recovered = _start(cell, network, scale, permission, pacing, require_released)
-        moves = _checked_moves(cell, plan, scale, start_counts, permission)
+        moves = _checked_moves(cell, request.plan, scale, start_counts, permission)
         room = DiskRoom(out, free)
         room.require(_log_bytes(cell, moves, start_counts, files))
-        short: DiskSpaceShort | None = None
         temperatures = polling.temperatures(clocks.wall_ns())
         # Before the first SYNC of the recording's stream, whose schedule does not wait either.
         require_released()
-        started_ns = clocks.monotonic_ns()
-        run = RunInfo(
-            run_id=run_id,
-            rate_hz=rate_hz,
-            payload=payload,
-            operator=operator,
-            software=software(),
-            started_wall_ns=started_ns + clocks.wall_minus_monotonic_ns(),
-            started_monotonic_ns=started_ns,
-            speed=speed,
-            entered_kg=entered_kg,
-            controller_sha256=controller_digest(cell),
-        )
+        run = _run_info(request, rate_hz, clocks)
         content = LogContent.of(cell, run, files, readback)
         with LogWriter(out, content, scale.joint_position_of, clocks.monotonic_ns) as log:
             kept = Kept(
-                log, feed or Feed(cell_file), lambda done: progress(done, len(moves)), RecordedMotion(len(cell.axes))
+                log,
+                feed or Feed(request.cell_file),
+                lambda done: progress(done, len(moves)),
+                RecordedMotion(len(cell.axes)),
             )
             kept.feed.begin(_facts(cell, scale, run, out, len(moves)), lambda: log.statistics)
             log.readings(temperatures)
@@ -221,25 +210,40 @@ def record(
             polling.begin(stream, log.reading)
             for sample in until_complete(stream):
                 kept.sample(sample)
-            with closing(execute(network, stream, moves, permission)) as samples:
-                try:
-                    keep_samples(samples, kept, room, max(1, round(SPACE_CHECK_S * rate_hz)))
-                except DiskSpaceShort as error:
-                    short = error
+            samples = execute(network, stream, moves, permission)
+            short = _keep_motion(samples, kept, room, max(1, round(SPACE_CHECK_S * rate_hz)))
             stream.read_on(LATE_LOSSES_S)
             log.readings(polling.temperatures(stream.time_ns))
-            verdict = _judged(
+            valid, reason = _judged(
                 stream.statistics,
                 _stopped(short, kept, len(moves)),
                 impossible=partial(kept.motion.reason, cell, readback, rate_hz),
             )
-            log.conclude(*verdict, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns())
+            log.conclude(valid, reason, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns())
         kept.feed.finish()
         if short is not None:
             raise short
         if other := network.other_master():
-            warnings = (*warnings, f"{other}; it only read, but end that program before the next run")
-        return Recorded(out, log.statistics, stream.statistics, (*warnings, *remarks, *recovered, *polling.remarks))
+            warnings.append(f"{other}; it only read, but end that program before the next run")
+        warnings += (*remarks, *recovered, *polling.remarks)
+        return Recorded(out, log.statistics, stream.statistics, tuple(warnings))
+
+
+def _run_info(request: RecordingRequest, rate_hz: float, clocks: Clocks) -> RunInfo:
+    """Return what the log says of a run that starts now."""
+    started_ns = clocks.monotonic_ns()
+    return RunInfo(
+        run_id=request.run_id,
+        rate_hz=rate_hz,
+        payload=request.payload,
+        operator=request.operator,
+        software=software(),
+        started_wall_ns=started_ns + clocks.wall_minus_monotonic_ns(),
+        started_monotonic_ns=started_ns,
+        speed=request.speed,
+        entered_kg=request.entered_kg,
+        controller_sha256=controller_digest(request.cell),
+    )
 
 
 def controller_digest(cell: Cell) -> str | None:
@@ -312,9 +316,22 @@ def keep_samples(samples: Generator[Sample, None, None], kept: Kept, room: DiskR
             raise
 
 
+def _keep_motion(
+    samples: Generator[Sample, None, None], kept: Kept, room: DiskRoom, check_every: int
+) -> DiskSpaceShort | None:
+    """Log a motion to its end; returns the error of a disk that became full, after which the axes were stopped."""
+    with closing(samples):
+        try:
+            keep_samples(samples, kept, room, check_every)
+        except DiskSpaceShort as error:
+            return error
+    return None
+
+
 def duration_of(moves: Sequence[Move], start_counts: Sequence[int], rate_hz: float) -> float:
     """Return the duration of moves of the motors from given positions, dwells included [s]."""
-    total_s, here = 0.0, tuple(start_counts)
+    total_s = 0.0
+    here = tuple(start_counts)
     for move in moves:
         total_s += max(move.duration_s(here)) + move.dwell_cycles / rate_hz
         here = move.target_counts
@@ -357,7 +374,8 @@ def motor_limits(cell: Cell, scale: SiScaling) -> tuple[AxisLimits, ...]:
     checked in the plan.
     """
     lower, upper = np.array([axis.limits.position for axis in cell.axes]).T - scale.offset_rad
-    forwards, backwards = np.maximum(cell.ratio, 0.0), np.minimum(cell.ratio, 0.0)
+    forwards = np.maximum(cell.ratio, 0.0)
+    backwards = np.minimum(cell.ratio, 0.0)
     low = (forwards @ lower + backwards @ upper) / scale.rad_per_count
     high = (forwards @ upper + backwards @ lower) / scale.rad_per_count
     turns = np.abs(cell.ratio) * ROUNDING / scale.rad_per_count[:, None]
@@ -372,7 +390,8 @@ def motor_limits(cell: Cell, scale: SiScaling) -> tuple[AxisLimits, ...]:
 def motor_moves(cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence[int]) -> tuple[Move, ...]:
     """Convert the joint trapezoids of a plan to motor moves [counts]: R is linear, and all axes share the ramps."""
     moves = []
-    here_rad, here = scale.joint_position(np.array(start_counts)), tuple(start_counts)
+    here_rad = scale.joint_position(np.array(start_counts))
+    here = tuple(start_counts)
     for planned in plan.moves:
         path = path_of(cell, here_rad, planned)
         target_rad = np.array(planned.target_rad)
@@ -385,7 +404,8 @@ def motor_moves(cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence
         exact = [AxisLimits(0, 0, max(v, 2.0) + 1.0, max(a, 2.0) + 1.0) for v, a in zip(speed, ramp, strict=True)]
         dwell = round(planned.dwell_s * 1e6 / _sync(cell).period_us)
         moves.append(synchronised_move(here, target, exact, dwell))
-        here_rad, here = target_rad, target
+        here_rad = target_rad
+        here = target
     return tuple(moves)
 
 
@@ -514,7 +534,8 @@ def _sync_producer(cell: Cell, network: CanopenNetwork) -> AbstractContextManage
 
     On one SocketCAN bus the kernel sends it for this program, which a busy computer delays.
     """
-    sync, address = cell.sync, network.link.address
+    sync = cell.sync
+    address = network.link.address
     if sync is None:
         return nullcontext()
     timed = sync.pacing is declared.PacingMode.TIMED
@@ -540,13 +561,12 @@ def _started(cell: Cell, producer: SyncProducer | None) -> tuple[SyncProducer | 
 
 def _pacing(cell: Cell, start_ns: int, clocks: Clocks, producer: SyncProducer | None) -> Pacing:
     sync = _sync(cell)
-    period_ns, clock = sync.period_us * 1000, clocks.monotonic_ns
+    period_ns = sync.period_us * 1000
+    clock = clocks.monotonic_ns
     if producer is not None:
         producer.start()  # again: it may have ended while nothing was recorded
-        seen = producer.seen if isinstance(producer, KernelProducer) else None  # a drive keeps its period by itself
         silence_s = max(SYNC_SILENCE_S, SYNC_SILENCE_PERIODS * period_ns * 1e-9)
-        stop = producer.pause
-        return FollowedSync(period_ns, producer.name, seen is not None, silence_s, seen, stop, start_ns, clock)
+        return producer.pacing(silence_s, start_ns, clock)
     if sync.pacing is declared.PacingMode.LOCKSTEP:
         return LockstepSync(period_ns, timeout_s=LOCKSTEP_TIMEOUT_S, start_ns=start_ns, clock=clock)
     return TimedSync(period_ns, start_ns=start_ns, clock=clock)

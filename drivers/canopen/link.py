@@ -154,7 +154,7 @@ class Link:
         self.deadline_ns: int | None = None
         #: Whether the operator wants what is left to be given up.
         self.given_up: Callable[[], bool] = never
-        #: Device that sends SYNC on our behalf (drivers/stream/sync.py); None while only we send it.
+        #: Device that sends SYNC on our behalf (drivers/stream/producers.py); None while only we send it.
         self.sync_producer: str | None = None
         self._beat: can.Message | None = None
         self._beat_period_ns = 0

@@ -44,8 +44,8 @@ from drivers.profiles.cia402 import (
     next_command,
 )
 from drivers.profiles.profile import ObjectEntry
-from drivers.stream.stream import LARGEST_LAG_NS, MAX_MISSING_CYCLES, SyncStream, nothing_to_send
-from drivers.stream.sync import LockstepSync
+from drivers.stream.cycles import LARGEST_LAG_NS, nothing_to_send
+from drivers.stream.stream import MAX_MISSING_CYCLES, SyncStream
 from drivers.stream.watch import FrozenData
 
 _NEW_SETPOINT = Command.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
@@ -138,9 +138,13 @@ class _Execution:
     def __init__(self, network: CanopenNetwork, stream: SyncStream, bounds: MotionBounds, first: Sample) -> None:
         self.problems: list[DriverError] = []  #: Failures to confirm the last stop
         self.unreported: Exception | None = None  #: First failure to report an event of a stop
-        self._network, self._stream = network, stream
-        self._bounds, self._sample, self._pdos = bounds, first, network.pdos
-        self._nodes, self._axes = network.axes, range(len(network.axes))
+        self._network = network
+        self._stream = stream
+        self._bounds = bounds
+        self._sample = first
+        self._pdos = network.pdos
+        self._nodes = network.axes
+        self._axes = range(len(network.axes))
         self._targets = list(first.position_counts)
         self._sent: list[tuple[int, int] | None] = [None] * len(network.axes)
 
@@ -222,7 +226,8 @@ class _Execution:
         moving = [axis for axis in self._axes if move.target_counts[axis] != start[axis]]
         for axis in moving:
             # One axis a cycle: a whole set would not fit between two SYNCs of a classic bus.
-            velocity, acceleration = move.velocity_counts_s[axis], move.acceleration_counts_s2[axis]
+            velocity = move.velocity_counts_s[axis]
+            acceleration = move.acceleration_counts_s2[axis]
             ramps = {PROFILE_ACCELERATION: acceleration, PROFILE_DECELERATION: acceleration}
             self._send(axis, {PROFILE_VELOCITY: velocity, **ramps})
             yield self._checked()
@@ -234,12 +239,14 @@ class _Execution:
         yield sample
         yield from self._handshake(number, moving)
         duration_s = max(move.duration_s(start))
-        end, allowed = sample.cycle + self._cycles(duration_s), 2 * duration_s + self._bounds.settle_s
+        end = sample.cycle + self._cycles(duration_s)
+        allowed_s = 2 * duration_s + self._bounds.settle_s
         data = FrozenData(move, start, moving, self._stream.pacing.period_ns)
-        for _ in range(self._cycles(allowed)):
+        for _ in range(self._cycles(allowed_s)):
             for axis in data.frozen(self._sample):
                 if not self._arrived(axis, start[axis]):  # a stiff axis may be there before its profile ends
-                    position, current = self._sample.position_counts[axis], self._sample.current_raw[axis]
+                    position = self._sample.position_counts[axis]
+                    current = self._sample.current_raw[axis]
                     reason = f"move {number}: position {position} and current {current} do not change during the move"
                     remedy = "is its data frozen, its encoder or its motor cable off?"
                     error = DriveFault(self._nodes[axis], reason, remedy=remedy)
@@ -251,7 +258,7 @@ class _Execution:
         else:
             late = tuple(axis for axis in moving if not self._arrived(axis, start[axis]))
             if late:
-                raise self._timeout(number, late, allowed)
+                raise self._timeout(number, late, allowed_s)
         self.emit(None, EventKind.MOVE_END, number, f"move {number} ended at {self._sample.position_counts}")
         for _ in range(move.dwell_cycles):
             yield self._checked()
@@ -336,8 +343,10 @@ class _Execution:
 
     def _stop_by_pdo(self) -> Generator[Sample, None, tuple[int, ...]]:
         """Stop by synchronous RPDOs; returns the axes whose statusword does not confirm the stop."""
-        still, rest = [0] * len(self._sent), list(self._sample.position_counts)
-        silent, powered = 0, list(self._axes)
+        still = [0] * len(self._sent)
+        rest = list(self._sample.position_counts)
+        silent = 0
+        powered = list(self._axes)
         for cycle in range(self._cycles(self._bounds.stop_s)):
             for axis in powered:
                 state = self._state(axis)
@@ -352,11 +361,13 @@ class _Execution:
                 known = not self._sample.missing >> axis & 1
                 still[axis] = still[axis] + 1 if near and known else 0
                 rest[axis] = rest[axis] if near else position
-            silent = silent + 1 if self._sample.missing else 0
             missing = self._sample.missing
+            silent = silent + 1 if missing else 0
             powered = [axis for axis in self._axes if missing >> axis & 1 or self._state(axis) not in POWERLESS]
             self._network.powered -= {self._nodes[axis].node_id for axis in self._axes if axis not in powered}
-            lockstep_silent = self._stream.silent and isinstance(self._stream.pacing, LockstepSync)
-            if not powered or silent > (0 if lockstep_silent else MAX_MISSING_CYCLES):
+            # A stream that waits for answers has waited long enough in one cycle.
+            waited = self._stream.silent and self._stream.pacing.waits_for_answers
+            tolerated = 0 if waited else MAX_MISSING_CYCLES
+            if not powered or silent > tolerated:
                 break
         return tuple(powered)

@@ -1,50 +1,36 @@
-"""The schedule of SYNC and its time; SYNC producers other than this process: the kernel, or a drive.
+"""The pacings of a stream: the schedule of SYNC, and how the frames between two SYNCs are read.
 
 Samples and events of all pacings have one epoch: wall time [ns since 1970] at the stream's first SYNC, plus monotonic
 time since, so that setting the wall clock has no effect. On SocketCAN the time of a SYNC is the kernel's, converted to
 the monotonic clock (drivers/canopen/capture.py); `clock` must then be that clock.
 
-A producer is started once the network is prepared and stopped before the network is left:
-
-    with CanopenNetwork(...) as network, KernelProducer(network, period_us) as producer:
-        network.prepare()
-        producer.start()
+A pacing is frozen data; `cycles` returns what a stream runs on. Cycles end by the clock (`LockstepCycles`,
+`TimedCycles`) or by the next SYNC in the order of the frames (`EchoedCycles`, `FollowedCycles`).
 """
 
 from __future__ import annotations
 
-import errno
-import os
-import socket
-import struct
 import time
+from abc import abstractmethod
+from collections import deque
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from math import ceil
-from types import TracebackType
+from typing import ClassVar
 
-from drivers.canopen.bus import BusAddress
-from drivers.canopen.capture import FRAME
+import can
+
 from drivers.canopen.link import SYNC_COB_ID
-from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.sdo import Clock, download_request
-from drivers.errors import WHILE, BusError, DriverError
-from drivers.profiles.profile import ObjectEntry
+from drivers.canopen.sdo import Clock
+from drivers.canopen.socketcan import CapturedMessage, lags_behind, read_until_ns
+from drivers.errors import BusError
+from drivers.messages import CellEvent, EventKind
+from drivers.stream.cycles import LARGEST_LAG_NS, CycleBus, Cycles, arrived_ns, is_sync
 
-SYNC_COB_ID_OBJECT = ObjectEntry(0x1005, 0, 32, signed=False)
-CYCLE_PERIOD = ObjectEntry(0x1006, 0, 32, signed=False)
-"""Period [us]; a producer sends no SYNC while it is 0 (CiA 301)."""
-PRODUCES = 1 << 30
-LEASE_S = 0.4  #: Time for which the kernel goes on alone; less than the 0.5 s of the amplifiers' own watch
-LEAST_SYNCS = 3
-RENEWAL_S = 0.025  #: Time between two renewals
-STEERING_S = 0.25  #: Time between two corrections of the kernel's interval
-LARGEST_CORRECTION = 0.2
-"""Fraction of the period; a kernel that is later than that produces time stamps which are refused."""
-_TX_SETUP, _SET_TIMER, _SET_AND_START_TIMER = 1, 0x1, 0x3  # linux/can/bcm.h
-# struct bcm_msg_head: opcode, flags, count, two intervals of (s, us), identifier, number of frames; then can_frame.
-_HEAD = struct.Struct("@3I4l2I0q")
+SHORTENED, STRAGGLING = 16, 4
+"""Divisors of a lockstep time-out: if no axis answered the last SYNC, and once another axis has answered this one."""
+PATIENCE_S = 0.02  #: Time between two looks whether the capture process has received what came before a deadline
+FRAMES_PER_S = 50_000
+"""Frames per second of time-out to read past the deadline before a producer is dead; two full buses carry fewer."""
 SURPLUS = 3.0  #: SYNCs ahead of the schedule that are too many; a late producer catches up with one or two
 DECAY = 0.99
 """Decay of the lead per SYNC: the permanent difference of two clocks, some tens of ppm, then adds up to nothing."""
@@ -61,6 +47,12 @@ class LockstepSync:
     timeout_s: float = 1.0  #: time in which one cycle must be answered [s of the clock]
     start_ns: int = 0  #: wall time of cycle 0 [ns since 1970]
     clock: Clock = time.monotonic_ns  #: for the time-out and the heartbeats [ns]
+    #: Whether SYNC waits for the answers to the one before: none is late, and the samples' time is not the clock's.
+    waits_for_answers: ClassVar[bool] = True
+
+    def cycles(self, bus: CycleBus) -> Cycles:
+        """Return the cycles of a stream with this pacing."""
+        return LockstepCycles(bus, self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +65,11 @@ class TimedSync:
     period_ns: int  #: of the schedule [ns]
     start_ns: int = 0  #: wall time of the first SYNC [ns since 1970]
     clock: Clock = time.monotonic_ns  #: monotonic [ns]; the time since the first SYNC is added to start_ns
+    waits_for_answers: ClassVar[bool] = False  #: see `LockstepSync`
+
+    def cycles(self, bus: CycleBus) -> Cycles:
+        """Return the cycles of a stream with this pacing."""
+        return TimedCycles(bus, self.period_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,162 +91,316 @@ class FollowedSync:
     stop: Callable[[], None] | None = None  #: stops the producer after the last cycle, without waiting for an answer
     start_ns: int = 0  #: wall time of the first SYNC [ns since 1970]
     clock: Clock = time.monotonic_ns  #: monotonic [ns]; the time since the first SYNC is added to start_ns
+    waits_for_answers: ClassVar[bool] = False  #: see `LockstepSync`
+
+    def cycles(self, bus: CycleBus) -> Cycles:
+        """Return the cycles of a stream with this pacing."""
+        return FollowedCycles(bus, self)
 
 
 Pacing = LockstepSync | TimedSync | FollowedSync
 
 
-def steered_us(period_us: int, interval_us: int, late_ns: int, phase_ns: int, periods: int) -> int:
-    """Return the kernel's interval for the next window of so many periods [us].
+class _CyclesByClock(Cycles):
+    """Cycles that end at a deadline, after everything that has arrived was read."""
 
-    The lateness of the last window (`late_ns`) is expected again, and the lateness of its last SYNC in the whole
-    schedule (`phase_ns`) is to be corrected within one window.
+    def __init__(self, bus: CycleBus) -> None:
+        super().__init__(bus)
+        self._deadline_ns = 0
+
+    def _read_the_rest(self) -> int:
+        """Process what has arrived since the last cycle; returns the time by the clock [ns]."""
+        bus = self.bus
+        bus.link.beat()
+        bus.read_waiting()
+        now_ns = bus.clock()
+        if bus.cycles == 0:
+            bus.answered_ns = now_ns
+        return now_ns
+
+    def next_frame(self) -> can.Message | None:
+        bus = self.bus
+        recv = bus.link.bus.recv
+        while (left_ns := self._deadline_ns - bus.clock()) > 0:
+            message = recv(left_ns * 1e-9)
+            if message is not None and message.is_rx:
+                return message
+        # What has arrived belongs to this cycle: the next SYNC is not sent yet.
+        return None if -left_ns > LARGEST_LAG_NS else recv(0.0)
+
+
+class LockstepCycles(_CyclesByClock):
+    """A cycle ends when all axes have answered, or after its time-out."""
+
+    def __init__(self, bus: CycleBus, pacing: LockstepSync) -> None:
+        super().__init__(bus)
+        self._pacing = pacing
+        self._timeout_ns = round(pacing.timeout_s * 1e9)
+
+    def open(self) -> None:
+        bus = self.bus
+        pacing = self._pacing
+        now_ns = self._read_the_rest()
+        bus.time_ns = pacing.start_ns + bus.cycles * pacing.period_ns
+        # A cell that was silent for the whole time gets less the next time: the stop must not take minutes.
+        bound_s = pacing.timeout_s / SHORTENED if bus.silent else pacing.timeout_s
+        self._deadline_ns = now_ns + round(bound_s * 1e9)
+        bus.send_sync()
+        bus.cycles += 1
+
+    def note_first_answer(self) -> None:
+        # A simulated cell answers all at once.
+        straggling_ns = self.bus.clock() + self._timeout_ns // STRAGGLING
+        self._deadline_ns = min(self._deadline_ns, straggling_ns)
+
+
+class TimedCycles(_CyclesByClock):
+    """A cycle lasts from one SYNC to the time of the next one; for a bus whose frames have no stamps.
+
+    Args:
+        bus: of the stream.
+        period_ns: of the schedule [ns].
+        due_ns: time of the next SYNC by the clock [ns]; the first SYNC of a stream is sent at once.
     """
-    wanted_us = interval_us - (late_ns + phase_ns) / (1000 * periods)
-    return round(min(max(wanted_us, (1.0 - LARGEST_CORRECTION) * period_us), (1.0 + LARGEST_CORRECTION) * period_us))
+
+    def __init__(self, bus: CycleBus, period_ns: int, due_ns: int = 0) -> None:
+        super().__init__(bus)
+        self._period_ns = period_ns
+        self._due_ns = due_ns
+
+    def begin(self) -> Cycles:
+        if read_until_ns(self.bus.link.bus) is None:
+            return super().begin()
+        return EchoedCycles(self.bus, self._period_ns).begin()
+
+    def open(self) -> None:
+        bus = self.bus
+        now_ns = self._read_the_rest()
+        if bus.cycles == 0:
+            self._due_ns = now_ns
+        while (left_ns := self._due_ns - now_ns) > 0:
+            message = bus.link.bus.recv(left_ns * 1e-9)
+            if message is not None:
+                bus.between(message)
+            now_ns = bus.clock()
+        slipped = (now_ns - self._due_ns) // self._period_ns
+        bus.skipped += slipped
+        bus.too_late(slipped * self._period_ns)
+        bus.stamp(now_ns)
+        self._due_ns += (slipped + 1) * self._period_ns
+        self._deadline_ns = self._due_ns
+        bus.send_sync()
+        bus.cycles += 1
 
 
-def setup_message(flags: int, interval_us: int) -> bytes:
-    """Return a message to the broadcast manager: send so many SYNCs as last for `LEASE_S`, then none."""
-    seconds, rest_us = divmod(interval_us, 1_000_000)
-    count = max(LEAST_SYNCS, ceil(LEASE_S * 1e6 / interval_us))
-    head = _HEAD.pack(_TX_SETUP, flags, count, seconds, rest_us, 0, 0, SYNC_COB_ID, 1)
-    return head + FRAME.pack(SYNC_COB_ID, 0, bytes(8))
+class _CyclesByOrder(Cycles):
+    """Cycles that end with the next SYNC, in the order of the frames on the bus."""
+
+    @abstractmethod
+    def _read(self) -> can.Message | None:
+        """Return the next frame; None if none comes in time."""
+
+    def _next_sync(self) -> can.Message | None:
+        """Process the frames before the next SYNC, and return it; None if it does not come."""
+        sync = self.early_sync
+        self.early_sync = None
+        while sync is None:
+            message = self._read()
+            if message is None:
+                return None
+            if self.is_next_sync(message):
+                sync = message
+            else:
+                self.bus.between(message)
+        return sync
+
+    def next_frame(self) -> can.Message | None:
+        message = self._read()
+        if message is None or not self.is_next_sync(message):
+            return message
+        self.early_sync = message
+        return None
 
 
-class KernelProducer(AbstractContextManager["KernelProducer"]):
-    """SYNC by the kernel's broadcast manager (CAN_BCM), whose timer needs no process to wake up.
+class EchoedCycles(_CyclesByOrder):
+    """A cycle lasts from our SYNC to our next one: both come back among the frames of a bus with stamps.
 
-    It ends with the process that started it, and `LEASE_S` after that process has seen its last SYNC: a recorder that
-    hangs must not keep the axes running, one that is stopped for 300 ms must lose nothing. Each interval counts from
-    the actual time of the last SYNC, so the period is too long by the lateness of the timer: `seen` measures that and
-    shortens the interval.
+    SYNC is sent on schedule while frames are waited for.
+
+    Args:
+        bus: of the stream.
+        period_ns: of the schedule [ns].
     """
 
-    name = "the kernel"
+    def __init__(self, bus: CycleBus, period_ns: int) -> None:
+        super().__init__(bus)
+        self._period_ns = period_ns
+        self._due_ns = 0
+        # Each SYNC that was sent and has not come back: its time by the clock [ns], and the periods left out before it.
+        self._sent: deque[tuple[int, int]] = deque()
+        self._comes_back = True
 
-    def __init__(self, network: CanopenNetwork, period_us: int) -> None:
-        self._link = network.link
-        self._period_us = period_us
-        self._socket: socket.socket | None = None
-        self._interval_us = period_us
-        self._window = max(8, round(STEERING_S * 1e6 / period_us))
-        self._begun_ns = self._phase_ns = self._periods = self._renewed_ns = 0
+    def open(self) -> Cycles | None:
+        bus = self.bus
+        if bus.cycles == 0:
+            self._due_ns = bus.clock()
+            bus.answered_ns = self._due_ns
+        sync = self._next_sync()
+        if sync is None:
+            return TimedCycles(bus, self._period_ns, self._due_ns)
+        now_ns = bus.clock()
+        at_ns = arrived_ns(sync, now_ns)
+        bus.too_late(now_ns - at_ns)
+        if self._sent:
+            _, left_out = self._sent.popleft()
+            bus.skipped += left_out
+        bus.stamp(at_ns)
+        bus.cycles += 1
+        return None
 
-    def __exit__(self, *_: object) -> None:
-        self.stop()
+    def _read(self) -> can.Message | None:
+        """Return the next frame, and send SYNC when it is due; None once SYNC does not come back."""
+        bus = self.bus
+        if self._comes_back and (taken := bus.batched()) is not None:
+            return taken
+        while self._comes_back:
+            bus.link.beat()
+            now_ns = bus.clock()
+            if now_ns >= self._due_ns:
+                left_out = (now_ns - self._due_ns) // self._period_ns
+                bus.too_late(left_out * self._period_ns)
+                self._due_ns += (left_out + 1) * self._period_ns
+                bus.send_sync()
+                self._sent.append((now_ns, left_out))
+            if self._sent and bus.too_late(now_ns - self._sent[0][0]):
+                # From now on, cycles end by the clock.
+                self._comes_back = False
+                bus.skipped += sum(left_out for _, left_out in self._sent) + len(self._sent)
+            elif (message := bus.link.bus.recv((self._due_ns - now_ns) * 1e-9)) is not None:
+                return message
+        return None
 
-    def start(self) -> None:
-        """Send SYNC from now on, or again; while it runs, this counts as `seen`.
 
-        Raises:
-            BusError: the kernel has no broadcast manager, or the bus is not SocketCAN.
+class FollowedCycles(_CyclesByOrder):
+    """A cycle lasts from one SYNC of a producer to the next, in the order of the frames."""
+
+    def __init__(self, bus: CycleBus, pacing: FollowedSync) -> None:
+        super().__init__(bus)
+        self._pacing = pacing
+        self._timeout_ns = round(pacing.timeout_s * 1e9)
+        self._rate = SyncRate(pacing.period_ns)
+        self._last_sync_ns = 0
+        self._deadline_ns = 0
+        self._waited = False  # whether the last cycle waited for an answer in vain
+        self._reads_past_deadline = 0
+
+    def begin(self) -> Cycles:
+        bus = self.bus
+        begun_ns = bus.clock()
+        for message in bus.waiting():
+            if is_sync(message) and isinstance(message, CapturedMessage) and message.monotonic_ns > begun_ns:
+                self.early_sync = message  # if frames arrive as fast as they are read, the loop would not end
+                break
+            bus.between(message)
+        return self
+
+    def open(self) -> Cycles | None:
+        bus = self.bus
+        bus.link.beat()
+        if outgoing := bus.take_outgoing():
+            # As early in the period as possible: all of it should arrive before the next SYNC.
+            bus.link.send(outgoing)
+        # A cycle that waited in vain for answers waited for this SYNC too: half of the time-out is enough.
+        bound_ns = self._timeout_ns // 2 if self._waited else self._timeout_ns
+        self._deadline_ns = bus.clock() + bound_ns
+        sync = self._next_sync()
+        if sync is None:
+            return self._lose_sync()
+        self._take_sync(sync)
+        return None
+
+    def _take_sync(self, sync: can.Message) -> None:
+        """Begin the cycle of a SYNC that was read."""
+        bus = self.bus
+        pacing = self._pacing
+        at_ns = arrived_ns(sync, bus.clock())
+        periods = 0
+        if bus.cycles == 0:
+            bus.answered_ns = at_ns
+        else:
+            # One period after the SYNC before it, or more where SYNCs between them did not come.
+            since_ns = at_ns - self._last_sync_ns
+            periods = max(1, self._periods_in(since_ns))
+            bus.skipped += periods - 1
+            if self._rate.too_fast(since_ns):
+                bus.link.note_foreign(SYNC_COB_ID)
+        if pacing.in_kernel and isinstance(sync, CapturedMessage) and not sync.local:
+            bus.link.note_foreign(SYNC_COB_ID)
+        now_ns = bus.clock()
+        bus.too_late(now_ns - at_ns)
+        if pacing.seen is not None:
+            pacing.seen(at_ns, periods)
+        self._last_sync_ns = at_ns
+        bus.stamp(at_ns)
+        bus.cycles += 1
+        self._reads_past_deadline = 0
+        self._waited = False
+        self._deadline_ns = now_ns + self._timeout_ns
+
+    def _periods_in(self, time_ns: int) -> int:
+        """Return the number of periods in a time, rounded."""
+        return (time_ns + self._pacing.period_ns // 2) // self._pacing.period_ns
+
+    def _lose_sync(self) -> Cycles:
+        """Report the dead producer, and send SYNC from now on, because the axes must be stopped."""
+        bus = self.bus
+        pacing = self._pacing
+        reason = f"no SYNC from {pacing.producer} for {pacing.timeout_s:g} s"
+        bus.emit(CellEvent(bus.time_ns, None, EventKind.SYNC_LOST, bus.cycles, reason))
+        bus.faults.append(BusError(str(bus.link.address), reason))
+        due_ns = bus.clock()
+        if bus.cycles:
+            # The wait leaves a gap in the cycles, as it does in their times.
+            bus.skipped += max(0, self._periods_in(due_ns - self._last_sync_ns) - 1)
+        return TimedCycles(bus, pacing.period_ns, due_ns)
+
+    def next_frame(self) -> can.Message | None:
+        message = super().next_frame()
+        self._waited = message is None and self.early_sync is None
+        return message
+
+    def _read(self) -> can.Message | None:
+        """Return the next frame that arrived before the deadline, even if it is read late; None without any.
+
+        Only the order on the bus counts: frames that have arrived are read first, whatever the clock shows.
         """
-        address = self._link.address
-        if not isinstance(address, BusAddress) or address.interface != "socketcan":
-            raise BusError(str(address), "SYNC by the kernel needs one bus of interface socketcan")
-        try:
-            if self._socket is None:
-                self._socket = socket.socket(socket.AF_CAN, socket.SOCK_DGRAM, socket.CAN_BCM)
-                self._socket.connect((address.channel,))
-            self._link.sync_producer = self.name
-            self._socket.send(setup_message(_SET_AND_START_TIMER, self._interval_us))
-        except OSError as error:
-            self.stop()
-            name = errno.errorcode.get(error.errno or 0, "")
-            reason = f"SYNC by the kernel: {os.strerror(error.errno or 0)} {name}; modprobe can-bcm?"
-            raise BusError(str(address), reason) from error
+        bus = self.bus
+        end_ns = self._deadline_ns
+        if (taken := bus.batched()) is not None:
+            return taken
+        recv = bus.link.bus.recv
+        bus.link.beat()
+        while (left_ns := end_ns - (now_ns := bus.clock())) > 0:
+            if (message := recv(left_ns * 1e-9)) is not None:
+                return message
+        self._reads_past_deadline += 1
+        if self._reads_past_deadline > FRAMES_PER_S * self._pacing.timeout_s:
+            return None
+        message = recv(0.0)
+        # A capture process that was stopped has not received all of it yet.
+        while message is None and now_ns < end_ns + LARGEST_LAG_NS and lags_behind(bus.link.bus, end_ns):
+            bus.link.beat()
+            message = recv(PATIENCE_S)
+            now_ns = bus.clock()
+        return message
 
-    def seen(self, monotonic_ns: int, periods: int) -> None:
-        """Process a SYNC and its periods since the one before, 0 for the first; keeps average period and phase."""
-        if self._socket is not None and not 0 <= monotonic_ns - self._renewed_ns < RENEWAL_S * 1e9:
-            # The timer itself is not started again, if it has ended: the recorder was stopped for too long.
-            self._renewed_ns = monotonic_ns
-            self._socket.send(setup_message(_SET_TIMER, self._interval_us))
-        if periods == 0:
-            self._begun_ns, self._phase_ns, self._periods = monotonic_ns, 0, 0
-            return
-        self._periods += periods
-        if self._periods < self._window or self._socket is None:
-            return
-        late_ns = monotonic_ns - self._begun_ns - 1000 * self._period_us * self._periods
-        self._phase_ns += late_ns
-        interval_us = steered_us(self._period_us, self._interval_us, late_ns, self._phase_ns, self._periods)
-        self._begun_ns, self._periods = monotonic_ns, 0
-        if interval_us != self._interval_us:
-            self._interval_us = interval_us
-            self._socket.send(setup_message(_SET_TIMER, interval_us))
-
-    def pause(self) -> None:
-        """Stop sending; SYNCs on their way are still the kernel's."""
-        if self._socket is not None:
-            self._socket.close()
-        self._socket = None
+    def is_next_sync(self, message: can.Message) -> bool:
+        """Return whether a frame is a SYNC, which the producer has sent."""
+        return is_sync(message)
 
     def stop(self) -> None:
-        """Stop sending, if started."""
-        self.pause()
-        self._link.sync_producer = None
-
-
-class DriveProducer(AbstractContextManager["DriveProducer"]):
-    """SYNC by a drive of the cell, `axis` by its index: objects 1005h (bit 30) and 1006h, which are restored."""
-
-    def __init__(self, network: CanopenNetwork, axis: int, period_us: int) -> None:
-        self.name = network.axes[axis].name
-        self._network = network
-        self._node_id = network.node_ids[axis]
-        self._period_us = period_us
-        self._before: tuple[int, int] | None = None
-        self._produces = False
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        try:
-            if error is not None:
-                self._network.begin_closing()
-            self.stop()
-        except DriverError as problem:
-            if error is None:
-                raise
-            error.add_note(f"{WHILE}stopping SYNC: {problem}")
-
-    def start(self) -> None:
-        """Let the drive send SYNC; nothing happens if it does."""
-        if self._produces:
-            return
-        access = self._network.link.objects(self._node_id)
-        if self._before is None:
-            self._before = (access.read(SYNC_COB_ID_OBJECT), access.read(CYCLE_PERIOD))
-        self._network.link.sync_producer = self.name
-        # CiA 301: the period may be refused while the drive produces, so production begins last and ends first.
-        access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID)
-        access.write(CYCLE_PERIOD, self._period_us)
-        access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID | PRODUCES)
-        self._produces = True
-
-    def pause(self) -> None:
-        """Tell the drive to stop, without waiting for its answer; `stop` restores its objects."""
-        if self._before is not None:
-            self._network.link.send((download_request(self._node_id, SYNC_COB_ID_OBJECT, SYNC_COB_ID),))
-            self._produces = False
-
-    def stop(self) -> None:
-        """Restore both objects, if started and if the drive still answers."""
-        before, self._before, self._produces = self._before, None, False
-        try:
-            if before is not None and self._node_id not in self._network.link.silent:
-                access = self._network.link.objects(self._node_id)
-                access.write(SYNC_COB_ID_OBJECT, before[0] & ~PRODUCES)
-                access.write(CYCLE_PERIOD, before[1])
-                if before[0] & PRODUCES:
-                    access.write(SYNC_COB_ID_OBJECT, before[0])
-        finally:
-            self._network.link.sync_producer = None
-
-
-SyncProducer = KernelProducer | DriveProducer
+        if self._pacing.stop is not None:
+            self._pacing.stop()
 
 
 class SyncRate:

@@ -17,7 +17,7 @@ from daq.environment import shipped_configurations
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.plan import plan
 from daq.workflow.plan_file import load_plan, save_plan
-from daq.workflow.record import record
+from daq.workflow.record import RecordingRequest, record
 from drivers.canopen.bus import open_bus
 from drivers.simulation.cell import SimulatedCell
 
@@ -49,14 +49,16 @@ def main(path: str) -> None:
         try:
             with SimulatedCell(replace(spec, seed=SEED + index), bus):
                 record(
-                    cell_file,
-                    cell,
-                    moves,
-                    log,
-                    payload=None if payload is None else payloads[payload],
-                    operator="bench",
-                    granted_by="the benchmark: a simulated cell",
-                    run_id=f"bench-{name}",
+                    RecordingRequest(
+                        cell_file,
+                        cell,
+                        moves,
+                        log,
+                        payload=None if payload is None else payloads[payload],
+                        operator="bench",
+                        granted_by="the benchmark: a simulated cell",
+                        run_id=f"bench-{name}",
+                    )
                 )
         finally:
             bus.shutdown()

@@ -27,7 +27,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.log.conversion import load_run
 from daq.workflow.plan import Plan, plan
-from daq.workflow.record import record
+from daq.workflow.record import RecordingRequest, record
 from drivers.canopen.bus import open_bus
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.spec import CellSpec
@@ -181,14 +181,16 @@ def difference(cell: Cell, spec: CellSpec, moves: Plan, folder: Path) -> tuple[s
     try:
         with SimulatedCell(spec, bus):
             record(
-                CELL,
-                cell,
-                moves,
-                folder / "check.mcap",
-                payload=declared,
-                operator="study",
-                granted_by="the study of coverage: a simulated cell",
-                run_id="coverage-check",
+                RecordingRequest(
+                    CELL,
+                    cell,
+                    moves,
+                    folder / "check.mcap",
+                    payload=declared,
+                    operator="study",
+                    granted_by="the study of coverage: a simulated cell",
+                    run_id="coverage-check",
+                )
             )
     finally:
         bus.shutdown()

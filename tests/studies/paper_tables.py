@@ -25,7 +25,7 @@ from daq.config.bus import bus_address
 from daq.config.cell_file import load_cell
 from daq.report.paper_tables import PaperTable, percent
 from daq.workflow.plan_file import load_plan
-from daq.workflow.record import record
+from daq.workflow.record import RecordingRequest, record
 from drivers.canopen.bus import open_bus
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.spec import Body
@@ -151,14 +151,16 @@ def _disc_run(logs: StudyLogs, letter: str, folder: Path) -> Path:
     try:
         with SimulatedCell(spec, bus):
             recorded = record(
-                CELL,
-                cell,
-                load_plan(plan_file, cell),
-                path,
-                payload=declared_payload("disc"),
-                operator="study",
-                granted_by="the study of the paper's tables: a simulated cell",
-                run_id=f"paper-{logs.seed}-{letter}",
+                RecordingRequest(
+                    CELL,
+                    cell,
+                    load_plan(plan_file, cell),
+                    path,
+                    payload=declared_payload("disc"),
+                    operator="study",
+                    granted_by="the study of the paper's tables: a simulated cell",
+                    run_id=f"paper-{logs.seed}-{letter}",
+                )
             )
     finally:
         bus.shutdown()

@@ -29,7 +29,7 @@ from daq.files import replace_file
 from daq.log.metadata import VERSION
 from daq.workflow.plan import Plan, plan
 from daq.workflow.plan_file import load_plan, save_plan
-from daq.workflow.record import record
+from daq.workflow.record import RecordingRequest, record
 from drivers.canopen.bus import open_bus
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.spec import CellSpec
@@ -222,14 +222,16 @@ def _record(task: _RunTask) -> str:
     try:
         with SimulatedCell(spec, bus):
             recorded = record(
-                CELL,
-                cell,
-                moves,
-                path,
-                payload=None if task.run.payload is None else declared_payload(task.run.payload),
-                operator="study",
-                granted_by="the study of the estimators: a simulated cell",
-                run_id=f"study-{task.floor}-{task.seed}-{task.run.name}",
+                RecordingRequest(
+                    CELL,
+                    cell,
+                    moves,
+                    path,
+                    payload=None if task.run.payload is None else declared_payload(task.run.payload),
+                    operator="study",
+                    granted_by="the study of the estimators: a simulated cell",
+                    run_id=f"study-{task.floor}-{task.seed}-{task.run.name}",
+                )
             )
     finally:
         bus.shutdown()

@@ -28,7 +28,7 @@ from daq.report.bus import current_signals
 from daq.simulation.simulation_file import load_simulation
 from daq.workflow.nameplates import actual_current_note
 from daq.workflow.plan_file import load_plan
-from daq.workflow.record import record
+from daq.workflow.record import RecordingRequest, record
 from drivers.canopen.bus import open_bus
 from drivers.profiles.profile import Basis, DriveProfile, ObjectEntry, ScaleForm, TapPoint
 from drivers.simulation.amplifier import AmplifierSet
@@ -395,7 +395,10 @@ def recorded(
         with SimulatedCell(spec, bus):
             moves = load_plan(folder / "plan.yaml", cell)
             out = folder / "a.mcap"
-            done = record(cell_file, cell, moves, out, payload=None, operator="Ada", granted_by="test", run_id="1")
+            request = RecordingRequest(
+                cell_file, cell, moves, out, payload=None, operator="Ada", granted_by="test", run_id="1"
+            )
+            done = record(request)
     finally:
         bus.shutdown()
     assert done.log.valid, done.log.reason

@@ -7,14 +7,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.files import sha256_of
 from daq.jobs.context import Tools
 from daq.workflow.fit import Fit
-from daq.workflow.plan import Plan
-from daq.workflow.record import Recorded
+from daq.workflow.record import Recorded, RecordingRequest
 from ident.calibration import Calibration
 from tests.daq.jobs.rig import Rig, make_plan, make_rig, powerless, serving
 
@@ -46,7 +44,8 @@ class Made:
             factors: by which gains have changed since, by axis.
         """
 
-        def copied(_file: Path, _cell: Cell, _plan: Plan, out: Path, **further: Any) -> Recorded:
+        def copied(request: RecordingRequest, **further: Any) -> Recorded:
+            out = request.out
             further["require_released"]()  # before the drives are used
             further["require_released"]()  # before they get power
             # Logs of another day are other logs; the fit that would read them knows its result already.
@@ -106,8 +105,8 @@ def whole_job(folder: Path) -> tuple[Rig, Made]:
     recorded: dict[str, Recorded] = {}
     tools = rig.tools
 
-    def keep_record(*given: Any, **further: Any) -> Recorded:
-        found = tools.record(*given, **further)
+    def keep_record(request: RecordingRequest, **further: Any) -> Recorded:
+        found = tools.record(request, **further)
         recorded[found.path.stem] = found
         return found
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +11,7 @@ import pytest
 from daq.cli.app import main
 from daq.errors import ExitCode, NotReleased
 from daq.workflow.plan_file import load_plan
-from daq.workflow.record import record
+from daq.workflow.record import RecordingRequest, record
 from drivers.errors import MotionRefused
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
@@ -68,13 +68,15 @@ def test_a_program_that_records_is_held_by_a_door_that_opens_before_power(tmp_pa
     rig = make_rig(tmp_path / "cell", one_move, interlock=CLOSED_ONCE)
     out = rig.folder / "a.mcap"
     plan = load_plan(one_move, rig.cell)
-    begin = partial(record, rig.cell_file, rig.cell, plan, out, payload=None, operator="Ada", run_id="1")
+    request = RecordingRequest(
+        rig.cell_file, rig.cell, plan, out, payload=None, operator="Ada", granted_by=None, run_id="1"
+    )
     with serving(rig) as cell:
         with pytest.raises(MotionRefused, match="--enable-motion"):
-            begin(granted_by=None)
+            record(request)
         assert rig.closed.exists()
         with pytest.raises(NotReleased):
-            begin(granted_by="Ada")
+            record(replace(request, granted_by="Ada"))
         assert unmoved(cell)
         assert cell.cycles > 0
     assert not rig.closed.exists()

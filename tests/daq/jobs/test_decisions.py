@@ -16,6 +16,7 @@ from daq.documents.session_state import Outcome
 from daq.errors import CalibrationRefused, ExitCode, HistoryUnreadable
 from daq.ledger.audit import AuditAction
 from daq.ledger.store import HistoryStore
+from daq.workflow.record import RecordingRequest
 from daq.writeback.signature import generate
 from drivers.errors import DriveFault
 from ident.errors import ModelContradicted
@@ -239,9 +240,9 @@ def failing_once(rig: Rig) -> Any:
     tools = rig.tools
     copied = tools.record
 
-    def record(*given: Any, **further: Any) -> Any:
-        if given[3].stem == "loaded-1":
+    def record(request: RecordingRequest, **further: Any) -> Any:
+        if request.out.stem == "loaded-1":
             raise DriveFault(3, "EMCY 7305h")
-        return copied(*given, **further)
+        return copied(request, **further)
 
     return replace(tools, record=record)

@@ -38,7 +38,7 @@ from daq.jobs.time_bound import time_bound
 from daq.ledger.audit import AuditAction
 from daq.workflow.bus_lock import bus_lock, lock_name
 from daq.workflow.interlock import MAX_OUTPUT_CHARACTERS, Finished, require_release, run_command
-from daq.workflow.record import Recorded
+from daq.workflow.record import Recorded, RecordingRequest
 from drivers.errors import MotionRefused
 from drivers.simulation.drive import PowerState
 from tests.daq.jobs.made import Made, made_rig
@@ -124,9 +124,9 @@ def test_a_payload_that_cannot_be_mounted_ends_the_job_and_the_next_goes_on_with
     recorded = []
     copied = rig.tools.record
 
-    def noting(*given: Any, **further: Any) -> Recorded:
-        recorded.append(given[3].stem)
-        found: Recorded = copied(*given, **further)
+    def noting(request: RecordingRequest, **further: Any) -> Recorded:
+        recorded.append(request.out.stem)
+        found: Recorded = copied(request, **further)
         return found
 
     rig.tools = replace(rig.tools, record=noting)
@@ -466,14 +466,14 @@ def test_a_warm_up_is_made_of_the_plans_moves_and_asks_the_interlock_too(tmp_pat
     rig = made_rig(tmp_path / "cell", made, warm_up_min=0.2)
     made_of, copied = [], rig.tools.record
 
-    def noting(*given: Any, **further: Any) -> Recorded:
-        made_of.append(given[3].stem)
-        if given[3].stem == "warm-up":
+    def noting(request: RecordingRequest, **further: Any) -> Recorded:
+        made_of.append(request.out.stem)
+        if request.out.stem == "warm-up":
             further["require_released"]()  # before the drives are used
             further["require_released"]()  # before they get power
-            given[3].touch()
+            request.out.touch()
             return made.recorded["bare-1"]
-        found: Recorded = copied(*given, **further)
+        found: Recorded = copied(request, **further)
         return found
 
     asked = []

@@ -21,6 +21,7 @@ from daq.jobs.context import Tools
 from daq.ledger.audit import AuditAction
 from daq.ledger.ledger import Ledger, Verification
 from daq.ledger.store import HistoryStore
+from daq.workflow.record import RecordingRequest
 from daq.writeback.file_target import FileTarget
 from daq.writeback.target import rollback
 from tests.daq.jobs.made import Made, made_rig
@@ -241,12 +242,12 @@ def test_half_a_recording_is_kept_as_partial_and_recorded_again(tmp_path: Path, 
     whole = made.logs["loaded-1"].read_bytes()
     copied = rig.tools.record
 
-    def dies(*given: Any, **further: Any) -> Any:
-        out = given[3]
+    def dies(request: RecordingRequest, **further: Any) -> Any:
+        out = request.out
         if out.stem == "loaded-1":
             out.with_name(out.name + ".part").write_bytes(whole[: len(whole) // 2])
             os.kill(os.getpid(), signal.SIGKILL)
-        return copied(*given, **further)
+        return copied(request, **further)
 
     rig.tools = replace(rig.tools, record=dies)
     killed_job(rig, Kill())

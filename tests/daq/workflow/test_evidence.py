@@ -26,7 +26,7 @@ from daq.log.reader import LossyLogs, read_log
 from daq.workflow import fit as fit_module
 from daq.workflow.fit import Fit, Reading, calibration_of, close_loop, fit
 from daq.workflow.plan_file import load_plan
-from daq.workflow.record import Clocks, record
+from daq.workflow.record import Clocks, RecordingRequest, record
 from daq.workflow.safeguards import check_entered_mass
 from daq.writeback.gates.gate import Gate, GateContext
 from daq.writeback.gates.table import check_gates
@@ -250,18 +250,19 @@ def test_a_mass_off_the_cell_s_is_refused_before_anything_is_asked_of_the_bus(
 ) -> None:
     rig = Rig(checkout, tmp_path, monkeypatch, "lockstep")
     declared = load_cell(rig.cell_file)
+    request = RecordingRequest(
+        rig.cell_file,
+        declared,
+        load_plan(rig.plan, declared),
+        rig.out,
+        payload=DISC,
+        operator="Ada",
+        granted_by="the test",
+        run_id="1",
+        entered_kg=entered,
+    )
     with pytest.raises(UsageError, match=r"4\.59 kg within 0\.005 kg"):
-        record(
-            rig.cell_file,
-            declared,
-            load_plan(rig.plan, declared),
-            rig.out,
-            payload=DISC,
-            operator="Ada",
-            granted_by="the test",
-            run_id="1",
-            entered_kg=entered,
-        )
+        record(request)
     assert not rig.bus.sent
     command = ["record", str(rig.cell_file), str(rig.plan), "--out", str(rig.out), "--enable-motion"]
     assert main([*command, "--payload", "disc", "--mass", str(entered)]) == ExitCode.USAGE
@@ -276,7 +277,7 @@ def test_the_log_has_the_second_weighing_and_the_controller_s_digest(
     rig.cell_file.write_text(rig.cell_file.read_text().replace("../controllers/demo.yaml", "controller.yaml"))
     (tmp_path / "controller.yaml").write_bytes(b"drives: {}\n")
     declared = load_cell(rig.cell_file)
-    record(
+    request = RecordingRequest(
         rig.cell_file,
         declared,
         load_plan(rig.plan, declared),
@@ -285,10 +286,10 @@ def test_the_log_has_the_second_weighing_and_the_controller_s_digest(
         operator="Ada",
         granted_by="the test",
         run_id="1",
-        clocks=Clocks(lambda: WALL_NS, rig.bus.clock),
         entered_kg=4.595,
         unguarded=True,  # the scripted drives have no 1016h
     )
+    record(request, clocks=Clocks(lambda: WALL_NS, rig.bus.clock))
     run = read_log(rig.out).head.run
     assert run.entered_kg == 4.595
     assert run.controller_sha256 == hashlib.sha256(b"drives: {}\n").hexdigest()

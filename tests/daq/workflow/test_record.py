@@ -20,7 +20,7 @@ from daq.log.conversion import load_run
 from daq.log.reader import read_log
 from daq.log.salvage import salvage
 from daq.workflow.plan_file import load_plan
-from daq.workflow.record import LATE_LOSSES_S, Clocks, Recorded, record
+from daq.workflow.record import LATE_LOSSES_S, Clocks, Recorded, RecordingRequest, record
 from daq.workflow.safeguards import NEVER
 from drivers.canopen.network import CanopenNetwork, SignalBlocker
 from drivers.canopen.socketcan import Losses
@@ -71,7 +71,7 @@ class Rig:
         declared = load_cell(self.cell_file)
         clocks = clocks or Clocks(lambda: WALL_NS, self.bus.clock)
         moves = load_plan(self.plan, declared)
-        return record(
+        request = RecordingRequest(
             self.cell_file,
             declared,
             moves,
@@ -80,10 +80,9 @@ class Rig:
             operator="Ada",
             granted_by=granted_by,
             run_id="1",
-            clocks=clocks,
-            require_released=require_released,
             unguarded=unguarded,  # the scripted drives have no 1016h
         )
+        return record(request, clocks=clocks, require_released=require_released)
 
     def profiles(self) -> list[bytes]:
         """Commands to the elbow that set velocity and acceleration."""

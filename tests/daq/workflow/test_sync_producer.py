@@ -12,7 +12,8 @@ from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent
 from daq.workflow.record import Clocks, _pacing, _sync_producer, _verdict, network_of
 from drivers.stream.answers import StreamStatistics
-from drivers.stream.sync import DriveProducer, FollowedSync, KernelProducer
+from drivers.stream.producers import DriveProducer, KernelProducer
+from drivers.stream.sync import FollowedSync
 
 CONFIGURATIONS = Path(__file__).parents[3] / "configs"
 EXPLAINED = ("cycles", "frames", "foreign")

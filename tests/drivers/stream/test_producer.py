@@ -7,7 +7,7 @@ import struct
 import pytest
 
 from drivers.errors import BusError, ObjectAccessError
-from drivers.stream.sync import PRODUCES, DriveProducer, KernelProducer, setup_message
+from drivers.stream.producers import PRODUCES, DriveProducer, KernelProducer, setup_message
 from tests.drivers.scripted import ScriptedBus, ScriptedNode, cell
 
 PERIOD_US = 2000

@@ -14,8 +14,9 @@ from drivers.canopen.socketcan import CapturedMessage, Losses
 from drivers.errors import BusBusy, BusError, DriveFault, DriverError, SampleLost
 from drivers.messages import CellEvent, EventKind
 from drivers.stream.answers import StreamStatistics
+from drivers.stream.producers import steered_us
 from drivers.stream.stream import SyncStream
-from drivers.stream.sync import FollowedSync, LockstepSync, SyncRate, TimedSync, steered_us
+from drivers.stream.sync import FollowedSync, LockstepSync, SyncRate, TimedSync
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell
 
 Prepared = tuple[SyncStream, ScriptedBus, list[CellEvent]]
@@ -518,6 +519,28 @@ def test_a_producer_that_dies_before_an_answer_came_is_noticed_in_one_bound(foll
     assert EventKind.SYNC_LOST in [event.kind for event in events]
 
 
+def test_a_lost_sync_that_cannot_be_replaced_is_not_waited_for_again(followed: Followed) -> None:
+    """The stop of the axes comes next, and must not wait for the dead producer a second time."""
+    stream, bus, _, events = followed
+    next(stream)
+    send = bus.send
+
+    def refuse_sync(msg: can.Message, timeout: float | None = None) -> None:
+        if msg.arbitration_id == 0x80:
+            raise can.CanOperationError("the wire was cut")
+        send(msg, timeout)
+
+    bus.send = refuse_sync  # type: ignore[method-assign]
+    with pytest.raises(BusError, match="the wire was cut"):
+        stream.advance()
+    begun_ns = bus.clock.now_ns
+    with pytest.raises(BusError, match="the wire was cut"):
+        stream.advance()
+    bus.send = send  # type: ignore[method-assign]
+    assert bus.clock.now_ns - begun_ns <= 2 * PERIOD_NS
+    assert [event.kind for event in events].count(EventKind.SYNC_LOST) == 1
+
+
 def test_a_flood_of_other_frames_is_no_sign_of_a_producer(followed: Followed) -> None:
     stream, bus, _, events = followed
     next(stream)
@@ -628,7 +651,8 @@ def test_jitter_is_no_second_producer(late_ns: list[int]) -> None:
 
 def test_the_kernels_sync_never_comes_from_the_wire(followed: Followed) -> None:
     stream, _, producer, _ = followed
-    stream.pacing = FollowedSync(PERIOD_NS, "the kernel", in_kernel=True, timeout_s=0.01, clock=stream.pacing.clock)
+    pacing = FollowedSync(PERIOD_NS, "the kernel", in_kernel=True, timeout_s=0.01, clock=stream.pacing.clock)
+    stream = SyncStream(stream.network, pacing)
     next(stream)
     producer.pulse(local=False)
     next(stream)

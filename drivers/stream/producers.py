@@ -1,0 +1,218 @@
+"""SYNC producers other than this process: the kernel, or a drive. A stream follows them (`FollowedSync`).
+
+A producer is started once the network is prepared and stopped before the network is left:
+
+    with CanopenNetwork(...) as network, KernelProducer(network, period_us) as producer:
+        network.prepare()
+        producer.start()
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import struct
+from contextlib import AbstractContextManager
+from math import ceil
+from types import TracebackType
+
+from drivers.canopen.bus import BusAddress
+from drivers.canopen.capture import FRAME
+from drivers.canopen.link import SYNC_COB_ID
+from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.sdo import Clock, download_request
+from drivers.errors import WHILE, BusError, DriverError
+from drivers.profiles.profile import ObjectEntry
+from drivers.stream.sync import FollowedSync
+
+SYNC_COB_ID_OBJECT = ObjectEntry(0x1005, 0, 32, signed=False)
+CYCLE_PERIOD = ObjectEntry(0x1006, 0, 32, signed=False)
+"""Period [us]; a producer sends no SYNC while it is 0 (CiA 301)."""
+PRODUCES = 1 << 30
+LEASE_S = 0.4  #: Time for which the kernel goes on alone; less than the 0.5 s of the amplifiers' own watch
+LEAST_SYNCS = 3
+RENEWAL_S = 0.025  #: Time between two renewals
+STEERING_S = 0.25  #: Time between two corrections of the kernel's interval
+LARGEST_CORRECTION = 0.2
+"""Fraction of the period; a kernel that is later than that produces time stamps which are refused."""
+_TX_SETUP, _SET_TIMER, _SET_AND_START_TIMER = 1, 0x1, 0x3  # linux/can/bcm.h
+# struct bcm_msg_head: opcode, flags, count, two intervals of (s, us), identifier, number of frames; then can_frame.
+_HEAD = struct.Struct("@3I4l2I0q")
+
+
+def steered_us(period_us: int, interval_us: int, late_ns: int, phase_ns: int, periods: int) -> int:
+    """Return the kernel's interval for the next window of so many periods [us].
+
+    The lateness of the last window (`late_ns`) is expected again, and the lateness of its last SYNC in the whole
+    schedule (`phase_ns`) is to be corrected within one window.
+    """
+    wanted_us = interval_us - (late_ns + phase_ns) / (1000 * periods)
+    return round(min(max(wanted_us, (1.0 - LARGEST_CORRECTION) * period_us), (1.0 + LARGEST_CORRECTION) * period_us))
+
+
+def setup_message(flags: int, interval_us: int) -> bytes:
+    """Return a message to the broadcast manager: send so many SYNCs as last for `LEASE_S`, then none."""
+    seconds, rest_us = divmod(interval_us, 1_000_000)
+    count = max(LEAST_SYNCS, ceil(LEASE_S * 1e6 / interval_us))
+    head = _HEAD.pack(_TX_SETUP, flags, count, seconds, rest_us, 0, 0, SYNC_COB_ID, 1)
+    return head + FRAME.pack(SYNC_COB_ID, 0, bytes(8))
+
+
+class KernelProducer(AbstractContextManager["KernelProducer"]):
+    """SYNC by the kernel's broadcast manager (CAN_BCM), whose timer needs no process to wake up.
+
+    It ends with the process that started it, and `LEASE_S` after that process has seen its last SYNC: a recorder that
+    hangs must not keep the axes running, one that is stopped for 300 ms must lose nothing. Each interval counts from
+    the actual time of the last SYNC, so the period is too long by the lateness of the timer: `seen` measures that and
+    shortens the interval.
+    """
+
+    name = "the kernel"
+
+    def __init__(self, network: CanopenNetwork, period_us: int) -> None:
+        self._link = network.link
+        self._period_us = period_us
+        self._socket: socket.socket | None = None
+        self._interval_us = period_us
+        self._window = max(8, round(STEERING_S * 1e6 / period_us))
+        self._begun_ns = self._phase_ns = self._periods = self._renewed_ns = 0
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def start(self) -> None:
+        """Send SYNC from now on, or again; while it runs, this counts as `seen`.
+
+        Raises:
+            BusError: the kernel has no broadcast manager, or the bus is not SocketCAN.
+        """
+        address = self._link.address
+        if not isinstance(address, BusAddress) or address.interface != "socketcan":
+            raise BusError(str(address), "SYNC by the kernel needs one bus of interface socketcan")
+        try:
+            if self._socket is None:
+                self._socket = socket.socket(socket.AF_CAN, socket.SOCK_DGRAM, socket.CAN_BCM)
+                self._socket.connect((address.channel,))
+            self._link.sync_producer = self.name
+            self._socket.send(setup_message(_SET_AND_START_TIMER, self._interval_us))
+        except OSError as error:
+            self.stop()
+            name = errno.errorcode.get(error.errno or 0, "")
+            reason = f"SYNC by the kernel: {os.strerror(error.errno or 0)} {name}; modprobe can-bcm?"
+            raise BusError(str(address), reason) from error
+
+    def pacing(self, timeout_s: float, start_ns: int, clock: Clock) -> FollowedSync:
+        """Return the pacing of a stream that follows this producer and steers it; see `FollowedSync`."""
+        return FollowedSync(
+            1000 * self._period_us,
+            self.name,
+            in_kernel=True,
+            timeout_s=timeout_s,
+            seen=self.seen,
+            stop=self.pause,
+            start_ns=start_ns,
+            clock=clock,
+        )
+
+    def seen(self, monotonic_ns: int, periods: int) -> None:
+        """Process a SYNC and its periods since the one before, 0 for the first; keeps average period and phase."""
+        if self._socket is not None and not 0 <= monotonic_ns - self._renewed_ns < RENEWAL_S * 1e9:
+            # The timer itself is not started again, if it has ended: the recorder was stopped for too long.
+            self._renewed_ns = monotonic_ns
+            self._socket.send(setup_message(_SET_TIMER, self._interval_us))
+        if periods == 0:
+            self._begun_ns, self._phase_ns, self._periods = monotonic_ns, 0, 0
+            return
+        self._periods += periods
+        if self._periods < self._window or self._socket is None:
+            return
+        late_ns = monotonic_ns - self._begun_ns - 1000 * self._period_us * self._periods
+        self._phase_ns += late_ns
+        interval_us = steered_us(self._period_us, self._interval_us, late_ns, self._phase_ns, self._periods)
+        self._begun_ns, self._periods = monotonic_ns, 0
+        if interval_us != self._interval_us:
+            self._interval_us = interval_us
+            self._socket.send(setup_message(_SET_TIMER, interval_us))
+
+    def pause(self) -> None:
+        """Stop sending; SYNCs on their way are still the kernel's."""
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
+
+    def stop(self) -> None:
+        """Stop sending, if started."""
+        self.pause()
+        self._link.sync_producer = None
+
+
+class DriveProducer(AbstractContextManager["DriveProducer"]):
+    """SYNC by a drive of the cell, `axis` by its index: objects 1005h (bit 30) and 1006h, which are restored."""
+
+    def __init__(self, network: CanopenNetwork, axis: int, period_us: int) -> None:
+        self.name = network.axes[axis].name
+        self._network = network
+        self._node_id = network.node_ids[axis]
+        self._period_us = period_us
+        self._before: tuple[int, int] | None = None
+        self._produces = False
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            if error is not None:
+                self._network.begin_closing()
+            self.stop()
+        except DriverError as problem:
+            if error is None:
+                raise
+            error.add_note(f"{WHILE}stopping SYNC: {problem}")
+
+    def start(self) -> None:
+        """Let the drive send SYNC; nothing happens if it does."""
+        if self._produces:
+            return
+        access = self._network.link.objects(self._node_id)
+        if self._before is None:
+            self._before = (access.read(SYNC_COB_ID_OBJECT), access.read(CYCLE_PERIOD))
+        self._network.link.sync_producer = self.name
+        # CiA 301: the period may be refused while the drive produces, so production begins last and ends first.
+        access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID)
+        access.write(CYCLE_PERIOD, self._period_us)
+        access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID | PRODUCES)
+        self._produces = True
+
+    def pacing(self, timeout_s: float, start_ns: int, clock: Clock) -> FollowedSync:
+        """Return the pacing of a stream that follows this drive, which keeps its period by itself."""
+        return FollowedSync(
+            1000 * self._period_us,
+            self.name,
+            timeout_s=timeout_s,
+            stop=self.pause,
+            start_ns=start_ns,
+            clock=clock,
+        )
+
+    def pause(self) -> None:
+        """Tell the drive to stop, without waiting for its answer; `stop` restores its objects."""
+        if self._before is not None:
+            self._network.link.send((download_request(self._node_id, SYNC_COB_ID_OBJECT, SYNC_COB_ID),))
+            self._produces = False
+
+    def stop(self) -> None:
+        """Restore both objects, if started and if the drive still answers."""
+        before, self._before, self._produces = self._before, None, False
+        try:
+            if before is not None and self._node_id not in self._network.link.silent:
+                access = self._network.link.objects(self._node_id)
+                access.write(SYNC_COB_ID_OBJECT, before[0] & ~PRODUCES)
+                access.write(CYCLE_PERIOD, before[1])
+                if before[0] & PRODUCES:
+                    access.write(SYNC_COB_ID_OBJECT, before[0])
+        finally:
+            self._network.link.sync_producer = None
+
+
+SyncProducer = KernelProducer | DriveProducer
