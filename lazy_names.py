@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
-from pkgutil import get_data
+from pathlib import Path
 
 
 def lazy_names(package: str) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
@@ -29,7 +29,7 @@ def lazy_names(package: str) -> tuple[Callable[[str], object], Callable[[], list
 
     @cache  # read at the first name: a program that uses none does not wait for it
     def homes() -> dict[str, str]:
-        return _homes(get_data(package, "__init__.py") or b"")
+        return _homes(Path(str(sys.modules[package].__file__)).read_bytes())
 
     def load(name: str) -> object:
         if name == "__all__":

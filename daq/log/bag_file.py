@@ -29,7 +29,8 @@ SQLITE_MAGIC = b"SQLite format 3\0"
 STEPS = 10_000_000  #: Instructions of SQLite for any file, and STEPS_A_BYTE more for each byte; a message takes 20
 STEPS_A_BYTE = 2
 COUNTED_STEPS = 1000  #: Instructions between two counts
-PIECE_BYTES = 2**20
+BYTES_A_TOPIC = 64  #: Least size of a topic in the file
+PIECE_BYTES = 2**20  #: Unpacked at a time
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +130,6 @@ class SqliteBag:
         """Store the path and where the content is."""
         self.path = path
         self._source = source
-        self._topics: dict[int, Topic] = {}
         self._steps_left = 0
         self._bytes_left = 0
 
@@ -158,8 +158,8 @@ class SqliteBag:
             raise self._broken(str(self.path), str(error)) from error
 
     def corrupt(self, place: int, found: str, expected: str) -> LogCorrupt:
-        """Make the error for a row of the messages."""
-        return self._broken(f"{self.path}, message {place}", found, expected)
+        """Make the error for a row of a table."""
+        return self._broken(f"{self.path}, row {place}", found, expected)
 
     def _bound(self, database: sqlite3.Connection) -> None:
         """Bound time and memory: a table of the file may be computed, and then has any number of rows of any size."""
@@ -183,18 +183,22 @@ class SqliteBag:
             raise self._broken(str(self.path), str(found))
 
     def _messages(self, database: sqlite3.Connection) -> Iterator[BagMessage]:
-        for number, name, schema, encoding in database.execute(
-            "SELECT id, name, type, serialization_format FROM topics"
-        ):
-            self._topics[number] = Topic(str(name), schema == JOINTS_SCHEMA and encoding == "cdr")
+        topics: dict[int, Topic] = {}
+        for row, name, schema, encoding in database.execute("SELECT id, name, type, serialization_format FROM topics"):
+            self._spend(row, BYTES_A_TOPIC + len(str(name)))
+            topics[row] = Topic(str(name), schema == JOINTS_SCHEMA and encoding == "cdr")
         for row, number, time_ns, data in database.execute("SELECT id, topic_id, timestamp, data FROM messages"):
-            topic = self._topics.get(number)
+            topic = topics.get(number)
             if topic is None or not isinstance(time_ns, int) or not isinstance(data, bytes):
                 raise self.corrupt(row, f"topic {number}, time {time_ns!r:.40}", "a topic, nanoseconds and bytes")
-            self._bytes_left -= len(data)
-            if self._bytes_left < 0:
-                raise self.corrupt(row, "more bytes than the file has", "a recording")
+            self._spend(row, len(data))
             yield BagMessage(row, topic, time_ns, data)
+
+    def _spend(self, row: int, size: int) -> None:
+        """Count what is read; a table that is computed may have more of it than the file."""
+        self._bytes_left -= size
+        if self._bytes_left < 0:
+            raise self.corrupt(row, "more bytes than the file has", "a recording")
 
     def _refuse_unfinished(self) -> None:
         """Refuse a file beside which SQLite has left what belongs into it: it would be read without that."""

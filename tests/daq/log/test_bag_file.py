@@ -98,6 +98,11 @@ ENDLESS = """
     CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)
                             SELECT id, 1 AS topic_id, 1 AS timestamp, x'00' AS data FROM n WHERE {which};
 """
+MANY_TOPICS = """
+    ALTER TABLE topics RENAME TO kept;
+    CREATE VIEW topics AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)
+                          SELECT id, {name} AS name, '' AS type, '' AS serialization_format FROM n;
+"""
 
 
 @pytest.mark.parametrize(
@@ -107,6 +112,8 @@ ENDLESS = """
         (COMPUTED.format(size=900_000_000), "string or blob too big"),
         (ENDLESS.format(which="id < 0"), "interrupted"),
         (ENDLESS.format(which="1"), "/joint_states with encapsulation 00"),
+        (MANY_TOPICS.format(name="''"), "more bytes than the file has"),
+        (MANY_TOPICS.format(name="hex(zeroblob(20000000))"), "row 1: found more bytes than the file has"),
         ("DROP TABLE topics", "no such table: topics"),
         ("DELETE FROM topics", "found topic 1, time 17000"),
         ("UPDATE messages SET timestamp = 'noon'", "time 'noon'; expected a topic, nanoseconds and bytes"),
