@@ -31,8 +31,9 @@ proposal passes. The science behind is in `ident`, the bus in `drivers`; their e
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell as Cell
@@ -71,34 +72,6 @@ if TYPE_CHECKING:
     from daq.writeback.target import rollback as rollback
     from ident.calibration import Calibration as Calibration
 
-_HOMES = {
-    "daq.config.cell": "Cell",
-    "daq.config.cell_file": "load_cell",
-    "daq.config.controller": "ControllerFormat",
-    "daq.errors": "CalibrationRefused ConfigurationError ControllerChanged ControllerUnfit DaqError DataError ExitCode "
-    "LogUnreadable OutputFailed UsageError",
-    "daq.log.conversion": "load_run",
-    "daq.log.reader": "Log LossyLogs read_log",
-    "daq.documents.calibration_file": "load_calibration save_calibration",
-    "daq.workflow.fit": "Fit calibration_of close_loop fit fit_logs",
-    "daq.workflow.validate": "Validation validate",
-    "daq.writeback.drive_target": "DriveTarget",
-    "daq.writeback.file_target": "FileTarget",
-    "daq.writeback.request": "Request",
-    "daq.writeback.target": "Proposal Written apply propose rollback",
-    "ident.calibration": "Calibration",
-}
-_MODULES = {name: home for home, names in _HOMES.items() for name in names.split()}
-__all__ = list(_MODULES)
-
-
-if not TYPE_CHECKING:  # a type checker knows the names above, and no others
-
-    def __getattr__(name: str) -> object:
-        if name not in _MODULES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it exports {', '.join(__all__)}")
-        value = globals()[name] = getattr(import_module(_MODULES[name]), name)
-        return value
-
-    def __dir__() -> list[str]:
-        return __all__
+    __all__: list[str]
+else:
+    __getattr__, __dir__ = lazy_names(__name__)

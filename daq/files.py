@@ -93,6 +93,11 @@ def open_folder(path: Path, target: Path) -> Path | None:
     return target.parent
 
 
+def is_taken(path: Path) -> bool:
+    """Whether a name leads anywhere or is a link: a new file of that name would replace it, or be made elsewhere."""
+    return path.exists() or path.is_symlink()
+
+
 def follow_links(path: Path) -> Path:
     """Resolve the symbolic links of a name, those of its folders included, as long as they can be trusted.
 

@@ -22,8 +22,9 @@ Nothing moves without a `MotionPermission`. A simulated cell for trials runs on 
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from drivers.canopen.bus import BusAddress as BusAddress
@@ -72,33 +73,6 @@ if TYPE_CHECKING:
     from drivers.stream.sync import LockstepSync as LockstepSync
     from drivers.stream.sync import TimedSync as TimedSync
 
-_HOMES = {
-    "canopen.bus": "BusAddress",
-    "canopen.network": "CanopenNetwork open_cell",
-    "canopen.scan": "FoundNode scan",
-    "canopen.split_bus": "BusPart SplitAddress",
-    "errors": "BusBusy BusError DriveFault DriverError MotionRefused MotionTimeout NodeError NodeMisplaced NodeMissing "
-    "ObjectAccessError ParameterRefused ParametersMixed SampleLost SetupRefused StateRefused",
-    "messages": "CellEvent EventKind Sample",
-    "motion.execute": "execute",
-    "move": "AxisLimits MotionPermission Move synchronised_move",
-    "profiles.cia402": "State decode",
-    "profiles.profile": "CIA402 Amplitude Axis CurrentScale DriveProfile Identity ObjectEntry TapPoint",
-    "stream.answers": "StreamStatistics",
-    "stream.stream": "SyncStream",
-    "stream.sync": "FollowedSync LockstepSync TimedSync",
-}
-_MODULES = {name: home for home, names in _HOMES.items() for name in names.split()}
-__all__ = list(_MODULES)
-
-
-if not TYPE_CHECKING:  # a type checker knows the names above, and no others
-
-    def __getattr__(name: str) -> object:
-        if name not in _MODULES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it exports {', '.join(__all__)}")
-        value = globals()[name] = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
-        return value
-
-    def __dir__() -> list[str]:
-        return __all__
+    __all__: list[str]
+else:
+    __getattr__, __dir__ = lazy_names(__name__)

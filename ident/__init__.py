@@ -23,8 +23,9 @@ makes the `Calibration` with which `predict_torque`, `predict_current`, `weigh` 
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from ident.calibration import Calibration as Calibration
@@ -73,40 +74,6 @@ if TYPE_CHECKING:
     from ident.weighing import WeighedBody as WeighedBody
     from ident.weighing import weigh as weigh
 
-# Importing the package stays light: a name brings its module along when it is first used.
-_HOMES = {
-    "ident.calibration": "Calibration calibration_of",
-    "ident.contact": "ExternalTorque external_torque prediction_band",
-    "ident.data.conditioning": "Conditioning",
-    "ident.data.dataset": "Dataset differentiate planned",
-    "ident.data.run": "Run",
-    "ident.discovery.evidence": "Evidence gather",
-    "ident.discovery.loop": "Step find_effects",
-    "ident.errors": "CurrentUnsigned DataUnfit Diagnosis EffectRefused IdentificationError ModelContradicted "
-    "ModelError NotConverged PayloadUnseen RankDeficient RolesExchanged TooFewMoves",
-    "ident.estimators.diagnosis": "diagnose exchanged_channels",
-    "ident.estimators.estimate": "Estimate RelativeError",
-    "ident.estimators.identify": "Identification identify",
-    "ident.estimators.method": "Method",
-    "ident.estimators.turned_geometry": "find_turned_geometry",
-    "ident.model.bodies": "Payload",
-    "ident.model.model": "DriveTrain Model",
-    "ident.model.robot": "Motion Robot",
-    "ident.model.urdf": "robot_from_urdf",
-    "ident.prediction": "measured_torque predict_current predict_torque",
-    "ident.weighing": "WeighedBody weigh",
-}
-_MODULES = {name: home for home, names in _HOMES.items() for name in names.split()}
-__all__ = list(_MODULES)
-
-
-if not TYPE_CHECKING:  # a type checker knows the names above, and no others
-
-    def __getattr__(name: str) -> object:
-        if name not in _MODULES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it exports {', '.join(__all__)}")
-        value = globals()[name] = getattr(import_module(_MODULES[name]), name)
-        return value
-
-    def __dir__() -> list[str]:
-        return __all__
+    __all__: list[str]
+else:
+    __getattr__, __dir__ = lazy_names(__name__)

@@ -11,19 +11,16 @@ import functools
 import gc
 import re
 import resource
-from collections import OrderedDict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from hypothesis import settings
 from pydantic import TypeAdapter
 from xdist.scheduler import LoadFileScheduling
 
 from daq.cli import app, failure
-from daq.config import yaml_file
 from daq.report.schemas import REPORTS, ErrorReport
 from daq.report.text import json_text
 
@@ -76,37 +73,6 @@ class _FolderTogether(LoadFileScheduling):  # type: ignore[misc]  # xdist has no
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling | None:
     """Replace the scheduler of `--dist loadfile`."""
     return _FolderTogether(config, log) if config.getvalue("dist") == "loadfile" else None
-
-
-PARSED = 128
-"""Texts whose nodes are kept."""
-
-
-@pytest.fixture(scope="session", autouse=True)
-def parsed_once() -> Iterator[None]:
-    """Compose the nodes of equal YAML texts once: the same few files are read thousands of times.
-
-    Nodes depend on the bytes alone and are not changed afterwards. What cannot be parsed is not kept, so that each
-    error is raised by the file that it names.
-    """
-    kept: OrderedDict[bytes, yaml.Node | None] = OrderedDict()
-
-    class Loader(yaml_file._Loader):
-        def __init__(self, text: bytes, name: str) -> None:
-            super().__init__(text, name)
-            self._text = text
-
-        def get_single_node(self) -> yaml.Node | None:
-            if self._text not in kept:
-                kept[self._text] = super().get_single_node()
-            kept.move_to_end(self._text)
-            if len(kept) > PARSED:
-                kept.popitem(last=False)
-            return kept[self._text]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(yaml_file, "_Loader", Loader)
-        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

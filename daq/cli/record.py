@@ -12,6 +12,7 @@ import typer
 
 from daq.cli.verb import CellArgument, JsonOption, Verb, judged_output, print_json, say_next
 from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError
+from daq.files import is_taken
 from drivers.errors import POWERED, DriverError, SampleLost, all_notes, error_chain
 
 if TYPE_CHECKING:
@@ -182,7 +183,7 @@ def _free(out: Path) -> Path:
         (out, "a file of that name", "choose another --out, or move it away"),
         (part, unfinished, f"`fit` does not read it; {_next_command(part)}"),
     ):
-        if path.exists() or path.is_symlink():
+        if is_taken(path):
             raise UsageError(str(path), found=found, expected="none", remedy=remedy)
     return part
 

@@ -16,6 +16,7 @@ from rich.console import Console, RenderableType
 
 from daq.cli.verb import judged_output
 from daq.errors import OutputFailed, UsageError, writing
+from daq.files import is_taken
 from daq.report.text import terminal_text
 
 if TYPE_CHECKING:
@@ -105,7 +106,7 @@ def check_replaceable(out: Path, mark: str, kind: str) -> None:
             head = stream.read(4096)
         replaceable = not head or mark.encode() in head
     else:
-        replaceable = not (out.exists() or out.is_symlink())  # a dangling link would be followed
+        replaceable = not is_taken(out)
     if not replaceable:
         raise UsageError(
             str(out),

@@ -12,6 +12,7 @@ import dataclasses
 import difflib
 import json
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -25,7 +26,6 @@ from daq.files import follow_links, read_regular
 
 Location = tuple[str | int, ...]
 MAX_BYTES = 4 * 2**20  #: Largest configuration [bytes]
-MAX_EXAMINED = 2**20  #: Largest file whose flaw is searched by the slow parser, in a second or two [bytes]
 MAX_DEPTH = 40  #: Deepest nesting; more takes time and memory beyond the size of the file
 MAX_VALUES = 50_000  #: Largest number of keys and values; the largest shipped configuration has a hundredth of that
 MAX_BITS = 64  #: Longest integer: no object of an amplifier is longer
@@ -93,47 +93,11 @@ class Fault:
     expected: str
 
 
-class _Loader(yaml.SafeLoader):
-    """YAML 1.2 core scalars only: `no` is text and 1e-6 a number, unlike in YAML 1.1.
-
-    A few lines of aliases can unfold to gigabytes; deep nesting and very many values take minutes. All three are
-    refused while the file is read.
-    """
-
-    def __init__(self, text: bytes, name: str) -> None:
-        super().__init__(text)
-        self._name = name
-        self._depth = self._values = 0
-
-    def get_event(self) -> yaml.Event | None:
-        """Return the next event.
-
-        Raises:
-            YamlInvalid: it is an alias, too deep, or one too many.
-        """
-        event: yaml.Event | None = yaml.SafeLoader.get_event(self)
-        self._depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        self._values += isinstance(event, yaml.NodeEvent)
-        alias = isinstance(event, yaml.AliasEvent)
-        if event is not None and (alias or self._depth > MAX_DEPTH or self._values > MAX_VALUES):
-            mark = event.start_mark
-            large = self._values > MAX_VALUES
-            many = f"more than {MAX_VALUES} values" if large else f"more than {MAX_DEPTH} lists in lists"
-            raise YamlInvalid(
-                f"{self._name}:{mark.line + 1 if mark else '?'}",
-                found="an alias (*name)" if alias else many,
-                expected="plain values" if alias or self._depth > MAX_DEPTH else "a configuration",
-                remedy="write the value out" if alias else "is this the right file?",
-            )
-        return event
-
-
-class _QuickLoader(yaml.CSafeLoader):
-    """The same by libyaml, twenty times as fast. It can check no limits, and its messages are worse."""
+class _Loader(yaml.CSafeLoader):
+    """YAML 1.2 core scalars only: `no` is text and 1e-6 a number, unlike in YAML 1.1."""
 
 
 _Loader.yaml_implicit_resolvers = {}
-_QuickLoader.yaml_implicit_resolvers = {}
 
 _CORE_SCALARS = (
     ("null", r"(?:~|null|Null|NULL|)$", ["~", "n", "N", ""]),
@@ -147,8 +111,7 @@ _CORE_SCALARS = (
     ),
 )
 for _tag, _pattern, _first in _CORE_SCALARS:
-    for _kind in (_Loader, _QuickLoader):
-        _kind.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), _first)
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), _first)
 _TAGS = {f"tag:yaml.org,2002:{tag}" for tag in ("null", "bool", "int", "float", "str", "map", "seq")}
 
 
@@ -179,29 +142,20 @@ def parse_yaml(text: bytes, name: str) -> Document:
             remedy="give the files in the order of the command's help",
         )
     lines: dict[Location, int] = {}
-    plain = _is_plain(text)
-    if not plain and len(text) > MAX_EXAMINED:
-        raise YamlInvalid(
-            name,
-            found=f"{len(text)} bytes that are no YAML, or with aliases, more than {MAX_VALUES} values, or more than "
-            f"{MAX_DEPTH} lists in lists",
-            expected="a configuration",
-            remedy="is this the right file?",
-        )
     try:
-        loader = _QuickLoader(text) if plain else _Loader(text, name)
+        _check_events(text, name)
+        loader = _Loader(text)
         try:
             node = loader.get_single_node()
             tree = None if node is None else _convert(loader, node, (), name, lines)
         finally:
             loader.dispose()
     except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
         raise YamlInvalid(
-            f"{name}:{mark.line + 1 if mark else '?'}",
+            f"{name}:{_line(error.problem_mark or error.context_mark)}",
             found=error.problem or error.context or "broken YAML",
             expected="one YAML document",
-            remedy="mind indentation, colons and quotes",
+            remedy="mind indentation (spaces, no tabs), colons and quotes; is this the right file?",
         ) from error
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
         raise YamlInvalid(
@@ -213,18 +167,50 @@ def parse_yaml(text: bytes, name: str) -> Document:
     return Document(name, tree, lines)
 
 
-def _is_plain(text: bytes) -> bool:
-    """Whether libyaml can read it and it is within the limits; `_Loader` finds out what is wrong with anything else."""
-    depth = values = 0
-    try:
-        for event in yaml.parse(text, Loader=_QuickLoader):
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            values += isinstance(event, yaml.NodeEvent)
-            if isinstance(event, yaml.AliasEvent) or depth > MAX_DEPTH or values > MAX_VALUES:
-                return False
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError):
-        return False
-    return True
+def _check_events(text: bytes, name: str) -> None:
+    """Refuse aliases, deep nesting and very many values while nothing is built of them.
+
+    A few lines of aliases can unfold to gigabytes; the other two take minutes.
+
+    Raises:
+        YamlInvalid: there is one of them.
+        yaml.YAMLError, ValueError: it is no YAML.
+    """
+    for event, depth, values in yaml_events(text):
+        where = f"{name}:{_line(event.start_mark)}"
+        if isinstance(event, yaml.AliasEvent):
+            raise YamlInvalid(where, found="an alias (*name)", expected="plain values", remedy="write the value out")
+        if depth > MAX_DEPTH:
+            found = f"more than {MAX_DEPTH} lists in lists"
+            raise YamlInvalid(where, found=found, expected="plain values", remedy="is this the right file?")
+        if values > MAX_VALUES:
+            found = f"more than {MAX_VALUES} values"
+            raise YamlInvalid(where, found=found, expected="a configuration", remedy="is this the right file?")
+
+
+def yaml_events(text: bytes) -> Iterator[tuple[yaml.Event, int, int]]:
+    """Yield each event of a YAML text, with the depth of nesting and the number of keys and values so far.
+
+    libyaml needs a fraction of a second for a text of which a tree would take minutes.
+
+    Raises:
+        yaml.YAMLError, ValueError: it is no YAML.
+    """
+    depth = 0
+    values = 0
+    for event in yaml.parse(text, Loader=_Loader):
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        if isinstance(event, yaml.NodeEvent):
+            values += 1
+        yield event, depth, values
+
+
+def _line(mark: Any) -> int | str:
+    """Line of a mark of libyaml, from 1."""
+    return "?" if mark is None else mark.line + 1
 
 
 def not_in_file(kind: str) -> str:
@@ -300,9 +286,7 @@ def spell(path: Location) -> str:
     return text.lstrip(".") or "the whole file"
 
 
-def _convert(
-    loader: _Loader | _QuickLoader, node: yaml.Node, path: Location, name: str, lines: dict[Location, int]
-) -> Any:
+def _convert(loader: _Loader, node: yaml.Node, path: Location, name: str, lines: dict[Location, int]) -> Any:
     """Convert a node to plain Python and note its lines; refuse YAML features that a configuration must not use."""
     line = node.start_mark.line + 1
     lines[path] = line

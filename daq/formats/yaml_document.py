@@ -14,6 +14,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
+from daq.config.yaml_file import yaml_events
 from daq.errors import ControllerUnfit
 from daq.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPath, Leaves, Scalar, unfit, utf8
 
@@ -104,17 +105,12 @@ def yaml_document(content: bytes, name: str) -> YamlDocument:
 
 
 def _check_size(content: bytes, name: str) -> None:
-    """Refuse at once what the two parsers would take minutes for: libyaml counts in a fraction of a second."""
-    depth = values = 0
-    found = f"{len(content)} bytes" if len(content) > MAX_BYTES else ""
-    if not found:
-        with contextlib.suppress(yaml.YAMLError, ValueError):  # explained by the parsers
-            for event in yaml.parse(content, Loader=yaml.CSafeLoader):
-                depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-                values += isinstance(event, yaml.NodeEvent)
-                if values > MAX_VALUES or depth > MAX_DEPTH:
-                    found = f"more than {MAX_VALUES} values, or lists in lists deeper than {MAX_DEPTH}"
-                    break
+    """Refuse at once what the two parsers would take minutes for."""
+    found = ""
+    if len(content) > MAX_BYTES:
+        found = f"{len(content)} bytes"
+    elif _is_large(content):
+        found = f"more than {MAX_VALUES} values, or lists in lists deeper than {MAX_DEPTH}"
     if found:
         raise ControllerUnfit(
             name,
@@ -122,6 +118,14 @@ def _check_size(content: bytes, name: str) -> None:
             expected=f"at most {MAX_BYTES} bytes, {MAX_VALUES} values, {MAX_DEPTH} lists in lists",
             remedy="is this the controller's file? then keep its gains in a file of their own; nothing was written",
         )
+
+
+def _is_large(content: bytes) -> bool:
+    with contextlib.suppress(yaml.YAMLError, ValueError):  # explained by the parsers
+        for _, depth, values in yaml_events(content):
+            if values > MAX_VALUES or depth > MAX_DEPTH:
+                return True
+    return False
 
 
 @lru_cache(maxsize=8)  # composing is expensive, and a write reads each of its two texts several times

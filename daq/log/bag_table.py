@@ -1,4 +1,4 @@
-"""Read joint states from ROS 2 bags in MCAP as tables.
+"""Read joint states from ROS 2 bags as tables.
 
 A column is `position.JOINT`, `velocity.JOINT` or `effort.JOINT`; the time column is `header.stamp`. Messages of one
 stamp that hold different joints make one row, because several publishers may share a topic.
@@ -8,24 +8,23 @@ from __future__ import annotations
 
 import struct
 from array import array
-from collections.abc import Iterable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Header, McapRecord, Message, Schema
 
 from daq.config.import_description import Column, ImportDescription, TimeColumn, TimeUnit
-from daq.errors import LogForeign, LogTruncated, LogUnreadable, TableUnfit
-from daq.log.container import RecordFile
+from daq.errors import LogForeign, LogUnreadable, TableUnfit
+from daq.log.bag_file import McapBag, open_bag, unpack_message
 from daq.log.message import JOINTS_SCHEMA, SAMPLES_TOPIC
 from daq.log.table import LATEST_NS, Table, digest_of, require_finite, stamps_of_ns
 
 STAMP = "header.stamp"  #: Name of the time column
 FIELDS = ("position", "velocity", "effort")
+PACKED = ".zstd"  #: Suffix of a file that is packed as a whole
+PATTERNS = ("*.mcap", "*.db3", "*.mcap.zstd", "*.db3.zstd")  #: Files of a bag in its folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,94 +85,29 @@ def joint_state_from_cdr(data: bytes) -> JointState:
         raise ValueError(f"a message of {len(data)} bytes ({error})") from error
 
 
-class BagFile(RecordFile):
-    """Records of a bag, which is laxer than a log of ours: checksums are optional, and messages need no chunks."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self.library = ""
-        self.channels: dict[int, Channel] = {}
-        self.schemas: dict[int, Schema] = {}
-
-    def messages(self, records: Iterable[tuple[int, McapRecord]]) -> Iterator[tuple[int, Channel, Message]]:
-        """Yield offset, channel and message of this bag's records; `channels` and `schemas` grow meanwhile.
-
-        Raises:
-            LogUnreadable: one of its kinds, with the place in the file.
-        """
-        for offset, outer in records:
-            for record in self._inside(offset, outer) if isinstance(outer, Chunk) else (outer,):
-                if isinstance(record, Header):
-                    self.library = record.library
-                elif isinstance(record, Schema):
-                    self.schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    self.channels[record.id] = record
-                elif isinstance(record, Message):
-                    if record.channel_id not in self.channels:
-                        raise self.corrupt(offset, f"a message of channel {record.channel_id}", "a channel before it")
-                    yield offset, self.channels[record.channel_id], record
-
-    def is_joint_state(self, channel: Channel) -> bool:
-        """Whether a channel has joint states."""
-        schema = self.schemas.get(channel.schema_id)
-        return schema is not None and schema.name == JOINTS_SCHEMA and channel.message_encoding == "cdr"
-
-    def _inside(self, offset: int, chunk: Chunk) -> Iterator[McapRecord]:
-        data = self.unpack(offset, chunk)
-        at = 0
-        while at < len(data):
-            self.spend(offset)
-            opcode, length = struct.unpack_from("<BQ", data, at) if len(data) - at >= 9 else (0, len(data))
-            at += 9 + length
-            if at > len(data):
-                raise self.corrupt(offset, "a record beyond the end of its chunk", "one inside")
-            for _, record in self._record(offset, opcode, data[at - length : at]):
-                yield record
-
-    def _record(self, offset: int, opcode: int, body: bytes) -> Iterator[tuple[int, McapRecord]]:
-        if opcode != Opcode.MESSAGE:
-            yield from super()._record(offset, opcode, body)
-        elif len(body) < 22:
-            raise self.corrupt(offset, "a message without its head", "one of at least 22 bytes")
-        else:
-            channel, sequence, log_time, publish_time = struct.unpack_from("<HIQQ", body)
-            yield offset, Message(channel, log_time, body[22:], publish_time, sequence)
-
-    def _check_crc(self, offset: int, what: str, stored: int, computed: int) -> None:
-        if stored != 0:  # ROS 2 leaves the checksum of the data section out
-            super()._check_crc(offset, what, stored, computed)
-
-    def _truncated(self, size: int, good: int | None) -> LogTruncated:
-        error = super()._truncated(size, good)
-        remedy = "the recorder was killed or the copy is incomplete: copy it again, or repair it with `mcap recover`"
-        return LogTruncated(error.subject, found=error.found, expected="a finished bag", remedy=remedy)
-
-
 def read_bag(path: Path, wanted: ImportDescription, columns: tuple[Column, ...], time: TimeColumn | None) -> Table:
     """Read columns of a bag, which is a file or a folder of several.
 
     Raises:
-        LogUnreadable: a file is no MCAP file, ends early or is damaged.
+        LogUnreadable: a file is no bag, ends early or is damaged.
         TableUnfit: there are no joint states, or not those that the columns name.
     """
-    files = sorted(path.glob("*.mcap"), key=lambda file: (len(file.name), file.name)) if path.is_dir() else [path]
     if time is not None and (time.column != STAMP or time.unit is not TimeUnit.NANOSECOND):
         found = f"time column {time.column!r} in {time.unit.value}"
         raise _unfit(path, found, f"`column: {STAMP}` and `unit: ns`", "correct `time` in the import description")
     rows = _Rows(path, tuple(_field_and_joint(path, column) for column in columns))
     topics: dict[str, bool] = {}
-    for file in files:
-        bag = BagFile(file)
-        with closing(iter(bag)) as records:
-            for offset, channel, message in bag.messages(records):
-                chosen = wanted.topic in {None, channel.topic} and bag.is_joint_state(channel)
-                topics[channel.topic] = chosen
+    for file in _files(path):
+        with open_bag(file) as bag, closing(bag.messages()) as messages:
+            for message in messages:
+                topic = message.topic
+                chosen = topic.has_joint_states and wanted.topic in {None, topic.name}
+                topics[topic.name] = chosen
                 if chosen:
                     try:
-                        rows.add(joint_state_from_cdr(message.data), message.log_time)
+                        rows.add(joint_state_from_cdr(unpack_message(message.data)), message.time_ns)
                     except ValueError as error:
-                        raise bag.corrupt(offset, f"{channel.topic} with {error}", JOINTS_SCHEMA) from error
+                        raise bag.corrupt(message.place, f"{topic.name} with {error}", JOINTS_SCHEMA) from error
     used = [topic for topic, chosen in topics.items() if chosen]
     if not used:
         found = f"topics {', '.join(topics)}" if topics else "no message"
@@ -182,6 +116,23 @@ def read_bag(path: Path, wanted: ImportDescription, columns: tuple[Column, ...],
         remedy = "choose one in the import description: `topic: NAME`"
         raise _unfit(path, f"joint states on {len(used)} topics, {', '.join(used)}", "one topic", remedy)
     return rows.table(columns, time)
+
+
+def _files(path: Path) -> list[Path]:
+    """Files of a bag in their order; `path` itself if it is no folder."""
+    if not path.is_dir():
+        return [path]
+    files = [file for pattern in PATTERNS for file in path.glob(pattern)]
+    # A player leaves what it has unpacked beside the packed file.
+    unpacked = {file.with_name(file.name + PACKED) for file in files}
+    once = [file for file in files if file not in unpacked]
+    return sorted(once, key=_part)
+
+
+def _part(file: Path) -> tuple[int, str]:
+    """Key of the files of a bag, NAME_0 to NAME_10."""
+    name = file.name.removesuffix(PACKED)
+    return len(name), name
 
 
 def _unfit(
@@ -328,13 +279,13 @@ EXAMINED = 10_000  #: Messages that are examined to say what a file is
 
 def foreign_recording(path: Path) -> LogForeign | None:
     """Return the error for an MCAP file of another program; None if it may be a log of ours, or no MCAP file."""
-    bag = BagFile(path)
+    bag = McapBag(path)
     joints: tuple[str, ...] = ()
-    with suppress(LogUnreadable, ValueError), closing(bag.unfinished()) as records:
-        for _, channel, message in islice(bag.messages(records), EXAMINED):
-            if bag.is_joint_state(channel):
-                joints = joints or joint_state_from_cdr(message.data).names
-    topics = {channel.topic: bag.is_joint_state(channel) for channel in bag.channels.values()}
+    with suppress(LogUnreadable, ValueError), closing(bag.unfinished_messages()) as messages:
+        for message in islice(messages, EXAMINED):
+            if message.topic.has_joint_states:
+                joints = joints or joint_state_from_cdr(unpack_message(message.data)).names
+    topics = {topic.name: topic.has_joint_states for topic in bag.topics.values()}
     if not topics or SAMPLES_TOPIC in topics:
         return None
     states = [topic for topic, has in topics.items() if has]

@@ -73,9 +73,10 @@ class RecordFile:
         LogMissing, LogForeign, LogTruncated, LogCorrupt: with the offset in the file.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Store the path."""
+    def __init__(self, path: Path, source: Path | None = None) -> None:
+        """Store the path, and where the content is if not there."""
         self.path = path
+        self._source = source or path
         self.sha256 = ""
         self.whole_bytes = 0
         self._allowance = self._records_left = 0
@@ -101,7 +102,7 @@ class RecordFile:
         self, records: Callable[[BinaryIO, int], Iterator[tuple[int, McapRecord]]]
     ) -> Generator[tuple[int, McapRecord], None, None]:
         try:
-            with open_regular(self.path) as stream:
+            with open_regular(self._source) as stream:
                 size = os.fstat(stream.fileno()).st_size
                 self._allowance = LARGEST_CHUNK + LARGEST_RATIO * size
                 self._records_left = RECORDS + size // BYTES_A_RECORD

@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence, Set
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from daq.config.import_description import ImportDescription, Section, TemperatureColumns
 from daq.errors import ConfigurationInconsistent, TableUnfit
-from daq.files import open_regular
+from daq.log.bag_file import SQLITE_MAGIC, ZSTD_MAGIC, first_bytes
 from daq.log.bag_table import FIELDS, read_bag
 from daq.log.container import MAGIC
 from daq.log.csv_table import read_csv
 from daq.log.mat_table import read_mat
 from daq.log.table import Reader
 
-_HEADS: dict[bytes, Reader] = {MAGIC: read_bag, b"MATLAB ": read_mat, b"\x89HDF\r\n": read_mat}
-_SUFFIXES: dict[str, Reader] = {".mcap": read_bag, ".mat": read_mat}
-_UNREADABLE = {
-    b"SQLite format 3\0": ("a ROS 2 bag in SQLite (.db3)", "convert it: `ros2 bag convert` with storage_id mcap"),
-    b"#ROSBAG V": ("a ROS 1 bag", "convert it to a ROS 2 bag in MCAP: `rosbags-convert`"),
+_HEADS: dict[bytes, Reader] = {
+    MAGIC: read_bag,
+    SQLITE_MAGIC: read_bag,
+    ZSTD_MAGIC: read_bag,
+    b"MATLAB ": read_mat,
+    b"\x89HDF\r\n": read_mat,
 }
+_SUFFIXES: dict[str, Reader] = {".mcap": read_bag, ".db3": read_bag, ".mat": read_mat}
+_ROS_1_BAG = b"#ROSBAG V"
 
 
 def reader_of(path: Path) -> Reader:
@@ -32,14 +34,14 @@ def reader_of(path: Path) -> Reader:
     """
     if path.is_dir():
         return read_bag
-    head = b""
-    with suppress(OSError), open_regular(path) as stream:  # the reader reports it
-        head = stream.read(16)
-    for start, (found, remedy) in _UNREADABLE.items():
-        if head.startswith(start):
-            raise TableUnfit(
-                str(path), found=found, expected="CSV, a MATLAB file or a ROS 2 bag in MCAP", remedy=remedy
-            )
+    head = first_bytes(path)
+    if head.startswith(_ROS_1_BAG):
+        raise TableUnfit(
+            str(path),
+            found="a ROS 1 bag",
+            expected="CSV, a MATLAB file or a ROS 2 bag",
+            remedy="convert it to a ROS 2 bag: `rosbags-convert`",
+        )
     by_content = next((reader for start, reader in _HEADS.items() if head.startswith(start)), None)
     return by_content or _SUFFIXES.get(path.suffix.lower(), read_csv)
 

@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 
 from daq.config.cell import Cell, joint_names
 from daq.errors import OutputFailed, UsageError
-from daq.files import fsync_folder
+from daq.files import fsync_folder, is_taken
 from daq.log.container import UNFINISHED
 from daq.log.message import (
     CURRENTS_TOPIC,
@@ -126,7 +126,7 @@ class LogWriter:
 
     def __enter__(self) -> LogWriter:
         """Open the file and write everything before the first sample."""
-        if self.path.exists() or self.path.is_symlink():  # of a dangling link, the name would be taken at the end
+        if is_taken(self.path):
             raise UsageError(
                 str(self.path),
                 found="a file of that name",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import shutil
 import subprocess
@@ -139,3 +140,14 @@ def test_the_science_brings_no_bus_no_log_and_no_screen() -> None:
     assert int(count) > 5
     assert "numpy" in loaded
     assert not set(FOREIGN_TO_IDENT) & set(loaded)
+
+
+def test_the_helper_of_the_front_doors_imports_the_standard_library_alone() -> None:
+    """It is beside the packages, where no contract sees it; whatever it imports, all three would."""
+    imported = set[str]()
+    for node in ast.walk(ast.parse((ROOT / "lazy_names.py").read_text())):
+        if isinstance(node, ast.Import):
+            imported.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            imported.add(str(node.module))
+    assert {name.partition(".")[0] for name in imported} <= sys.stdlib_module_names

@@ -220,9 +220,9 @@ def test_a_matrix_is_imported_with_its_columns_as_axes(
     assert run.rate_hz == pytest.approx(1000.0)
     np.testing.assert_allclose(run.position_rad, np.radians(Q), atol=2e-9)
     np.testing.assert_allclose(run.current_a, CURRENT, atol=1e-9)
-    (tmp_path / "run.mat").write_bytes(b"SQLite format 3\0 and so on")
+    (tmp_path / "run.mat").write_bytes(b"#ROSBAG V2.0\n and so on")
     assert main(["import", str(description), "--data", str(tmp_path), "--out", str(tmp_path / "x.mcap")]) == 4
-    assert "ros2 bag convert" in " ".join(capfd.readouterr().err.split())
+    assert "rosbags-convert" in " ".join(capfd.readouterr().err.split())
 
 
 def test_stamps_and_numbers_of_columns_without_end_are_refused(tmp_path: Path) -> None:

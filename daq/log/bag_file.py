@@ -1,0 +1,298 @@
+"""Read the messages of a file of a ROS 2 bag: MCAP or SQLite, with messages or the whole file packed by zstd, or not.
+
+The file may be truncated, damaged or malicious: what it unfolds to, or makes SQLite compute, is bounded by its size.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import struct
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import zstandard
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Header, McapRecord, Message, Schema
+
+from daq.errors import LogCorrupt, LogMissing, LogTruncated, OutputFailed
+from daq.files import open_regular
+from daq.log.container import LARGEST_CHUNK, LARGEST_RATIO, LARGEST_RECORD, RecordFile
+from daq.log.message import JOINTS_SCHEMA
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+SQLITE_MAGIC = b"SQLite format 3\0"
+STEPS = 10_000_000  #: Instructions of SQLite for any file, and STEPS_A_BYTE more for each byte; a message takes 20
+STEPS_A_BYTE = 2
+COUNTED_STEPS = 1000  #: Instructions between two counts
+BYTES_A_TOPIC = 64  #: Least size of a topic in the file
+PIECE_BYTES = 2**20  #: Unpacked at a time
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of a bag."""
+
+    name: str  #: as publishers know it
+    has_joint_states: bool  #: in CDR
+
+
+class BagMessage(NamedTuple):
+    """A message as it was recorded."""
+
+    place: int  #: byte of the file, or row of the table
+    topic: Topic  #: where it was published
+    time_ns: int  #: time of its recording
+    data: bytes  #: its fields, maybe packed: see `unpack_message`
+
+
+class McapBag(RecordFile):
+    """A bag in MCAP, which is laxer than a log of ours: checksums are optional, and messages need no chunks."""
+
+    def __init__(self, path: Path, source: Path | None = None) -> None:
+        """Store the path, and where the content is if not there."""
+        super().__init__(path, source)
+        self.library = ""
+        self.topics: dict[int, Topic] = {}
+        self._schemas: dict[int, Schema] = {}
+
+    def messages(self) -> Generator[BagMessage, None, None]:
+        """Yield the messages; `topics` grows meanwhile.
+
+        Raises:
+            LogUnreadable: one of its kinds, with the place in the file.
+        """
+        with closing(iter(self)) as records:
+            yield from self._messages(records)
+
+    def unfinished_messages(self) -> Generator[BagMessage, None, None]:
+        """Yield the messages before the damage of a file without a valid end, then raise as `messages`."""
+        with closing(self.unfinished()) as records:
+            yield from self._messages(records)
+
+    def _messages(self, records: Iterable[tuple[int, McapRecord]]) -> Iterator[BagMessage]:
+        for offset, outer in records:
+            inside = self._inside(offset, outer) if isinstance(outer, Chunk) else (outer,)
+            for record in inside:
+                if isinstance(record, Message):
+                    topic = self.topics.get(record.channel_id)
+                    if topic is None:
+                        raise self.corrupt(offset, f"a message of channel {record.channel_id}", "a channel before it")
+                    yield BagMessage(offset, topic, record.log_time, record.data)
+                elif isinstance(record, Header):
+                    self.library = record.library
+                elif isinstance(record, Schema):
+                    self._schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    schema = self._schemas.get(record.schema_id)
+                    is_joints = schema is not None and schema.name == JOINTS_SCHEMA
+                    self.topics[record.id] = Topic(record.topic, is_joints and record.message_encoding == "cdr")
+
+    def _inside(self, offset: int, chunk: Chunk) -> Iterator[McapRecord]:
+        data = self.unpack(offset, chunk)
+        at = 0
+        while at < len(data):
+            self.spend(offset)
+            opcode, length = struct.unpack_from("<BQ", data, at) if len(data) - at >= 9 else (0, len(data))
+            at += 9 + length
+            if at > len(data):
+                raise self.corrupt(offset, "a record beyond the end of its chunk", "one inside")
+            for _, record in self._record(offset, opcode, data[at - length : at]):
+                yield record
+
+    def _record(self, offset: int, opcode: int, body: bytes) -> Iterator[tuple[int, McapRecord]]:
+        if opcode != Opcode.MESSAGE:
+            yield from super()._record(offset, opcode, body)
+        elif len(body) < 22:
+            raise self.corrupt(offset, "a message without its head", "one of at least 22 bytes")
+        else:
+            channel, sequence, log_time, publish_time = struct.unpack_from("<HIQQ", body)
+            yield offset, Message(channel, log_time, body[22:], publish_time, sequence)
+
+    def _check_crc(self, offset: int, what: str, stored: int, computed: int) -> None:
+        if stored != 0:  # ROS 2 leaves the checksum of the data section out
+            super()._check_crc(offset, what, stored, computed)
+
+    def _truncated(self, size: int, good: int | None) -> LogTruncated:
+        error = super()._truncated(size, good)
+        remedy = "the recorder was killed or the copy is incomplete: copy it again, or repair it with `mcap recover`"
+        return LogTruncated(error.subject, found=error.found, expected="a finished bag", remedy=remedy)
+
+
+class SqliteBag:
+    """A bag in SQLite (.db3), which has no checksums: a flipped bit of a number passes, as in every reader of it."""
+
+    def __init__(self, path: Path, source: Path) -> None:
+        """Store the path and where the content is."""
+        self.path = path
+        self._source = source
+        self._steps_left = 0
+        self._bytes_left = 0
+
+    def messages(self) -> Generator[BagMessage, None, None]:
+        """Yield the messages in the order of their recording.
+
+        Raises:
+            LogUnreadable: one of its kinds, with the row of the table where there is one.
+        """
+        # Only read, and without locks: no file is made beside it.
+        uri = f"{self._source.absolute().as_uri()}?immutable=1"
+        try:
+            self._refuse_unfinished()
+            with closing(sqlite3.connect(uri, uri=True)) as database:
+                self._bound(database)
+                self._check(database)
+                yield from self._messages(database)
+        except OSError as error:
+            raise LogMissing(
+                str(self.path),
+                found=(error.strerror or type(error).__name__).lower(),
+                expected="a ROS 2 bag",
+                remedy="check the name",
+            ) from error
+        except (sqlite3.Error, UnicodeDecodeError) as error:
+            raise self._broken(str(self.path), str(error)) from error
+
+    def corrupt(self, place: int, found: str, expected: str) -> LogCorrupt:
+        """Make the error for a row of a table."""
+        return self._broken(f"{self.path}, row {place}", found, expected)
+
+    def _bound(self, database: sqlite3.Connection) -> None:
+        """Bound time and memory: a table of the file may be computed, and then has any number of rows of any size."""
+        with open_regular(self._source) as stream:
+            size = os.fstat(stream.fileno()).st_size
+        self._bytes_left = size
+        self._steps_left = (STEPS + STEPS_A_BYTE * size) // COUNTED_STEPS
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_RECORD)
+        database.set_progress_handler(self._count_steps, COUNTED_STEPS)
+        database.execute("PRAGMA trusted_schema = OFF")
+
+    def _count_steps(self) -> bool:
+        """Count; SQLite stops at True."""
+        self._steps_left -= 1
+        return self._steps_left < 0
+
+    def _check(self, database: sqlite3.Connection) -> None:
+        """Refuse a file with broken pages: SQLite would leave out their rows without a word."""
+        (found,) = database.execute("PRAGMA quick_check(1)").fetchone()
+        if found != "ok":
+            raise self._broken(str(self.path), str(found))
+
+    def _messages(self, database: sqlite3.Connection) -> Iterator[BagMessage]:
+        topics: dict[int, Topic] = {}
+        for row, name, schema, encoding in database.execute("SELECT id, name, type, serialization_format FROM topics"):
+            self._spend(row, BYTES_A_TOPIC + len(str(name)))
+            topics[row] = Topic(str(name), schema == JOINTS_SCHEMA and encoding == "cdr")
+        for row, number, time_ns, data in database.execute("SELECT id, topic_id, timestamp, data FROM messages"):
+            topic = topics.get(number)
+            if topic is None or not isinstance(time_ns, int) or not isinstance(data, bytes):
+                raise self.corrupt(row, f"topic {number}, time {time_ns!r:.40}", "a topic, nanoseconds and bytes")
+            self._spend(row, len(data))
+            yield BagMessage(row, topic, time_ns, data)
+
+    def _spend(self, row: int, size: int) -> None:
+        """Count what is read; a table that is computed may have more of it than the file."""
+        self._bytes_left -= size
+        if self._bytes_left < 0:
+            raise self.corrupt(row, "more bytes than the file has", "a recording")
+
+    def _refuse_unfinished(self) -> None:
+        """Refuse a file beside which SQLite has left what belongs into it: it would be read without that."""
+        name = self.path.name
+        for rest in (self.path.with_name(f"{name}-wal"), self.path.with_name(f"{name}-journal")):
+            if rest.exists() and rest.stat().st_size > 0:
+                raise LogTruncated(
+                    str(self.path),
+                    found=f"{rest.name}, with messages that are not in it yet",
+                    expected="a finished bag",
+                    remedy=f"the recorder was killed: copy both, and run `sqlite3 {name} 'PRAGMA quick_check'` there",
+                )
+
+    def _broken(self, subject: str, found: str, expected: str = "a ROS 2 bag in SQLite") -> LogCorrupt:
+        remedy = "copy it again from where it was recorded, or convert it: `ros2 bag convert` with storage_id mcap"
+        return LogCorrupt(subject, found=found, expected=expected, remedy=remedy)
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[McapBag | SqliteBag]:
+    """Open a file of a bag, by its content; a file that cannot be read is reported with its messages.
+
+    Raises:
+        LogCorrupt: it is packed, and unfolds to more than a recording.
+        OutputFailed: there is no room for what it unfolds to.
+    """
+    if not first_bytes(path).startswith(ZSTD_MAGIC):
+        yield _bag(path, path)
+        return
+    with TemporaryDirectory() as folder:
+        source = Path(folder) / "bag"
+        _unpack_file(path, source)
+        yield _bag(path, source)
+
+
+def _bag(path: Path, source: Path) -> McapBag | SqliteBag:
+    if first_bytes(source).startswith(SQLITE_MAGIC):
+        return SqliteBag(path, source)
+    return McapBag(path, source)
+
+
+def first_bytes(path: Path) -> bytes:
+    """Return the first 16 bytes of a file, none if it cannot be read: its reader reports that."""
+    with suppress(OSError), open_regular(path) as stream:
+        return stream.read(16)
+    return b""
+
+
+def _unpack_file(path: Path, target: Path) -> None:
+    with open_regular(path) as packed:
+        left = LARGEST_CHUNK + LARGEST_RATIO * os.fstat(packed.fileno()).st_size
+        reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+        try:
+            with target.open("wb") as stream:
+                while piece := reader.read(PIECE_BYTES):
+                    left -= len(piece)
+                    if left < 0:
+                        raise _packed_wrong(path, f"a file that unfolds to {LARGEST_RATIO} times its size")
+                    stream.write(piece)
+        except zstandard.ZstdError as error:
+            raise _packed_wrong(path, str(error)) from error
+        except OSError as error:
+            raise OutputFailed(
+                str(target),
+                found=(error.strerror or type(error).__name__).lower(),
+                expected=f"room for what {path.name} unfolds to",
+                remedy="free space, or name another folder in the environment variable TMPDIR",
+            ) from error
+
+
+def _packed_wrong(path: Path, found: str) -> LogCorrupt:
+    return LogCorrupt(
+        str(path),
+        found=found,
+        expected="a recording, packed by zstd",
+        remedy="copy it again from where it was recorded",
+    )
+
+
+def unpack_message(data: bytes) -> bytes:
+    """Return the fields of a message that may be packed by itself (`compression_mode: MESSAGE`).
+
+    CDR begins with two bytes of which the first is 0, a frame of zstd never does.
+
+    Raises:
+        ValueError: it is packed, and broken or large.
+    """
+    if not data.startswith(ZSTD_MAGIC):
+        return data
+    try:
+        largest = LARGEST_RATIO * len(data)
+        claimed = zstandard.frame_content_size(data)
+        if claimed > largest:
+            raise ValueError(f"{len(data)} bytes that unfold to {claimed}")
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=largest)
+    except zstandard.ZstdError as error:
+        raise ValueError(f"packed bytes ({error})") from error

@@ -1,0 +1,223 @@
+"""ROS 2 bags in SQLite, and packed ones, as `rosbags` writes them: the same numbers, or an error."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import sqlite3
+import time
+from collections.abc import Callable
+from contextlib import closing, nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from daq.cli import main
+from daq.errors import DataError, ExitCode, LogCorrupt, LogTruncated, TableUnfit
+from daq.log.bag_file import unpack_message
+from daq.log.formats import reader_of
+from daq.log.message import JOINTS_SCHEMA
+from tests.daq.log.test_bag import EFFORT, JOINTS, POSITION, ROWS, START_NS, STEP_NS, assert_whole, read
+from tests.daq.logs import damaged
+
+TYPES = get_typestore(Stores.ROS2_HUMBLE)
+
+
+def record(folder: Path, storage: StoragePlugin, packed: CompressionMode, rows: int = ROWS) -> Path:
+    """The recording of `test_bag`, with another topic, written by the library of another maker."""
+    state = TYPES.types[JOINTS_SCHEMA]
+    header = TYPES.types["std_msgs/msg/Header"]
+    stamp = TYPES.types["builtin_interfaces/msg/Time"]
+    text = TYPES.types["std_msgs/msg/String"]
+    writer = Writer(folder, version=9, storage_plugin=storage)
+    writer.set_compression(packed, CompressionFormat.ZSTD)
+    with writer:
+        joints = writer.add_connection("/joint_states", JOINTS_SCHEMA, typestore=TYPES)
+        chatter = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=TYPES)
+        for row in range(rows):
+            time_ns = START_NS + row * STEP_NS
+            at = header(stamp(*divmod(time_ns, 10**9)), "base")
+            message = state(at, list(JOINTS), POSITION[row], np.zeros(0), EFFORT[row])
+            writer.write(joints, time_ns, TYPES.serialize_cdr(message, JOINTS_SCHEMA))
+            writer.write(chatter, time_ns, TYPES.serialize_cdr(text("hello"), "std_msgs/msg/String"))
+    return folder
+
+
+KINDS = [
+    (storage, packed)
+    for storage in StoragePlugin
+    for packed in CompressionMode
+    if (storage, packed) != (StoragePlugin.SQLITE3, CompressionMode.STORAGE)  # there is no such kind
+]
+
+
+@pytest.mark.parametrize(("storage", "packed"), KINDS, ids=lambda value: value.name.lower())
+def test_every_kind_of_bag_has_the_same_numbers(
+    storage: StoragePlugin, packed: CompressionMode, tmp_path: Path
+) -> None:
+    """As a folder and as its one file, whatever they are called."""
+    folder = record(tmp_path / "bag", storage, packed).rename(tmp_path / "run #1 50%?")
+    assert_whole(read(folder))
+    (file,) = [file for file in folder.iterdir() if file.name != "metadata.yaml"]
+    assert_whole(read(file))
+    plain = file.rename(tmp_path / "data")
+    assert reader_of(plain) is reader_of(folder)
+    assert_whole(read(plain))
+
+
+def test_a_file_that_a_player_has_unpacked_is_read_once(tmp_path: Path) -> None:
+    folder = record(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.FILE)
+    packed = folder / "bag.db3.zstd"
+    with packed.open("rb") as stream, (folder / "bag.db3").open("wb") as unpacked:
+        zstandard.ZstdDecompressor().copy_stream(stream, unpacked)
+    assert_whole(read(folder))
+
+
+@pytest.fixture(scope="module")
+def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short bag in SQLite."""
+    folder = tmp_path_factory.mktemp("bags")
+    return record(folder / "bag", StoragePlugin.SQLITE3, CompressionMode.NONE, rows=60) / "bag.db3"
+
+
+COMPUTED = """
+    ALTER TABLE messages RENAME TO kept;
+    CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, unused INTEGER,
+                           data BLOB GENERATED ALWAYS AS (zeroblob({size})) VIRTUAL);
+    INSERT INTO messages SELECT id, topic_id, timestamp, 0 FROM kept;
+"""
+ENDLESS = """
+    ALTER TABLE messages RENAME TO kept;
+    CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)
+                            SELECT id, 1 AS topic_id, 1 AS timestamp, x'00' AS data FROM n WHERE {which};
+"""
+MANY_TOPICS = """
+    ALTER TABLE topics RENAME TO kept;
+    CREATE VIEW topics AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)
+                          SELECT id, {name} AS name, '' AS type, '' AS serialization_format FROM n;
+"""
+
+
+@pytest.mark.parametrize(
+    ("script", "message"),
+    [
+        (COMPUTED.format(size=50_000_000), "more bytes than the file has"),
+        (COMPUTED.format(size=900_000_000), "string or blob too big"),
+        (ENDLESS.format(which="id < 0"), "interrupted"),
+        (ENDLESS.format(which="1"), "/joint_states with encapsulation 00"),
+        (MANY_TOPICS.format(name="''"), "more bytes than the file has"),
+        (MANY_TOPICS.format(name="hex(zeroblob(20000000))"), "row 1: found more bytes than the file has"),
+        ("DROP TABLE topics", "no such table: topics"),
+        ("DELETE FROM topics", "found topic 1, time 17000"),
+        ("UPDATE messages SET timestamp = 'noon'", "time 'noon'; expected a topic, nanoseconds and bytes"),
+        ("UPDATE messages SET data = 5", "expected a topic, nanoseconds and bytes"),
+        ("UPDATE messages SET data = x'00010000'", "/joint_states with a message of 4 bytes"),
+        ("UPDATE topics SET offered_qos_profiles = '" + "[" * 100_000 + "'", None),
+    ],
+)
+def test_a_hostile_database_is_refused_in_bounded_time(
+    script: str, message: str | None, database: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "bag.db3"
+    shutil.copyfile(database, path)
+    with closing(sqlite3.connect(path)) as connection:
+        connection.executescript(script)
+    began = time.process_time()
+    if message is None:  # what is not needed is not parsed
+        assert len(read(path).values) == 60
+    else:
+        with pytest.raises(LogCorrupt, match=message) as caught:
+            read(path)
+        assert str(path) in str(caught.value)
+    assert time.process_time() - began < 5.0
+
+
+@pytest.mark.parametrize("topic", [None, "/chatter"])
+def test_a_bag_without_the_joints_says_what_it_has(topic: str | None, database: Path, tmp_path: Path) -> None:
+    path = tmp_path / "bag.db3"
+    shutil.copyfile(database, path)
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("DELETE FROM messages WHERE topic_id = (SELECT id FROM topics WHERE name = '/joint_states')")
+    with pytest.raises(TableUnfit, match=r"found topics /chatter; expected (a topic|/chatter) of type sensor_msgs"):
+        read(path, topic=topic)
+
+
+@pytest.mark.parametrize("suffix", ["-wal", "-journal"])
+def test_a_database_that_its_recorder_has_not_finished_is_refused(suffix: str, database: Path, tmp_path: Path) -> None:
+    path = tmp_path / "bag.db3"
+    shutil.copyfile(database, path)
+    rest = tmp_path / f"bag.db3{suffix}"
+    rest.touch()
+    assert len(read(path).values) == 60
+    rest.write_bytes(b"rows")
+    with pytest.raises(LogTruncated, match=rf"found bag\.db3{suffix}, .*; expected a finished bag; .*quick_check"):
+        read(path)
+
+
+@settings(deadline=None, max_examples=80, derandomize=True)
+@given(seed=st.integers(0, 10**6), hurt=st.sampled_from(("flip", "cut", "junk")))
+def test_a_damaged_database_is_read_or_refused(seed: int, hurt: str, database: Path, tmp_path_factory: Any) -> None:
+    """SQLite has no checksums: a flipped bit of a number passes, a broken page does not."""
+    rng = random.Random(seed)
+    content = database.read_bytes()
+    path = tmp_path_factory.getbasetemp() / "hurt.db3"
+    path.write_bytes(damaged(content, hurt, rng.randrange(len(content)), rng, junk_bytes=40))
+    try:
+        table = read(path)
+    except DataError as error:
+        assert str(path) in str(error)
+    else:
+        assert 0 < len(table.values) <= 60
+
+
+def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "bag.mcap.zstd"
+    path.write_bytes(zstandard.compress(bytes(2**28)))
+    with pytest.raises(LogCorrupt, match="unfolds to 200 times its size; expected a recording, packed by zstd"):
+        read(path)
+    with pytest.raises(ValueError, match="bytes that unfold to 268435456"):
+        unpack_message(zstandard.compress(bytes(2**28)))
+    with pytest.raises(ValueError, match="packed bytes"):
+        unpack_message(zstandard.compress(bytes(range(200)))[:-9])
+
+
+@pytest.mark.parametrize("change", [lambda data: data[:-50], lambda data: data[:50] + bytes(50) + data[100:]])
+def test_a_packed_file_that_is_damaged_is_named(
+    change: Callable[[bytes], bytes], database: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "bag.db3.zstd"
+    path.write_bytes(change(zstandard.compress(database.read_bytes())))
+    with pytest.raises(DataError) as caught:
+        read(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_no_room_for_what_a_file_unfolds_to_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], checkout: Path
+) -> None:
+    """As on a full disk."""
+    folder = record(tmp_path / "bag", StoragePlugin.MCAP, CompressionMode.FILE)
+    description = tmp_path / "run.yaml"
+    description.write_text(
+        f"name: run\ncell: {checkout / 'configs/cells/demo.yaml'}\n"
+        "position: {file: bag, columns: [position], unit: rad, side: joint}\n"
+        "current: {file: bag, columns: [effort], unit: A}\ntime: {file: bag, column: header.stamp, unit: ns}\n"
+    )
+    words = ["import", str(description), "--data", str(folder.parent), "--out", str(tmp_path / "log.mcap")]
+    assert main(words) == 0
+    (tmp_path / "log.mcap").unlink()
+    full = tmp_path / "full"
+    full.mkdir()
+    (full / "bag").symlink_to("/dev/full")
+    monkeypatch.setattr("daq.log.bag_file.TemporaryDirectory", lambda: nullcontext(str(full)))
+    assert main(words) == ExitCode.UNEXPECTED
+    said = " ".join(capfd.readouterr().err.split())
+    assert "no space left on device" in said
+    assert "TMPDIR" in said
