@@ -163,7 +163,11 @@ def apply(proposal: Proposal[E], now: datetime, *, audit: Path | None = None, wh
         return None
     actions = (AuditAction.APPLY_BEGUN, AuditAction.APPLIED)
     written = _write(proposal.target, edit, recorder, actions, details, details)
-    return replace(written, not_in_history=_complete_history(proposal, recorder))
+    try:
+        return replace(written, not_in_history=_complete_history(proposal, recorder))
+    except BaseException as error:  # an interrupt: the write is done
+        error.add_note(f"kept: {_IN_PLACE.format(edit.subject)}")
+        raise
 
 
 def rollback(

@@ -336,7 +336,9 @@ def test_after_a_kill_behind_the_write_the_same_command_enters_the_history(
         patch.setattr("daq.writeback.target.enter_calibration", killed)
         assert bench.apply("--yes") == ExitCode.INTERRUPTED
     assert b"-9.2100" in bench.controller.read_bytes()
-    capsys.readouterr()
+    said = " ".join(capsys.readouterr().err.split())
+    assert "has the new content, complete; the history lacks this write" in said
+    assert "nothing was written" not in said
     for _ in range(2):
         assert bench.apply("--yes") == ExitCode.OK
         assert "these gains already" in capsys.readouterr().out
@@ -633,7 +635,7 @@ def test_an_output_that_fails_says_which_were_written_before(bench: Bench, capsy
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("place", ["daq.writeback.target.append", "daq.writeback.file_target.replace_file"])
+@pytest.mark.parametrize("place", ["daq.writeback.target.record_write", "daq.writeback.file_target.replace_file"])
 def test_a_signal_within_a_write_is_heard_when_the_write_and_its_records_are_whole(
     bench: Bench,
     number: signal.Signals,
