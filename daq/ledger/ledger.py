@@ -15,7 +15,7 @@ from pathlib import Path
 
 from daq.config.cell import Cell
 from daq.documents.calibration_file import encode
-from daq.errors import DataError, HistoryUnreadable, writing
+from daq.errors import DataError, HistoryUnreadable, evidence, writing
 from daq.files import fsync_folder
 from daq.ledger.audit import (
     FIRST,
@@ -197,7 +197,7 @@ def record_session(
 def enter_calibration(ledger: Ledger, calibration: Calibration, *, digest: str, who: str, at: datetime) -> bool:
     """Enter a calibration, with the SHA-256 of its file, and writes whose writer was killed before it ended them.
 
-    A history of an earlier version is migrated first.
+    A history of an earlier version is migrated first, but not into an audit log that was changed.
 
     Returns:
         whether the calibration is new: a file is entered once.
@@ -206,7 +206,12 @@ def enter_calibration(ledger: Ledger, calibration: Calibration, *, digest: str, 
         DataError: another cell, other axes, or a gain in another unit than the history's.
         AuditUnusable, HistoryUnreadable, OutputFailed: it could not be entered; see `migrate`.
     """
-    migrate(ledger, who=who, at=at)
+    try:
+        migrate(ledger, who=who, at=at)
+    except HistoryUnreadable:
+        raise
+    except DataError as error:  # the next line goes behind the changed ones all the same
+        _LOG.warning("the history of an earlier version stays where it is: %s", evidence(error))
     entries = verify(ledger.audit).intact
     known = {one.digest for one in entered_calibrations(entries, ledger.cell.name)}
     new = digest not in known
@@ -262,7 +267,8 @@ def migrate(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) -> 
     """
     if not ledger.outdated and not forced:
         return Migrated(0, None, trusted=True)
-    stored, flaws = EMPTY, tuple[str, ...]()
+    stored = EMPTY
+    flaws: tuple[str, ...] = ()
     try:
         stored = _read_stored(ledger)
     except HistoryUnreadable as error:

@@ -341,9 +341,12 @@ def test_nothing_is_migrated_into_an_audit_that_was_changed(
         assert main(["history", str(cell), *options]) == ExitCode.DATA_UNFIT
         assert "demo.audit.jsonl" in capsys.readouterr().err
         assert stored_of(cell).read_bytes() == stored
-    # What is left is shown all the same.
+    # What is left is shown all the same, and the write-back goes on.
     assert main(["history", str(cell)]) == ExitCode.OK
+    assert main(["apply", str(cell), str(calibration_for(cell, 1.005)), "--yes"]) == ExitCode.OK
+    assert len(history_of(cell).entries) == 4
     assert stored_of(cell).read_bytes() == stored
+    assert main(["history", str(cell), "--verify"]) == ExitCode.DATA_UNFIT
 
 
 def test_a_cell_whose_gains_are_applied_again_knows_the_old_write(
