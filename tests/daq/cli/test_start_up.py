@@ -74,7 +74,7 @@ def test_a_quick_verb_loads_only_libraries_that_it_uses(verb: str, checkout: Pat
 
 
 def _cell_with_history(checkout: Path, folder: Path) -> Path:
-    kept = shutil.ignore_patterns("*.jsonl", "*.sqlite*")
+    kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
     shutil.copytree(checkout / "configs", folder / "configs", ignore=kept)
     cell = folder / "configs" / "cells" / "demo.yaml"
     fill(ledger_of(cell), 12, lambda _week: (1.0,) * 6)

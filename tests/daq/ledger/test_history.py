@@ -70,7 +70,7 @@ def stepping(factors: tuple[float, ...]) -> Callable[[int], tuple[float, ...]]:
 @pytest.fixture
 def cell(tmp_path: Path) -> Path:
     """The demo cell in a folder of its own."""
-    kept = shutil.ignore_patterns("*.jsonl", "*.sqlite*")
+    kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
     shutil.copytree(Path(__file__).parents[3] / "configs", tmp_path / "configs", ignore=kept)
     return tmp_path / "configs" / "cells" / "demo.yaml"
 
