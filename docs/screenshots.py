@@ -27,8 +27,7 @@ from rich.console import Console
 from rich.terminal_theme import MONOKAI
 from rich.text import Text
 
-from daq.ledger.store import HistoryStore
-from tests.daq.histories import fill
+from tests.daq.histories import fill, ledger_of
 
 ROOT = Path(__file__).resolve().parent.parent
 PICTURES = ROOT / "docs" / "pictures"
@@ -101,8 +100,7 @@ def _history(folder: Path) -> None:
     cell = folder / "press-4" / "cells" / "press-4.yaml"
     text = cell.read_text(encoding="utf-8").replace("name: press-4", "name: demo", 1)
     cell.write_text(text, encoding="utf-8")
-    store = HistoryStore(cell.with_suffix(".history.sqlite"))
-    fill(store, 20, lambda week: (1.0, 1.0, 1.0, 1.0 - 0.006 * max(0, week - 10), 1.0, 1.0))
+    fill(ledger_of(cell), 20, lambda week: (1.0, 1.0, 1.0, 1.0 - 0.006 * max(0, week - 10), 1.0, 1.0))
     _run(["history", str(cell), "--axis", "J4", "--plot", "history.png"], folder)
     _webp(folder / "history.png", "history", width=1100)
 

@@ -24,7 +24,7 @@ from daq.cli.verb import HELP_NAMES, Job, Listed
 from daq.environment import software
 from daq.errors import DaqError, ExitCode, OutputFailed
 from daq.report.text import printable
-from drivers.errors import DriverError
+from drivers.errors import DriverError, all_notes
 from ident.errors import IdentificationError
 
 CLICK_ERROR: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
@@ -95,7 +95,8 @@ class _Verbs(TyperGroup):
         except KeyboardInterrupt as interrupt:
             writes = ctx.invoked_subcommand in {"apply", "rollback"}
             nothing = "nothing was changed" if writes else "no file was written"
-            say_last(printable(f"interrupted: {_kept() or nothing}"))
+            said = _kept() or "; ".join(all_notes(interrupt)) or nothing
+            say_last(printable(f"interrupted: {said}"))
             raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
 
 

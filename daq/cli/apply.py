@@ -5,11 +5,10 @@ Both are dry runs without --yes, but for the rollback of a file, whose backup ca
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -29,21 +28,18 @@ from daq.cli.terminal import (
 )
 from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
 from daq.environment import login
-from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, ExitCode, UsageError, evidence
+from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, ExitCode, UsageError
 from daq.report.text import terminal_text
 from drivers.errors import all_notes
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
     from daq.config.policy import ApplyPolicy
-    from daq.ledger.ledger import Ledger
     from daq.writeback.drive_target import DriveTarget
     from daq.writeback.request import Request
     from daq.writeback.target import E, Proposal, Target, Written
     from drivers.canopen.parameters import Saving
     from ident.calibration import Calibration
-
-_LOG = logging.getLogger("drivegain")
 
 ByOption = Annotated[str | None, typer.Option("--by", help="Name of the operator for the audit; by default the login.")]
 DrivesOption = Annotated[bool, typer.Option("--drives", help="The objects in the drives, not the controller's file.")]
@@ -129,9 +125,8 @@ def apply_to(
 ) -> None:
     """Show what a calibration changes in a target, and write it with `yes`; `undo` is the command that undoes it.
 
-    The write, its audit and its entry in the history are done within `whole`.
+    The write, with its entries in audit log and history, is done within `whole`.
     """
-    from daq.files import sha256
     from daq.report.proposal import describe, show
     from daq.writeback.judgement import query_history
     from daq.writeback.target import apply, propose
@@ -143,20 +138,10 @@ def apply_to(
         known = query_history(declared, edit.subject, request, edit.changes)
         if not json:
             show(proposal, output_console(), known)
-
-        def enter(ledger: Ledger) -> None:
-            # A write of an earlier command too, that was killed before it could enter it.
-            digest, entry = sha256(request.signed), None if written is None else written.audit_sha256
-            ledger.add(request.calibration, digest=digest, at=request.now)
-            after = sha256(edit.after)
-            ledger.record_applied(digest, at=request.now, target=edit.subject, sha256_after=after, entry=entry)
-
         try:
             if yes:
-                with whole or nullcontext():
-                    with write_output(edit.place) if edit.has_effect else nullcontext():
-                        written = apply(proposal, request.now, audit=audit, who=str(actor))
-                    record_in_history(declared, actor, enter)
+                with whole or nullcontext(), write_output(edit.place) if edit.has_effect else nullcontext():
+                    written = apply(proposal, request.now, audit=audit, who=str(actor))
         except CalibrationRefused:
             if json:
                 print_json(describe(proposal, None, known))
@@ -288,12 +273,9 @@ def rollback(
         )
     format_ = None if declared is None or declared.controller is None else declared.controller.format
     with interruptible():
-        with delay_signals():
-            with write_output(path):
-                file = FileTarget(path, format=format_, cell=declared)
-                written = target.rollback(file, now, audit=audit, who=str(actor))
-            if declared is not None:
-                _enter_rollback(declared, written, now, actor)
+        with delay_signals(), write_output(path):
+            file = FileTarget(path, format=format_, cell=declared)
+            written = target.rollback(file, now, audit=audit, who=str(actor))
         if json:
             print_json({**describe_file_rollback(written), "audit": None if audit is None else str(audit)})
             return
@@ -320,8 +302,6 @@ def rollback_drives(
         if yes:
             with write_output(record_folder(declared)):
                 written = target.rollback(drives, now, audit=audit, who=str(actor), planned=planned)
-    if written is not None:
-        _enter_rollback(declared, written, now, actor)
     if json:
         print_json(describe_drive_rollback(planned, written))
     elif written is None:
@@ -330,15 +310,6 @@ def rollback_drives(
         backup = "" if written.backup is None else written.backup.name
         console.print(f"Restored the values of {planned.source}; those before are now in {backup}.", end=" ")
         console.print(_saving_text(saving))
-
-
-def _enter_rollback(cell: Cell, written: Written, now: datetime, actor: Applier) -> None:
-    from daq.files import sha256
-
-    target, after, entry = written.edit.subject, sha256(written.edit.after), written.audit_sha256
-    record_in_history(
-        cell, actor, lambda ledger: ledger.record_rolled_back(at=now, target=target, sha256_after=after, entry=entry)
-    )
 
 
 ROLLBACK = Verb("rollback", rollback, "drivegain rollback press-4/cells/press-4.yaml")
@@ -393,22 +364,6 @@ def require_separate_audit(audit: Path, others: Iterable[Path | None]) -> None:
                 expected="a file of the audit's own",
                 remedy="correct `history.audit` of the cell file, or --audit; nothing was written",
             )
-
-
-def record_in_history(cell: Cell, actor: Applier, record: Callable[[Ledger], object]) -> None:
-    """Enter a write into the cell's history; a history that cannot take it is only warned about."""
-    from daq.ledger.ledger import Ledger
-
-    if cell.history is None:
-        return
-    try:
-        with Ledger(cell, cell.history, str(actor)) as ledger:
-            record(ledger)
-    except Exception as error:  # noqa: BLE001 - the controller has its gains: no error of the history may call that undone
-        _LOG.warning(
-            "the history does not have this write: %s; `drivegain history CELL --add CALIBRATION` enters it",
-            evidence(error),
-        )
 
 
 def saving_of(ram_only: bool, save_unknown: bool, *, drives: bool = True) -> Saving:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,14 +14,23 @@ import typer
 from daq.cli.apply import applier
 from daq.cli.terminal import check_replaceable, output_console, say_written, write_output
 from daq.cli.verb import JsonOption, Verb, judged_output, print_json
-from daq.errors import AuditUnusable, ConfigurationInconsistent, DataError, HistoryUnreadable, UsageError
+from daq.errors import (
+    AuditUnusable,
+    ConfigurationInconsistent,
+    DaqError,
+    DataError,
+    HistoryUnreadable,
+    UsageError,
+    evidence,
+)
 from daq.report.text import printable
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
-    from daq.config.policy import HistoryPlace
     from daq.ledger.ledger import Ledger, Verification
     from daq.ledger.watch import Series
+
+_LOG = logging.getLogger("drivegain")
 
 _SHOWN = 5  #: Sentences of a kind in an error; --json has all
 
@@ -46,8 +56,9 @@ def history_verb(
         str | None, typer.Option("--since", metavar="DATE", help="With --acknowledge: first day of the baseline.")
     ] = None,
     verify: Annotated[bool, typer.Option("--verify", help="Check audit and history; exit code 4 if broken.")] = False,
-    rebuild: Annotated[
-        bool, typer.Option("--rebuild", help="Rebuild it from the audit; the old file is kept.")
+    migrate: Annotated[
+        bool,
+        typer.Option("--migrate", "--rebuild", help="Take the SQLite file of earlier versions into the audit."),
     ] = False,
     json: JsonOption = False,
 ) -> None:
@@ -58,7 +69,7 @@ def history_verb(
     false.
     """
     from daq.config.cell_file import load_cell
-    from daq.ledger.ledger import Ledger
+    from daq.ledger.ledger import Ledger, read_history, warn_if_broken
     from daq.ledger.watch import watch
     from daq.report.history import (
         describe,
@@ -72,8 +83,8 @@ def history_verb(
     from daq.writeback.file_access import resolve_links
 
     declared = load_cell(cell)
-    place = declared.history
-    if place is None:
+    ledger = Ledger.of(declared)
+    if ledger is None:
         raise ConfigurationInconsistent(
             str(cell), found="no history", expected="a cell file", remedy="give the cell file, not a log"
         )
@@ -86,45 +97,47 @@ def history_verb(
             remedy="name the axis whose change is explained",
         )
     now, who = datetime.now(UTC), str(applier(by if acknowledge is not None else None))
-    if rebuild:
-        _rebuild(declared, place, who, now)
-    with Ledger(declared, place, who) as ledger:
-        if add is not None:
-            _add(ledger, add, now)
-        lost = not verify and ledger.warn_if_lost()
-        all_series = watch(ledger.entries(), ledger.acknowledgements())
-        if acknowledge is not None:
-            _acknowledge(ledger, _named(all_series, acknowledge, declared), why, since, now)
-            all_series = watch(ledger.entries(), ledger.acknowledgements())
-        chosen = all_series if axis is None else (_named(all_series, axis, declared),)
-        _write_files(chosen, declared, plot, csv)
-        entries = ledger.entries()
-        current = in_force(declared, ledger)
-        actions = describe_actions(entries, ledger.events(), current)
-        if verify and declared.controller_path is not None:
-            # Where its links lead decides which writes are this cell's: another user's link could hide some.
-            resolve_links(declared.controller_path)
+    _migrate(ledger, who, now, forced=migrate)
+    if add is not None:
+        _add(ledger, add, who, now)
+    checked = _verified(ledger) if verify else None
+    history = read_history(ledger) if checked is None else checked.history
+    all_series = watch(history.entries, history.acknowledgements)
+    if acknowledge is not None:
+        _acknowledge(ledger, _named(all_series, acknowledge, declared), who, why, since, now)
         checked = _verified(ledger) if verify else None
-        console = output_console()
-        if json:
-            document = describe(declared.name, entries, chosen, all_series, current)
-            print_json(document if checked is None else {**document, "audit": describe_verification(checked)})
-        else:
-            if checked is not None:
-                say_verification(checked, console)
-            elif axis is not None:
-                show_axis(chosen[0], all_series, actions, console)
-            elif not lost:
-                show(entries, all_series, actions, console)
-            say_written(console, plot, csv)
+        history = read_history(ledger) if checked is None else checked.history
+        all_series = watch(history.entries, history.acknowledgements)
+    broken = checked is None and warn_if_broken(ledger)
+    chosen = all_series if axis is None else (_named(all_series, axis, declared),)
+    _write_files(chosen, declared, plot, csv)
+    current = in_force(declared, history)
+    actions = describe_actions(history.entries, history.events, current)
+    if verify and declared.controller_path is not None:
+        # Where its links lead decides which writes are this cell's: another user's link could hide some.
+        resolve_links(declared.controller_path)
+    console = output_console()
+    if json:
+        document = describe(declared.name, history.entries, chosen, all_series, current)
+        print_json(document if checked is None else {**document, "audit": describe_verification(checked)})
+    else:
         if checked is not None:
-            _require(checked)
+            say_verification(checked, console)
+        elif axis is not None:
+            show_axis(chosen[0], all_series, actions, console)
+        elif history.entries or not broken:
+            show(history.entries, all_series, actions, console)
+        say_written(console, plot, csv)
+    if checked is not None:
+        _require(ledger, checked)
 
 
 def _verified(ledger: Ledger) -> Verification:
     """Check audit and history; an audit that is no regular file is as broken as one that was edited."""
+    from daq.ledger.ledger import verify_ledger
+
     try:
-        return ledger.verify(_session_heads(ledger.cell))
+        return verify_ledger(ledger, _session_heads(ledger.cell))
     except AuditUnusable as error:
         remedy = "correct `history.audit` of the cell file"
         raise DataError(error.subject, found=error.found, expected=error.expected, remedy=remedy) from error
@@ -138,35 +151,31 @@ def _session_heads(cell: Cell) -> list[str]:
     return [session.state.audit_sha256 for session in past if session.state.audit_sha256 is not None]
 
 
-def _require(checked: Verification) -> None:
+def _require(ledger: Ledger, checked: Verification) -> None:
     """Raise what is wrong: with the audit log, with the history, or with a write that it lacks."""
-    from daq.ledger.ledger import audit_error
+    from daq.ledger.ledger import audit_error, stored_error
 
     if not checked.verdict.holds:
-        raise audit_error(checked.place, checked.verdict)
-    store, unknown = str(checked.place.store), [f"no event of {one}" for one in checked.unknown]
+        raise audit_error(checked.audit, checked.verdict)
+    unknown = [f"no event of {one}" for one in checked.unknown]
+    if checked.broken and ledger.outdated:
+        raise stored_error(ledger, [printable(one) for one in (*checked.broken, *unknown)])
     if checked.broken:
         raise HistoryUnreadable(
-            store,
+            str(checked.audit),
             found=_first([*checked.broken, *unknown]),
-            expected="a sound SQLite file with the rows that drivegain wrote",
-            remedy="keep a copy, ask who can write to it, and restore the last good one from a backup, or make it anew "
-            "from the audit with `drivegain history CELL --rebuild`",
+            expected="calibrations that this version can read",
+            remedy="use the version of drivegain that entered them, or keep this file and begin audit and history "
+            "anew, both (`history.audit`, `history.store`)",
         )
     if checked.unknown:
-        adding = (
-            "`drivegain history CELL --add CALIBRATION` for each calibration that was written, which also enters its "
-            "writes from the audit"
-        )
         raise HistoryUnreadable(
-            store,
+            str(checked.audit),
             found=_first(unknown),
-            expected="an event of every write to this cell's controller that the audit has",
-            remedy=f"it knows of a later write: {adding}, then `drivegain history CELL --rebuild`, which puts them in "
-            "their order"
-            if checked.late
-            else f"{adding}; of a rollback with any one. Where a calibration is lost, keep both files and begin audit "
-            "and history anew (`history.audit`, `history.store`)",
+            expected="a calibration in the history, and an end, of every write to this cell's controller",
+            remedy="`drivegain history CELL --add CALIBRATION` for each calibration that was written, which also "
+            "enters its writes from the audit; of a rollback with any one. Where a calibration is lost, keep the file "
+            "and begin audit and history anew, both (`history.audit`, `history.store`)",
         )
 
 
@@ -188,28 +197,41 @@ def _check_files(plot: Path | None, csv: Path | None) -> None:
         check_replaceable(csv, ",".join(COLUMNS[:3]), "table of a history")
 
 
-def _rebuild(cell: Cell, place: HistoryPlace, who: str, now: datetime) -> None:
-    from daq.ledger.ledger import rebuild
+def _migrate(ledger: Ledger, who: str, now: datetime, *, forced: bool) -> None:
+    """Migrate a history of an earlier version; where that fails unasked, reading it reports what is wrong."""
+    from daq.ledger.ledger import migrate
 
-    done = rebuild(cell, place, who=who, at=now, heads=_session_heads(cell))
-    kept = "There was no history before." if done.kept is None else f"The old one is {done.kept}."
-    counts = f"{done.calibrations} calibrations, {done.writes} writes, {done.acknowledgements} acknowledgements"
-    typer.echo(f"Rebuilt from {place.audit}: {counts}. {kept}", err=True)
-    if done.kept is not None and not done.trusted:
+    if not forced and not ledger.outdated:
+        return
+    try:
+        done = migrate(ledger, who=who, at=now, forced=forced)
+    except DaqError as error:
+        if forced:
+            raise
+        _LOG.warning("the history of an earlier version stays where it is: %s", evidence(error))
+        return
+    if done.aside is None:
+        typer.echo(f"There is no history of an earlier version; {ledger.audit} is the history.", err=True)
+        return
+    typer.echo(f"Migrated to {ledger.audit}: {done.entries} entries. The old history is {done.aside}.", err=True)
+    if not done.trusted:
         typer.echo("The old history was broken: what only it had was not taken over.", err=True)
 
 
-def _acknowledge(ledger: Ledger, series: Series, why: str | None, since: str | None, now: datetime) -> None:
+def _acknowledge(ledger: Ledger, series: Series, who: str, why: str | None, since: str | None, now: datetime) -> None:
+    from daq.ledger.ledger import acknowledge
+
     if not why or not why.strip():
         reason = "what happened, for a reader in a year"
         raise UsageError("--why", found="nothing", expected=reason, remedy='give it: --why "gearbox changed"')
     # Of a drift, only the newest calibration surely shows the gain as it is now; a log's clock may be ahead of ours.
     begins = min(series.points[-1].entry.recorded, now) if since is None else _day(since, now)
-    ledger.acknowledge_change(series.axis, since=begins, at=now, who=ledger.who, why=why)
+    acknowledge(ledger, series.axis, since=begins, at=now, who=who, why=why)
 
 
-def _add(ledger: Ledger, file: Path, now: datetime) -> None:
+def _add(ledger: Ledger, file: Path, who: str, now: datetime) -> None:
     from daq.documents.calibration_file import decode, read
+    from daq.ledger.ledger import enter_calibration, verify_ledger
 
     content = read(file)
     calibration = decode(content, str(file))
@@ -220,12 +242,16 @@ def _add(ledger: Ledger, file: Path, now: datetime) -> None:
             expected=f"one of {ledger.cell.name!r}",
             remedy="give the file of the cell that it belongs to; nothing was entered",
         )
-    new = ledger.add(calibration, digest=hashlib.sha256(content).hexdigest(), at=now)
+    before = verify_ledger(ledger).unknown
+    new = enter_calibration(ledger, calibration, digest=hashlib.sha256(content).hexdigest(), who=who, at=now)
     typer.echo(f"{file.name}: {'entered' if new else 'it was in the history already'}.", err=True)
     # The process that wrote it may have been killed before it was entered.
-    for write in ledger.catch_up():
-        typer.echo(f"Entered too: {printable(str(write))}.", err=True)
-    if not ledger.verify(_session_heads(ledger.cell)).complete:
+    checked = verify_ledger(ledger, _session_heads(ledger.cell))
+    left = {write.ended.number for write in checked.unknown}
+    for write in before:
+        if write.ended.number not in left:
+            typer.echo(f"Entered too: {printable(str(write))}.", err=True)
+    if not checked.complete:
         typer.echo("Not all writes in the audit could be entered: see `drivegain history CELL --verify`.", err=True)
 
 

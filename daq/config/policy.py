@@ -129,5 +129,5 @@ class HistorySection:
 class HistoryPlace:
     """Files of a cell's history, absolute."""
 
-    store: Path  #: SQLite file with every calibration
-    audit: Path  #: hash-chained record of all write actions
+    store: Path  #: SQLite file in which earlier versions kept the history; the records of drives are named after it
+    audit: Path  #: hash-chained record of all write actions, of which the history is folded

@@ -16,7 +16,7 @@ from daq.documents.session_state import Outcome
 from daq.errors import DaqError, ExitCode
 from daq.jobs.reporting import Conclusion, to_do
 from daq.jobs.session import CALIBRATION, REPORT, Session, sessions
-from daq.ledger.store import HistoryStore
+from daq.ledger.ledger import Ledger, read_history
 from daq.ledger.watch import alarm_text, watch
 from daq.report.residual_page import PAGE
 from ident.calibration import Calibration
@@ -103,14 +103,15 @@ class Results:
         }
 
     def _history(self) -> dict[str, Any] | None:
-        place = self._cell.history
-        if place is None or not place.store.exists():
+        ledger = Ledger.of(self._cell)
+        if ledger is None:
             return None
-        with HistoryStore(place.store) as store:
-            entries, acknowledged = store.entries(), store.acknowledgements()
-        series = watch(entries, acknowledged)
+        history = read_history(ledger)
+        if not history.entries:
+            return None
+        series = watch(history.entries, history.acknowledgements)
         return {
-            "calibrations": len(entries),
+            "calibrations": len(history.entries),
             "axes": [
                 {
                     "axis": one.axis,

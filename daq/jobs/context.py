@@ -17,7 +17,7 @@ from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, writi
 from daq.jobs.drives import check_drives
 from daq.jobs.journal import Journal, Level
 from daq.jobs.session import Session
-from daq.ledger.store import HistoryStore
+from daq.ledger.ledger import Ledger, read_history
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.interlock import Runner, release_check, run_command
 from daq.workflow.plan import Plan, plan
@@ -77,6 +77,12 @@ class JobContext:
     who: str  #: name of the job in audit and logs
     began_s: float = 0.0  #: start of the job on the monotonic clock [s]
     block_signals: SignalBlocker = nullcontext  #: keeps signals away while the axes are stopped
+
+    @property
+    def ledger(self) -> Ledger:
+        """The ledger of the cell."""
+        place = self.target.history
+        return Ledger(self.cell, place.audit, place.store)
 
     def within(self, step: str) -> JobContext:
         """The same context, with a journal that names the step."""
@@ -170,7 +176,7 @@ def before_motion(context: JobContext, *, take_over: bool = True) -> None:
         take_over: remove the power of drives that a killed recorder left with it; else nothing is changed.
 
     Raises:
-        DiskSpaceShort, HistoryUnreadable, NotReleased, DriverError: nothing has moved.
+        DiskSpaceShort, HistoryUnreadable, AuditUnusable, NotReleased, DriverError: nothing has moved.
         OutputFailed: the session's folder is gone.
     """
     section, tools = context.section, context.tools
@@ -183,8 +189,7 @@ def before_motion(context: JobContext, *, take_over: bool = True) -> None:
             expected=f"{section.min_free_mb:g} MB (min_free_mb)",
             remedy="nothing has moved; free space, keep fewer sessions, or name a folder on another disk",
         )
-    with HistoryStore(context.target.history.store) as store:
-        store.entries()  # the gains are compared with them: unreadable now is better than after the recordings
+    read_history(context.ledger)  # the gains are compared with it: unreadable now is better than after the recordings
     release_check(context.cell, tools.now, tools.run)()
     context.journal.say(Level.INFO, "the interlock lets the robot move", free_mb=round(free_mb))
     tools.drives(context.cell, context.block_signals, take_over)

@@ -8,14 +8,15 @@ from datetime import datetime
 from daq.config.policy import AppliedBy
 from daq.documents.calibration_file import read
 from daq.documents.session_state import Decision, JudgedGain, Outcome, Target
-from daq.errors import DaqError, evidence, writing
+from daq.errors import writing
 from daq.files import replace_file, sha256, sha256_of
 from daq.jobs.context import JobContext
 from daq.jobs.journal import Level
 from daq.jobs.session import CALIBRATION, Session
-from daq.ledger.audit import AuditAction, append
+from daq.ledger.audit import AuditAction
 from daq.ledger.audit import read as read_audit
-from daq.ledger.ledger import Ledger
+from daq.ledger.history import History
+from daq.ledger.ledger import record_session
 from daq.report.text import json_text, picked
 from daq.writeback.file_access import resolve_links
 from daq.writeback.file_target import FileEdit, FileTarget
@@ -29,7 +30,7 @@ CHANGED_SINCE_START = "The controller's file was written or rolled back since th
 PROPOSAL, DIFF = "proposal.json", "proposal.diff"
 
 
-def decide_outcome(context: JobContext, session: Session, calibration: Calibration, ledger: Ledger) -> Session:
+def decide_outcome(context: JobContext, session: Session, calibration: Calibration, history: History) -> Session:
     """Compare a calibration with the gains in the controller, and act on it; the outcome is in the returned state.
 
     Raises:
@@ -40,15 +41,14 @@ def decide_outcome(context: JobContext, session: Session, calibration: Calibrati
     digest = sha256_of(path) or ""
     before = session.state.target
     if before is not None and before.base_sha256 != before.after_sha256 == sha256_of(context.target.file):
-        # The job was killed right after its write: it is entered, and never repeated.
+        # The job was killed right after its write: the history has it by now, and it is never repeated.
         words = "the controller's file has these gains already: an earlier job of this session wrote it"
         context.journal.say(Level.NOTICE, words)
-        _note_applied(context, ledger, digest, before.after_sha256)
         return session.update(outcome=Outcome.APPLIED)
     request = Request(calibration, now, file=path, content=read(path))
     proposal = context.tools.propose(FileTarget.of(context.cell), request)
     edit = proposal.edit
-    decision = decision_of(proposal, known_of(ledger, str(resolve_links(context.target.file)), digest, edit.changes))
+    decision = decision_of(proposal, known_of(history, str(resolve_links(context.target.file)), digest, edit.changes))
     differs, touched = any(gain.differs for gain in decision.gains), _written_since(context, session)
     if differs and touched:
         decision = decision.model_copy(update={"remark": f"{decision.remark} {CHANGED_SINCE_START}"})
@@ -75,20 +75,19 @@ def decide_outcome(context: JobContext, session: Session, calibration: Calibrati
     # An operator writes drives, whatever the policy says.
     needs_person = context.cell.apply.by is AppliedBy.PERSON or bool(context.target.controller.objects)
     if proposal.refusals or needs_person or touched:
-        with writing(context.target.history.audit):
-            append(
-                context.target.history.audit,
-                AuditAction.PROPOSED,
-                at=context.tools.now(),
-                who=context.who,
-                subject=str(resolve_links(context.target.file)),
-                details={
-                    "session": session.state.session,
-                    "calibration_sha256": digest,
-                    "sha256_before": target.base_sha256,
-                    "sha256_after": after,
-                },
-            )
+        record_session(
+            context.target.history.audit,
+            AuditAction.PROPOSED,
+            at=context.tools.now(),
+            who=context.who,
+            subject=str(resolve_links(context.target.file)),
+            details={
+                "session": session.state.session,
+                "calibration_sha256": digest,
+                "sha256_before": target.base_sha256,
+                "sha256_after": after,
+            },
+        )
         context.journal.say(Level.NOTICE, "proposed: an operator has to apply it", folder=str(session.folder))
         return session.update(outcome=Outcome.PROPOSED)
     written = _apply(context, proposal, now)
@@ -96,23 +95,15 @@ def decide_outcome(context: JobContext, session: Session, calibration: Calibrati
         context.journal.say(
             Level.NOTICE, "written to the controller's file", file=edit.subject, backup=str(written.backup)
         )
-    _note_applied(context, ledger, digest, after)
+        if written.not_in_history:
+            words = "the history does not have this write; the next job, apply or history --add enters it"
+            context.journal.say(Level.WARNING, words, text=written.not_in_history)
     return session.update(outcome=Outcome.APPLIED)
 
 
 def _apply(context: JobContext, proposal: Proposal[FileEdit], now: datetime) -> Written | None:
     with writing(proposal.edit.file):
         return context.tools.apply(proposal, now, audit=context.target.history.audit, who=context.who)
-
-
-def _note_applied(context: JobContext, ledger: Ledger, digest: str, after_sha256: str) -> None:
-    """Enter the write in the history, once; the controller has its gains already, so a failure is only reported."""
-    target = str(resolve_links(context.target.file))
-    try:
-        ledger.record_applied(digest, at=context.tools.now(), target=target, sha256_after=after_sha256)
-    except DaqError as error:
-        words = "the history does not have this write; the next job, apply or history --add enters it"
-        context.journal.say(Level.WARNING, words, text=evidence(error))
 
 
 def decision_of(proposal: Proposal[FileEdit], known: Spread) -> Decision:

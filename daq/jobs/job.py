@@ -22,7 +22,7 @@ from daq.jobs.reporting import Conclusion, audit_entry, report_failure, report_s
 from daq.jobs.session import Session
 from daq.jobs.time_bound import time_bound
 from daq.ledger.audit import AuditAction
-from daq.ledger.ledger import Ledger
+from daq.ledger.ledger import enter_calibration, read_history
 from daq.ledger.watch import alarm_text, watch
 from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.network import SignalBlocker
@@ -116,17 +116,18 @@ def _run(context: JobContext, session: Session) -> Session:
         before_motion(context.within("preflight"))
         session = record_runs(context, session)
     session, calibration = fit_session(context.within("fit"), session)
-    target, tools = context.target, context.tools
-    with Ledger(context.cell, target.history, context.who) as ledger:
-        ledger.add(calibration, digest=sha256_of(session.folder / sessions.CALIBRATION) or "", at=tools.now())
-        series = watch(ledger.entries(), ledger.acknowledgements())
-        watched = tuple(WatchedGain(axis=one.axis, alarm=alarm_text(one) or "") for one in series)
-        session = session.update(watched=watched)
-        for gain in watched:
-            if gain.alarm:
-                # Each slice of a slow drift may be small enough to be written without an operator.
-                context.within("watch").journal.say(Level.WARNING, "drift", axis=gain.axis, text=gain.alarm)
-        return decide_outcome(context.within("decide"), session, calibration, ledger)
+    digest = sha256_of(session.folder / sessions.CALIBRATION) or ""
+    # Before the decision: what is only proposed is in the history, too. This also ends the write of a killed job.
+    enter_calibration(context.ledger, calibration, digest=digest, who=context.who, at=context.tools.now())
+    history = read_history(context.ledger)
+    series = watch(history.entries, history.acknowledgements)
+    watched = tuple(WatchedGain(axis=one.axis, alarm=alarm_text(one) or "") for one in series)
+    session = session.update(watched=watched)
+    for gain in watched:
+        if gain.alarm:
+            # Each slice of a slow drift may be small enough to be written without an operator.
+            context.within("watch").journal.say(Level.WARNING, "drift", axis=gain.axis, text=gain.alarm)
+    return decide_outcome(context.within("decide"), session, calibration, history)
 
 
 def _not_due(section: Recalibration, cell: Cell, now: datetime) -> Conclusion | None:

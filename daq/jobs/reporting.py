@@ -21,8 +21,8 @@ from daq.jobs.context import JobContext
 from daq.jobs.journal import Level
 from daq.jobs.recording import calibration_of_session
 from daq.jobs.session import CALIBRATION, REPORT, Session
-from daq.ledger.audit import AuditAction, AuditEntry, append
-from daq.ledger.store import HistoryStore
+from daq.ledger.audit import AuditAction, AuditEntry
+from daq.ledger.ledger import read_history, record_session
 from daq.report.text import json_text, picked
 from drivers.errors import stop_notes
 from ident.calibration import Calibration
@@ -71,15 +71,14 @@ def audit_entry(context: JobContext, action: AuditAction, session: Session, deta
     Raises:
         AuditUnusable, OutputFailed: it could not be written.
     """
-    with writing(context.target.history.audit):
-        return append(
-            context.target.history.audit,
-            action,
-            at=context.tools.now(),
-            who=context.who,
-            subject=str(session.folder),
-            details={"session": session.state.session, "cell": context.cell.name, **details},
-        )
+    return record_session(
+        context.target.history.audit,
+        action,
+        at=context.tools.now(),
+        who=context.who,
+        subject=str(session.folder),
+        details={"session": session.state.session, "cell": context.cell.name, **details},
+    )
 
 
 def _report(
@@ -129,10 +128,9 @@ def _report(
 
 def _remove_old(context: JobContext, found: tuple[Session, ...]) -> None:
     try:
-        with HistoryStore(context.target.history.store) as store:
-            newest = {event.target: event.digest for event in store.events()}
+        newest = {event.target: event.digest for event in read_history(context.ledger).events}
         in_force = frozenset(digest for digest in newest.values() if digest is not None)
-    except HistoryUnreadable as error:
+    except (AuditUnusable, HistoryUnreadable) as error:
         # The calibrations in force are unknown: keep all sessions.
         context.journal.say(Level.WARNING, "no old session removed", text=str(error))
         return

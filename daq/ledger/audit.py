@@ -3,6 +3,9 @@
 One JSON line an entry, each with the digest of the one before: the chain reveals lines that were edited, removed,
 moved or added. An entry is on the disk before `append` returns, written in one piece under a lock. A killed writer
 leaves at most an unfinished line. That line stays; the next entry begins on a line of its own and records its digest.
+
+Beside the log is FILE.head with the digest of its last entry: a chain alone cannot show that its end, or all of it,
+is missing. docs/decisions/0036 says what this defends against.
 """
 
 from __future__ import annotations
@@ -28,6 +31,8 @@ _TRIES, _PAUSE_S = 100, 0.05  #: For the lock, which is held for one line
 FIRST = "0" * 64  #: Previous digest of the first entry
 GONE = "gone"  #: Takes the place of a missing file's digest
 _BEGINNING = b'{"action":"'  #: Begin of every line: the keys are sorted
+_DIGEST = b',"sha256":"'  #: Before the digest of a line; in a text of it, the quotation marks would be escaped
+_DIGITS = 64  #: Of a digest, hexadecimal
 
 
 class AuditAction(Enum):
@@ -45,7 +50,7 @@ class AuditAction(Enum):
     RECALIBRATION_ENDED = "recalibration ended"
     ACKNOWLEDGED = "acknowledged"
     CALIBRATION_ENTERED = "calibration entered"
-    """The history has this calibration; details: SHA-256 of its file, cell, time, and the whole document."""
+    """The history has this calibration; details: SHA-256 of its file, cell, time, document, and its figures."""
     WRITE_FOUND = "write found"
     """A controller has these gains, though no entry ends the write that put them there; details as of its begin."""
     TORN_LINE = "torn line"
@@ -98,14 +103,28 @@ _TYPES = {
 
 def decode(line: bytes) -> AuditEntry | None:
     """Return the entry of a line, its digest unchecked; None for a line that `encode` could not write."""
+    return _decode(line)[0]
+
+
+def _decode(line: bytes) -> tuple[AuditEntry | None, bool]:
+    """Return the entry of a line, and whether its digest is that of its content."""
     try:
         tree = json.loads(line)
         if not isinstance(tree, dict) or {name: type(value) for name, value in tree.items()} != _TYPES:
-            return None
+            return None, False
         found = AuditEntry(**{**tree, "action": AuditAction(tree["action"])})
-        return found if encode(found) == line else None
+        # Encoding again costs four times as much as reading: it is only done to tell what a changed line is.
+        if found.sha256 == _digest_of_line(line):
+            return found, True
+        return (found, found.holds) if encode(found) == line else (None, False)
     except (ValueError, TypeError, RecursionError):
-        return None
+        return None, False
+
+
+def _digest_of_line(line: bytes) -> str:
+    """Return the SHA-256 of a line without the digest in it, as `entry` computes it."""
+    before, _, after = line.rpartition(_DIGEST)
+    return sha256(before + after[_DIGITS + 1 :])
 
 
 def _is_fragment(line: bytes) -> bool:
@@ -174,7 +193,48 @@ def append(
         os.fsync(descriptor)
         if not content:
             fsync_folder(Path(os.path.realpath(path)).parent)
+        _note_head(path, content, new[-1].sha256)
         return new[-1]
+
+
+def noted_heads(path: Path) -> tuple[str, ...]:
+    """Return the digests of entries that were noted beside an audit log, and that it must have; none without a note.
+
+    The last one is that of the last entry. Others are of entries that were missing when the next one was appended.
+    """
+    try:
+        text = read_regular(_head_file(path), MAX_BYTES).decode(errors="replace")
+    except OSError:
+        return ()
+    lines = text.split("\n")
+    return tuple(line for line in lines if len(line) == _DIGITS and set(line) <= set("0123456789abcdef"))
+
+
+def _note_head(path: Path, content: bytes, head: str) -> None:
+    """Note the last entry; the caller has the lock, and `content` is what was before it.
+
+    The note is behind the log after a kill, which is harmless: an older entry is in the chain, too.
+    """
+    missing = [one for one in noted_heads(path) if one.encode() not in content]
+    with contextlib.suppress(OSError):  # the entry is on the disk, and a note can be missing
+        _write_heads(path, (*missing, head))
+
+
+def _write_heads(path: Path, heads: Sequence[str]) -> None:
+    flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    descriptor = os.open(_head_file(path), flags, 0o666)
+    try:
+        # In one piece and in place: there are never fewer lines than before, but where a missing entry came back.
+        content = "".join(f"{head}\n" for head in heads).encode()
+        os.pwrite(descriptor, content, 0)
+        os.ftruncate(descriptor, len(content))
+    finally:
+        os.close(descriptor)
+
+
+def _head_file(path: Path) -> Path:
+    target = Path(os.path.realpath(path))
+    return target.with_name(f"{target.name}.head")
 
 
 def read(path: Path) -> tuple[AuditEntry, ...]:
@@ -206,8 +266,8 @@ def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]
     """
     unfinished: list[bytes] = []
     for number, line in reversed(list(enumerate(_lines_of(content), start=1))):
-        one = decode(line)
-        if one is not None and one.holds:
+        one, holds = _decode(line)
+        if one is not None and holds:
             return one, unfinished[::-1]
         if one is not None or not _is_fragment(line):
             raise AuditUnusable(
@@ -322,6 +382,7 @@ class AuditVerdict:
     """Result of checking a chain."""
 
     entries: tuple[AuditEntry, ...]  #: all of them, in the order of the file
+    intact: tuple[AuditEntry, ...]  #: those whose digest is that of their content
     flaws: tuple[AuditFlaw, ...]  #: by their lines; empty for an intact chain
     torn: tuple[int, ...]  #: lines, from 1, that a killed writer left unfinished; they are no flaw
     open_writes: tuple[OpenWrite, ...]  #: begun and not ended
@@ -346,19 +407,25 @@ def judge(content: bytes, digest_now: Callable[[str], str | None], heads: Collec
         heads: digests of entries that were noted elsewhere. One that is not in the chain shows that its end is missing.
     """
     chain = _Chain(content)
-    for index, one in enumerate(chain.found):
+    for index, (one, holds) in enumerate(chain.decoded):
         if one is None:
             chain.unfinished.append(index)
         else:
-            chain.take(index, one)
+            chain.take(index, one, holds=holds)
     chain.settle(None)
-    entries = tuple(one for one in chain.found if one is not None)
+    entries = tuple(one for one, _ in chain.decoded if one is not None)
     unknown = sorted(set(heads) - {one.sha256 for one in entries})
     if unknown:
         says = f"{len(unknown)} entries that were noted elsewhere are missing: {', '.join(h[:12] for h in unknown)}"
         chain.flaws.append(AuditFlaw(len(chain.lines) + 1, Flaw.CUT_OFF, says))
     flaws = tuple(sorted(chain.flaws, key=lambda flaw: flaw.line))
-    return AuditVerdict(entries, flaws, tuple(chain.torn), tuple(_open_writes(entries, digest_now)))
+    return AuditVerdict(
+        entries=entries,
+        intact=tuple(one for one, holds in chain.decoded if one is not None and holds),
+        flaws=flaws,
+        torn=tuple(chain.torn),
+        open_writes=tuple(open_writes(entries, digest_now)),
+    )
 
 
 def _lines_of(content: bytes) -> list[bytes]:
@@ -378,8 +445,9 @@ class _Chain:
 
     def __init__(self, content: bytes) -> None:
         self.lines = _lines_of(content)
-        self.found = [decode(line) for line in self.lines]
-        self.numbers = Counter(one.number for one in self.found if one is not None)
+        self.decoded = [_decode(line) for line in self.lines]
+        """The entry of each line, None for a line that is none, and whether its digest is that of its content."""
+        self.numbers = Counter(one.number for one, _ in self.decoded if one is not None)
         self.flaws: list[AuditFlaw] = []
         self.torn: list[int] = []
         self.unfinished: list[int] = []
@@ -390,11 +458,11 @@ class _Chain:
         self.place = 1
         """Line of the entry before."""
 
-    def take(self, index: int, one: AuditEntry) -> None:
+    def take(self, index: int, one: AuditEntry, *, holds: bool) -> None:
         """The next line, which is an entry."""
         self.settle(one)
         place = index + 1
-        if not one.holds:
+        if not holds:
             self._add_flaw(place, Flaw.EDITED, f"the digest of entry {one.number} is not that of its content")
             self.number, self.previous, self.place = self.number + 1, None, place
             return
@@ -436,7 +504,8 @@ class _Chain:
         self.flaws.append(AuditFlaw(line, flaw, says))
 
 
-def _open_writes(entries: Sequence[AuditEntry], digest_now: Callable[[str], str | None]) -> Iterator[OpenWrite]:
+def open_writes(entries: Sequence[AuditEntry], digest_now: Callable[[str], str | None]) -> Iterator[OpenWrite]:
+    """Find writes that were begun and never ended. Args as of `judge`."""
     # A forged chain can hold: a value that is no number names no entry.
     ended = {begun for one in entries if one.action in _ENDS and isinstance(begun := one.details.get("begun"), int)}
     begins = [one for one in entries if one.action in _BEGUN]

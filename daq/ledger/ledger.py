@@ -1,50 +1,108 @@
-"""A cell's ledger: the audit log, which is the truth, and the history, which is its index.
+"""The ledger of a cell: its audit log, and the history that is folded from it.
 
-What is added goes to the audit log first and then to the index. A process that is killed in between leaves an index
-that lacks an entry; the next one adds it (`catch_up`), and `rebuild` makes the whole index anew.
+Everything is written once, into the audit log. `record_write` is for `apply` and `rollback` of `daq.writeback.target`
+alone: whoever writes gains calls these. A history of an earlier version, in SQLite, is taken into the audit log by the
+first command that enters or shows the history (`migrate`).
 """
 
 from __future__ import annotations
 
 import logging
-import shutil
-import sqlite3
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
-from datetime import datetime
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 from daq.config.cell import Cell
-from daq.config.policy import HistoryPlace
-from daq.documents.calibration_file import decode, encode
-from daq.errors import AuditUnusable, DataError, HistoryUnreadable, OutputFailed, evidence
+from daq.documents.calibration_file import encode
+from daq.errors import DataError, HistoryUnreadable, evidence, writing
 from daq.files import fsync_folder
-from daq.ledger.audit import AuditAction, AuditEntry, AuditVerdict, append, read, verify
-from daq.ledger.entry import Acknowledgement, Event, iso
-from daq.ledger.store import HistoryStore
-from daq.ledger.verify import (
+from daq.ledger.audit import (
+    FIRST,
+    AuditAction,
+    AuditEntry,
+    AuditVerdict,
+    Content,
+    OpenWrite,
+    append,
+    entry,
+    noted_heads,
+    open_writes,
+    verify,
+)
+from daq.ledger.entry import Entry, figures_of, iso
+from daq.ledger.history import (
     AuditedWrite,
-    catch_up,
-    contradictions,
-    entered_calibration,
-    is_end,
+    History,
+    at_of,
+    entered_calibrations,
+    fold,
     unknown_writes,
     writes_to,
+)
+from daq.ledger.migration import (
+    EMPTY,
+    Draft,
+    StoredHistory,
+    contradictions,
+    drafts_of,
+    history_subject,
+    read_stored,
+    set_aside,
 )
 from ident.calibration import Calibration
 
 _LOG = logging.getLogger("drivegain")
+_SHOWN = 5  #: Sentences in an error; `history --verify --json` has all
+
+WRITES = frozenset(
+    {
+        AuditAction.REFUSED,
+        AuditAction.NOTHING_TO_DO,
+        AuditAction.APPLY_BEGUN,
+        AuditAction.APPLIED,
+        AuditAction.ROLLBACK_BEGUN,
+        AuditAction.ROLLED_BACK,
+        AuditAction.FAILED,
+        AuditAction.WRITE_FOUND,
+    }
+)
+"""What `record_write` enters."""
+SESSIONS = frozenset({AuditAction.PROPOSED, AuditAction.RECALIBRATION_BEGUN, AuditAction.RECALIBRATION_ENDED})
+"""What `record_session` enters."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ledger:
+    """The ledger of a cell."""
+
+    cell: Cell  #: as it is now
+    audit: Path  #: the audit log
+    stored: Path | None = None  #: history of an earlier version; None where the cell cannot have one
+
+    @classmethod
+    def of(cls, cell: Cell, audit: Path | None = None) -> Ledger | None:
+        """The ledger of a cell, or that of another audit log; None for a cell from a log without either."""
+        place = cell.history
+        if place is not None and audit in {None, place.audit}:
+            return cls(cell, place.audit, place.store)
+        return None if audit is None else cls(cell, audit)
+
+    @property
+    def outdated(self) -> bool:
+        """Whether there is a history of an earlier version that was not migrated yet."""
+        return self.stored is not None and self.stored.exists()
 
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """Result of checking audit log and history."""
+    """Result of checking a ledger."""
 
-    place: HistoryPlace  #: of both files
-    verdict: AuditVerdict  #: on the audit log
-    broken: tuple[str, ...]  #: what is broken in the history, and where its rows are not what the audit log says
+    audit: Path  #: the audit log
+    verdict: AuditVerdict  #: on it
+    history: History  #: as far as it can be read
+    broken: tuple[str, ...]  #: what the history cannot show, and what a history of an earlier version says otherwise
     unknown: tuple[AuditedWrite, ...] = ()  #: writes that the history lacks
-    late: bool = False  #: whether the history has a later write than one of these
 
     @property
     def complete(self) -> bool:
@@ -52,234 +110,303 @@ class Verification:
         return self.verdict.holds and not self.unknown
 
 
-class Ledger(HistoryStore):
-    """The history of a cell that writes through the audit log; use as a context manager.
-
-    Where the audit log cannot be written, the history has what was added all the same, a warning says so, and `rebuild`
-    enters it in the audit log later: a write that was made must not be called undone.
-    """
-
-    def __init__(self, cell: Cell, place: HistoryPlace, who: str) -> None:
-        super().__init__(place.store)
-        self.cell = cell
-        self.place = place
-        self.who = who
-
-    def add(self, calibration: Calibration, *, digest: str, at: datetime) -> bool:
-        """See `HistoryStore.add`."""
-        if self.document(digest) is None:
-            self._check_like(calibration)
-            at = self._enter_calibration(calibration, digest, at, at)
-        return super().add(calibration, digest=digest, at=at)
-
-    def record_applied(
-        self, digest: str, *, at: datetime, target: str, sha256_after: str, entry: str | None = None
-    ) -> None:
-        """Enter that a controller has the gains of a calibration; before it what other processes could not enter.
-
-        `entry` is the SHA-256 of the audit log's entry of the write; None where an earlier process wrote, which may
-        have been killed before it entered the write, or entered it.
-
-        Raises:
-            AuditUnusable, HistoryUnreadable, OutputFailed: see `HistoryStore.applied`.
-        """
-        if entry is None:
-            if self.in_force(target) == digest:
-                return
-            for one in read(self.place.audit):
-                if (one.subject, one.details.get("sha256_after")) == (target, sha256_after):
-                    entry = one.sha256  # the newest one counts
-        if not any(entry in write.digests for write in self.catch_up()):
-            self.applied(digest, at=at, who=self.who, target=target, audit=entry, sha256_after=sha256_after)
-
-    def record_rolled_back(self, *, at: datetime, target: str, sha256_after: str, entry: str | None) -> None:
-        """Enter that the last write to a target was undone. Args and errors as in `record_applied`."""
-        if not any(entry in write.digests for write in self.catch_up()):
-            self.rolled_back(at=at, who=self.who, target=target, sha256_after=sha256_after, audit=entry)
-
-    def acknowledge_change(self, axis: str, *, since: datetime, at: datetime, who: str, why: str) -> None:
-        """Record that a change of a gain is explained.
-
-        Raises:
-            AuditUnusable, HistoryUnreadable, OutputFailed: it could not be recorded.
-        """
-        details = {"axis": axis, "cell": self.cell.name, "since": since.isoformat(), "why": why}
-        try:
-            entry = self._append(AuditAction.ACKNOWLEDGED, at, who, f"gain of {axis}", details)
-        except OSError as error:
-            raise OutputFailed.of(self.place.audit, error) from error
-        self.acknowledge(Acknowledgement(axis, since, at, who, why, entry.sha256))
-
-    def catch_up(self) -> tuple[AuditedWrite, ...]:
-        """Add what the audit log has and the index lacks; see `daq.ledger.verify.catch_up`."""
-        return catch_up(self.cell, self.place, self)
-
-    def verify(self, heads: Collection[str] = ()) -> Verification:
-        """Check audit log and history, each by itself and against the other.
-
-        Args:
-            heads: SHA-256 of entries of the audit log that were noted elsewhere, besides the history.
-
-        Raises:
-            AuditUnusable, HistoryUnreadable: see `daq.ledger.audit.verify` and the store.
-        """
-        verdict, broken = verify(self.place.audit, self.audited().union(heads)), self.integrity()
-        if not verdict.holds:  # its entries prove nothing
-            return Verification(self.place, verdict, broken)
-        broken += tuple(contradictions(verdict.entries, self.cell.name, self))
-        unknown, new = unknown_writes(writes_to(self.cell, verdict), self.audited())
-        return Verification(self.place, verdict, broken, tuple(unknown), new != unknown)
-
-    def warn_if_lost(self) -> bool:
-        """Warn, and return true, if the index is empty though the audit log has entries of this cell."""
-        if self.entries():
-            return False
-        verdict = verify(self.place.audit)
-        entered = any(entered_calibration(one, self.cell.name) for one in verdict.entries)
-        if lost := entered or bool(writes_to(self.cell, verdict, everywhere=True)):
-            _LOG.warning("the history lacks what the audit has; to make it anew: drivegain history CELL --rebuild")
-        return lost
-
-    def enter_in_audit(self, at: datetime) -> None:
-        """Enter in the audit log what only the history has: calibrations and found writes of an earlier version."""
-        for one in self.entries():
-            document = self.document(one.digest)
-            if document is not None:
-                self._enter_calibration(decode(document, one.digest), one.digest, one.entered, at)
-        found = {
-            (one.subject, one.at, one.who) for one in read(self.place.audit) if one.action is AuditAction.WRITE_FOUND
-        }
-        for event in self.events():
-            if (event.target, event.at.isoformat(), event.who) not in found:
-                self._with_entry(event, {"migrated": True})
-
-    def _note(self, connection: sqlite3.Connection, event: Event) -> None:
-        """Enter a write; one that no entry of the audit log ends is entered there as found."""
-        super()._note(connection, self._with_entry(event, {}))
-
-    def _with_entry(self, event: Event, more: dict[str, object]) -> Event:
-        try:
-            entries = {one.sha256: one for one in read(self.place.audit)}
-            named = entries.get(event.audit or "")
-            if named is not None and is_end(named):
-                return event
-            details: dict[str, object] = {
-                "action": event.action.value,
-                "begun": None if named is None else named.number,
-                "calibration": {"sha256": event.digest, "cell": self.cell.name},
-                "sha256_after": event.sha256_after,
-                **more,
-            }
-            found = self._append(AuditAction.WRITE_FOUND, event.at, event.who, event.target, details)
-            return replace(event, audit=found.sha256)
-        except (AuditUnusable, OSError) as error:
-            _LOG.warning("the audit log does not have this write: %s", evidence(error))
-            return event
-
-    def _enter_calibration(self, calibration: Calibration, digest: str, entered: datetime, at: datetime) -> datetime:
-        """Enter a calibration in the audit log, once; return when it was entered: an earlier process may have done it.
-
-        Its row has this time, too, so that `verify` can compare the two.
-        """
-        try:
-            for one in read(self.place.audit):
-                for known, earlier, _ in entered_calibration(one, self.cell.name):
-                    if known == digest:
-                        return earlier
-            details = {
-                "sha256": digest,
-                "cell": self.cell.name,
-                "entered": iso(entered),
-                "document": encode(calibration).decode(),
-            }
-            subject = f"history of {self.cell.name}"
-            self._append(AuditAction.CALIBRATION_ENTERED, at, self.who, subject, details)
-        except (AuditUnusable, OSError) as error:
-            _LOG.warning("the audit log does not have this calibration: %s", evidence(error))
-        return entered
-
-    def _append(
-        self, action: AuditAction, at: datetime, who: str, subject: str, details: Mapping[str, object]
-    ) -> AuditEntry:
-        return append(self.place.audit, action, at=at, who=who, subject=subject, details=details)
-
-
 @dataclass(frozen=True, slots=True)
-class Rebuilt:
-    """Content of a history after `rebuild`."""
+class Migrated:
+    """What was taken over from a history of an earlier version."""
 
-    calibrations: int  #: number of calibrations
-    writes: int  #: number of writes
-    acknowledgements: int  #: number of acknowledged changes
-    kept: Path | None  #: the history that was replaced, None where there was none
-    trusted: bool  #: whether what only the old history had was entered in the audit log: not where it was broken
+    entries: int  #: number of entries that the audit log got
+    aside: Path | None  #: new name of the file; None where there was none
+    trusted: bool  #: whether anything was taken over from it: not where it is broken
 
 
-def rebuild(cell: Cell, place: HistoryPlace, *, who: str, at: datetime, heads: Collection[str] = ()) -> Rebuilt:
-    """Make the history anew from the audit log; the old file is kept under another name.
-
-    Calibrations and writes that only the history has, which an earlier version wrote, are entered in the audit log
-    first, unless the history contradicts itself or the audit log.
-
-    `heads` are the SHA-256 of entries of the audit log that were noted elsewhere.
+def read_history(ledger: Ledger) -> History:
+    """Read the history of a cell; nothing is written.
 
     Raises:
-        DataError: the audit log is not what was written; nothing was changed.
-        AuditUnusable, OutputFailed: a file cannot be written; the history is as it was.
+        AuditUnusable: the audit log is no regular file, or it cannot be read.
+        HistoryUnreadable: there is a history of an earlier version that cannot be read, or contradicts the audit log.
     """
-    entries = read(place.audit)
-    own = frozenset(one.sha256 for one in entries if "cell" not in one.details)
-    verdict, trusted = verify(place.audit, heads), False
+    entries = verify(ledger.audit).intact
+    stored = _read_stored(ledger)
+    flaws = _flaws(ledger, stored, entries)
+    if flaws:
+        raise stored_error(ledger, flaws)
+    return fold(_with_stored(entries, stored, ledger.cell), ledger.cell)
+
+
+def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
+    """Check the audit log, and that the history has what it reports.
+
+    Args:
+        ledger: to check.
+        heads: SHA-256 of entries of the audit log that were noted elsewhere, besides the note beside it.
+
+    Raises:
+        AuditUnusable, HistoryUnreadable: see `read_history`.
+    """
+    stored = _read_stored(ledger)
+    verdict = verify(ledger.audit, stored.noted.union(heads, noted_heads(ledger.audit)))
+    broken = _flaws(ledger, stored, verdict.intact)
+    entries = _with_stored(verdict.intact, EMPTY if broken else stored, ledger.cell)
+    history = fold(entries, ledger.cell)
+    broken += history.unreadable
+    if not verdict.holds:  # its entries do not prove that anything is missing
+        return Verification(ledger.audit, verdict, history, broken)
+    known = {one.digest for one in history.entries}
+    unknown = unknown_writes(ledger.cell, entries, verdict.open_writes, known)
+    return Verification(ledger.audit, verdict, history, broken, unknown)
+
+
+def warn_if_broken(ledger: Ledger) -> bool:
+    """Warn, and return true, if the audit log is not what was written: the history may lack something."""
+    broken = not verify(ledger.audit, noted_heads(ledger.audit)).holds
+    if broken:
+        _LOG.warning("the audit log is not what was written; what is missing: drivegain history CELL --verify")
+    return broken
+
+
+def record_write(
+    audit: Path, action: AuditAction, *, at: datetime, who: str, subject: str, details: Mapping[str, object]
+) -> AuditEntry:
+    """Enter one step of a write to a controller; only `apply` and `rollback` of `daq.writeback.target` do.
+
+    Raises:
+        ValueError: the action is none of `WRITES`.
+        AuditUnusable, OSError: see `daq.ledger.audit.append`.
+    """
+    if action not in WRITES:
+        raise ValueError(f"{action.value!r} is no step of a write")
+    return append(audit, action, at=at, who=who, subject=subject, details=details)
+
+
+def record_session(
+    audit: Path, action: AuditAction, *, at: datetime, who: str, subject: str, details: Mapping[str, object]
+) -> AuditEntry:
+    """Enter a step of a scheduled job, which writes to no controller.
+
+    Raises:
+        ValueError: the action is none of `SESSIONS`.
+        AuditUnusable, OutputFailed: it could not be recorded.
+    """
+    if action not in SESSIONS:
+        raise ValueError(f"{action.value!r} is no step of a job")
+    with writing(audit):
+        return append(audit, action, at=at, who=who, subject=subject, details=details)
+
+
+def enter_calibration(ledger: Ledger, calibration: Calibration, *, digest: str, who: str, at: datetime) -> bool:
+    """Enter a calibration, with the SHA-256 of its file, and writes whose writer was killed before it ended them.
+
+    A history of an earlier version is migrated first, but not into an audit log that was changed.
+
+    Returns:
+        whether the calibration is new: a file is entered once.
+
+    Raises:
+        DataError: another cell, other axes, or a gain in another unit than the history's.
+        AuditUnusable, HistoryUnreadable, OutputFailed: it could not be entered; see `migrate`.
+    """
     try:
-        with Ledger(cell, place, who) as old:
-            found = old.verify(heads)
-            verdict, trusted = found.verdict, not found.broken
-            if trusted and verdict.holds and place.store.exists():
-                own = old.audited()
-                old.enter_in_audit(at)
+        migrate(ledger, who=who, at=at)
+    except HistoryUnreadable:
+        raise
+    except DataError as error:  # the next line goes behind the changed ones all the same
+        _LOG.warning("the history of an earlier version stays where it is: %s", evidence(error))
+    entries = verify(ledger.audit).intact
+    known = {one.digest for one in entered_calibrations(entries, ledger.cell.name)}
+    new = digest not in known
+    if new:
+        _check_like(ledger, calibration, fold(entries, ledger.cell).entries)
+        details = {
+            "sha256": digest,
+            "cell": ledger.cell.name,
+            "entered": iso(at),
+            "document": encode(calibration).decode(),
+            "figures": figures_of(calibration, digest, at),
+        }
+        _append(ledger, Draft(AuditAction.CALIBRATION_ENTERED, at, who, history_subject(ledger.cell.name), details))
+    _end_found_writes(ledger)
+    return new
+
+
+def acknowledge(ledger: Ledger, axis: str, *, since: datetime, at: datetime, who: str, why: str) -> None:
+    """Enter that a change of a gain is explained.
+
+    Args:
+        ledger: of the cell.
+        axis: whose gain changed.
+        since: calibrations from then on make the new baseline.
+        at: time, with zone.
+        who: explains it.
+        why: what happened.
+
+    Raises:
+        AuditUnusable, OutputFailed: it could not be recorded.
+    """
+    details = {"axis": axis, "cell": ledger.cell.name, "since": since.isoformat(), "why": why}
+    _append(ledger, Draft(AuditAction.ACKNOWLEDGED, at, who, f"gain of {axis}", details))
+
+
+def migrate(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) -> Migrated:
+    """Take what only a history of an earlier version has into the audit log, and rename its file.
+
+    A process that is killed in between leaves the file; the next one enters what is still missing. Calibrations that
+    an earlier version has entered get their figures.
+
+    Args:
+        ledger: of the cell.
+        who: the person or the job.
+        at: time, with zone.
+        forced: also rename a file that is broken or contradicts the audit log, from which nothing is taken over; and
+            add figures where there is no such file.
+
+    Raises:
+        HistoryUnreadable: the file is broken or contradicts the audit log, without `forced`; nothing was changed.
+        DataError: the audit log is not what was written; nothing was changed.
+        AuditUnusable, OutputFailed: a file cannot be written; the next call goes on.
+    """
+    if not ledger.outdated and not forced:
+        return Migrated(0, None, trusted=True)
+    stored = EMPTY
+    flaws: tuple[str, ...] = ()
+    try:
+        stored = _read_stored(ledger)
     except HistoryUnreadable as error:
-        _LOG.warning("the old history cannot be read: %s", error)
+        if not forced:
+            raise
+        flaws = (error.found,)
+    verdict = verify(ledger.audit, stored.noted.union(noted_heads(ledger.audit)))
     if not verdict.holds:
-        raise audit_error(place, verdict)
-    new = place.store.with_name(f"{place.store.name}.part")
-    try:
-        new.unlink(missing_ok=True)
-        with HistoryStore(new) as index:
-            catch_up(cell, place, index, own)
-            counts = len(index.entries()), len(index.events()), len(index.acknowledgements())
-        kept = None
-        if place.store.exists():
-            kept = place.store.with_name(f"{place.store.name}.{at:%Y%m%dT%H%M%SZ}.bak")
-            shutil.copyfile(place.store, kept)
-            journal = place.store.with_name(f"{place.store.name}-journal")
-            if journal.exists():  # SQLite would apply it to the new history
-                journal.rename(kept.with_name(f"{kept.name}-journal"))
-        if new.exists():
-            new.replace(place.store)
-        else:
-            place.store.unlink(missing_ok=True)
-        fsync_folder(place.store.parent)
-    except OSError as error:
-        raise OutputFailed.of(place.store, error) from error
-    return Rebuilt(*counts, kept, trusted)
+        raise audit_error(ledger.audit, verdict)
+    flaws += _flaws(ledger, stored, verdict.entries)
+    if flaws and not forced:
+        raise stored_error(ledger, flaws)
+    drafts = drafts_of(EMPTY if flaws else stored, verdict.entries, ledger.cell.name, who, at)
+    for draft in drafts:
+        _append(ledger, draft)
+    aside = None
+    if ledger.stored is not None and ledger.outdated:
+        with writing(ledger.stored):
+            aside = set_aside(ledger.stored, at)
+            fsync_folder(aside.parent)
+    return Migrated(len(drafts), aside, trusted=not flaws)
 
 
-def audit_error(place: HistoryPlace, verdict: AuditVerdict) -> DataError:
+def audit_error(audit: Path, verdict: AuditVerdict) -> DataError:
     """Return the error for an audit log that is not what was written."""
     first = verdict.flaws[0]
-    if not place.audit.exists():
+    if not audit.exists():
         return DataError(
-            str(place.audit),
+            str(audit),
             found=f"no file; {first.says}",
             expected="the audit log with these entries",
             remedy="restore it from a backup; without one begin both anew (`history.audit`, `history.store`)",
         )
     more = "".join(f"\n  line {flaw.line}: {flaw.flaw.value}: {flaw.says}" for flaw in verdict.flaws)
     return DataError(
-        f"{place.audit}, line {first.line}",
+        f"{audit}, line {first.line}",
         found=f"{len(verdict.flaws)} places that are not what was written{more}\n ",
         expected="entries that were never changed, moved or removed",
         remedy="keep this file as it is, compare it with a backup, ask who can write to it; until that is known trust "
         "the controller's file by its backups only, and begin audit and history anew, both (`history.audit`, "
-        "`history.store`): the old history would report the missing entries for ever",
+        "`history.store`)",
+    )
+
+
+def stored_error(ledger: Ledger, flaws: Collection[str]) -> HistoryUnreadable:
+    """Return the error for a history of an earlier version that is broken, or contradicts the audit log."""
+    listed = list(flaws)
+    more = len(listed) - _SHOWN
+    return HistoryUnreadable(
+        str(ledger.stored),
+        found="; ".join(listed[:_SHOWN]) + (f"; and {more} more" if more > 0 else ""),
+        expected="a sound SQLite file with what the audit log says",
+        remedy="ask who can write to it, and restore the last good one from a backup, or go on without it: "
+        "`drivegain history CELL --migrate` keeps it under another name, and takes nothing over from it",
+    )
+
+
+def _read_stored(ledger: Ledger) -> StoredHistory:
+    if ledger.stored is None or not ledger.outdated:
+        return EMPTY
+    return read_stored(ledger.stored)
+
+
+def _flaws(ledger: Ledger, stored: StoredHistory, entries: Sequence[AuditEntry]) -> tuple[str, ...]:
+    return (*stored.flaws, *contradictions(stored, entries, ledger.cell.name))
+
+
+def _with_stored(entries: Sequence[AuditEntry], stored: StoredHistory, cell: Cell) -> tuple[AuditEntry, ...]:
+    """Return the entries as they will be once a history of an earlier version is migrated."""
+    chain = list(entries)
+    never = datetime.min.replace(tzinfo=UTC)  # these entries are only folded
+    for draft in drafts_of(stored, entries, cell.name, "", never):
+        number = chain[-1].number + 1 if chain else 1
+        previous = chain[-1].sha256 if chain else FIRST
+        at = draft.at.isoformat()
+        chain.append(entry(number, at, draft.who, draft.action, draft.subject, draft.details, previous))
+    return tuple(chain)
+
+
+def _append(ledger: Ledger, draft: Draft) -> AuditEntry:
+    with writing(ledger.audit):
+        return append(
+            ledger.audit, draft.action, at=draft.at, who=draft.who, subject=draft.subject, details=draft.details
+        )
+
+
+def _end_found_writes(ledger: Ledger) -> None:
+    """Enter the writes without an end whose content the controller has now, in the name of their writers.
+
+    Nothing is concluded from an audit log that was changed.
+    """
+    verdict = verify(ledger.audit)
+    if not verdict.holds:
+        return
+    witnessed = {one.begun.number for one in open_writes(verdict.entries, lambda _: None) if _is_made(one)}
+    made = [one for one in verdict.open_writes if _is_made(one)]
+    found = {one.begun.number for one in made} - witnessed
+    for write in writes_to(ledger.cell, verdict.entries, made, everywhere=True):
+        begun = write.ended
+        at = at_of(begun)
+        if begun.number not in found or at is None:
+            continue
+        details = {
+            "action": write.action.value,
+            "begun": begun.number,
+            "calibration": {"sha256": write.calibration, "cell": ledger.cell.name},
+            "sha256_after": write.sha256_after,
+        }
+        _append(ledger, Draft(AuditAction.WRITE_FOUND, at, begun.who, begun.subject, details))
+
+
+def _is_made(one: OpenWrite) -> bool:
+    return one.content is Content.AFTER
+
+
+def _check_like(ledger: Ledger, calibration: Calibration, entries: Collection[Entry]) -> None:
+    """Refuse a calibration that cannot be compared with those of the history."""
+    found: str
+    expected: str
+    units = {gain.axis: gain.unit for gain in calibration.gains}
+    known = {gain.axis: gain.unit for one in entries for gain in one.gains}
+    other = [axis for axis in units if axis in known and units[axis] != known[axis]]
+    if calibration.cell != ledger.cell.name:
+        found = f"a calibration of cell {calibration.cell!r}"
+        expected = f"of {ledger.cell.name!r}, as all in this history"
+    elif known and units.keys() != known.keys():
+        found = f"gains of {', '.join(units)}"
+        expected = f"of {', '.join(known)}"
+    elif other:
+        axis = other[0]
+        found = f"the gain of {axis} in {units[axis]}"
+        expected = f"{known[axis]}, as in the calibrations before"
+    else:
+        return
+    raise DataError(
+        str(ledger.audit),
+        found=found,
+        expected=expected,
+        remedy="gains are compared over time only where they mean the same: begin another audit log "
+        "(`history.audit` of the cell file); nothing was entered",
     )

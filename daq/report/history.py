@@ -18,8 +18,8 @@ from daq.formats.document import decode, read_bytes
 from daq.formats.scalar import Scalar, rewrite_gain
 from daq.ledger.audit import AuditEntry
 from daq.ledger.entry import Entry, Event, WriteAction, drives_of
+from daq.ledger.history import History
 from daq.ledger.ledger import Verification
-from daq.ledger.store import HistoryStore
 from daq.ledger.watch import Series, alarm_text, pattern_of, questions
 from daq.report.gains import with_deviation
 from daq.report.picture import BLUE, GREY, ORANGE, PURPLE, SKY, legend_below, panels, render, unformatted
@@ -180,8 +180,8 @@ def describe(
 
 def say_verification(found: Verification, console: Console) -> None:
     """Print the state of audit log and history; flaws are in the error."""
-    place, verdict = found.place, found.verdict
-    console.print(f"{place.audit}: {len(verdict.entries)} entries, chain {'unbroken' if verdict.holds else 'BROKEN'}.")
+    verdict = found.verdict
+    console.print(f"{found.audit}: {len(verdict.entries)} entries, chain {'unbroken' if verdict.holds else 'BROKEN'}.")
     if verdict.torn:
         lines = ", ".join(map(str, verdict.torn))
         console.print(f"Unfinished lines, left by a writer that was killed: {lines}. They are no flaw.")
@@ -191,14 +191,19 @@ def say_verification(found: Verification, console: Console) -> None:
             f"Line of entry {begun.number}: {begun.action.value} by {printable(begun.who)} at {begun.at} was never "
             f"ended; {printable(begun.subject)} was found {one.content.value}."
         )
-    console.print(f"{place.store}: {'BROKEN' if found.broken else 'NOT COMPLETE' if found.unknown else 'sound'}.")
+    state = "sound"
+    if found.broken:
+        state = "BROKEN"
+    elif found.unknown:
+        state = "NOT COMPLETE"
+    console.print(f"History: {state}.")
 
 
 def describe_verification(found: Verification) -> dict[str, Any]:
     """Return the same for --json."""
     verdict = found.verdict
     return {
-        "file": str(found.place.audit),
+        "file": str(found.audit),
         "entries": len(verdict.entries),
         "holds": verdict.holds,
         "broken_line": verdict.broken,
@@ -221,7 +226,7 @@ _WORDS = {WriteAction.APPLIED: "applied by", WriteAction.ROLLED_BACK: "gains res
 """Words for an event after which a controller had the gains of a calibration."""
 
 
-def in_force(cell: Cell, store: HistoryStore) -> str | None:
+def in_force(cell: Cell, history: History) -> str | None:
     """Return the digest of the calibration whose gains this cell's own controller has.
 
     The controller's file is read: it may have been edited, or a backup copied back by hand, and a write to another file
@@ -232,17 +237,18 @@ def in_force(cell: Cell, store: HistoryStore) -> str | None:
     if controller is None:
         return None
     if file is None or not controller.gains:
-        return store.in_force(drives_of(cell.name)) if controller.objects else None
+        return history.in_force(drives_of(cell.name)) if controller.objects else None
     try:
         target = str(resolve_links(file))
         scalars = decode(read_bytes(file), str(file), controller.format).locate(controller.keys)
     except (ControllerUnfit, OSError):
         return None
     numbers = dict(zip(cell.axis_names, zip(scalars, controller.factors, strict=True), strict=True))
-    known, writes = store.in_force(target), [event.digest for event in store.events()]
+    known = history.in_force(target)
+    writes = [event.digest for event in history.events]
     # Where several have these numbers: the one that the history names, else the one that was written last.
     order = [digest for digest in (known, *reversed(writes)) if digest is not None]
-    having = [entry.digest for entry in reversed(store.entries()) if _has(entry, numbers)]
+    having = [entry.digest for entry in reversed(history.entries) if _has(entry, numbers)]
     return next((digest for digest in (*order, *having) if digest in having), None)
 
 

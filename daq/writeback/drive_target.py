@@ -69,7 +69,7 @@ class DriveRecord(StrictModel):
 
 
 def record_folder(cell: Cell) -> Path:
-    """Return the folder of a cell's records: `demo.drives` beside `demo.history.sqlite`.
+    """Return the folder of a cell's records: `demo.drives`, by the name of `history.store`.
 
     Raises:
         ConfigurationInconsistent: the cell was read from a log, and has no folder.

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from daq.config.cell import Cell
 from daq.errors import DaqError
 from daq.files import sha256
-from daq.ledger.store import HistoryStore
+from daq.ledger.history import History
+from daq.ledger.ledger import Ledger, read_history
 from daq.ledger.watch import dispersions_of
 from daq.writeback.request import GainChange, Request
 from ident.drift.change import DISPERSION, FALSE_ALARM, decide
@@ -50,17 +51,17 @@ NOT_JUDGED = JudgedChange()
 
 def query_history(cell: Cell, target: str, request: Request, changes: Sequence[GainChange]) -> Spread:
     """Return the figures of a cell's history; none, with a warning, where it cannot be read."""
-    if cell.history is None:
+    ledger = Ledger.of(cell)
+    if ledger is None:
         return NOTHING
     try:
-        with HistoryStore(cell.history.store) as store:
-            return known_of(store, target, sha256(request.signed), changes)
+        return known_of(read_history(ledger), target, sha256(request.signed), changes)
     except DaqError as error:
         _LOG.warning("the history cannot be read: the numbers in the controller are taken as exact: %s", error)
         return NOTHING
 
 
-def known_of(store: HistoryStore, target: str, digest: str, changes: Sequence[GainChange]) -> Spread:
+def known_of(history: History, target: str, digest: str, changes: Sequence[GainChange]) -> Spread:
     """Return the figures of a history for the gains in a controller.
 
     The σ of a gain is that of the calibration in force where the number is still that calibration's. Else it is that of
@@ -69,11 +70,9 @@ def known_of(store: HistoryStore, target: str, digest: str, changes: Sequence[Ga
 
     The calibration that is judged, by its digest, is left out: a number that is near to it is another one unless it is
     in force, and the scatter is that of the others.
-
-    Raises:
-        HistoryUnreadable: see `daq.ledger.store`.
     """
-    entries, in_force = store.entries(), store.in_force(target)
+    entries = history.entries
+    in_force = history.in_force(target)
     others = [entry for entry in entries if entry.digest != digest]
     gains = {change.axis: change.old for change in changes}
     stds = dict.fromkeys(gains, 0.0)

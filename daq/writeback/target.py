@@ -2,7 +2,7 @@
 
 A target is a place that holds the gains of a cell: the controller's file (`FileTarget`) or the drives themselves
 (`DriveTarget`). It plans an `Edit` and writes it. Everything else is done here, once for all targets: the gates, the
-audit before and after the write, and the refusal.
+audit before and after the write, the refusal, and the calibration's entry in the history. Nothing else writes either.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
@@ -18,7 +18,9 @@ from typing import Generic, Protocol, TypeVar
 from daq.config.cell import Cell
 from daq.errors import AuditUnusable, CalibrationRefused, OutputFailed, evidence
 from daq.files import sha256
-from daq.ledger.audit import GONE, AuditAction, AuditEntry, append, digest_now
+from daq.ledger.audit import GONE, AuditAction, AuditEntry, digest_now
+from daq.ledger.entry import WriteAction
+from daq.ledger.ledger import Ledger, enter_calibration, read_history, record_write
 from daq.writeback.gates.gate import GateContext, Refusal
 from daq.writeback.gates.table import check_gates
 from daq.writeback.request import Edit, Request
@@ -36,7 +38,7 @@ class Written:
     edit: Edit  #: the change
     backup: Path | None  #: file with the content before it; None where there was none
     parameters: tuple[ParameterChange, ...] = ()  #: one for each drive that was written
-    audit_sha256: str | None = None  #: of the audit's last entry about it, to be noted elsewhere; None without an audit
+    not_in_history: str = ""  #: why the history lacks it; empty where it does not
 
 
 class Target(Protocol[E]):
@@ -94,9 +96,9 @@ class Proposal(Generic[E]):
     """A planned change with the verdict of the gates."""
 
     target: Target[E]  #: where it would be made
+    request: Request  #: whose calibration it is
     edit: E  #: the change
     refusals: tuple[Refusal, ...]  #: failed checks; only a proposal without any can be applied
-    evidence: Mapping[str, object] = field(default_factory=dict)  #: digests of what the change rests on, for the audit
 
     @property
     def error(self) -> CalibrationRefused:
@@ -123,20 +125,24 @@ def propose(target: Target[E], request: Request) -> Proposal[E]:
     """
     edit = target.plan(request.calibration)
     refusals = check_gates(GateContext(request, edit, target.cell))
-    return Proposal(target, edit, refusals, request.evidence)
+    return Proposal(target, request, edit, refusals)
 
 
 def apply(proposal: Proposal[E], now: datetime, *, audit: Path | None = None, who: str = "") -> Written | None:
-    """Make a proposed change.
+    """Make a proposed change, and enter it in audit log and history.
+
+    The history is part of the audit log: of a target without a cell there is none.
 
     Args:
         proposal: without refusals.
         now: time for the name of the backup, and for the audit.
-        audit: file that records the beginning before anything is replaced, the end, and refusals; None for none.
+        audit: file that records the beginning before anything is replaced, the end, the calibration, and refusals;
+            None for none of it.
         who: the operator or the job.
 
     Returns:
-        the change, None where there was nothing to write.
+        the change, None where there was nothing to write. What is written is not undone where the history cannot take
+        it: a warning is logged, and the change says why.
 
     Raises:
         CalibrationRefused: a check failed; every failed one is listed.
@@ -146,22 +152,28 @@ def apply(proposal: Proposal[E], now: datetime, *, audit: Path | None = None, wh
     """
     edit = proposal.edit
     recorder = _Recorder(audit, who, now, edit.subject)
-    details = {**proposal.target.details(edit), **proposal.evidence}
+    details = {**proposal.target.details(edit), **proposal.request.evidence}
     if proposal.refusals:
         listed = [{"gate": one.gate.value, "subject": one.subject, "found": one.found} for one in proposal.refusals]
         recorder.end(AuditAction.REFUSED, {"refusals": listed, **details})
         raise proposal.error
     if not edit.has_effect:
         recorder.end(AuditAction.NOTHING_TO_DO, {"sha256_found": sha256(edit.after), **details})
+        _complete_history(proposal, recorder)
         return None
     actions = (AuditAction.APPLY_BEGUN, AuditAction.APPLIED)
-    return _write(proposal.target, edit, recorder, actions, details, details)
+    written = _write(proposal.target, edit, recorder, actions, details, details)
+    try:
+        return replace(written, not_in_history=_complete_history(proposal, recorder))
+    except BaseException as error:  # an interrupt: the write is done
+        error.add_note(f"kept: {_IN_PLACE.format(edit.subject)}")
+        raise
 
 
 def rollback(
     target: Target[E], now: datetime, *, audit: Path | None = None, who: str = "", planned: E | None = None
 ) -> Written:
-    """Restore the content before the last write.
+    """Restore the content before the last write, and enter that in audit log and history, which are one.
 
     The replaced content is kept as well, so that a second rollback undoes the first. A file that was deleted comes
     back as it was before the last write.
@@ -213,10 +225,39 @@ def _write(
             if made:
                 error.add_note(f"kept: {_IN_PLACE.format(edit.subject)}")
             raise
-        if begun is None:
-            return written
-        ended = recorder.end(actions[1], {"begun": begun.number})
-        return replace(written, audit_sha256=(ended or begun).sha256)
+        if begun is not None:
+            recorder.end(actions[1], {"begun": begun.number})
+        return written
+
+
+def _complete_history(proposal: Proposal[E], recorder: _Recorder) -> str:
+    """Enter the calibration whose gains the target has now; return why it could not be entered, empty if it was.
+
+    The target may have had them before: their writer was killed, or they were entered by hand.
+    """
+    cell = proposal.target.cell
+    ledger = None if cell is None or recorder.audit is None else Ledger.of(cell, recorder.audit)
+    if ledger is None:
+        return ""
+    request = proposal.request
+    digest = sha256(request.signed)
+    try:
+        enter_calibration(ledger, request.calibration, digest=digest, who=recorder.who, at=recorder.at)
+        if not proposal.edit.has_effect and read_history(ledger).in_force(recorder.subject) != digest:
+            details = {
+                "action": WriteAction.APPLIED.value,
+                "begun": None,
+                "calibration": {"sha256": digest, "cell": ledger.cell.name},
+                "sha256_after": sha256(proposal.edit.after),
+            }
+            recorder.begin(AuditAction.WRITE_FOUND, details)
+    except Exception as error:  # noqa: BLE001 - the target has these gains: no error of the history may call that undone
+        _LOG.warning(
+            "the history does not have this write: %s; `drivegain history CELL --add CALIBRATION` enters it",
+            evidence(error),
+        )
+        return evidence(error)
+    return ""
 
 
 _IN_PLACE = "{} has the new content, complete; the history lacks this write"
@@ -248,7 +289,7 @@ class _Recorder:
         if self.audit is None:
             return None
         try:
-            return append(self.audit, action, at=self.at, who=self.who, subject=self.subject, details=details)
+            return record_write(self.audit, action, at=self.at, who=self.who, subject=self.subject, details=details)
         except OSError as error:
             raise OutputFailed(
                 str(self.audit),

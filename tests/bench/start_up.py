@@ -26,7 +26,7 @@ def start_up(out: Path, log: Path, repeats: int, environment: dict[str, str]) ->
     """
     folder = out / "start-up"
     shutil.rmtree(folder, ignore_errors=True)
-    shutil.copytree("configs", folder, ignore=shutil.ignore_patterns("*.jsonl", "*.sqlite*"))
+    shutil.copytree("configs", folder, ignore=shutil.ignore_patterns("*.jsonl*", "*.sqlite*"))
     cell = str(folder / "cells" / CELL.name)
     commands = {f"{listed.name} --help": [listed.name, "--help"] for listed in VERBS}
     commands |= {"scan": ["scan", cell, "--wait", "0.05"], "info": ["info", str(log)], "history": ["history", cell]}

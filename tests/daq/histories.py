@@ -6,11 +6,16 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import numpy as np
 
+from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import encode
-from daq.ledger.store import HistoryStore
+from daq.environment import shipped_configurations
+from daq.ledger.audit import AuditAction, AuditEntry, append
+from daq.ledger.history import History
+from daq.ledger.ledger import Ledger, enter_calibration, read_history
 from ident.calibration import Calibration
 from tests.daq.calibrations import demo_calibration, recorded
 
@@ -47,18 +52,70 @@ def digest_of(calibration: Calibration) -> str:
     return hashlib.sha256(encode(calibration)).hexdigest()
 
 
-def enter(store: HistoryStore, calibration: Calibration) -> str:
+def ledger_in(folder: Path) -> Ledger:
+    """The ledger of the demo cell with its audit log in a folder."""
+    demo = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    return Ledger(demo, folder / "demo.audit.jsonl")
+
+
+def ledger_of(cell: Path) -> Ledger:
+    """The ledger of a cell file."""
+    ledger = Ledger.of(load_cell(cell))
+    assert ledger is not None
+    return ledger
+
+
+def history_of(cell: Path) -> History:
+    """The history of a cell file."""
+    return read_history(ledger_of(cell))
+
+
+def enter(ledger: Ledger, calibration: Calibration) -> str:
     """Add it at the time that it was made."""
     digest = digest_of(calibration)
-    store.add(calibration, digest=digest, at=datetime.fromisoformat(calibration.created))
+    at = datetime.fromisoformat(calibration.created)
+    enter_calibration(ledger, calibration, digest=digest, who="anna", at=at)
     return digest
 
 
-def fill(store: HistoryStore, weeks: int, true: Callable[[int], tuple[float, ...]], seed: int = 3) -> tuple[str, ...]:
+def write(
+    ledger: Ledger,
+    target: str,
+    after: str,
+    *,
+    digest: str | None = None,
+    at: datetime = BEGIN,
+    who: str = "anna",
+    before: str = "0" * 64,
+) -> AuditEntry:
+    """Enter a write to a controller as `apply` does, or as `rollback` does where it is of no calibration.
+
+    Args:
+        ledger: that gets the entries.
+        target: that was written.
+        after: SHA-256 of its content afterwards.
+        digest: of the calibration.
+        at: time.
+        who: wrote.
+        before: SHA-256 of the content before.
+
+    Returns:
+        the entry that ends the write.
+    """
+    begun, ended = AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK
+    details: dict[str, object] = {"sha256_before": before, "sha256_after": after}
+    if digest is not None:
+        begun, ended = AuditAction.APPLY_BEGUN, AuditAction.APPLIED
+        details["calibration"] = {"sha256": digest, "cell": ledger.cell.name}
+    first = append(ledger.audit, begun, at=at, who=who, subject=target, details=details)
+    return append(ledger.audit, ended, at=at, who=who, subject=target, details={"begun": first.number})
+
+
+def fill(ledger: Ledger, weeks: int, true: Callable[[int], tuple[float, ...]], seed: int = 3) -> tuple[str, ...]:
     """Enter calibrations with their noise.
 
     Args:
-        store: to fill.
+        ledger: to fill.
         weeks: number of calibrations.
         true: factor of each gain in that week.
         seed: of the noise.
@@ -69,6 +126,6 @@ def fill(store: HistoryStore, weeks: int, true: Callable[[int], tuple[float, ...
     rng = np.random.default_rng(seed)
     noise = 1.0 + STD * rng.standard_normal((weeks, 6))
     return tuple(
-        enter(store, calibration_of(week, tuple(map(float, np.array(true(week)) * noise[week]))))
+        enter(ledger, calibration_of(week, tuple(map(float, np.array(true(week)) * noise[week]))))
         for week in range(weeks)
     )

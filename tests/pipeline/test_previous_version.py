@@ -20,9 +20,10 @@ from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import load_calibration
 from daq.ledger.audit import read as read_audit
 from daq.ledger.audit import verify
-from daq.ledger.store import HistoryStore
-from daq.ledger.verify import writes_to
+from daq.ledger.history import writes_to
+from daq.ledger.ledger import Ledger, read_history
 from daq.log.reader import read_log
+from tests.daq.histories import history_of
 
 FILES = Path(__file__).parents[1] / "data" / "previous_version"
 J4 = {"wls": -9.0029, "ml": -9.6291, "tls": -9.507}
@@ -56,10 +57,7 @@ def _where_it_was_made(cell: Path) -> Cell:
 
 def _digest(cell: Path, method: str) -> str:
     """SHA-256 of a calibration, as the history has it."""
-    place = load_cell(cell).history
-    assert place is not None
-    with HistoryStore(place.store) as store:
-        (digest,) = [one.digest for one in store.entries() if one.method == method]
+    (digest,) = [one.digest for one in history_of(cell).entries if one.method == method]
     return digest
 
 
@@ -88,18 +86,19 @@ def test_the_history_is_what_was_written(cell: Path, capsys: pytest.CaptureFixtu
     (j4,) = [axis for axis in found["axes"] if axis["axis"] == "J4"]
     assert [one["why"] for one in j4["acknowledged"]] == ["gearbox exchanged"]
     audit = found["audit"]
-    assert (audit["entries"], audit["holds"], audit["flaws"], audit["open_writes"]) == (7, True, [], [])
+    # Of the SQLite file: three calibrations, and the acknowledgement with the name of the cell.
+    assert (audit["entries"], audit["holds"], audit["flaws"], audit["open_writes"]) == (7 + 4, True, [], [])
     assert (audit["history_broken"], audit["unknown_writes"]) == ([], [])
 
 
 def test_the_history_knows_all_writes_of_the_audit(cell: Path) -> None:
     declared = _where_it_was_made(cell)
     assert declared.history is not None
-    writes = writes_to(declared, verify(declared.history.audit))
+    writes = writes_to(declared, verify(declared.history.audit).entries, ())
     assert [write.ended.who.split()[0] for write in writes] == ["Ada", "Bert", "Cleo"]
-    with HistoryStore(declared.history.store) as store:
-        assert [event.who.split()[0] for event in store.events()] == ["Ada", "Bert", "Cleo"]
-        assert all(not write.digests.isdisjoint(store.audited()) for write in writes)
+    ledger = Ledger.of(declared)
+    assert ledger is not None
+    assert [event.audit for event in read_history(ledger).events] == [write.ended.sha256 for write in writes]
 
 
 def test_a_changed_line_of_the_audit_is_found(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -115,7 +114,7 @@ def test_rollback_undoes_the_last_write(cell: Path, capsys: pytest.CaptureFixtur
     _json(capsys, "rollback", "--cell", cell, "--by", "Fay")
     assert str(J4["ml"]) in controller.read_text()
     found = _json(capsys, "history", cell, "--verify")
-    assert found["audit"]["entries"] == 9
+    assert found["audit"]["entries"] == 9 + 4
     assert found["in_force"] == _digest(cell, "ml")
 
 

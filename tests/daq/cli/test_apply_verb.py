@@ -29,12 +29,12 @@ from daq.environment import login
 from daq.errors import ExitCode, UsageError
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, read, verify
-from daq.ledger.store import HistoryStore
 from daq.report.proposal import change_table
 from daq.writeback.judgement import NOTHING, Spread
 from daq.writeback.request import GainChange
 from ident.drift.change import DISPERSION
 from tests.daq.calibrations import AXES, demo_calibration, recorded, with_recordings
+from tests.daq.histories import history_of
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 
@@ -157,8 +157,7 @@ def test_the_command_shows_writes_and_rolls_back(bench: Bench, capsys: pytest.Ca
     back = [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
     assert bench.actions() == [*[AuditAction.REFUSED] * 2, *there, AuditAction.NOTHING_TO_DO, *back]
     assert read(bench.audit)[2].who == f"Ada (login {login()})"
-    with HistoryStore(bench.cell.with_name("cell.history.sqlite")) as store:
-        assert [event.target for event in store.events()] == [str(bench.controller)] * 2
+    assert [event.target for event in history_of(bench.cell).events] == [str(bench.controller)] * 2
 
 
 def test_the_audit_says_who_what_and_from_which_logs(bench: Bench) -> None:
@@ -330,32 +329,33 @@ def test_a_name_that_cannot_be_shown_is_no_name(bench: Bench, name: str) -> None
 def test_after_a_kill_behind_the_write_the_same_command_enters_the_history(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def killed(*_: object) -> None:
+    def killed(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("daq.cli.apply.record_in_history", killed)
+        patch.setattr("daq.writeback.target.enter_calibration", killed)
         assert bench.apply("--yes") == ExitCode.INTERRUPTED
     assert b"-9.2100" in bench.controller.read_bytes()
-    capsys.readouterr()
+    said = " ".join(capsys.readouterr().err.split())
+    assert "has the new content, complete; the history lacks this write" in said
+    assert "nothing was written" not in said
     for _ in range(2):
         assert bench.apply("--yes") == ExitCode.OK
         assert "these gains already" in capsys.readouterr().out
-        with HistoryStore(bench.cell.with_name("cell.history.sqlite")) as store:
-            assert store.in_force(str(bench.controller)) == store.entries()[0].digest
-            assert len(store.events()) == 1
-            assert store.audited() == {read(bench.audit)[1].sha256}
+        history = history_of(bench.cell)
+        assert history.in_force(str(bench.controller)) == history.entries[0].digest
+        assert [event.audit for event in history.events] == [read(bench.audit)[1].sha256]
     assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
     assert bench.rollback() == ExitCode.OK
     assert bench.rollback() == ExitCode.OK
-    with HistoryStore(bench.cell.with_name("cell.history.sqlite")) as store:
-        assert store.in_force(str(bench.controller)) == store.entries()[0].digest
+    history = history_of(bench.cell)
+    assert history.in_force(str(bench.controller)) == history.entries[0].digest
 
 
 def test_a_dry_run_of_what_is_there_already_enters_the_history_nothing(bench: Bench) -> None:
     bench.controller.write_bytes(bench.controller.read_bytes())
     assert bench.apply() == ExitCode.OK
-    assert not bench.cell.with_name("cell.history.sqlite").exists()
+    assert not bench.audit.exists()
 
 
 def test_a_history_that_is_none_does_not_make_a_write_undone(
@@ -517,7 +517,7 @@ def test_whatever_the_history_does_a_write_is_not_called_undone(
     def broken(*_: object, **__: object) -> None:
         raise UnicodeEncodeError("utf-8", "\udcff", 0, 1, "surrogates not allowed")
 
-    monkeypatch.setattr(HistoryStore, "add", broken)
+    monkeypatch.setattr("daq.writeback.target.enter_calibration", broken)
     assert bench.apply("--yes") == ExitCode.OK
     assert "the history does not have this write" in caplog.text + capsys.readouterr().err
     assert b"-9.2100" in bench.controller.read_bytes()
@@ -600,10 +600,7 @@ def test_a_link_of_one_s_own_is_followed_and_history_and_audit_name_the_file_beh
     assert bench.controller.is_symlink()
     assert target.read_bytes() == before
     assert {entry.subject for entry in read(bench.audit)} == {str(target), "history of demo"}
-    place = load_cell(bench.cell).history
-    assert place is not None
-    with HistoryStore(place.store) as store:
-        assert {event.target for event in store.events()} == {str(target)}
+    assert {event.target for event in history_of(bench.cell).events} == {str(target)}
     assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
 
 
@@ -638,7 +635,7 @@ def test_an_output_that_fails_says_which_were_written_before(bench: Bench, capsy
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("place", ["daq.writeback.target.append", "daq.writeback.file_target.replace_file"])
+@pytest.mark.parametrize("place", ["daq.writeback.target.record_write", "daq.writeback.file_target.replace_file"])
 def test_a_signal_within_a_write_is_heard_when_the_write_and_its_records_are_whole(
     bench: Bench,
     number: signal.Signals,

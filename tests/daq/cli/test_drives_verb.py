@@ -16,7 +16,7 @@ from daq.config.cell import Cell
 from daq.documents.calibration_file import encode
 from daq.errors import BusTaken, CalibrationRefused, UsageError
 from daq.ledger.audit import AuditAction, read
-from daq.ledger.store import HistoryStore
+from daq.ledger.ledger import Ledger, read_history
 from daq.report.controller_schemas import DriveChange, DriveRollback
 from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.bus import BusAddress
@@ -92,14 +92,15 @@ def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: p
         "created": demo_calibration().created,
         "software": demo_calibration().software,
     }
-    with HistoryStore(cell.history.store) as store:
-        assert [event.target for event in store.events()] == ["drives of cell demo"] * 2
-        assert store.in_force() is None
-        # The two entries that record how the writes ended.
-        assert store.audited() == {entry.sha256 for entry in read(cell.history.audit)[1::3]}
+    ledger = Ledger.of(cell)
+    assert ledger is not None
+    history = read_history(ledger)
+    assert [event.target for event in history.events] == ["drives of cell demo"] * 2
+    assert history.in_force() is None
+    # The two entries that record how the writes ended.
+    assert {event.audit for event in history.events} == {entry.sha256 for entry in read(cell.history.audit)[1::3]}
     _back(cell)
-    with HistoryStore(cell.history.store) as store:
-        assert store.in_force() == hashlib.sha256(encode(demo_calibration())).hexdigest()
+    assert read_history(ledger).in_force() == hashlib.sha256(encode(demo_calibration())).hexdigest()
 
 
 @pytest.mark.usefixtures("simulation")

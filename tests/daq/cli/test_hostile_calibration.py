@@ -45,7 +45,7 @@ NONSENSE: dict[str, dict[str, Any]] = {
 @pytest.fixture
 def cell(tmp_path: Path) -> Path:
     """The demo cell in a folder of its own."""
-    kept = shutil.ignore_patterns("*.jsonl", "*.sqlite*")
+    kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
     shutil.copytree(Path(__file__).parents[3] / "configs", tmp_path / "configs", ignore=kept)
     return tmp_path / "configs" / "cells" / "demo.yaml"
 

@@ -36,7 +36,7 @@ REFUSED = {ExitCode.CALIBRATION_REFUSED, ExitCode.DATA_UNFIT, ExitCode.CONFIGURA
 @pytest.fixture
 def cell(tmp_path: Path) -> Path:
     """The demo cell with a job, in a folder of its own."""
-    kept = shutil.ignore_patterns("*.jsonl", "*.sqlite*")
+    kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
     shutil.copytree(Path(__file__).parents[3] / "configs", tmp_path / "configs", ignore=kept)
     path = tmp_path / "configs" / "cells" / "demo.yaml"
     path.write_text(path.read_text() + JOB)

@@ -9,10 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
-from daq.ledger.store import HistoryStore
-from tests.daq.histories import fill
+from tests.daq.histories import fill, ledger_of
 from tests.daq.logs import DISC, demo_content, samples, write
 
 NUMERICS = ("scipy.signal", "scipy.stats", "pinocchio", "numba", "matplotlib")
@@ -76,11 +74,8 @@ def test_a_quick_verb_loads_only_libraries_that_it_uses(verb: str, checkout: Pat
 
 
 def _cell_with_history(checkout: Path, folder: Path) -> Path:
-    kept = shutil.ignore_patterns("*.jsonl", "*.sqlite*")
+    kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
     shutil.copytree(checkout / "configs", folder / "configs", ignore=kept)
     cell = folder / "configs" / "cells" / "demo.yaml"
-    place = load_cell(cell).history
-    assert place is not None
-    with HistoryStore(place.store) as store:
-        fill(store, 12, lambda _week: (1.0,) * 6)
+    fill(ledger_of(cell), 12, lambda _week: (1.0,) * 6)
     return cell

@@ -17,7 +17,7 @@ from rich.console import Console
 from daq.jobs.cell_fit import Failure, Summary
 from daq.jobs.fleet import FleetRow
 from daq.jobs.fleet_report import FIRST_COLUMNS, fleet_csv, fleet_document
-from daq.ledger.store import HistoryStore
+from daq.ledger.ledger import read_history
 from daq.ledger.watch import Series, watch
 from daq.report.history import csv_text, plot_history
 from daq.report.proposal import show
@@ -27,7 +27,7 @@ from daq.writeback.request import Request
 from daq.writeback.target import Proposal, propose
 from ident.calibration import Gain
 from tests.daq.calibrations import AXES, demo_calibration, recorded
-from tests.daq.histories import calibration_of, enter
+from tests.daq.histories import calibration_of, enter, ledger_in
 
 FORMULAS = ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1", "＝1", "a\r=1"]
 
@@ -74,11 +74,12 @@ def test_the_table_of_a_fleet_has_no_formula_and_can_be_written(text: str) -> No
 
 
 def _watched(path: Path, times: tuple[datetime, ...], unit: str = "Nm/A") -> tuple[Series, ...]:
-    with HistoryStore(path / "history.sqlite") as store:
-        for number, time in enumerate(times):
-            made = replace(calibration_of(number), created=time.isoformat())
-            enter(store, recorded(replace(made, gains=tuple(replace(gain, unit=unit) for gain in made.gains)), time))
-        return watch(store.entries(), store.acknowledgements())
+    ledger = ledger_in(path)
+    for number, time in enumerate(times):
+        made = replace(calibration_of(number), created=time.isoformat())
+        enter(ledger, recorded(replace(made, gains=tuple(replace(gain, unit=unit) for gain in made.gains)), time))
+    history = read_history(ledger)
+    return watch(history.entries, history.acknowledgements)
 
 
 def test_the_table_of_a_history_has_no_formula(tmp_path: Path) -> None:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import sqlite3
-from contextlib import closing
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,12 @@ import pytest
 from daq.cli.app import main
 from daq.documents.session_state import Outcome
 from daq.errors import CalibrationRefused, ExitCode, HistoryUnreadable
-from daq.ledger.audit import AuditAction
-from daq.ledger.store import HistoryStore
+from daq.ledger.audit import AuditAction, append, read
 from daq.workflow.record import RecordingRequest
 from daq.writeback.signature import generate
 from drivers.errors import DriveFault
 from ident.errors import ModelContradicted
+from tests.daq.histories import history_of
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import Rig
 
@@ -47,8 +46,8 @@ def test_a_change_waits_for_a_person_who_applies_it_with_the_command_that_was_sh
     assert main(command.split()[1:]) == ExitCode.OK
     capsys.readouterr()
     assert rig.controller.read_bytes() != before
-    with HistoryStore(rig.cells / "demo.history.sqlite") as store:
-        assert store.in_force(str(rig.controller)) == rig.audit[2].details["calibration_sha256"]
+    in_force = history_of(rig.cell_file).in_force(str(rig.controller))
+    assert in_force == rig.audit[2].details["calibration_sha256"]
     # The next week nothing is new: the σ of what the person applied is known from the history.
     rig.clock.go_on(days=7)
     assert rig.job().outcome is Outcome.UNCHANGED
@@ -135,10 +134,9 @@ def test_a_timer_over_many_weeks(tmp_path: Path, made: Made) -> None:
     # The last four, and the one whose gains are in force: its logs are what the controller rests on.
     assert len(rig.sessions) == 5
     assert rig.sessions[0].state.outcome is Outcome.APPLIED
-    with HistoryStore(rig.cells / "demo.history.sqlite") as store:
-        fitted = rig.sessions[0].state.fitted
-        assert fitted is not None
-        assert store.in_force() == fitted.calibration_sha256
+    fitted = rig.sessions[0].state.fitted
+    assert fitted is not None
+    assert history_of(rig.cell_file).in_force() == fitted.calibration_sha256
     assert len(rig.backups) == 2
     begun, ended = (
         [entry for entry in rig.audit if entry.action is action]
@@ -151,9 +149,8 @@ def test_a_write_that_the_history_does_not_contain_is_known_by_its_numbers(tmp_p
     """Their writer was killed right after the write: taken for exact, they would differ from each new one too often."""
     rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160)
     assert rig.job().outcome is Outcome.APPLIED
-    with closing(sqlite3.connect(rig.cells / "demo.history.sqlite")) as history:
-        history.execute("DELETE FROM event")
-        history.commit()
+    _forget_the_write(rig)
+    assert history_of(rig.cell_file).events == ()
     rig.clock.go_on(days=7)
     assert rig.job().outcome is Outcome.UNCHANGED
     decision = rig.sessions[-1].state.decision
@@ -196,11 +193,8 @@ def test_what_is_written_stays_reported_as_written_whatever_becomes_of_the_histo
     apply = rig.tools.apply
 
     def breaks_the_history(*given: Any, **further: Any) -> Any:
-        written = apply(*given, **further)
-        with closing(sqlite3.connect(rig.cells / "demo.history.sqlite")) as history:
-            history.execute("DROP TABLE event")
-            history.commit()
-        return written
+        (rig.cells / "demo.history.sqlite").write_bytes(b"no database at all" * 100)
+        return apply(*given, **further)
 
     rig.tools = replace(rig.tools, apply=breaks_the_history)
     before = rig.controller.read_bytes()
@@ -233,6 +227,17 @@ def test_a_calibration_that_a_second_person_must_sign_says_so_in_what_is_to_do(
     assert main(options.replace("NAME", "bob").split()) == ExitCode.OK
     assert main(apply.split()[1:]) == ExitCode.OK
     capsys.readouterr()
+
+
+def _forget_the_write(rig: Rig) -> None:
+    """Take the only write out of the audit log, as if its writer had had another one."""
+    audit = rig.cells / "demo.audit.jsonl"
+    entries = read(audit)
+    audit.unlink()
+    for one in entries:
+        if one.action not in (AuditAction.APPLY_BEGUN, AuditAction.APPLIED):
+            at = datetime.fromisoformat(one.at)
+            append(audit, one.action, at=at, who=one.who, subject=one.subject, details=one.details)
 
 
 def failing_once(rig: Rig) -> Any:

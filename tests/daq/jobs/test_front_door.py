@@ -14,6 +14,9 @@ from typing import Any
 import pytest
 
 import daq
+from daq.cli.app import main
+from daq.files import sha256
+from tests.daq.histories import history_of
 from tests.daq.jobs.made import Made
 from tests.daq.jobs.rig import Rig
 
@@ -59,6 +62,12 @@ def test_the_documented_lines_write_the_gains(
     assert capsys.readouterr().out.count("±") == len(calibration.gains) == 6
     assert given["proposal"].refusals == ()
     assert controller.read_bytes() != before.read_bytes()
+    # Written with audit log and history, of which nothing is missing.
+    history = history_of(Path("cells/press.yaml"))
+    (entry,) = history.entries
+    assert [(event.who, event.digest) for event in history.events] == [("Ada", entry.digest)]
+    assert history.in_force(str(controller.resolve())) == sha256(Path("calibration.yaml").read_bytes())
+    assert main(["history", "cells/press.yaml", "--verify"]) == 0
     # The same numbers as the job's fit of the same logs.
     assert [gain.value for gain in calibration.gains] == [gain.value for gain in made.calibration.gains]
     (validation,) = daq.validate(calibration, [Path("held-out.mcap")])

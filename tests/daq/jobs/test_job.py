@@ -13,9 +13,9 @@ from daq.documents.session_state import Outcome
 from daq.errors import ExitCode
 from daq.jobs import session as sessions
 from daq.jobs.recording import basis_of
-from daq.ledger.audit import AuditAction
-from daq.ledger.store import HistoryStore
+from daq.ledger.audit import AuditAction, noted_heads
 from daq.report.schemas import JobReport
+from tests.daq.histories import history_of
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import WHO, Rig
 
@@ -46,12 +46,11 @@ def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_records_it
     ]
     assert rig.audit[-1].details["outcome"] == "applied"
     assert rig.audit[-1].sha256 == session.state.audit_sha256
-    with HistoryStore(rig.cells / "demo.history.sqlite") as store:
-        assert [event.who for event in store.events()] == [WHO]
-        assert store.in_force(str(rig.controller)) == rig.audit[-1].details["calibration_sha256"]
-        # By which `history --verify` notices an audit whose end was cut off.
-        assert store.audited() <= {entry.sha256 for entry in rig.audit}
-        assert len(store.audited()) == 1
+    history = history_of(rig.cell_file)
+    assert [(event.who, event.audit) for event in history.events] == [(WHO, rig.audit[3].sha256)]
+    assert history.in_force(str(rig.controller)) == rig.audit[-1].details["calibration_sha256"]
+    # By which `history --verify` notices an audit whose end was cut off.
+    assert noted_heads(rig.cells / "demo.audit.jsonl") == (rig.audit[-1].sha256,)
     # The numbers in the file were the manufacturer's: of none of them a σ is known.
     assert session.state.decision is not None
     assert {gain.old_std for gain in session.state.decision.gains} == {0.0}
@@ -73,8 +72,7 @@ def test_the_rollback_and_its_rollback_to_what_a_job_wrote_is_known(tmp_path: Pa
     known: list[str | None] = []
     for _ in range(2):
         assert main(["rollback", "--cell", str(rig.cell_file), "--by", "a person"]) == ExitCode.OK
-        with HistoryStore(rig.cells / "demo.history.sqlite") as store:
-            known.append(store.in_force(target))
+        known.append(history_of(rig.cell_file).in_force(target))
     assert known == [None, digest]
 
 

@@ -19,11 +19,11 @@ from daq.documents.session_state import Outcome
 from daq.errors import ExitCode
 from daq.jobs.context import Tools
 from daq.ledger.audit import AuditAction
-from daq.ledger.ledger import Ledger, Verification
-from daq.ledger.store import HistoryStore
+from daq.ledger.ledger import Verification, verify_ledger
 from daq.workflow.record import RecordingRequest
 from daq.writeback.file_target import FileTarget
 from daq.writeback.target import rollback
+from tests.daq.histories import history_of, ledger_of
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import Rig
 
@@ -90,8 +90,8 @@ def applied_once(rig: Rig) -> None:
     assert actions[0] is AuditAction.RECALIBRATION_BEGUN
     assert actions[-1] is AuditAction.RECALIBRATION_ENDED
     assert len(rig.backups) == 1
-    with HistoryStore(rig.cells / "demo.history.sqlite") as store:
-        assert len(store.events()) == len(store.entries()) == 1
+    history = history_of(rig.cell_file)
+    assert len(history.events) == len(history.entries) == 1
     assert rig.job().outcome is Outcome.NOT_DUE
 
 
@@ -164,13 +164,10 @@ def finished_from_any_moment(rig: Rig, wait_s: float) -> tuple[bool, bool]:
     before = rig.controller.read_bytes()
     killed = killed_after(rig, wait_s)
     left = rig.controller.read_bytes()
-    with HistoryStore(rig.cells / "demo.history.sqlite") as store:
-        entered = bool(store.events())
-    found = _verify(rig)
-    assert found.verdict.holds
-    # Killed between the two, a row of the audit is not in the index yet: verify says so, and the next job enters it.
-    assert all("found no such row, expected one as" in flaw for flaw in found.broken)
-    assert found.broken or found.complete == (left == before or entered)
+    entered = bool(history_of(rig.cell_file).events)
+    found = _verified(rig)
+    # Killed before it ended its write, it left a begin: verify says so, and the next job ends it.
+    assert found.complete == (left == before or entered)
     rig.clock.go_on(minutes=10)
     assert rig.job().exit_code == ExitCode.OK
     after = rig.controller.read_bytes()
@@ -182,16 +179,9 @@ def finished_from_any_moment(rig: Rig, wait_s: float) -> tuple[bool, bool]:
     return killed, left == after
 
 
-def _verify(rig: Rig) -> Verification:
-    """`drivegain history --verify`."""
-    assert rig.cell.history is not None
-    with Ledger(rig.cell, rig.cell.history, "a test") as ledger:
-        return ledger.verify()
-
-
 def _verified(rig: Rig) -> Verification:
-    """The same of an audit that holds and a history without a flaw, whatever it lacks."""
-    found = _verify(rig)
+    """`drivegain history --verify`, of an audit that holds and a history without a flaw, whatever it lacks."""
+    found = verify_ledger(ledger_of(rig.cell_file))
     assert found.verdict.holds
     assert found.broken == ()
     return found

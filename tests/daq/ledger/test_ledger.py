@@ -1,278 +1,380 @@
-"""The history is an index of the audit log: what is killed in between is repaired, and all of it can be made anew."""
+"""The ledger of a cell: one chain of entries, and the history that is folded from it."""
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import random
 import shutil
-import sqlite3
-from contextlib import closing
-from datetime import timedelta
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from daq.cli.app import main
-from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
-from daq.config.policy import HistoryPlace
-from daq.ledger.audit import AuditAction, append, read
-from daq.ledger.entry import WriteAction
-from daq.ledger.ledger import Ledger, rebuild
-from daq.ledger.store import HistoryStore
-from tests.daq.histories import BEGIN, calibration_of, digest_of, enter
+from daq.documents.calibration_file import decode, encode
+from daq.errors import DataError, OutputFailed, exit_code
+from daq.ledger.audit import AuditAction, append, read, verify
+from daq.ledger.entry import Acknowledgement, WriteAction, iso, utc
+from daq.ledger.ledger import Ledger, acknowledge, enter_calibration, read_history, record_session, record_write
+from tests.daq.calibrations import AXES, demo_calibration
+from tests.daq.histories import BEGIN, calibration_of, digest_of, enter, history_of, ledger_in, ledger_of, write
 
-OTHER = "/other/controller.yaml"
-
-
-class Bench:
-    """A cell with its ledger.
-
-    Args:
-        file: of the cell.
-    """
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        self.cell: Cell = load_cell(file)
-        assert self.cell.history is not None
-        self.place: HistoryPlace = self.cell.history
-        self.controller = str(self.cell.controller_path)
-
-    def ledger(self) -> Ledger:
-        return Ledger(self.cell, self.place, "anna")
-
-    def write(self, week: int, target: str | None = None) -> str:
-        """Enter a calibration, and write it as `apply` does; SHA-256 of the entry that ends the write."""
-        with self.ledger() as ledger:
-            digest = enter(ledger, calibration_of(week))
-            entry = self.append_write(digest, week, target)
-            at = BEGIN + timedelta(weeks=week)
-            ledger.applied(
-                digest, at=at, who="anna", target=target or self.controller, audit=entry, sha256_after=digest[::-1]
-            )
-        return entry
-
-    def append_write(self, digest: str, week: int, target: str | None = None) -> str:
-        at, subject = BEGIN + timedelta(weeks=week), target or self.controller
-        details = {
-            "sha256_before": "0" * 64,
-            "sha256_after": digest[::-1],
-            "calibration": {"sha256": digest, "cell": self.cell.name},
-        }
-        begun = append(self.place.audit, AuditAction.APPLY_BEGUN, at=at, who="anna", subject=subject, details=details)
-        ended = append(
-            self.place.audit, AuditAction.APPLIED, at=at, who="anna", subject=subject, details={"begun": begun.number}
-        )
-        return ended.sha256
-
-    def rows(self) -> tuple[object, ...]:
-        """All that the history has."""
-        with HistoryStore(self.place.store) as store:
-            entries = store.entries()
-            return entries, store.events(), store.acknowledgements(), [store.document(one.digest) for one in entries]
-
-    def rebuild(self) -> bool:
-        return rebuild(self.cell, self.place, who="anna", at=BEGIN).trusted
-
-    def verify(self) -> int:
-        return main(["history", str(self.file), "--verify"])
+FORK = multiprocessing.get_context("fork")
+NO_ONE = 65534
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Bench:
+def cell(tmp_path: Path) -> Path:
     """The demo cell in a folder of its own."""
-    kept = shutil.ignore_patterns("*.jsonl", "*.sqlite*")
+    kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
     shutil.copytree(Path(__file__).parents[3] / "configs", tmp_path / "configs", ignore=kept)
-    return Bench(tmp_path / "configs" / "cells" / "demo.yaml")
+    return tmp_path / "configs" / "cells" / "demo.yaml"
 
 
-def test_the_history_is_made_anew_from_the_audit_alone(bench: Bench) -> None:
-    for week in range(2):
-        bench.write(week)
-    bench.write(2, OTHER)
-    with bench.ledger() as ledger:
-        enter(ledger, calibration_of(3))
-        ledger.acknowledge_change("J4", since=BEGIN, at=BEGIN, who="anna", why="gearbox changed")
-    before, entries = bench.rows(), len(read(bench.place.audit))
-    assert bench.verify() == 0
-    bench.place.store.unlink()
-    bench.rebuild()
-    assert bench.rows() == before
-    assert len(read(bench.place.audit)) == entries
-    assert bench.verify() == 0
+@pytest.fixture
+def ledger(tmp_path: Path) -> Ledger:
+    """An empty ledger."""
+    return ledger_in(tmp_path)
 
 
-def test_a_broken_history_is_made_anew_and_kept(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
-    bench.write(0)
-    before = bench.rows()
-    bench.place.store.write_bytes(b"no history" * 1000)
-    assert main(["history", str(bench.file), "--rebuild", "--verify"]) == 0
-    assert "The old history was broken" in " ".join(capsys.readouterr().err.split())
-    assert bench.rows() == before
-    (kept,) = bench.file.parent.glob("*.bak")
-    assert kept.read_bytes() == b"no history" * 1000
+def test_without_a_file_it_is_empty_and_makes_none(ledger: Ledger) -> None:
+    history = read_history(ledger)
+    assert not any((history.entries, history.events, history.acknowledgements))
+    assert history.in_force() is None
+    assert not ledger.audit.exists()
 
 
-@pytest.mark.parametrize(
-    "change",
-    ["DELETE FROM event", "UPDATE event SET who = 'kim'", "DELETE FROM gain", "UPDATE acknowledgement SET why = 'x'"],
-)
-def test_what_someone_changed_in_the_history_never_gets_into_the_audit(bench: Bench, change: str) -> None:
-    bench.write(0)
-    with bench.ledger() as ledger:
-        ledger.acknowledge_change("J4", since=BEGIN, at=BEGIN, who="anna", why="gearbox changed")
-    before, audit = bench.rows(), bench.place.audit.read_bytes()
-    with closing(sqlite3.connect(bench.place.store)) as other:
-        other.execute(change)
-        other.commit()
-    assert bench.verify() == 4
-    assert not bench.rebuild()
-    assert (bench.rows(), bench.place.audit.read_bytes()) == (before, audit)
-    assert bench.verify() == 0
+def test_a_calibration_comes_back_as_it_was(ledger: Ledger) -> None:
+    given_ = demo_calibration()
+    digest = digest_of(given_)
+    assert enter_calibration(ledger, given_, digest=digest, who="anna", at=BEGIN)
+    (entry,) = read_history(ledger).entries
+    (entered,) = read(ledger.audit)
+    document = str(entered.details["document"]).encode()
+    assert document == encode(given_)
+    assert decode(document, "document") == given_
+    assert entry.gains == given_.gains
+    assert (entry.digest, entry.cell, entry.method, entry.rows) == (digest, "demo", "ml", 14400)
+    assert (entry.error_percent, entry.holdout_percent) == (3.2, 3.3)
+    assert entry.created == datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
+    assert entry.entered == BEGIN
+    assert not entry.applied
 
 
-def test_a_history_of_an_earlier_version_enters_the_audit_once(bench: Bench) -> None:
-    """It has calibrations, and a write without an entry that ends it, which the audit has not."""
-    first = bench.append_write(digest_of(calibration_of(0)), 0)
-    with HistoryStore(bench.place.store) as store:
-        one, two = (enter(store, calibration_of(week)) for week in range(2))
-        target, after = bench.controller, "2" * 64
-        store.applied(one, at=BEGIN, who="anna", target=target, audit=first, sha256_after=one[::-1])
-        store.applied(two, at=BEGIN + timedelta(days=1), who="kim", target=target, sha256_after=after)
-    third = bench.append_write(one, 2)
-    with HistoryStore(bench.place.store) as store:
-        at = BEGIN + timedelta(weeks=2)
-        store.applied(one, at=at, who="anna", target=target, audit=third, sha256_after=one[::-1])
-    assert bench.verify() == 0
-    assert bench.rebuild()
-    bench.place.store.unlink()
+def test_the_same_file_is_entered_once(ledger: Ledger) -> None:
+    digest = enter(ledger, calibration_of(0))
+    assert not enter_calibration(ledger, calibration_of(0), digest=digest, who="anna", at=BEGIN)
+    assert len(read(ledger.audit)) == 1
+    # Two processes at once may both find that it is not there.
+    (entry,) = read(ledger.audit)
+    later = {**entry.details, "entered": iso(BEGIN + timedelta(hours=1))}
+    append(ledger.audit, entry.action, at=BEGIN, who="kim", subject=entry.subject, details=later)
+    (found,) = read_history(ledger).entries
+    assert found.entered == BEGIN
+
+
+def test_entries_are_in_the_order_in_which_they_were_fitted(ledger: Ledger) -> None:
+    for week in (3, 0, 2, 1):
+        enter(ledger, calibration_of(week))
+    # Of another time zone, and at another spelling of it.
+    late = replace(
+        calibration_of(0),
+        created=(BEGIN + timedelta(hours=1)).astimezone(timezone(-timedelta(hours=9))).isoformat(),
+    )
+    enter(ledger, late)
+    found = [entry.created for entry in read_history(ledger).entries]
+    assert found == [BEGIN, BEGIN + timedelta(hours=1), *(BEGIN + timedelta(weeks=week) for week in (1, 2, 3))]
+
+
+def test_a_calibration_without_a_time_has_that_of_its_entry(ledger: Ledger) -> None:
+    timeless = replace(calibration_of(0), created="yesterday")
+    enter_calibration(ledger, timeless, digest="1" * 64, who="anna", at=BEGIN)
+    assert read_history(ledger).entries[0].created == BEGIN
+
+
+@pytest.mark.parametrize("different", ["cell", "axes", "unit"])
+def test_what_cannot_be_compared_is_refused(ledger: Ledger, different: str) -> None:
+    known = calibration_of(0)
+    other = {
+        "cell": replace(calibration_of(1), cell="another"),
+        "axes": replace(calibration_of(1), gains=known.gains[:5]),
+        "unit": replace(calibration_of(1), gains=(*known.gains[:5], replace(known.gains[5], unit="Nm/A_peak"))),
+    }[different]
+    enter(ledger, known)
+    with pytest.raises(DataError) as refused:
+        enter(ledger, other)
+    assert len(read(ledger.audit)) == len(read_history(ledger).entries) == 1
+    assert exit_code(DataError) == 4
+    assert "nothing was entered" in refused.value.remedy
+
+
+def test_what_is_applied_and_rolled_back_is_reported(ledger: Ledger) -> None:
+    first = enter(ledger, calibration_of(0))
+    second = enter(ledger, calibration_of(1))
+    reported = []
+
+    def in_force() -> None:
+        reported.append({None: "-", first: "first", second: "second"}[read_history(ledger).in_force("x.yaml")])
+
+    write(ledger, "x.yaml", "1", digest=first)
+    in_force()
+    write(ledger, "x.yaml", "0")
+    in_force()
+    write(ledger, "x.yaml", "1")  # undoes the rollback
+    in_force()
+    write(ledger, "x.yaml", "2", digest=second)
+    in_force()
+    write(ledger, "another.yaml", "1", digest=second)
+    write(ledger, "x.yaml", "1")
+    in_force()
+    assert reported == ["first", "-", "first", "second", "first"]
+    history = read_history(ledger)
+    assert history.in_force("another.yaml") == second
+    assert history.in_force() == first
+    assert [event.action for event in history.entries[0].events] == [
+        WriteAction.APPLIED,
+        WriteAction.ROLLED_BACK,
+        WriteAction.ROLLED_BACK,
+    ]
+    assert all(entry.applied for entry in history.entries)
+
+
+def test_what_a_person_entered_between_two_writes_is_no_calibration(ledger: Ledger) -> None:
+    """The target of a rollback follows from the content, not from the order of the writes."""
+    first = enter(ledger, calibration_of(0))
+    second = enter(ledger, calibration_of(1))
+    write(ledger, "x.yaml", "1", digest=first)
+    write(ledger, "x.yaml", "2", digest=second)  # over what was entered by hand
+    write(ledger, "x.yaml", "entered by hand")
+    assert read_history(ledger).in_force("x.yaml") is None
+    write(ledger, "x.yaml", "2")
+    assert read_history(ledger).in_force("x.yaml") == second
+
+
+def test_acknowledgements_come_back(ledger: Ledger) -> None:
+    later = BEGIN + timedelta(days=1)
+    acknowledge(ledger, "J4", since=BEGIN, at=later, who="anna", why="gearbox — changed")
+    (entry,) = read(ledger.audit)
+    expected = Acknowledgement("J4", BEGIN, later, "anna", "gearbox — changed", entry.sha256)
+    assert read_history(ledger).acknowledgements == (expected,)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.datetimes(min_value=datetime(2, 1, 1), max_value=datetime(9998, 1, 1), timezones=st.timezones()))
+def test_times_are_kept_in_utc_in_their_order(at: datetime) -> None:
+    kept = iso(at)
+    # Of a time that a clock shows twice, or never, Python says that it equals none.
+    at = at.astimezone(UTC)
+    assert utc(kept, BEGIN) == at
+    assert len(kept) == len(iso(BEGIN))
+    assert kept.endswith("+00:00")
+    assert (kept < iso(BEGIN)) == (at < BEGIN)
+
+
+def test_a_time_without_its_zone_is_refused(ledger: Ledger) -> None:
+    with pytest.raises(ValueError, match="zone"):
+        enter_calibration(ledger, calibration_of(0), digest="0" * 64, who="anna", at=datetime(2026, 1, 1))
+    assert read_history(ledger).entries == ()
+
+
+def test_a_step_of_a_write_is_no_step_of_a_job(ledger: Ledger) -> None:
+    given_: dict[str, Any] = {"at": BEGIN, "who": "anna", "subject": "x", "details": {}}
+    with pytest.raises(ValueError, match="no step of a job"):
+        record_session(ledger.audit, AuditAction.APPLIED, **given_)
+    with pytest.raises(ValueError, match="no step of a write"):
+        record_write(ledger.audit, AuditAction.RECALIBRATION_ENDED, **given_)
+    assert not ledger.audit.exists()
+
+
+def _write_on(folder: Path, week: int, written: Any, begun: Any) -> None:
+    ledger = ledger_in(folder)
+    digest = enter(ledger, calibration_of(week))
+    begun.set()
+    while True:
+        write(ledger, "x.yaml", "1", digest=digest)
+        written.value += 1
+
+
+def test_a_writer_killed_at_any_moment_leaves_a_whole_history(tmp_path: Path) -> None:
+    """Ended writes are there, others are not, and none is half."""
+    rng = random.Random(7)
+    written = FORK.RawValue("i", 0)  # without a lock, which a killed writer would keep
+    known = 0
+    for week in range(20):
+        begun = FORK.Event()
+        writer = FORK.Process(target=_write_on, args=(tmp_path, week, written, begun))
+        writer.start()
+        assert begun.wait(60)
+        writer.join(rng.uniform(0.0, 0.05))
+        assert writer.pid is not None
+        os.kill(writer.pid, signal.SIGKILL)
+        writer.join()
+        assert writer.exitcode == -signal.SIGKILL
+        ledger = ledger_in(tmp_path)
+        assert verify(ledger.audit).holds
+        history = read_history(ledger)
+        assert len(history.entries) == week + 1
+        assert all([gain.axis for gain in entry.gains] == list(AXES) for entry in history.entries)
+        # One may have been ended whose writer did not live to say so.
+        assert known <= written.value <= len(history.events) <= written.value + 1
+        written.value = known = len(history.events)
+
+
+def _add_many(folder: Path, weeks: range) -> None:
+    for week in weeks:
+        enter(ledger_in(folder), calibration_of(week))
+
+
+def test_two_processes_at_once_lose_nothing(tmp_path: Path) -> None:
+    writers = [FORK.Process(target=_add_many, args=(tmp_path, range(first, 30))) for first in (0, 10, 20)]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    assert [writer.exitcode for writer in writers] == [0, 0, 0]
+    ledger = ledger_in(tmp_path)
+    assert verify(ledger.audit).holds
+    assert len(read_history(ledger).entries) == 30
+
+
+@contextmanager
+def _no_one() -> Iterator[None]:
+    """Without root's leave to write everywhere."""
+    if os.geteuid() != 0:
+        yield
+        return
+    os.seteuid(NO_ONE)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+
+
+def test_where_nothing_can_be_written_reading_works(ledger: Ledger) -> None:
+    enter(ledger, calibration_of(0))
+    ledger.audit.chmod(0o444)
+    ledger.audit.parent.chmod(0o555)
+    for folder in ledger.audit.parents[1:4]:
+        folder.chmod(folder.stat().st_mode | 0o011)
+    try:
+        with _no_one():
+            assert len(read_history(ledger).entries) == 1
+            with pytest.raises(OutputFailed):
+                enter(ledger, calibration_of(1))
+        assert len(read_history(ledger).entries) == 1
+    finally:
+        ledger.audit.parent.chmod(0o755)
+
+
+def test_a_folder_that_is_not_there_is_reported(tmp_path: Path) -> None:
+    with pytest.raises(OutputFailed):
+        enter(ledger_in(tmp_path / "none"), calibration_of(0))
+
+
+def test_a_folder_may_have_any_name(tmp_path: Path) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/b\xff ?#%"))
+    folder.mkdir()
+    digest = enter(ledger_in(folder), calibration_of(0))
+    assert [one.digest for one in read_history(ledger_in(folder)).entries] == [digest]
+
+
+def test_a_write_of_a_killed_process_is_entered_by_the_next_one(cell: Path) -> None:
+    """The controller has its content, and no entry ends it."""
+    ledger = ledger_of(cell)
+    digest = enter(ledger, calibration_of(0))
+    controller = load_cell(cell).controller_path
+    assert controller is not None
+    controller.write_bytes(b"new")
+    subject = str(controller.resolve())
+    details = {
+        "sha256_before": "0" * 64,
+        "sha256_after": "11507a0e2f5e69d5dfa40a62a1bd7b6ee57e6bcd85c67c9b8431b36fff21c437",
+        "calibration": {"sha256": digest, "cell": "demo"},
+    }
+    append(ledger.audit, AuditAction.APPLY_BEGUN, at=BEGIN, who="anna", subject=subject, details=details)
+    assert history_of(cell).events == ()  # a history does not depend on what a file is today
+    assert main(["history", str(cell), "--verify"]) == 4
     for _ in range(2):
-        bench.rebuild()
-        with HistoryStore(bench.place.store) as store:
-            assert [(event.digest, event.who) for event in store.events()] == [
-                (one, "anna"),
-                (two, "kim"),
-                (one, "anna"),
-            ]
-        actions = [entry.action for entry in read(bench.place.audit)]
-        assert actions.count(AuditAction.CALIBRATION_ENTERED) == 2
+        enter(ledger, calibration_of(0))
+        assert [(event.who, event.at) for event in history_of(cell).events] == [("anna", BEGIN)]
+        actions = [entry.action for entry in read(ledger.audit)]
         assert actions.count(AuditAction.WRITE_FOUND) == 1
-        assert bench.verify() == 0
+    assert main(["history", str(cell), "--verify"]) == 0
+    controller.write_bytes(b"edited")
+    assert len(history_of(cell).events) == 1
+    # Its writer was not killed after all, only late.
+    append(ledger.audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject=subject, details={"begun": 2})
+    assert len(history_of(cell).events) == 1
 
 
-def test_a_process_killed_before_the_index_is_repaired_by_the_next(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def killed(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch, bench.ledger() as ledger:
-        patch.setattr(HistoryStore, "add", killed)
-        patch.setattr(HistoryStore, "acknowledge", killed)
-        with pytest.raises(KeyboardInterrupt):
-            enter(ledger, calibration_of(0))
-        with pytest.raises(KeyboardInterrupt):
-            ledger.acknowledge_change("J4", since=BEGIN, at=BEGIN, who="anna", why="gearbox changed")
-    bench.append_write(digest_of(calibration_of(0)), 0)
-    assert bench.verify() == 4
-    with bench.ledger() as ledger:
-        assert [write.action for write in ledger.catch_up()] == [WriteAction.APPLIED]
-        assert (len(ledger.entries()), len(ledger.acknowledgements())) == (1, 1)
-    assert bench.verify() == 0
+def test_the_next_write_proves_the_killed_one_before_it(cell: Path) -> None:
+    ledger = ledger_of(cell)
+    first = enter(ledger, calibration_of(0))
+    second = enter(ledger, calibration_of(1))
+    subject = str(load_cell(cell).controller_path)
+    calibration = {"sha256": first, "cell": "demo"}
+    details = {"sha256_before": "0" * 64, "sha256_after": "1" * 64, "calibration": calibration}
+    append(ledger.audit, AuditAction.APPLY_BEGUN, at=BEGIN, who="anna", subject=subject, details=details)
+    write(ledger, subject, "2" * 64, digest=second, before="1" * 64)
+    assert [event.digest for event in history_of(cell).events] == [first, second]
+    write(ledger, subject, "1" * 64, before="2" * 64)
+    assert history_of(cell).in_force(subject) == first
+    assert main(["history", str(cell), "--verify"]) == 0
 
 
-def test_a_rollback_enters_the_killed_write_before_it(bench: Bench) -> None:
-    with bench.ledger() as ledger:
-        digest = enter(ledger, calibration_of(0))
-    bench.append_write(digest, 0)
-    details = {"sha256_before": digest[::-1], "sha256_after": "0" * 64}
-    begun = append(
-        bench.place.audit, AuditAction.ROLLBACK_BEGUN, at=BEGIN, who="anna", subject=bench.controller, details=details
-    )
-    ended = append(
-        bench.place.audit,
-        AuditAction.ROLLED_BACK,
-        at=BEGIN,
-        who="anna",
-        subject=bench.controller,
-        details={"begun": begun.number},
-    )
-    with bench.ledger() as ledger:
-        ledger.record_rolled_back(at=BEGIN, target=bench.controller, sha256_after="0" * 64, entry=ended.sha256)
-        assert [event.action for event in ledger.events()] == [WriteAction.APPLIED, WriteAction.ROLLED_BACK]
-    assert bench.verify() == 0
-
-
-def test_a_late_write_is_put_in_its_place(bench: Bench) -> None:
-    with bench.ledger() as ledger:
-        one, two = (enter(ledger, calibration_of(week)) for week in range(2))
-    bench.append_write(one, 0)
-    bench.write(1)
-    assert bench.verify() == 4
-    bench.rebuild()
-    with HistoryStore(bench.place.store) as store:
-        assert [event.digest for event in store.events()] == [one, two]
-    assert bench.verify() == 0
-
-
-def test_a_calibration_that_was_exchanged_in_the_history_is_reported(
-    bench: Bench, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Document, row and gains agree with each other: only the audit has what was entered."""
-    with bench.ledger() as ledger:
-        digest = enter(ledger, calibration_of(0))
-    bench.place.store.unlink()
-    with HistoryStore(bench.place.store) as store:
-        store.add(calibration_of(1), digest=digest, at=BEGIN)
-    assert bench.verify() == 4
-    assert "document of calibration" in " ".join(capsys.readouterr().err.split())
-    bench.place.store.unlink()
-    assert bench.verify() == 4
-    assert "found no such row" in " ".join(capsys.readouterr().err.split())
-
-
-def test_nothing_is_made_anew_from_an_audit_that_was_changed(bench: Bench) -> None:
-    bench.write(0)
-    audit = bench.place.audit
-    audit.write_bytes(audit.read_bytes().replace(b'"who":"anna"', b'"who":"kim"', 1))
-    before = bench.place.store.read_bytes()
-    assert main(["history", str(bench.file), "--rebuild"]) == 4
-    assert bench.place.store.read_bytes() == before
-    audit.unlink()
-    assert main(["history", str(bench.file), "--rebuild"]) == 4
-    assert bench.place.store.read_bytes() == before
-
-
-def test_another_cell_of_the_same_audit_has_its_own(bench: Bench) -> None:
-    bench.write(0)
-    before = bench.rows()
-    details = {"sha256_after": "1" * 64, "calibration": {"sha256": "2" * 64, "cell": "another"}}
-    begun = append(
-        bench.place.audit, AuditAction.APPLY_BEGUN, at=BEGIN, who="ben", subject=bench.controller, details=details
-    )
+def test_another_cell_of_the_same_audit_has_its_own(cell: Path) -> None:
+    ledger = ledger_of(cell)
+    subject = str(load_cell(cell).controller_path)
+    write(ledger, subject, "0" * 64, digest=enter(ledger, calibration_of(0)))
+    before = history_of(cell)
+    calibration = {"sha256": "2" * 64, "cell": "another"}
+    details = {"sha256_after": "1" * 64, "calibration": calibration}
+    begun = append(ledger.audit, AuditAction.APPLY_BEGUN, at=BEGIN, who="ben", subject=subject, details=details)
     for action, more in (
         (AuditAction.APPLIED, {"begun": begun.number}),
         (AuditAction.CALIBRATION_ENTERED, {"cell": "another", "sha256": "2" * 64, "entered": "x", "document": "y"}),
         (AuditAction.ACKNOWLEDGED, {"cell": "another", "axis": "J4", "since": BEGIN.isoformat(), "why": "z"}),
     ):
-        append(bench.place.audit, action, at=BEGIN, who="ben", subject=bench.controller, details=more)
-    bench.rebuild()
-    assert bench.rows() == before
+        append(ledger.audit, action, at=BEGIN, who="ben", subject=subject, details=more)
+    assert history_of(cell) == before
 
 
-def test_a_path_that_is_not_utf_8_is_in_the_history(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_calibration_that_cannot_be_read_is_a_finding(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Another program entered it, or a later version."""
+    ledger = ledger_of(cell)
+    enter(ledger, calibration_of(0))
+    unreadable: list[dict[str, object]] = [{"document": "no calibration"}, {"figures": {"gains": 1}}]
+    for number, more in enumerate(unreadable):
+        details = {"cell": "demo", "sha256": f"{number}" * 64, "entered": iso(BEGIN), **more}
+        append(ledger.audit, AuditAction.CALIBRATION_ENTERED, at=BEGIN, who="ben", subject="x", details=details)
+    assert len(history_of(cell).entries) == 1
+    assert main(["history", str(cell), "--verify"]) == 4
+    said = " ".join(capsys.readouterr().err.split())
+    assert "calibration 000000000000… of entry 2: its document is" in said
+    assert "calibration 111111111111… of entry 3: its figures are not those" in said
+
+
+def test_a_path_that_is_not_utf_8_is_in_the_history(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = "/other/ctl\udcff.yaml"
-    bench.write(0, other)
-    bench.write(1)
-    with bench.ledger() as ledger:
-        ledger.acknowledge_change("J4", since=BEGIN, at=BEGIN, who="anna", why="gearbox \udcff")
-        assert [event.target for event in ledger.events()] == [other, bench.controller]
-        assert ledger.in_force(other) == digest_of(calibration_of(0))
-    assert bench.verify() == 0
-    before = bench.rows()
-    bench.place.store.unlink()
-    assert main(["history", str(bench.file), "--rebuild", "--axis", "J4"]) == 0
-    assert bench.rows() == before
-    assert bench.verify() == 0
-    for arguments in (["--axis", "J4"], ["--json"], ["--csv", str(bench.file.with_suffix(".csv"))]):
-        assert main(["history", str(bench.file), *arguments]) == 0
+    ledger = ledger_of(cell)
+    subject = str(load_cell(cell).controller_path)
+    first = enter(ledger, calibration_of(0))
+    write(ledger, other, "1" * 64, digest=first)
+    write(ledger, subject, "2" * 64, digest=enter(ledger, calibration_of(1)))
+    acknowledge(ledger, "J4", since=BEGIN, at=BEGIN, who="anna", why="gearbox \udcff")
+    history = history_of(cell)
+    assert [event.target for event in history.events] == [other, subject]
+    assert history.in_force(other) == first
+    assert main(["history", str(cell), "--verify"]) == 0
+    for arguments in (["--axis", "J4"], ["--json"], ["--csv", str(cell.with_suffix(".csv"))]):
+        assert main(["history", str(cell), *arguments]) == 0
     assert "ctl\udcff" not in capsys.readouterr().out

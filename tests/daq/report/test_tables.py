@@ -20,11 +20,12 @@ from rich.table import Table
 from daq.cli.terminal import PIPE_COLUMNS
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
+from daq.jobs import fleet_report
 from daq.jobs.cell_fit import Failure, Summary
 from daq.jobs.fleet import FleetRow
-from daq.ledger.store import HistoryStore
+from daq.ledger.ledger import read_history
 from daq.ledger.watch import Series, watch
-from daq.report import bus, fit, fleet, gains, history, paper_tables, proposal, residual, urdf, validation, weighing
+from daq.report import bus, fit, gains, history, paper_tables, proposal, residual, urdf, validation, weighing
 from daq.report.log import log_lines
 from daq.report.text import WholeTable
 from daq.workflow.prediction import RecentCurrent
@@ -38,7 +39,7 @@ from ident.discovery.loop import Step
 from ident.estimators.comparison import ESTIMATORS, Comparison, EstimatorTrial
 from ident.estimators.estimate import RelativeError
 from tests.daq.calibrations import demo_calibration
-from tests.daq.histories import fill
+from tests.daq.histories import fill, ledger_in
 
 AXES = tuple(f"gantry-axis-number-{number}" for number in range(1, 15))
 GAINS = tuple(Gain(axis, -1234.5 - n, 0.0123 + 0.001 * n, "Nm/A", -1200.25 - n) for n, axis in enumerate(AXES))
@@ -56,9 +57,9 @@ def cell(checkout: Path) -> Cell:
 @pytest.fixture(scope="module")
 def series(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, tuple[Series, ...], dict[str, str]]:
     """Entries of a history, its series, and what was done with each calibration."""
-    with HistoryStore(tmp_path_factory.mktemp("tables") / "history.sqlite") as store:
-        fill(store, 6, lambda week: (1.0, 1.0, 1.0, 1.0 + 0.01 * week, 1.0, 1.0))
-        entries = store.entries()
+    ledger = ledger_in(tmp_path_factory.mktemp("tables"))
+    fill(ledger, 6, lambda week: (1.0, 1.0, 1.0, 1.0 + 0.01 * week, 1.0, 1.0))
+    entries = read_history(ledger).entries
     actions = {entry.digest: "applied by a person with quite a long name, rolled back by another" for entry in entries}
     return entries, watch(entries, ()), actions
 
@@ -194,7 +195,7 @@ def _fleet(cell: Cell, _: Any) -> Iterator[RenderableType]:
     summary = Summary(GAINS, (("load-friction", AXES[3]),), 3.21, held_out=False, partial=True)
     results: tuple[Summary | Failure, ...] = (summary, Failure("DataUnfit", "run-17.mcap lost 1234 samples", 4))
     names = ("press-4-in-hall-12-line-7", "gantry-23")
-    return fleet.fleet_view(
+    return fleet_report.fleet_view(
         [FleetRow(name, "c" * 64, (), (), one, 1234.56) for name, one in zip(names, results, strict=True)]
     )
 
@@ -219,7 +220,7 @@ EXAMPLES: dict[str, Callable[[Cell, Any], Iterable[RenderableType]]] = {
     "bus.scan_table": _scan,
     "fit.comparison_tables": _comparison,
     "fit.error_table": lambda _cell, _: [fit.error_table("Error", AXES, {"held out, before": ERROR})],
-    "fleet.fleet_view": _fleet,
+    "fleet_report.fleet_view": _fleet,
     "gains.gain_table": lambda _cell, _: [gains.gain_table(GAINS, dict.fromkeys(AXES, -1230.5), title="Gains")],
     "gains.torque_table": lambda _cell, _: [gains.torque_table([TorqueSlope(-1250.0, 0.0123, 98765)] * 14, GAINS)],
     "history.axis_table": lambda _cell, known: [history.axis_table(known[1][3], known[2])],

@@ -502,7 +502,7 @@ def test_back_and_forth(address: BusAddress, tmp_path: Path) -> None:
     actions = [entry.action for entry in read(cell.history.audit)]
     assert (
         actions
-        == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED]
+        == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.CALIBRATION_ENTERED]
         + [
             AuditAction.ROLLBACK_BEGUN,
             AuditAction.ROLLED_BACK,

@@ -40,8 +40,9 @@ OLD = b"# K. has weighed it.\ndrives:\n  J1: {gain: 32.96, kp: 120.0}   # Nm/A\n
 KEYS = {"J1": "drives.J1.gain"}
 MIN_CALLS = 50
 MIN_STATES = 8
-LEFT = re.compile(r"x\.yaml|x\.yaml\..*\.bak|audit\.jsonl|\.x\.yaml\.lock|\.x\.yaml\..*\.tmp")
-"""Files that may remain: the files themselves, whole backups, the lock file without a holder, unfinished copies."""
+LEFT = re.compile(r"x\.yaml|x\.yaml\..*\.bak|audit\.jsonl(\.head)?|\.x\.yaml\.lock|\.x\.yaml\..*\.tmp")
+"""Files that may remain: the files themselves, the note of the audit's last entry, whole backups, the lock file without
+a holder, unfinished copies."""
 
 
 @cache

@@ -25,7 +25,7 @@ DENIALS = ("nothing was", "it is as it was", "as before")
 @pytest.fixture
 def cell(tmp_path: Path) -> Path:
     """The demo cell in a folder of its own."""
-    kept = shutil.ignore_patterns("*.jsonl", "*.sqlite*")
+    kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
     shutil.copytree(Path(__file__).parents[3] / "configs", tmp_path / "configs", ignore=kept)
     return tmp_path / "configs" / "cells" / "demo.yaml"
 

@@ -179,7 +179,7 @@ def test_an_end_that_cannot_be_recorded_leaves_the_write_and_a_warning(
             raise OSError(28, "No space left on device")
         return append(path, action, **rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("daq.writeback.target.append", full_at_the_end)
+    monkeypatch.setattr("daq.writeback.target.record_write", full_at_the_end)
     proposal = propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW))
     assert apply(proposal, NOW, audit=audit, who="Ada") is not None
     assert "the audit log does not have that it is applied" in caplog.text

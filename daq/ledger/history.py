@@ -1,0 +1,314 @@
+"""The history of a cell, folded from its audit log: calibrations, writes to controllers, acknowledged changes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from daq.config.cell import Cell
+from daq.documents.calibration_file import decode
+from daq.errors import DaqError
+from daq.ledger.audit import AuditAction, AuditEntry, Content, OpenWrite, open_writes
+from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, drives_of, entry_of, figures_of, utc
+
+_ENDS = {AuditAction.APPLIED: WriteAction.APPLIED, AuditAction.ROLLED_BACK: WriteAction.ROLLED_BACK}
+_BEGINS = {AuditAction.APPLY_BEGUN: WriteAction.APPLIED, AuditAction.ROLLBACK_BEGUN: WriteAction.ROLLED_BACK}
+_NEVER = datetime.min.replace(tzinfo=UTC)
+
+
+@dataclass(frozen=True, slots=True)
+class History:
+    """All that an audit log says of the gains of a cell."""
+
+    entries: tuple[Entry, ...]  #: calibrations in the order in which they were fitted
+    events: tuple[Event, ...]  #: writes to controllers, oldest first
+    acknowledgements: tuple[Acknowledgement, ...]  #: explained changes, oldest first
+    unreadable: tuple[str, ...] = ()  #: calibrations of the audit log that cannot be read, as sentences
+
+    def in_force(self, target: str | None = None) -> str | None:
+        """Return the digest of the calibration in a target, or in the last written one; None for other numbers."""
+        events = [event for event in self.events if target in {None, event.target}]
+        return events[-1].digest if events else None
+
+
+@dataclass(frozen=True, slots=True)
+class AuditedWrite:
+    """A successful write, as the audit log reports it."""
+
+    #: The entry before the write, with its details; None where the audit log has none. Of a write that was found later,
+    #: the entry of the finding.
+    begun: AuditEntry | None
+    ended: AuditEntry  #: the entry after it; the one before it, where the writer was killed in between
+
+    @property
+    def action(self) -> WriteAction:
+        """Applied or rolled back."""
+        return {**_ENDS, **_BEGINS}.get(self.ended.action) or WriteAction(text_of(self.ended, "action"))
+
+    @property
+    def calibration(self) -> str | None:
+        """SHA-256 of the calibration, None where the audit log has none."""
+        return None if self.begun is None else calibration_of(self.begun, "sha256")
+
+    @property
+    def sha256_after(self) -> str | None:
+        """SHA-256 of the target's content after the write, None where the audit log has none."""
+        return None if self.begun is None else text_of(self.begun, "sha256_after")
+
+    def __str__(self) -> str:
+        one = self.ended
+        written = f", calibration {self.calibration[:12]}…" if self.calibration else ""
+        return f"entry {one.number} of the audit, {one.action.value} by {one.who} at {one.at} to {one.subject}{written}"
+
+
+@dataclass(frozen=True, slots=True)
+class EnteredCalibration:
+    """A calibration of the audit log."""
+
+    number: int  #: of the entry
+    digest: str  #: SHA-256 of its file
+    entered: datetime  #: when it was entered, UTC
+    document: str | None  #: the whole calibration; None where an earlier entry has it
+    figures: dict[str, Any] | None  #: as of `figures_of`; None in an entry of an earlier version
+
+
+def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
+    """Fold the entries of an audit log, oldest first, into the history of a cell; other cells may share the log.
+
+    A write without an end counts where a later entry shows that it was made: the next write found its content, or a
+    process did (`write found`). What the controller's file is by now is not asked: a history does not change by itself.
+    """
+    witnessed = [one for one in open_writes(entries, lambda _: None) if one.content is Content.AFTER]
+    events = _events(writes_to(cell, entries, witnessed, everywhere=True))
+    by_digest: dict[str | None, list[Event]] = {}
+    for event in events:
+        by_digest.setdefault(event.digest, []).append(event)
+    found: list[Entry] = []
+    unreadable: list[str] = []
+    for one in entered_calibrations(entries, cell.name):
+        try:
+            figures = one.figures or _figures_of_document(one)
+            found.append(entry_of(one.digest, cell.name, one.entered, figures, by_digest.get(one.digest, ())))
+        except DaqError as error:
+            unreadable.append(f"{_named(one)}: its document is {error.found}, expected {error.expected}")
+        except (KeyError, TypeError, ValueError) as error:
+            unreadable.append(f"{_named(one)}: its figures are not those that drivegain writes: {error}")
+    last = _units(found[-1]) if found else {}
+    comparable = [one for one in found if _units(one) == last]
+    return History(
+        entries=tuple(sorted(comparable, key=lambda one: (one.created, one.entered, one.digest))),
+        events=tuple(events),
+        acknowledgements=tuple(_acknowledgements(entries, cell.name)),
+        unreadable=tuple(unreadable),
+    )
+
+
+def _figures_of_document(one: EnteredCalibration) -> dict[str, object]:
+    """Return the figures of a calibration that an earlier version entered; parsing its document takes 7 ms."""
+    calibration = decode((one.document or "").encode(), f"entry {one.number}")
+    return figures_of(calibration, one.digest, one.entered)
+
+
+def _named(one: EnteredCalibration) -> str:
+    return f"calibration {one.digest[:12]}… of entry {one.number}"
+
+
+def _units(entry: Entry) -> dict[str, str]:
+    """Return the axes with their units; calibrations with other ones are of a history that an earlier version began."""
+    return {gain.axis: gain.unit for gain in entry.gains}
+
+
+def _events(writes: Iterable[AuditedWrite]) -> list[Event]:
+    events: list[Event] = []
+    for write in writes:
+        one = write.ended
+        at = at_of(one)
+        if at is None:
+            continue
+        digest = write.calibration
+        if write.action is WriteAction.ROLLED_BACK:
+            # Not the calibration before the last one: the content shows which gains are back, if any calibration's.
+            like = (one.subject, write.sha256_after)
+            digest = next((e.digest for e in reversed(events) if (e.target, e.sha256_after) == like), digest)
+        events.append(Event(digest, write.action, at, one.who, one.subject, one.sha256, write.sha256_after))
+    return events
+
+
+def entered_calibrations(entries: Iterable[AuditEntry], cell: str) -> list[EnteredCalibration]:
+    """Return the calibrations of a cell that an audit log has, once each, in the order in which they were entered."""
+    found: dict[str, EnteredCalibration] = {}
+    for entry in entries:
+        one = _entered_calibration(entry, cell)
+        if one is None:
+            continue
+        first = found.setdefault(one.digest, one)
+        # A later entry gives the figures of one that an earlier version has entered.
+        found[one.digest] = EnteredCalibration(
+            number=first.number,
+            digest=first.digest,
+            entered=first.entered,
+            document=first.document or one.document,
+            figures=first.figures or one.figures,
+        )
+    return list(found.values())
+
+
+def _entered_calibration(entry: AuditEntry, cell: str) -> EnteredCalibration | None:
+    if entry.action is not AuditAction.CALIBRATION_ENTERED or text_of(entry, "cell") != cell:
+        return None
+    digest = text_of(entry, "sha256")
+    entered = utc(text_of(entry, "entered") or "", _NEVER)
+    document = text_of(entry, "document")
+    figures = entry.details.get("figures")
+    known = figures if isinstance(figures, dict) else None
+    if digest is None or entered == _NEVER or (document is None and known is None):
+        return None
+    return EnteredCalibration(entry.number, digest, entered, document, known)
+
+
+def _acknowledgements(entries: Iterable[AuditEntry], cell: str) -> Iterator[Acknowledgement]:
+    for entry in entries:
+        found = acknowledgement_of(entry)
+        if found is not None and text_of(entry, "cell") == cell:
+            yield found
+
+
+def acknowledgement_of(entry: AuditEntry) -> Acknowledgement | None:
+    """Return the acknowledgement of an entry, None where it lacks a part or would silence an axis beforehand."""
+    axis = text_of(entry, "axis")
+    why = text_of(entry, "why")
+    at = at_of(entry)
+    since = utc(text_of(entry, "since") or "", _NEVER)
+    if entry.action is not AuditAction.ACKNOWLEDGED or axis is None or why is None or at is None:
+        return None
+    if not _NEVER < since <= at:
+        return None
+    return Acknowledgement(axis, since, at, entry.who, why, entry.sha256)
+
+
+def is_end(entry: AuditEntry) -> bool:
+    """Whether an entry says that a controller has other gains now."""
+    return entry.action in _ENDS or (
+        entry.action is AuditAction.WRITE_FOUND and text_of(entry, "action") in {one.value for one in WriteAction}
+    )
+
+
+def writes_to(
+    cell: Cell, entries: Sequence[AuditEntry], made: Iterable[OpenWrite], *, everywhere: bool = False
+) -> list[AuditedWrite]:
+    """Return the writes of this cell's calibrations, and the rollbacks of them, in their order.
+
+    Another cell may have the same audit log, and even the same controller file: what was written with its calibrations,
+    and rolled back from there, is in its own history.
+
+    Args:
+        cell: whose writes are wanted.
+        entries: of the audit log, oldest first.
+        made: writes without an end that were made all the same; `write found` reports some of them.
+        everywhere: include files that are not the cell's controller (`apply --to`).
+    """
+    targets = _targets(cell)
+    begun = {one.number: one for one in entries if one.action in _BEGINS}
+    unended = {one.begun.number for one in made} - {begun_by(one) for one in entries if is_end(one)}
+    found: list[AuditedWrite] = []
+    known: set[object] = set()
+    owners = dict.fromkeys(targets, cell.name)
+    for one in entries:
+        if not (is_end(one) or one.number in unended) or not (everywhere or one.subject in targets):
+            continue
+        same = _identity(one)
+        if same in known:  # two processes found it at once, or one found it before its writer ended it
+            continue
+        known.add(same)
+        itself = one.number in unended or one.action is AuditAction.WRITE_FOUND
+        write = AuditedWrite(one if itself else begun.get(begun_by(one)), one)
+        if write.action is WriteAction.APPLIED:
+            owner = None if write.begun is None else calibration_of(write.begun, "cell")
+            owners[one.subject] = owner or (cell.name if one.subject in targets else "")
+        if owners.get(one.subject) == cell.name:
+            found.insert(_place(found, one), write)
+    return found
+
+
+def _targets(cell: Cell) -> set[str]:
+    """Return the cell's own targets as an audit log names them."""
+    targets = {drives_of(cell.name)}
+    if cell.controller_path is not None:
+        # Not `resolve_links`: a link that it refuses today was followed on the day of the write.
+        targets.add(os.path.realpath(cell.controller_path))
+    return targets
+
+
+def _identity(one: AuditEntry) -> object:
+    """Return what two entries about one write have in common."""
+    number = begun_by(one)
+    if number:
+        return number
+    if one.action is AuditAction.WRITE_FOUND:
+        return one.subject, one.at, one.who, text_of(one, "sha256_after")
+    return one.number
+
+
+def _place(found: Sequence[AuditedWrite], one: AuditEntry) -> int:
+    """Return where a write belongs among the ones before; the entry of a found one may be younger than the write."""
+    at = at_of(one)
+    if one.action is AuditAction.WRITE_FOUND and at is not None:
+        for place, other in enumerate(found):
+            other_at = at_of(other.ended)
+            if other_at is not None and other_at > at:
+                return place
+    return len(found)
+
+
+def unknown_writes(
+    cell: Cell, entries: Sequence[AuditEntry], opened: Iterable[OpenWrite], calibrations: Collection[str]
+) -> tuple[AuditedWrite, ...]:
+    """Return the writes to this cell's controller that its history lacks.
+
+    Args:
+        cell: whose writes are wanted.
+        entries: of the audit log, oldest first.
+        opened: writes that were begun and never ended.
+        calibrations: SHA-256 of those in the history.
+
+    Returns:
+        writes whose content the controller has now, though no later entry shows it; writes of calibrations that were
+        never entered.
+    """
+    witnessed = {one.begun.number for one in open_writes(entries, lambda _: None) if one.content is Content.AFTER}
+    made = [one for one in opened if one.content is Content.AFTER]
+    shown = {one.begun.number for one in made} - witnessed
+    return tuple(
+        write
+        for write in writes_to(cell, entries, made)
+        if write.ended.number in shown
+        or (write.action is WriteAction.APPLIED and write.calibration not in calibrations)
+    )
+
+
+def at_of(entry: AuditEntry) -> datetime | None:
+    """Return when an entry was written, UTC; None where its time is none."""
+    found = utc(entry.at, _NEVER)
+    return None if found == _NEVER else found
+
+
+def text_of(entry: AuditEntry, key: str) -> str | None:
+    """Return a text of an entry's details, None where there is none."""
+    found = entry.details.get(key)
+    return found if isinstance(found, str) else None
+
+
+def begun_by(entry: AuditEntry) -> int:
+    """Return the number of the entry that began the write, 0 where there is none."""
+    found = entry.details.get("begun")
+    return found if isinstance(found, int) else 0
+
+
+def calibration_of(begun: AuditEntry, key: str) -> str | None:
+    """Return what an entry says of its calibration, None without it."""
+    recorded = begun.details.get("calibration")
+    found = recorded.get(key) if isinstance(recorded, dict) else None
+    return found if isinstance(found, str) else None

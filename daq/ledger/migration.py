@@ -1,0 +1,338 @@
+"""The SQLite file in which earlier versions kept the history: what only it has goes into the audit log, once.
+
+Those versions wrote each calibration and each write to a controller twice. Where the two differ, the audit log is
+right, and nothing is taken over from the file (docs/decisions/0036).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from pathlib import Path
+from urllib.parse import quote
+
+from daq.documents.calibration_file import decode
+from daq.errors import DaqError, HistoryUnreadable
+from daq.ledger.audit import AuditAction, AuditEntry
+from daq.ledger.entry import Acknowledgement, Event, WriteAction, figures_of, iso, zoned
+from daq.ledger.history import (
+    AuditedWrite,
+    acknowledgement_of,
+    at_of,
+    begun_by,
+    calibration_of,
+    entered_calibrations,
+    is_end,
+    text_of,
+)
+
+BUSY_S = 5.0  #: How long to wait for another process' transaction
+APPLICATION_ID = 0x64726776  #: In the header of every history of earlier versions
+VERSION = 1  #: Of its tables; there was no other
+
+
+@dataclass(frozen=True, slots=True)
+class StoredCalibration:
+    """A calibration as the file has it."""
+
+    digest: str  #: SHA-256 of its file
+    entered: datetime  #: when it was entered, UTC
+    document: str  #: the whole calibration
+
+
+@dataclass(frozen=True, slots=True)
+class StoredHistory:
+    """Content of the file."""
+
+    calibrations: tuple[StoredCalibration, ...]  #: oldest first
+    events: tuple[Event, ...]  #: writes to controllers, oldest first
+    acknowledgements: tuple[Acknowledgement, ...]  #: oldest first
+    flaws: tuple[str, ...]  #: what is broken in it, as sentences
+
+    @property
+    def noted(self) -> frozenset[str]:
+        """SHA-256 of the entries that the audit log must have."""
+        digests = [event.audit for event in self.events] + [noted.audit for noted in self.acknowledgements]
+        return frozenset(digest for digest in digests if digest is not None)
+
+
+EMPTY = StoredHistory((), (), (), ())
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """An entry that the audit log is to get."""
+
+    action: AuditAction  #: its kind
+    at: datetime  #: its time, with zone
+    who: str  #: the person or the job
+    subject: str  #: as in `AuditEntry`
+    details: Mapping[str, object]  #: plain JSON
+
+
+def read_stored(path: Path) -> StoredHistory:
+    """Read a history of an earlier version, and check it by itself; nothing is changed.
+
+    Raises:
+        HistoryUnreadable: it is none, of a later version, broken, or locked for long.
+    """
+    # Not "ro", which could not undo the unfinished transaction of a killed writer; "rw" opens a read-only file, too.
+    address = f"file:{quote(os.fsencode(path.absolute()))}?mode=rw"
+    with _translate_errors(path), contextlib.closing(sqlite3.connect(address, uri=True, timeout=BUSY_S)) as connection:
+        (tables,) = connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()
+        (application,) = connection.execute("PRAGMA application_id").fetchone()
+        if not tables and not application:  # its first writer was killed before it was done
+            return EMPTY
+        (version,) = connection.execute("PRAGMA user_version").fetchone()
+        if application != APPLICATION_ID or version != VERSION:
+            known = application == APPLICATION_ID
+            raise _unreadable(path, f"a history of version {version}" if known else "a file of another program")
+        damaged = [str(row[0]) for row in connection.execute("PRAGMA integrity_check") if row[0] != "ok"]
+        if damaged:  # rows of a broken file prove nothing
+            return StoredHistory((), (), (), tuple(damaged))
+        return StoredHistory(
+            calibrations=tuple(_calibrations(connection)),
+            events=tuple(_events(connection)),
+            acknowledgements=tuple(_acknowledgements(connection)),
+            flaws=(*_gaps(connection, "event"), *_gaps(connection, "acknowledgement")),
+        )
+
+
+@contextlib.contextmanager
+def _translate_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        raise _unreadable(path, f"a row that drivegain did not write: {error}") from error
+    except sqlite3.Error as error:
+        name = getattr(error, "sqlite_errorname", "") or type(error).__name__
+        # Without the bytes of a damaged row.
+        raise _unreadable(path, f"{str(error).partition(' with text ')[0]} ({name})") from error
+
+
+def _unreadable(path: Path, found: str) -> HistoryUnreadable:
+    return HistoryUnreadable(
+        str(path),
+        found=found,
+        expected="the history that earlier versions of drivegain kept of a cell",
+        remedy="check its rights, and who has it open (`fuser`); if it is broken, restore the last good one from a "
+        "backup, or go on without it: `drivegain history CELL --migrate` keeps it under another name",
+    )
+
+
+def _calibrations(connection: sqlite3.Connection) -> Iterator[StoredCalibration]:
+    for row in connection.execute("SELECT digest, entered, document FROM calibration ORDER BY created, digest"):
+        yield StoredCalibration(str(row[0]), zoned(row[1]), str(row[2]))
+
+
+def _events(connection: sqlite3.Connection) -> Iterator[Event]:
+    query = "SELECT digest, deed, at, who, target, audit, sha256_after FROM event ORDER BY number"
+    for digest, deed, at, who, target, audit, after in connection.execute(query):
+        yield Event(digest, WriteAction(deed), zoned(at), _raw(who), _raw(target), audit, after)
+
+
+def _acknowledgements(connection: sqlite3.Connection) -> Iterator[Acknowledgement]:
+    query = "SELECT axis, since, at, who, why, audit FROM acknowledgement ORDER BY number"
+    for axis, since, at, who, why, audit in connection.execute(query):
+        yield Acknowledgement(axis, zoned(since), zoned(at), _raw(who), _raw(why), audit)
+
+
+def _raw(text: str) -> str:
+    """Turn bytes of a name that are not UTF-8, which SQLite refuses, into what they are in the audit log."""
+    return re.sub(r"\\u(d[89a-f][0-9a-f]{2})", lambda found: chr(int(found[1], 16)), text)
+
+
+def _gaps(connection: sqlite3.Connection, table: str) -> Iterator[str]:
+    """Report missing rows of a table: their numbers go from 1 to the last that SQLite gave, without gaps."""
+    there = {int(row[0]) for row in connection.execute(f"SELECT number FROM {table}")}
+    given = connection.execute("SELECT seq FROM sqlite_sequence WHERE name = ?", (table,)).fetchone()
+    last = max([*there, 0 if given is None else int(given[0])], default=0)
+    if len(there) != last:
+        yield f"{table}: found {len(there)} rows, expected all from 1 to {last}"
+
+
+def contradictions(stored: StoredHistory, entries: Sequence[AuditEntry], cell: str) -> Iterator[str]:
+    """Report what the file says otherwise than the audit log, as sentences."""
+    by_digest = {one.sha256: one for one in entries}
+    begun = {one.number: one for one in entries}
+    for number, event in enumerate(stored.events, start=1):
+        entry = by_digest.get(event.audit or "")
+        if entry is not None:
+            yield from _event_flaws(f"event {number}", event, entry, begun.get(begun_by(entry)))
+    for noted in stored.acknowledgements:
+        if noted.since > noted.at:  # until then it would silence the axis
+            yield f"acknowledgement of {noted.axis} at {iso(noted.at)}: found a baseline since {iso(noted.since)}"
+        entry = by_digest.get(noted.audit)
+        if entry is not None:
+            yield from _acknowledgement_flaws(noted, entry)
+    entered = {one.digest: one for one in entered_calibrations(entries, cell)}
+    for calibration in stored.calibrations:
+        yield from _document_flaws(calibration)
+        known = entered.get(calibration.digest)
+        if known is None or known.document is None:
+            continue
+        name = f"calibration {calibration.digest[:12]}…"
+        said = f"as entry {known.number} of the audit says"
+        if calibration.document != known.document:
+            yield f"document of {name}: found another one, expected it {said}"
+        yield from _differences(name, {"entered": calibration.entered}, {"entered": known.entered}, said)
+
+
+def _event_flaws(name: str, event: Event, entry: AuditEntry, begun: AuditEntry | None) -> Iterator[str]:
+    first = begun if begun is not None else entry
+    expected: dict[str, object] = {"target": entry.subject}
+    if is_end(entry):
+        # One that names the begin was entered later: its writer was killed, and another process may have done it.
+        expected |= {"who": entry.who, "at": at_of(entry), "action": AuditedWrite(first, entry).action}
+    after = text_of(first, "sha256_after")
+    if after is not None:
+        expected["sha256_after"] = after
+    digest = calibration_of(first, "sha256")
+    if digest is not None and entry.action is not AuditAction.ROLLED_BACK:
+        expected["digest"] = digest
+    yield from _differences(name, asdict(event), expected, _as_said_by(entry))
+
+
+def _acknowledgement_flaws(noted: Acknowledgement, entry: AuditEntry) -> Iterator[str]:
+    name = f"acknowledgement of {noted.axis} at {iso(noted.at)}"
+    expected = acknowledgement_of(entry)
+    if expected is None:
+        yield f"{name}: found entry {entry.number} of the audit, {entry.action.value}, expected an acknowledgement"
+    else:
+        yield from _differences(name, asdict(noted), asdict(expected), _as_said_by(entry))
+
+
+def _document_flaws(calibration: StoredCalibration) -> Iterator[str]:
+    name = f"calibration {calibration.digest[:12]}…"
+    try:
+        decode(calibration.document.encode(), f"document of {name}")
+    except DaqError as error:
+        yield f"{name}: its document is {error.found}, expected {error.expected}"
+
+
+def _as_said_by(entry: AuditEntry) -> str:
+    return f"as entry {entry.number} of the audit, which it names"
+
+
+def _differences(name: str, found: Mapping[str, object], expected: Mapping[str, object], source: str) -> Iterator[str]:
+    for key, wanted in expected.items():
+        if found[key] != wanted:
+            yield f"{name}: found {key} {_shown(found[key])}, expected {_shown(wanted)} {source}"
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, datetime):
+        return repr(iso(value))
+    return repr(value.value if isinstance(value, WriteAction) else value)
+
+
+def drafts_of(stored: StoredHistory, entries: Sequence[AuditEntry], cell: str, who: str, at: datetime) -> list[Draft]:
+    """Return what the audit log lacks of a stored history: nothing where it was migrated before.
+
+    Args:
+        stored: without flaws and contradictions.
+        entries: of the audit log.
+        cell: name of the cell.
+        who: the person or the job that migrates.
+        at: time, with zone.
+    """
+    return [
+        *_calibration_drafts(stored.calibrations, entries, cell, who, at),
+        *_event_drafts(stored.events, entries, cell),
+        *_acknowledgement_drafts(stored.acknowledgements, entries, cell),
+    ]
+
+
+def _calibration_drafts(
+    stored: Iterable[StoredCalibration], entries: Sequence[AuditEntry], cell: str, who: str, at: datetime
+) -> Iterator[Draft]:
+    """Enter calibrations that only the file has, and the figures of those that an earlier version entered."""
+    known = {one.digest: one for one in entered_calibrations(entries, cell)}
+    lacking = [one for one in stored if one.digest not in known]
+    without_figures = [
+        StoredCalibration(one.digest, one.entered, one.document)
+        for one in known.values()
+        if one.figures is None and one.document is not None
+    ]
+    for one in (*without_figures, *lacking):
+        try:
+            calibration = decode(one.document.encode(), f"document of calibration {one.digest[:12]}…")
+        except DaqError:
+            continue  # reported wherever the history is read
+        details = {
+            "sha256": one.digest,
+            "cell": cell,
+            "entered": iso(one.entered),
+            "figures": figures_of(calibration, one.digest, one.entered),
+        }
+        if one.digest not in known:
+            details["document"] = one.document
+        yield Draft(AuditAction.CALIBRATION_ENTERED, at, who, history_subject(cell), details)
+
+
+def history_subject(cell: str) -> str:
+    """Return what the entries about calibrations have as their subject."""
+    return f"history of {cell}"
+
+
+def _event_drafts(stored: Iterable[Event], entries: Sequence[AuditEntry], cell: str) -> Iterator[Draft]:
+    by_digest = {one.sha256: one for one in entries}
+    found = {(one.subject, one.at, one.who) for one in entries if one.action is AuditAction.WRITE_FOUND}
+    for event in stored:
+        named = by_digest.get(event.audit or "")
+        if named is not None and is_end(named):
+            continue
+        if (event.target, event.at.isoformat(), event.who) in found:
+            continue
+        details = {
+            "action": event.action.value,
+            "begun": None if named is None else named.number,
+            "calibration": {"sha256": event.digest, "cell": cell},
+            "sha256_after": event.sha256_after,
+            "migrated": True,
+        }
+        yield Draft(AuditAction.WRITE_FOUND, event.at, event.who, event.target, details)
+
+
+def _acknowledgement_drafts(
+    stored: Iterable[Acknowledgement], entries: Sequence[AuditEntry], cell: str
+) -> Iterator[Draft]:
+    known = set()
+    for entry in entries:
+        found = acknowledgement_of(entry)
+        if found is not None and text_of(entry, "cell") == cell:
+            known.add((found.axis, found.since, found.at, found.who, found.why))
+    for noted in stored:
+        # The first versions did not enter the name of the cell.
+        if (noted.axis, noted.since, noted.at, noted.who, noted.why) not in known:
+            details = {
+                "axis": noted.axis,
+                "cell": cell,
+                "since": noted.since.isoformat(),
+                "why": noted.why,
+                "migrated": True,
+            }
+            yield Draft(AuditAction.ACKNOWLEDGED, noted.at, noted.who, f"gain of {noted.axis}", details)
+
+
+def set_aside(path: Path, at: datetime) -> Path:
+    """Rename the file, with the journal of a killed writer; return its new name.
+
+    Raises:
+        OSError: from the file system.
+    """
+    aside = path.with_name(f"{path.name}.{at:%Y%m%dT%H%M%SZ}.bak")
+    count = 0
+    while aside.exists():
+        count += 1
+        aside = path.with_name(f"{path.name}.{at:%Y%m%dT%H%M%SZ}-{count}.bak")
+    journal = path.with_name(f"{path.name}-journal")
+    with contextlib.suppress(FileNotFoundError):
+        journal.rename(aside.with_name(f"{aside.name}-journal"))
+    path.rename(aside)
+    return aside

@@ -1,0 +1,366 @@
+"""A history of an earlier version, in SQLite: migrated once, kept aside, and never believed against the audit log.
+
+`tests/data/make_two_ledgers.py` made the files: Ada applied a calibration, Bert another one, which Cleo rolled back; a
+third one was entered by hand, and Dora acknowledged a change of J4.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import sqlite3
+import tempfile
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daq.cli.app import main
+from daq.errors import ExitCode, HistoryUnreadable
+from daq.ledger import ledger as ledger_module
+from daq.ledger.audit import AuditAction, read
+from daq.ledger.entry import WriteAction
+from daq.ledger.ledger import Ledger, migrate, read_history
+from daq.ledger.migration import VERSION, read_stored
+from tests.daq.calibrations import calibration_for
+from tests.daq.histories import BEGIN, history_of, ledger_of
+
+FILES = Path(__file__).parents[2] / "data" / "two_ledgers"
+WRITERS = ["Ada", "Bert", "Cleo"]
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Path:
+    """The demo cell with audit log, history and controller file of the version before."""
+    kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
+    shutil.copytree(Path(__file__).parents[3] / "configs", tmp_path / "configs", ignore=kept)
+    cell = tmp_path / "configs" / "cells" / "demo.yaml"
+    for name in ("demo.audit.jsonl", "demo.history.sqlite"):
+        shutil.copy(FILES / name, cell.with_name(name))
+    shutil.copy(FILES / "controller.yaml", cell.parents[1] / "controllers" / "demo.yaml")
+    return cell
+
+
+def stored_of(cell: Path) -> Path:
+    return cell.with_name("demo.history.sqlite")
+
+
+def audit_of(cell: Path) -> Path:
+    return cell.with_name("demo.audit.jsonl")
+
+
+def change(cell: Path, statements: str) -> None:
+    with closing(sqlite3.connect(stored_of(cell))) as other:
+        other.executescript(f"{statements};")
+        other.commit()
+
+
+def shown(cell: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    """What `history --json` prints."""
+    capsys.readouterr()
+    assert main(["history", str(cell), "--json"]) == ExitCode.OK
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def writers_of(cell: Path) -> list[str]:
+    return [event.who.split()[0] for event in history_of(cell).events]
+
+
+def asides_of(cell: Path) -> list[Path]:
+    return sorted(cell.parent.glob("demo.history.sqlite.*.bak"))
+
+
+def test_the_first_command_migrates_it_and_shows_what_the_version_before_showed(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = stored_of(cell).read_bytes()
+    expected = json.loads((FILES / "history.json").read_text())
+    assert shown(cell, capsys) == expected
+    assert not stored_of(cell).exists()
+    (aside,) = asides_of(cell)
+    assert aside.read_bytes() == content
+    entries = read(audit_of(cell))
+    assert len(entries) == 13  # the figures of three calibrations
+    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
+    assert shown(cell, capsys) == expected
+    assert read(audit_of(cell)) == entries
+    assert writers_of(cell) == WRITERS
+
+
+def test_what_reads_only_shows_the_same_and_writes_nothing(cell: Path) -> None:
+    before = {path: path.read_bytes() for path in cell.parent.iterdir() if path.is_file()}
+    ledger = ledger_of(cell)
+    history = read_history(ledger)
+    assert {path: path.read_bytes() for path in cell.parent.iterdir() if path.is_file()} == before
+    migrate(ledger, who="anna", at=BEGIN)
+    after = read_history(ledger)
+    assert (after.entries, after.events, after.acknowledgements) == (
+        history.entries,
+        history.events,
+        history.acknowledgements,
+    )
+
+
+@pytest.mark.parametrize("command", ["apply", "add", "migrate"])
+def test_each_command_that_enters_something_migrates_it(cell: Path, command: str) -> None:
+    calibration = str(calibration_for(cell, 1.005))
+    arguments = {
+        "apply": ["apply", str(cell), calibration, "--yes"],
+        "add": ["history", str(cell), "--add", calibration],
+        "migrate": ["history", str(cell), "--migrate"],
+    }[command]
+    assert main(arguments) == ExitCode.OK
+    assert not stored_of(cell).exists()
+    assert len(asides_of(cell)) == 1
+    assert writers_of(cell)[:3] == WRITERS
+    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
+
+
+def test_what_only_the_history_had_gets_into_the_audit(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A write without an audit log, as a program could make it, and one whose entry names only its begin."""
+    change(
+        cell,
+        "INSERT INTO event (digest, deed, at, who, target) SELECT digest, 'applied', "
+        "'2027-01-01T00:00:00.000000+00:00', 'kim', '/other.yaml' FROM calibration LIMIT 1",
+    )
+    before = read_history(ledger_of(cell))
+    assert shown(cell, capsys)["calibrations"] == 3
+    assert writers_of(cell) == [*WRITERS, "kim"]
+    (found,) = [one for one in read(audit_of(cell)) if one.action is AuditAction.WRITE_FOUND]
+    assert found.details["migrated"] is True
+    after = history_of(cell)
+    assert [event.action for event in after.events] == [event.action for event in before.events]
+    assert after.in_force("/other.yaml") == before.in_force("/other.yaml")
+    # An earlier version was run again, and found no history of its own.
+    asides_of(cell)[0].rename(stored_of(cell))
+    assert shown(cell, capsys)["calibrations"] == 3
+    assert writers_of(cell) == [*WRITERS, "kim"]
+
+
+def test_a_history_of_a_version_whose_audit_has_no_calibrations(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Only the last lines of the audit log are of calibrations: without them it is one of that version."""
+    audit = audit_of(cell)
+    lines = audit.read_bytes().splitlines(keepends=True)
+    audit.write_bytes(b"".join(lines[:2]))
+    change(cell, "DELETE FROM event WHERE number > 1; DELETE FROM acknowledgement; DELETE FROM sqlite_sequence")
+    digests = {one.digest for one in read_stored(stored_of(cell)).calibrations}
+    assert len(digests) == 3
+    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
+    assert {one.digest for one in history_of(cell).entries} == digests
+    assert writers_of(cell) == ["Ada"]
+
+
+@pytest.mark.parametrize("calls", range(4))
+def test_a_migration_that_is_killed_is_finished_by_the_next_command(
+    cell: Path, calls: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before each of the three entries, and before the file is renamed."""
+    left = [calls]
+
+    def killed_later(genuine: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*given_: Any, **further: Any) -> Any:
+            if not left[0]:
+                raise KeyboardInterrupt
+            left[0] -= 1
+            return genuine(*given_, **further)
+
+        return call
+
+    with monkeypatch.context() as patch:
+        for name in ("append", "set_aside"):
+            patch.setattr(ledger_module, name, killed_later(getattr(ledger_module, name)))
+        with pytest.raises(KeyboardInterrupt):
+            migrate(ledger_of(cell), who="anna", at=BEGIN)
+    assert stored_of(cell).exists()
+    assert len(read(audit_of(cell))) == 10 + calls
+    assert shown(cell, capsys) == json.loads((FILES / "history.json").read_text())
+    assert len(read(audit_of(cell))) == 13
+    assert len(asides_of(cell)) == 1
+
+
+CHANGES = [
+    ("event SET who = 'kim'", "event 1: found who 'kim', expected 'Ada"),
+    ("event SET target = '/other.yaml'", "event 1: found target '/other.yaml', expected"),
+    ("event SET at = '2026-02-02T00:00:00.000000+00:00'", "event 1: found at '2026-02-02T00:00:00"),
+    ("event SET deed = 'rolled back'", "event 1: found action 'rolled back', expected 'applied'"),
+    ("event SET digest = NULL", "event 1: found digest None, expected"),
+    ("event SET sha256_after = 'ab'", "event 1: found sha256_after 'ab', expected"),
+    ("event SET number = number + 7", "event: found 3 rows, expected all from 1 to 10"),
+    ("acknowledgement SET who = 'kim'", "found who 'kim', expected 'Dora"),
+    ("acknowledgement SET axis = 'J2'", "found axis 'J2', expected 'J4' as entry 10"),
+    ("acknowledgement SET why = 'x'", "found why 'x', expected 'gearbox exchanged'"),
+    ("acknowledgement SET since = '2026-01-01T00:00:00.000000+00:00'", "found since '2026-01-01T00:00:00"),
+    ("acknowledgement SET since = '2130-01-01T00:00:00.000000+00:00'", "found a baseline since 2130"),
+    ("acknowledgement SET audit = (SELECT audit FROM event)", "applied, expected an acknowledgement"),
+    ("calibration SET document = 'x'", "…: its document is"),
+    ("calibration SET document = replace(document, 'rows: ', 'rows: 1')", "its document is a change by hand"),
+    ("calibration SET document = (SELECT max(document) FROM calibration)", "document of calibration"),
+    ("calibration SET entered = '2001-01-01T00:00:00.000000+00:00'", "found entered '2001-01-01T00:00:00"),
+]
+
+
+@pytest.mark.parametrize(("statement", "says"), CHANGES)
+def test_a_row_that_is_not_what_the_audit_says_is_reported_and_never_believed(
+    cell: Path, statement: str, says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    audit = audit_of(cell).read_bytes()
+    change(cell, f"UPDATE {statement}")
+    for options in ((), ("--verify",)):
+        assert main(["history", str(cell), *options]) == ExitCode.DATA_UNFIT
+        said = " ".join(capsys.readouterr().err.split())
+        assert "--migrate" in said
+        assert says in said
+    assert stored_of(cell).exists()
+    assert main(["history", str(cell), "--migrate", "--verify"]) == ExitCode.OK
+    assert "what only it had was not taken over" in " ".join(capsys.readouterr().err.split())
+    assert audit_of(cell).read_bytes().startswith(audit)
+    assert len(asides_of(cell)) == 1
+    assert shown(cell, capsys) == json.loads((FILES / "history.json").read_text())
+
+
+def test_a_row_that_was_taken_away_is_reported(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change(cell, "DELETE FROM event WHERE number = 2")
+    assert main(["history", str(cell), "--verify", "--json"]) == ExitCode.DATA_UNFIT
+    found = json.loads(capsys.readouterr().out)["audit"]
+    assert found["history_broken"] == ["event: found 2 rows, expected all from 1 to 3"]
+    assert found["holds"]
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil"),
+    [
+        ("text", lambda path: path.write_bytes(b"no history" * 1000)),
+        ("zeros", lambda path: path.write_bytes(bytes(4096))),
+        ("another program's", lambda path: _pragma(path, "application_id = 7")),
+        ("a later version", lambda path: _pragma(path, f"user_version = {VERSION + 1}")),
+        ("without a table", lambda path: _execute(path, "DROP TABLE event")),
+        ("with a time that is none", lambda path: _execute(path, "UPDATE event SET at = ''")),
+    ],
+)
+def test_a_file_that_is_no_history_is_refused_and_kept(
+    cell: Path, name: str, spoil: Callable[[Path], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    spoil(stored_of(cell))
+    content = stored_of(cell).read_bytes()
+    for options in ((), ("--verify",), ("--add", str(calibration_for(cell)))):
+        assert main(["history", str(cell), *options]) == ExitCode.DATA_UNFIT, name
+        assert "--migrate" in " ".join(capsys.readouterr().err.split())
+    # The write-back goes on without it: the gains are judged by the calibration and the controller's file.
+    assert main(["apply", str(cell), str(calibration_for(cell))]) == ExitCode.OK
+    assert stored_of(cell).read_bytes() == content
+    assert main(["history", str(cell), "--migrate", "--verify"]) == ExitCode.OK
+    assert "what only it had was not taken over" in " ".join(capsys.readouterr().err.split())
+    (aside,) = asides_of(cell)
+    assert aside.read_bytes() == content
+    assert writers_of(cell) == WRITERS
+
+
+def _pragma(path: Path, setting: str) -> None:
+    _execute(path, f"PRAGMA {setting}")
+
+
+def _execute(path: Path, statements: str) -> None:
+    with closing(sqlite3.connect(path)) as other:
+        other.executescript(f"{statements};")
+        other.commit()
+
+
+def test_an_empty_file_is_an_empty_history(cell: Path) -> None:
+    stored_of(cell).write_bytes(b"")
+    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
+    assert writers_of(cell) == WRITERS
+
+
+@settings(max_examples=30, deadline=None)
+@given(random_=st.randoms(use_true_random=False))
+def test_a_damaged_file_is_reported_and_never_a_surprise(random_: random.Random) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "h"
+        damaged = bytearray((FILES / "demo.history.sqlite").read_bytes())
+        for _ in range(random_.randint(1, 400)):
+            damaged[random_.randrange(len(damaged))] = random_.randrange(256)
+        path.write_bytes(damaged[: random_.randint(1, len(damaged))] if random_.random() < 0.3 else damaged)
+        try:
+            read_stored(path)
+        except HistoryUnreadable as error:
+            assert str(path) in str(error)
+            assert "with text" not in str(error)
+
+
+def test_an_unfinished_transaction_of_a_killed_writer_is_undone_first(cell: Path) -> None:
+    child = os.fork()
+    if child == 0:
+        connection = sqlite3.connect(stored_of(cell), isolation_level=None)
+        connection.execute("PRAGMA cache_size = 1")  # pages go to the file, and the old ones to the journal, at once
+        connection.execute("BEGIN IMMEDIATE")
+        connection.execute("UPDATE calibration SET document = document || zeroblob(100000)")
+        connection.execute("DELETE FROM event")
+        os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    assert stored_of(cell).with_name("demo.history.sqlite-journal").stat().st_size
+    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
+    assert writers_of(cell) == WRITERS
+    (aside,) = asides_of(cell)
+    assert aside.read_bytes() == (FILES / "demo.history.sqlite").read_bytes()
+
+
+def test_one_that_is_locked_for_long_is_reported(
+    cell: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("daq.ledger.migration.BUSY_S", 0.01)
+    with closing(sqlite3.connect(stored_of(cell), isolation_level=None)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        assert main(["history", str(cell)]) == ExitCode.DATA_UNFIT
+        assert "who has it open" in " ".join(capsys.readouterr().err.split())
+        other.execute("ROLLBACK")
+    assert main(["history", str(cell)]) == ExitCode.OK
+
+
+@pytest.mark.parametrize("lost", ["changed", "deleted", "cut off"])
+def test_nothing_is_migrated_into_an_audit_that_was_changed(
+    cell: Path, lost: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    audit = audit_of(cell)
+    content = audit.read_bytes()
+    if lost == "changed":
+        audit.write_bytes(content.replace(b'"who":"Ada', b'"who":"Eve', 1))
+    elif lost == "cut off":
+        audit.write_bytes(b"".join(content.splitlines(keepends=True)[:4]))
+    else:
+        audit.unlink()
+    stored = stored_of(cell).read_bytes()
+    for options in (["--migrate"], ["--verify"]):
+        assert main(["history", str(cell), *options]) == ExitCode.DATA_UNFIT
+        assert "demo.audit.jsonl" in capsys.readouterr().err
+        assert stored_of(cell).read_bytes() == stored
+    # What is left is shown all the same, and the write-back goes on.
+    assert main(["history", str(cell)]) == ExitCode.OK
+    assert main(["apply", str(cell), str(calibration_for(cell, 1.005)), "--yes"]) == ExitCode.OK
+    assert len(history_of(cell).entries) == 4
+    assert stored_of(cell).read_bytes() == stored
+    assert main(["history", str(cell), "--verify"]) == ExitCode.DATA_UNFIT
+
+
+def test_a_cell_whose_gains_are_applied_again_knows_the_old_write(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The controller has the gains of Ada's calibration; the audit log names another folder."""
+    ledger = ledger_of(cell)
+    (first,) = [event for event in read_history(ledger).events if event.who.startswith("Ada")]
+    assert first.action is WriteAction.APPLIED
+    assert shown(cell, capsys)["in_force"] == first.digest
+
+
+def test_another_audit_than_the_cells_has_no_history_of_sqlite(cell: Path, tmp_path: Path) -> None:
+    ledger = Ledger.of(ledger_of(cell).cell, tmp_path / "another.jsonl")
+    assert ledger is not None
+    assert not ledger.outdated
+    assert read_history(ledger).entries == ()
