@@ -17,7 +17,7 @@ move axes                               `execute`, `Move`, `synchronised_move`, 
 errors                                  `DriverError` and its subclasses (drivers/errors.py)
 ======================================  ==========================================================================
 
-Nothing moves without a `MotionPermission`. A simulated cell for trials runs on the same buses: `drivegain simulate`.
+Nothing moves without a `MotionPermission`. A simulated cell for trials runs on the same buses (`drivers.simulation`).
 """
 
 from __future__ import annotations
@@ -80,11 +80,11 @@ _HOMES = {
     "errors": "BusBusy BusError DriveFault DriverError MotionRefused MotionTimeout NodeError NodeMisplaced NodeMissing "
     "ObjectAccessError ParameterRefused ParametersMixed SampleLost SetupRefused StateRefused",
     "motion.execute": "execute",
-    "motion.move": "AxisLimits MotionPermission Move synchronised_move",
+    "move": "AxisLimits MotionPermission Move synchronised_move",
     "profiles.cia402": "State decode",
     "profiles.profile": "CIA402 Amplitude Axis CurrentScale DriveProfile Identity ObjectEntry TapPoint",
     "stream.answers": "StreamStatistics",
-    "stream.sample": "CellEvent EventKind Sample",
+    "messages": "CellEvent EventKind Sample",
     "stream.stream": "SyncStream",
     "stream.sync": "FollowedSync LockstepSync TimedSync",
 }

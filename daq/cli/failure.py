@@ -1,7 +1,8 @@
 """An error for the user: subject, found, expected and remedy, a line each, or one line of JSON under `--json`.
 
 The errors of `daq` carry the four parts. Those of `drivers` and `ident` say what was found; `ADVICE` adds what the
-command line expects there, and a remedy. Errors of the operating system on a bus are explained by their number.
+command line expects there, and a remedy, and `daq.advice` puts verbs in the place of functions. Errors of the operating
+system on a bus are explained by their number.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
+from daq.advice import for_command_line
 from daq.errors import DaqError, ExitCode, exit_code
 from daq.report.text import printable, spelled_bytes
 from drivers import errors as driver
@@ -166,9 +168,13 @@ class Failure:
         """Take an error of `daq`, `drivers` or `ident` apart."""
         notes = getattr(error, "__notes__", ())
         labelled = {label: text for label, _, text in (note.partition(": ") for note in notes) if label in NOTES}
+        subject, found, expected, remedy = map(for_command_line, _parts(error))
         return cls(
             type(error).__name__,
-            *_parts(error),
+            subject,
+            found,
+            expected,
+            remedy,
             int(exit_code(type(error)) or ExitCode.UNEXPECTED),
             labelled,
             tuple(note for note in driver.stop_notes(error) if note.startswith(driver.WHILE)),

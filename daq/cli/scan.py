@@ -189,9 +189,10 @@ def explain_emcy_verb(
 
     For a manufacturer's own code only its class is known; the drive's manual has the rest.
     """
-    from drivers.canopen.emcy import CODES, explain
+    from daq.workflow.events import explain_error_code
+    from drivers.canopen.emcy import CODES
 
-    found = explain(read_code(code))
+    found = explain_error_code(read_code(code))
     if json:
         print_json({**asdict(found), "standard": found.code in CODES})
     else:

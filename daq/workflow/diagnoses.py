@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.advice import for_command_line
 from daq.config.cell import Cell, model_of, robot_of
 from daq.workflow.description import drift_diagnosis
 from daq.workflow.geometry import geometry_diagnoses
@@ -122,7 +123,8 @@ def diagnose_fit(
         return (turned,)
     effort_limit = read_urdf(cell.urdf).effort_limit[list(robot_of(cell).axis_joints)]
     # Each held-out run is judged alone, as in a validation.
-    diagnoses = diagnose(replace(found, holdout=None), cell.axis_names, nameplate, effort_limit)
+    named = diagnose(replace(found, holdout=None), cell.axis_names, nameplate, effort_limit)
+    diagnoses = tuple(map(_for_command_line, named))
     suspect = any(one.name in TRACES_OF_CURRENTS for one in diagnoses)
     if suspect or found.estimate.gains_fixed:
         require_right_currents(recordings, each=suspect)
@@ -164,7 +166,7 @@ def diagnose_run(
     found = list(scale_diagnoses(validation.measured_nm, validation.predicted_nm, used, axes, runs))
     if run.payload is not None and not found:
         found += _payload_diagnoses(calibration, run.payload, model, reduction)
-    errors = list(axis_error_diagnoses(size, left, idle, axes, runs))
+    errors = list(map(_for_command_line, axis_error_diagnoses(size, left, idle, axes, runs)))
     if not errors and not any(one.name == "current-reversed" for one in found):
         return tuple(found)
     gains = np.array([gain.value for gain in calibration.gains])
@@ -175,6 +177,11 @@ def diagnose_run(
     if exchanged is not None:
         return (replace(exchanged, runs=runs),)
     return tuple(found or errors)
+
+
+def _for_command_line(diagnosis: Diagnosis) -> Diagnosis:
+    """The same diagnosis with a remedy that names verbs and options."""
+    return replace(diagnosis, remedy=for_command_line(diagnosis.remedy))
 
 
 def _rms(torque_nm: FloatArray, use: BoolArray) -> FloatArray:

@@ -24,7 +24,7 @@ from daq.log.conversion import SiScaling, scaling
 from daq.log.feed import Feed, RunFacts, facts_of_recorder
 from daq.log.metadata import AxisReadback, Readback, RunStatistics
 from daq.workflow.bus_lock import bus_taken
-from daq.workflow.events import ALARMING
+from daq.workflow.events import ALARMING, explain_error_code
 from daq.workflow.prediction import Predictor, Recent, predictor_of
 from drivers.canopen.emcy import ErrorCode, explain, read_error_code
 from drivers.canopen.network import CanopenNetwork
@@ -175,7 +175,7 @@ class CellWatch:
             self._feed.event(CellEvent(time.time_ns(), axis, EventKind.EMCY, code, text))
 
     def _faults(self) -> dict[str, ErrorCode]:
-        return {self._cell.axis_names[axis]: explain(code) for axis, code in self._codes.items() if code}
+        return {self._cell.axis_names[axis]: explain_error_code(code) for axis, code in self._codes.items() if code}
 
     def _follow(self, reading: CellReading, recorder: bool) -> None:
         """Begin anew where the source of the samples has changed."""

@@ -216,10 +216,10 @@ def _require_savable(network: CanopenNetwork, axis: Axis, saving: Saving) -> Non
     save = axis.profile.save
     if save is None:
         reason = f"is not described in its profile {axis.profile.name}"
-        remedy = "describe it there, or write to its RAM alone (--ram-only): the gain is then lost with its power"
+        remedy = "describe it there, or write to its RAM alone (`Saving.RAM`): the gain is then lost with its power"
     elif save.mapping is Mapping.UNKNOWN and saving is Saving.KNOWN:
         reason = f"may store more than the gain ({axis.profile.name}: {axis.profile.save_semantics})"
-        remedy = "write to its RAM alone (--ram-only), or let it save all the same (--save-unknown)"
+        remedy = "write to its RAM alone (`Saving.RAM`), or let it save all the same (`Saving.ANY`)"
     elif save.mapping is not Mapping.SEPARATE and (left := recording_leftover(network, axis)):
         reason = f"would keep settings of a recording that was killed ({left})"
         remedy = "switch the drive off and on, so that it starts with its own settings, and try again"

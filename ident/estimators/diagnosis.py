@@ -236,12 +236,12 @@ def current_scale(measured_nm: FloatArray, predicted_nm: FloatArray) -> CurrentS
     return CurrentScale(product / square, std, left)
 
 
-_OF_LEAST_SQUARES = "use --method ml: noise in the currents makes the gains of least squares too small"
+_OF_LEAST_SQUARES = 'use `method="ml"`: noise in the currents makes the gains of least squares too small'
 REMEDIES_OF_DISAGREEMENT = {
     Method.LS: _OF_LEAST_SQUARES,
     Method.WLS: _OF_LEAST_SQUARES,
-    Method.TLS: "use --method ml: an effect that the model lacks, or a parameter that these moves hardly show, bends "
-    "tls more; `drivegain residual` looks for effects",
+    Method.TLS: 'use `method="ml"`: an effect that the model lacks, or a parameter that these moves hardly show, bends '
+    "tls more; `find_effects` looks for effects",
 }
 """What to do where an estimator's gain is far from that of ml; iv need not agree with it (`diagnose`)."""
 
@@ -306,7 +306,7 @@ def axis_error_diagnoses(
                 found,
                 f"some 3 to 15 %, below {LARGEST_AXIS_ERROR_PERCENT:g} %",
                 "look for what contradicts the model on this axis: its current channel and sign, gear ratio, payload, "
-                "friction or an effect that is not declared (`drivegain residual`)",
+                "friction or an effect that is not declared (`find_effects`)",
             )
 
 

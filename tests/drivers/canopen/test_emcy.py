@@ -37,4 +37,4 @@ def test_every_code_has_a_remedy_of_its_class() -> None:
     assert remedy_of(0x8611).startswith("check brake, load and collision")
     assert remedy_of(0x8130).startswith("check the bus's cable")
     assert remedy_of(0xFF01).startswith("see the drive's manual")
-    assert all("--reset-faults" in remedy_of(code) for code in CODES)
+    assert all("`CanopenNetwork.reset_faults`" in remedy_of(code) for code in CODES)
