@@ -39,10 +39,12 @@ from daq.workflow.geometry import geometry_diagnoses
 from daq.workflow.validation import Validation
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import Calibration
+from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.equations.instants import Instants, read_instants
-from ident.equations.reduction import Reduction
+from ident.equations.reduction import regrouped
+from ident.equations.system import System
 from ident.errors import (
     ChannelsExchanged,
     Diagnosis,
@@ -63,7 +65,6 @@ from ident.estimators.payload_diagnosis import payload_diagnoses
 from ident.estimators.refusals import idle_joints
 from ident.estimators.turned_geometry import GEOMETRY, find_turned_geometry, is_confirmed
 from ident.geometry_drift import geometry_drift
-from ident.model.base import BaseParameters
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
 from ident.model.urdf import read_urdf
@@ -137,7 +138,12 @@ def nameplate_of(cell: Cell) -> FloatArray:
 
 
 def diagnose_run(
-    calibration: Calibration, validation: Validation, model: Model, run: Run, reduction: Reduction
+    calibration: Calibration,
+    validation: Validation,
+    model: Model,
+    run: Run,
+    standard: System,
+    conditioning: Conditioning,
 ) -> tuple[Diagnosis, ...]:
     """Judge a run that the fit of a calibration has not seen: scale and sign of its currents, its payload, its errors.
 
@@ -146,7 +152,8 @@ def diagnose_run(
         validation: what it predicts of the run, and what was measured.
         model: of the cell.
         run: as it was read.
-        reduction: of this run alone.
+        standard: equations of this run alone, in standard parameters (`reduce_runs`).
+        conditioning: the filters.
     """
     if any(one.name in GEOMETRY for one in calibration.diagnoses):
         return ()  # it predicts in a wrong geometry
@@ -154,9 +161,9 @@ def diagnose_run(
     axes = [gain.axis for gain in calibration.gains]
     use = validation.use
     carried = replace(run, payload=as_calibrated(calibration, run.payload, run.name))
-    data = differentiate(carried, model.drive_train, reduction.conditioning)
+    data = differentiate(carried, model.drive_train, conditioning)
     left_nm = validation.measured_nm - validation.predicted_nm
-    moved = geometry_drift(calibration, model, data, reduction.conditioning, left_nm, use)
+    moved = geometry_drift(calibration, model, data, conditioning, left_nm, use)
     if moved is not None:
         return (drift_diagnosis(moved, model, axes, runs),)
     size = _rms(validation.measured_nm, use)
@@ -165,15 +172,15 @@ def diagnose_run(
     used = use & ~idle[:, None]
     found = list(scale_diagnoses(validation.measured_nm, validation.predicted_nm, used, axes, runs))
     if run.payload is not None and not found:
-        found += _payload_diagnoses(calibration, run.payload, model, reduction)
+        found += _payload_diagnoses(calibration, run.payload, standard)
     errors = list(map(_for_command_line, axis_error_diagnoses(size, left, idle, axes, runs)))
     if not errors and not any(one.name == "current-reversed" for one in found):
         return tuple(found)
     gains = np.array([gain.value for gain in calibration.gains])
-    turned = find_turned_geometry(model, read_instants(model, (run,), reduction.conditioning), gains)
+    turned = find_turned_geometry(model, read_instants(model, (run,), conditioning), gains)
     if turned is not None:
         return (turned.diagnosis(axes, runs),)
-    exchanged = exchanged_channels(model, (run,), reduction.conditioning, axes) if errors else None
+    exchanged = exchanged_channels(model, (run,), conditioning, axes) if errors else None
     if exchanged is not None:
         return (replace(exchanged, runs=runs),)
     return tuple(found or errors)
@@ -190,9 +197,7 @@ def _rms(torque_nm: FloatArray, use: BoolArray) -> FloatArray:
     return np.asarray(np.sqrt(np.sum(torque_nm**2, axis=1, where=use) / rows))
 
 
-def _payload_diagnoses(
-    calibration: Calibration, payload: Payload, model: Model, reduction: Reduction
-) -> Iterator[Diagnosis]:
+def _payload_diagnoses(calibration: Calibration, payload: Payload, standard: System) -> Iterator[Diagnosis]:
     """Compare the payload of a run with that of its mounting in the calibration."""
     mounted = mounted_parameters(calibration, payload.mounting)
     unknown = tuple(
@@ -200,12 +205,10 @@ def _payload_diagnoses(
         for index, parameter in enumerate(LINK_PARAMETERS)
         if parameter not in payload.known and parameter in mounted
     )
-    names = tuple(column.name for column in model.columns)
-    every = BaseParameters(tuple(range(len(names))), np.eye(len(names)), names)
     of_payload = [mounted[LINK_PARAMETERS[index]].value for index in unknown]
-    values = np.concatenate((standard_parameters(calibration, model), of_payload))
+    values = np.concatenate((standard_parameters(calibration, standard.model), of_payload))
     gains = np.array([gain.value for gain in calibration.gains])
-    return payload_diagnoses(reduction.system(every, (unknown,)), gains, values)
+    return payload_diagnoses(regrouped(standard, standard.base, (unknown,)), gains, values)
 
 
 def not_repeated(stored: Iterable[Diagnosis], fresh: Iterable[Diagnosis]) -> Iterator[Diagnosis]:

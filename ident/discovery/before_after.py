@@ -58,7 +58,7 @@ from ident.equations.linearisation import (
     linearise,
     scatter_of,
 )
-from ident.equations.rows import Observation
+from ident.equations.observation import Observation
 from ident.errors import IdentificationError
 from ident.estimators.estimate import Estimate, RelativeError, of_squares
 from ident.estimators.identify import estimate_with

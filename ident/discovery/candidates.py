@@ -28,7 +28,8 @@ from ident.effects.geometry import GeometryEffect
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.linearisation import Folds, Linearisation, MotorRows, cut_into_folds, linearise
-from ident.equations.rows import Observation, decimate_rows
+from ident.equations.observation import Observation
+from ident.equations.rows import decimate_rows
 from ident.estimators.estimate import Estimate
 from ident.model.model import Model
 from ident.model.robot import Motion

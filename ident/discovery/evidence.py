@@ -20,8 +20,9 @@ from ident.effects.effect import PlacedEffect, effect_torque
 from ident.effects.geometry import GeometryEffect, corrected_dataset, corrected_model, is_correction
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Signals, fitted_signals, session_began_s
-from ident.equations.reduction import reduce_runs
-from ident.equations.rows import Observation, RunRows, observe, on_demanded_motion, rows_of
+from ident.equations.observation import Observation, observe, on_demanded_motion
+from ident.equations.reduction import reduce_built, regrouped
+from ident.equations.rows import rows_of
 from ident.equations.system import System
 from ident.estimators.estimate import Estimate, Identification, RelativeError
 from ident.estimators.identify import estimate_with
@@ -128,11 +129,10 @@ def with_corrections(before: Evidence, corrections: tuple[PlacedEffect, ...]) ->
     model = corrected_model(given.model, corrections)
     datasets = tuple(corrected_dataset(data, corrections) for data in given.datasets)
     conditioning = before.conditioning
-    rows = [RunRows(data, tuple(rows_of(model, data, conditioning))) for data in datasets]
-    fitted = len(datasets) - before.held_out
-    reduction = reduce_runs(model, rows[:fitted], conditioning, payloads=before.training.payloads)
-    system = reduction.system(reduction.base(), reduction.payload_columns())
-    observation = observe(model, rows, conditioning, system)
+    rows = [tuple(rows_of(model, data, conditioning)) for data in datasets]
+    of_fit = zip(datasets[: len(datasets) - before.held_out], rows, strict=False)
+    system = regrouped(reduce_built(model, of_fit, payloads=before.training.payloads))
+    observation = observe(model, datasets, conditioning, system, rows)
     training, holdout = _split_holdout(observation, before.held_out)
     return replace(
         before,

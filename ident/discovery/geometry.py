@@ -13,7 +13,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.discovery.evidence import Evidence, with_covariance
-from ident.equations.rows import observe
+from ident.equations.observation import observe
 from ident.errors import IdentificationError
 from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.geometry import GeometryFinding

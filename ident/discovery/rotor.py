@@ -18,7 +18,7 @@ from ident.discovery.candidates import SearchProblem, Trial, shares_explained
 from ident.discovery.gates import Gates
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.rotor import next_inertia
-from ident.equations.rows import Observation
+from ident.equations.observation import Observation
 from ident.errors import EffectRefused
 
 Families = tuple[tuple[Effect, ...], ...]

@@ -10,7 +10,7 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
-from ident.equations.reduction import reduce_runs
+from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.system import System
 from ident.errors import IdentificationError
 from ident.estimators.estimate import Estimate
@@ -97,8 +97,7 @@ def compare(
         )
         progress(f"estimators under {filters.position_cutoff_hz:g} Hz / {filters.decimation_cutoff_hz:g} Hz")
         try:
-            reduction = reduce_runs(model, runs(), filters, instruments=True)
-            system = reduction.system(reduction.base(), reduction.payload_columns())
+            system = regrouped(reduce_runs(model, runs(), filters, instruments=True))
         except IdentificationError as error:
             if factor == 1.0:
                 raise

@@ -23,8 +23,8 @@ from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.data.unsigned_current import missing_sign, one_sided_currents, unsigned_currents
-from ident.equations.reduction import layout
-from ident.equations.rows import rows_of
+from ident.equations.reduction import motor_support
+from ident.equations.rows import motor_columns, rows_of
 from ident.equations.system import System
 from ident.equations.triangles import qr_update, triangle
 from ident.errors import CurrentUnsigned, DataUnfit, Diagnosis, IdentificationError
@@ -471,8 +471,8 @@ def channel_evidence(model: Model, runs: Iterable[Run], conditioning: Conditioni
         DataUnfit: as of `ident.equations.reduction.reduce_runs`.
     """
     count = model.robot.axis_count
-    motor_columns = layout(model).motor
-    to_motor = model.drive_train.to_motor
+    train = model.drive_train
+    support = motor_support(train, model.support)
     factors: list[list[FloatArray | None]] = [[None] * CHANNEL_BLOCKS for _ in range(count)]
     seen = np.zeros(count)
     for run_number, run in enumerate(runs):
@@ -480,10 +480,9 @@ def channel_evidence(model: Model, runs: Iterable[Run], conditioning: Conditioni
         for rows in rows_of(model, data, conditioning):
             block_of_row = (rows.move + run_number) % CHANNEL_BLOCKS
             for motor, used in enumerate(rows.motor_use):
-                joints = np.flatnonzero(to_motor[motor])
-                mixed = np.sum([to_motor[motor, joint] * rows.standard[joint] for joint in joints], axis=0)
+                mixed = motor_columns(train.to_motor[motor], rows.standard.__getitem__)
                 payload = mixed[model.flange] * (run.payload is not None)  # one body for all mountings will do
-                columns = np.concatenate((mixed[motor_columns[motor]], payload, rows.current))
+                columns = np.concatenate((mixed[support[motor]], payload, rows.current))
                 for block in np.unique(block_of_row[used]).tolist():
                     chosen = columns[:, used & (block_of_row == block)]
                     factors[motor][block] = qr_update(factors[motor][block], chosen)

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.data.dataset import differentiate
-from ident.equations.rows import Observation
+from ident.equations.observation import Observation
 from ident.estimators.identify import identify
 from ident.model.robot import Motion
 from ident.planning.clearance import LARGEST_PLANNED_MISFIT, Capsule, Checker, Scene
