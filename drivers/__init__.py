@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from drivers.canopen.bus import BusAddress as BusAddress
     from drivers.canopen.network import CanopenNetwork as CanopenNetwork
     from drivers.canopen.network import open_cell as open_cell
-    from drivers.canopen.scan import FoundNode as FoundNode
-    from drivers.canopen.scan import scan as scan
+    from drivers.canopen.node_scan import FoundNode as FoundNode
+    from drivers.canopen.node_scan import scan as scan
     from drivers.canopen.split_bus import BusPart as BusPart
     from drivers.canopen.split_bus import SplitAddress as SplitAddress
     from drivers.errors import BusBusy as BusBusy
@@ -75,7 +75,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "canopen.bus": "BusAddress",
     "canopen.network": "CanopenNetwork open_cell",
-    "canopen.scan": "FoundNode scan",
+    "canopen.node_scan": "FoundNode scan",
     "canopen.split_bus": "BusPart SplitAddress",
     "errors": "BusBusy BusError DriveFault DriverError MotionRefused MotionTimeout NodeError NodeMisplaced NodeMissing "
     "ObjectAccessError ParameterRefused ParametersMixed SampleLost SetupRefused StateRefused",

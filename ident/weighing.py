@@ -27,7 +27,7 @@ from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.effects.effect import PlacedEffect, effect_torque
-from ident.effects.geometry import corrected_dataset, corrected_model
+from ident.effects.geometry_corrections import corrected_dataset, corrected_model
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Signals, declared_signals
 from ident.equations.linearisation import jackknife_covariance
@@ -42,7 +42,7 @@ from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
 from ident.model.model import Column, Model
 from ident.model.robot import Place
 from ident.planning.excitation import UNSEEN, side_of_cube
-from ident.planning.verdict import ExtraMoves
+from ident.planning.gain_verdict import ExtraMoves
 from ident.prediction import corrections_of, left_of, placed_effect, standard_parameters
 
 MAX_PASSES = 8  #: Of the effects' columns; load friction of a tenth of the load needs three

@@ -150,7 +150,7 @@ _BY_NUMBER |= {
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
+class ErrorParts:
     """An error in its parts."""
 
     kind: str  #: class of the error
@@ -164,7 +164,7 @@ class Failure:
     powered: str = ""  #: axes that had power and are not confirmed without it
 
     @classmethod
-    def of(cls, error: Exception) -> Failure:
+    def of(cls, error: Exception) -> ErrorParts:
         """Take an error of `daq`, `drivers` or `ident` apart."""
         notes = getattr(error, "__notes__", ())
         labelled = {label: text for label, _, text in (note.partition(": ") for note in notes) if label in NOTES}
@@ -232,7 +232,7 @@ def _number(error: BaseException | None) -> int | None:
     return None
 
 
-def show_failure(failure: Failure, *, json_wanted: bool) -> None:
+def show_failure(failure: ErrorParts, *, json_wanted: bool) -> None:
     """Print an error on stderr; where that takes nothing, the exit code alone says it."""
     console = Console(stderr=True, soft_wrap=True)
     with suppress(OSError, ValueError):  # a full disk, a reader that has gone, a closed stream

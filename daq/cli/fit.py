@@ -170,7 +170,7 @@ def _fit_cases(
     from daq.documents.calibration_file import save_calibration
     from daq.files import replace_file
     from daq.report.fit import cases_document, cases_view
-    from daq.report.paper_tables import case_tables, page
+    from daq.report.paper_tables import case_tables, paper_page
     from daq.workflow.cases import CASES, CaseFit, calibration_of_case, fit_case, reduce_logs
 
     created = datetime.now(UTC)
@@ -191,7 +191,7 @@ def _fit_cases(
         folder.mkdir(parents=True, exist_ok=True)
         for name, file in files.items():
             save_calibration(calibrations[name], file)
-        replace_file(page_file, page(f"Identification of {reduced.cell.name}", tables, marker=TABLES).encode())
+        replace_file(page_file, paper_page(f"Identification of {reduced.cell.name}", tables, marker=TABLES).encode())
     if json:
         print_json(cases_document(fits, calibrations))
     else:

@@ -61,13 +61,13 @@ def history_verb(
     from daq.ledger.ledger import Ledger
     from daq.ledger.watch import watch
     from daq.report.history import (
-        describe,
         describe_actions,
         describe_verification,
+        history_document,
         in_force,
         say_verification,
-        show,
         show_axis,
+        show_history,
     )
     from daq.writeback.file_access import resolve_links
 
@@ -107,7 +107,7 @@ def history_verb(
         checked = _verified(ledger) if verify else None
         console = output_console()
         if json:
-            document = describe(declared.name, entries, chosen, all_series, current)
+            document = history_document(declared.name, entries, chosen, all_series, current)
             print_json(document if checked is None else {**document, "audit": describe_verification(checked)})
         else:
             if checked is not None:
@@ -115,7 +115,7 @@ def history_verb(
             elif axis is not None:
                 show_axis(chosen[0], all_series, actions, console)
             elif not lost:
-                show(entries, all_series, actions, console)
+                show_history(entries, all_series, actions, console)
             say_written(console, plot, csv)
         if checked is not None:
             _require(checked)
@@ -209,10 +209,10 @@ def _acknowledge(ledger: Ledger, series: Series, why: str | None, since: str | N
 
 
 def _add(ledger: Ledger, file: Path, now: datetime) -> None:
-    from daq.documents.calibration_file import decode, read
+    from daq.documents.calibration_file import decode_calibration, read_calibration_bytes
 
-    content = read(file)
-    calibration = decode(content, str(file))
+    content = read_calibration_bytes(file)
+    calibration = decode_calibration(content, str(file))
     if calibration.cell != ledger.cell.name:
         raise DataError(
             str(file),

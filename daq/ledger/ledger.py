@@ -16,7 +16,7 @@ from pathlib import Path
 
 from daq.config.cell import Cell
 from daq.config.policy import HistoryPlace
-from daq.documents.calibration_file import decode, encode
+from daq.documents.calibration_file import decode_calibration, encode_calibration
 from daq.errors import AuditUnusable, DataError, HistoryUnreadable, OutputFailed, evidence
 from daq.files import fsync_folder
 from daq.ledger.audit import AuditAction, AuditEntry, AuditVerdict, append, read, verify
@@ -145,7 +145,7 @@ class Ledger(HistoryStore):
         for one in self.entries():
             document = self.document(one.digest)
             if document is not None:
-                self._enter_calibration(decode(document, one.digest), one.digest, one.entered, at)
+                self._enter_calibration(decode_calibration(document, one.digest), one.digest, one.entered, at)
         found = {
             (one.subject, one.at, one.who) for one in read(self.place.audit) if one.action is AuditAction.WRITE_FOUND
         }
@@ -190,7 +190,7 @@ class Ledger(HistoryStore):
                 "sha256": digest,
                 "cell": self.cell.name,
                 "entered": iso(entered),
-                "document": encode(calibration).decode(),
+                "document": encode_calibration(calibration).decode(),
             }
             subject = f"history of {self.cell.name}"
             self._append(AuditAction.CALIBRATION_ENTERED, at, self.who, subject, details)

@@ -23,7 +23,7 @@ from typing import Any, Self
 from urllib.parse import quote
 
 from daq.config import yaml_file
-from daq.documents.calibration_file import decode, encode
+from daq.documents.calibration_file import decode_calibration, encode_calibration
 from daq.errors import DaqError, DataError, HistoryUnreadable, OutputFailed
 from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, differences, iso, listed, row_of, zoned
 from ident.calibration import Calibration, Gain
@@ -253,7 +253,7 @@ class HistoryStore:
             if connection.execute("SELECT 1 FROM calibration WHERE digest = ?", (digest,)).fetchone():
                 return False
             self._check_like(calibration)
-            row = {**row_of(calibration, digest, at), "document": encode(calibration).decode()}
+            row = {**row_of(calibration, digest, at), "document": encode_calibration(calibration).decode()}
             _insert(connection, "calibration", row)
             for place, gain in enumerate(calibration.gains):
                 _insert(connection, "gain", {"digest": digest, "place": place, **asdict(gain)})
@@ -374,7 +374,7 @@ class HistoryStore:
             digest, name = row["digest"], f"calibration {row['digest'][:12]}…"
             entered = zoned(row["entered"])
             try:
-                calibration = decode(row["document"].encode(), f"document of {name}")
+                calibration = decode_calibration(row["document"].encode(), f"document of {name}")
             except DaqError as error:
                 yield f"{name}: its document is {error.found}, expected {error.expected}"
                 continue

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 
 from daq.config.cell import Cell
 from daq.config.policy import HistoryPlace
-from daq.documents.calibration_file import decode
+from daq.documents.calibration_file import decode_calibration
 from daq.errors import DataError
 from daq.ledger.audit import AuditAction, AuditEntry, AuditVerdict, Content, verify
 from daq.ledger.entry import Acknowledgement, Event, WriteAction, differences, drives_of, iso, utc
@@ -156,7 +156,7 @@ def catch_up(
         for digest, entered_at, document in entered_calibration(one, cell.name):
             if digest not in known:
                 with contextlib.suppress(DataError):  # not comparable: of a history that was begun earlier
-                    store.add(decode(document, f"entry {one.number}"), digest=digest, at=entered_at)
+                    store.add(decode_calibration(document, f"entry {one.number}"), digest=digest, at=entered_at)
                     known.add(digest)
     _, new = unknown_writes(writes_to(cell, verdict, everywhere=True), audited)
     stopped, entered = set[str](), []

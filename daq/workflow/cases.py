@@ -20,7 +20,7 @@ from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.system import System, require_distinct
 from ident.estimators.comparison import Essential, essential
 from ident.estimators.estimate import Identification
-from ident.estimators.geometry import GeometryFinding
+from ident.estimators.geometry_estimate import GeometryFinding
 from ident.estimators.identify import each_run, estimate_with
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method

@@ -14,8 +14,8 @@ The order of the judgements, causes before their traces:
    is said of a fit in a wrong geometry, because all of it would be wrong.
 4. What is named (`ident.estimators.diagnosis.diagnose`): gains, estimators, payloads, errors, torques, condition.
 5. Currents without a sign and exchanged ones, where 4. named a trace of them, or the gains are fixed.
-6. Zeros and lengths that the encoders contradict (`daq.workflow.geometry`), where there are more of them than degrees
-   of freedom: found before any torque is looked at, and named first.
+6. Zeros and lengths that the encoders contradict (`daq.workflow.geometry_diagnoses`), where there are more of them than
+   degrees of freedom: found before any torque is looked at, and named first.
 7. Small mistakes of the description (`daq.workflow.description`): zeros, mounting and late positions, by torque. They
    are named before 4. to 6., and where they are, no exchange of currents is looked for (`daq.workflow.fit.judged`).
 8. Each held-out log; first whether the geometry has changed since the fit (`ident.geometry_drift`).
@@ -35,7 +35,7 @@ import numpy as np
 from daq.advice import for_command_line
 from daq.config.cell import Cell, model_of, robot_of
 from daq.workflow.description import drift_diagnosis
-from daq.workflow.geometry import geometry_diagnoses
+from daq.workflow.geometry_diagnoses import geometry_diagnoses
 from daq.workflow.validation import Validation
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import Calibration
@@ -71,7 +71,7 @@ from ident.model.urdf import read_urdf
 from ident.prediction import as_calibrated, mounted_parameters, standard_parameters
 
 if TYPE_CHECKING:  # which asks for these diagnoses
-    from ident.estimators.geometry import GeometryFinding
+    from ident.estimators.geometry_estimate import GeometryFinding
 
 ReadLog = Callable[[Path], tuple[Run, Cell]]  #: Reads a log, and the description of its cell
 

@@ -28,7 +28,7 @@ from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.effects.friction import TemperatureFriction
-from ident.effects.geometry import corrected_model
+from ident.effects.geometry_corrections import corrected_model
 from ident.effects.signals import REFERENCE_C
 from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.rows import row_filter, row_masks

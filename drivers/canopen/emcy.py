@@ -47,7 +47,7 @@ class ErrorCode:
 
 def explain(code: int) -> ErrorCode:
     """Return meaning and first remedy of an error code of 16 bits."""
-    return ErrorCode(code, f"{code:04X}h", describe(code), remedy_of(code))
+    return ErrorCode(code, f"{code:04X}h", describe_error_code(code), remedy_of(code))
 
 
 def remedy_of(code: int) -> str:
@@ -57,7 +57,7 @@ def remedy_of(code: int) -> str:
     return f"{first}; then reset the fault with `CanopenNetwork.reset_faults`"
 
 
-def describe(code: int) -> str:
+def describe_error_code(code: int) -> str:
     """Describe an error code of 16 bits; for a code that is in no standard, its class."""
     if code in CODES:
         return CODES[code]

@@ -17,7 +17,7 @@ from ident.data.demand import as_demanded, with_demand
 from ident.data.run import Run
 from ident.discovery.gates import own_unknowns, values_of
 from ident.effects.effect import PlacedEffect, effect_torque
-from ident.effects.geometry import GeometryEffect, corrected_dataset, corrected_model, is_correction
+from ident.effects.geometry_corrections import GeometryEffect, corrected_dataset, corrected_model, is_correction
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Signals, fitted_signals, session_began_s
 from ident.equations.observation import Observation, observe, on_demanded_motion
@@ -55,7 +55,7 @@ class Evidence:
     effects: tuple[PlacedEffect, ...]  #: in the model, in the order of their columns
     estimate: Estimate  #: of the training rows
     declared: int = 0  #: how many of the effects, the first ones, the cell declares: no search takes them out
-    #: Effects whose applied part has corrected model, runs and rows (`ident.effects.geometry`).
+    #: Effects whose applied part has corrected model, runs and rows (`ident.effects.geometry_corrections`).
     corrections: tuple[PlacedEffect, ...] = ()
     uncorrected: Uncorrected | None = None  #: as they were before; None where nothing was corrected
     _identification: list[Identification] = field(default_factory=list, init=False, repr=False, compare=False)

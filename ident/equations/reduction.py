@@ -197,6 +197,8 @@ class _Reducer:
             self.motor_rows += rows.motor_use.sum(axis=1)
             self.has_demanded_motion |= rows.instrument is not rows.standard
             numbers = np.unique(rows.move[rows.motor_use.any(axis=0)])
+            if not len(numbers):
+                continue  # every motor at standstill
             by_motor = [self._by_move(rows, motor, numbers) for motor in range(len(self.of_motor))]
             for move, own in zip(numbers.tolist(), zip(*by_motor, strict=True), strict=True):
                 counted = rows.motor_use[0] & (rows.move == move)

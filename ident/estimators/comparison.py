@@ -52,7 +52,7 @@ class EstimatorTrial:
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class EstimatorComparison:
     """All trials, those of the declared filters first."""
 
     trials: tuple[EstimatorTrial, ...]
@@ -71,12 +71,12 @@ class Comparison:
         return np.asarray(100.0 * np.ptp(values, axis=0) / np.abs(values.mean(axis=0)))
 
 
-def compare(
+def try_estimators(
     model: Model,
     runs: Callable[[], Iterable[Run]],
     conditioning: Conditioning,
     progress: Callable[[str], None] = lambda _: None,
-) -> Comparison:
+) -> EstimatorComparison:
     """Run every estimator under the declared filters, and under half and twice their cut-offs.
 
     Args:
@@ -119,7 +119,7 @@ def compare(
                     relative_error_percent=estimate.relative_error(system).total,
                 )
             )
-    return Comparison(tuple(trials))
+    return EstimatorComparison(tuple(trials))
 
 
 def _failed(estimator: str, filters: Conditioning, error: IdentificationError) -> EstimatorTrial:

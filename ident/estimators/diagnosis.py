@@ -212,7 +212,7 @@ def scale_diagnoses(
 
 
 @dataclass(frozen=True, slots=True)
-class CurrentScale:
+class TorqueScale:
     """Scale of the torque of an axis, from its current, beside the predicted one."""
 
     ratio: float  #: by least squares; NaN without torque
@@ -220,7 +220,7 @@ class CurrentScale:
     left: float  #: what no scale explains, relative to the measured torque (root mean squares)
 
 
-def current_scale(measured_nm: FloatArray, predicted_nm: FloatArray) -> CurrentScale:
+def current_scale(measured_nm: FloatArray, predicted_nm: FloatArray) -> TorqueScale:
     """Fit measured = ratio · predicted over the rows of one axis, shape (r,) each."""
     products = measured_nm * predicted_nm
     squares = predicted_nm**2
@@ -228,12 +228,12 @@ def current_scale(measured_nm: FloatArray, predicted_nm: FloatArray) -> CurrentS
     square = float(squares.sum())
     size = float(np.sum(measured_nm**2))
     if product == 0.0 or len(products) < SCALE_BLOCKS:
-        return CurrentScale(np.nan, np.nan, 1.0)
+        return TorqueScale(np.nan, np.nan, 1.0)
     starts = np.arange(SCALE_BLOCKS) * len(products) // SCALE_BLOCKS
     others = (product - np.add.reduceat(products, starts)) / (square - np.add.reduceat(squares, starts))
     std = float(np.sqrt((SCALE_BLOCKS - 1) * np.var(others)))
     left = float(np.sqrt(max(0.0, 1.0 - product**2 / (square * size))))
-    return CurrentScale(product / square, std, left)
+    return TorqueScale(product / square, std, left)
 
 
 _OF_LEAST_SQUARES = 'use `method="ml"`: noise in the currents makes the gains of least squares too small'

@@ -9,7 +9,7 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
-from daq.documents.calibration_file import encode
+from daq.documents.calibration_file import encode_calibration
 from daq.ledger.store import HistoryStore
 from ident.calibration import Calibration
 from tests.daq.calibrations import demo_calibration, recorded
@@ -44,7 +44,7 @@ def calibration_of(week: int, factors: tuple[float, ...] = (1.0,) * 6) -> Calibr
 
 def digest_of(calibration: Calibration) -> str:
     """SHA-256 of its file."""
-    return hashlib.sha256(encode(calibration)).hexdigest()
+    return hashlib.sha256(encode_calibration(calibration)).hexdigest()
 
 
 def enter(store: HistoryStore, calibration: Calibration) -> str:

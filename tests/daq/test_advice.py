@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from daq.advice import COMMANDS, for_command_line
-from daq.cli.failure import Failure
+from daq.cli.failure import ErrorParts
 from drivers.canopen.emcy import remedy_of
 from drivers.errors import NodeMisplaced, ParametersMixed
 from ident.errors import PayloadMissing
@@ -24,7 +24,7 @@ def test_every_name_of_the_table_is_in_a_message(name: str) -> None:
 
 
 def test_a_missing_payload_names_the_options_of_record_and_fit() -> None:
-    assert Failure.of(PayloadMissing(("bare",))).do == (
+    assert ErrorParts.of(PayloadMissing(("bare",))).do == (
         "record one (`record --payload NAME --mass KG`), or hold the gains (`--gains fixed`)"
     )
 
@@ -41,8 +41,8 @@ def test_estimators_that_disagree_name_method_and_residual() -> None:
 
 
 def test_a_misplaced_node_names_the_scan() -> None:
-    assert "; `drivegain scan` shows the nodes of each bus" in Failure.of(NodeMisplaced(3, "can0", "can1")).error
+    assert "; `drivegain scan` shows the nodes of each bus" in ErrorParts.of(NodeMisplaced(3, "can0", "can1")).error
 
 
 def test_mixed_parameters_name_the_rollback() -> None:
-    assert "`drivegain rollback CELL --drives`" in Failure.of(ParametersMixed(("J1",), ("J2: silent",))).do
+    assert "`drivegain rollback CELL --drives`" in ErrorParts.of(ParametersMixed(("J1",), ("J2: silent",))).do

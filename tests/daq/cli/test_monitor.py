@@ -21,13 +21,13 @@ from rich.table import Table
 
 from daq.advice import for_command_line
 from daq.cli.app import main
-from daq.config.bus import answer_us, bus_loads_percent, drive_axes
 from daq.config.cell import Cell, PacingMode, model_of
+from daq.config.cell_buses import answer_us, bus_loads_percent, drive_axes
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
 from daq.log.feed import Feed, RunFacts
-from daq.report.bus import monitor_document, monitor_view, prediction_view
 from daq.report.bus_schemas import MonitorReport
+from daq.report.bus_views import monitor_document, monitor_view, prediction_view
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.bus_lock import bus_lock, bus_taken
 from daq.workflow.events import event_document, explain_error_code

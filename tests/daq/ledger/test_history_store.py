@@ -19,7 +19,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daq.documents.calibration_file import decode, encode
+from daq.documents.calibration_file import decode_calibration, encode_calibration
 from daq.errors import DataError, HistoryUnreadable, OutputFailed, exit_code
 from daq.ledger.entry import Acknowledgement, WriteAction, iso, utc
 from daq.ledger.store import VERSION, HistoryStore
@@ -49,8 +49,8 @@ def test_a_calibration_comes_back_as_it_was(tmp_path: Path) -> None:
         (entry,) = store.entries()
         document = store.document(digest)
         assert store.integrity() == ()
-    assert document == encode(given_)
-    assert decode(document, "document") == given_
+    assert document == encode_calibration(given_)
+    assert decode_calibration(document, "document") == given_
     assert entry.gains == given_.gains
     assert (entry.digest, entry.cell, entry.method, entry.rows) == (digest, "demo", "ml", 14400)
     assert (entry.error_percent, entry.holdout_percent) == (3.2, 3.3)

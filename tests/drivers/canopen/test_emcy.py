@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canopen.emcy import CODES, describe, remedy_of
+from drivers.canopen.emcy import CODES, describe_error_code, remedy_of
 
 
 @pytest.mark.parametrize(
@@ -23,13 +23,13 @@ from drivers.canopen.emcy import CODES, describe, remedy_of
     ],
 )
 def test_a_code_has_the_text_of_its_standard_or_of_its_class(code: int, text: str) -> None:
-    assert describe(code) == text
+    assert describe_error_code(code) == text
 
 
 @given(st.integers(0, 0xFFFF))
 def test_every_code_says_something(code: int) -> None:
-    assert describe(code)
-    assert (describe(code) == CODES.get(code)) == (code in CODES)
+    assert describe_error_code(code)
+    assert (describe_error_code(code) == CODES.get(code)) == (code in CODES)
 
 
 def test_every_code_has_a_remedy_of_its_class() -> None:
