@@ -17,7 +17,7 @@ move axes                               `execute`, `Move`, `synchronised_move`, 
 errors                                  `DriverError` and its subclasses (drivers/errors.py)
 ======================================  ==========================================================================
 
-Nothing moves without a `MotionPermission`. A simulated cell for trials runs on the same buses: `drivegain simulate`.
+Nothing moves without a `MotionPermission`. A simulated cell for trials runs on the same buses (`drivers.simulation`).
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from drivers.canopen.bus import BusAddress as BusAddress
     from drivers.canopen.network import CanopenNetwork as CanopenNetwork
     from drivers.canopen.network import open_cell as open_cell
-    from drivers.canopen.scan import FoundNode as FoundNode
-    from drivers.canopen.scan import scan as scan
+    from drivers.canopen.node_scan import FoundNode as FoundNode
+    from drivers.canopen.node_scan import scan as scan
     from drivers.canopen.split_bus import BusPart as BusPart
     from drivers.canopen.split_bus import SplitAddress as SplitAddress
     from drivers.errors import BusBusy as BusBusy

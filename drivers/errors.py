@@ -154,7 +154,7 @@ class NodeMisplaced(DriverError):
         super().__init__(
             f"{node_label(node_id, {node_id: axis})} is heard on bus {found}, the cell configuration has it on bus "
             f"{expected}: it is wired to the other bus, two amplifiers have that node id, or both CAN interfaces are "
-            "on one wire; `drivegain scan` shows the nodes of each bus"
+            "on one wire; `drivers.scan` shows the nodes of each bus"
         )
         self.node_id = node_id
         self.expected = expected
@@ -211,7 +211,7 @@ class ParametersMixed(DriverError):
     def __init__(self, restored: tuple[str, ...], problems: tuple[str, ...]) -> None:
         super().__init__(
             f"the write failed midway; the old values are restored in {', '.join(restored) or 'no drive'}, and NOT "
-            f"confirmed where {'; '.join(problems)}; do not enable the axes before `drivegain rollback --drives`"
+            f"confirmed where {'; '.join(problems)}; do not enable an axis before every drive has its old value again"
         )
         self.restored = restored
         self.problems = problems

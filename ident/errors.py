@@ -57,7 +57,7 @@ class PayloadMissing(DataUnfit):
         self.subject = f"{'runs' if len(runs) > 1 else 'run'} {', '.join(runs)}"
         self.found = "no run with a payload of known mass"
         self.expected = "at least one; without it all gains could be scaled at will"
-        self.remedy = "record one (`record --payload NAME --mass KG`), or hold the gains (`--gains fixed`)"
+        self.remedy = "record one (`Run.payload`), or hold the gains (`fixed_gains`)"
         super().__init__(", ".join(runs), f"found {self.found}; expected {self.expected}; {self.remedy}")
 
 

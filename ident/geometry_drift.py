@@ -1,9 +1,9 @@
 """Whether the geometry of a robot has changed since its calibration, by one run that the fit has not seen.
 
 An encoder that lost its zero, or a base that was moved, leaves a part of the prediction's error that is the derivative
-of the whole arm's torque (`ident.effects.geometry`). Friction and gains change with temperature and wear, so what they
-explain is left out of the comparison: on each axis the predicted torque, its speed, the direction of motion and a
-constant. So is what another payload, or another way of mounting it, explains.
+of the whole arm's torque (`ident.effects.geometry_corrections`). Friction and gains change with temperature and wear,
+so what they explain is left out of the comparison: on each axis the predicted torque, its speed, the direction of
+motion and a constant. So is what another payload, or another way of mounting it, explains.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import GEOMETRY
 from ident.effects.effect import PlacedEffect, is_placeable
-from ident.effects.geometry import corrected_dataset, corrected_model
+from ident.effects.geometry_corrections import corrected_dataset, corrected_model
 from ident.effects.signals import declared_signals
 from ident.equations.rows import at_rows
 from ident.model.model import Model

@@ -11,7 +11,7 @@ from ident.calibration import EXTRAPOLATED, AcceptedEffect, Calibration, Paramet
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import EFFECTS, GEOMETRY, UNNAMED
 from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, at_joints, check_settings, columns_at
-from ident.effects.geometry import GeometryEffect, corrected_dataset, corrected_model, is_correction
+from ident.effects.geometry_corrections import GeometryEffect, corrected_dataset, corrected_model, is_correction
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import declared_signals, payload_parameters
 from ident.errors import DataUnfit, EffectRefused, ModelError

@@ -27,21 +27,22 @@ from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.effects.effect import PlacedEffect, effect_torque
-from ident.effects.geometry import corrected_dataset, corrected_model
+from ident.effects.geometry_corrections import corrected_dataset, corrected_model
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Signals, declared_signals
 from ident.equations.linearisation import jackknife_covariance
-from ident.equations.rows import Observation, observe
-from ident.equations.system import Equations, System
+from ident.equations.observation import Observation, observe
+from ident.equations.reduction import standard_equations
+from ident.equations.system import System
 from ident.equations.triangles import solve
 from ident.errors import DataUnfit
 from ident.estimators.estimate import RelativeError, relative_error
-from ident.model.base import BaseParameters, base_parameters
+from ident.model.base import base_parameters
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
 from ident.model.model import Column, Model
 from ident.model.robot import Place
 from ident.planning.excitation import UNSEEN, side_of_cube
-from ident.planning.verdict import ExtraMoves
+from ident.planning.gain_verdict import ExtraMoves
 from ident.prediction import corrections_of, left_of, placed_effect, standard_parameters
 
 MAX_PASSES = 8  #: Of the effects' columns; load friction of a tenth of the load needs three
@@ -211,11 +212,7 @@ def rows_to_weigh(
 
 def _rows_of(model: Model, datasets: tuple[Dataset, ...], bare: int, conditioning: Conditioning) -> RowsToWeigh:
     """Build the rows of runs, those without the body first."""
-    names = tuple(column.name for column in model.columns)
-    every = BaseParameters(tuple(range(len(names))), np.eye(len(names)), names)
-    runs = tuple(data.name for data in datasets)
-    standard = Equations(model, every, model.columns, (), (), runs)
-    rows = observe(model, datasets, conditioning, standard)
+    rows = observe(model, datasets, conditioning, standard_equations(model))
     body = tuple(Column(f"{name}:body", unit) for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True))
     rows = rows.extended(body, rows.flange * (rows.run >= bare))
     return RowsToWeigh(model, datasets, bare, rows)

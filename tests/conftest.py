@@ -80,7 +80,7 @@ def reports_match_their_schemas() -> Iterator[None]:
     """Hold every document that a verb prints under `--json`, in any test, against its published schema."""
     running = ""
     adapter = functools.cache(TypeAdapter[Any])
-    run, spell, describe = app._run, json_text, failure.Failure.document
+    run, spell, describe = app._run, json_text, failure.ErrorParts.document
 
     def noted(words: list[str], json_wanted: bool) -> int:
         nonlocal running
@@ -97,7 +97,7 @@ def reports_match_their_schemas() -> Iterator[None]:
             adapter(REPORTS[running]).validate_json(re.sub(r"(?<!\\)\\ud", "ud", text))
         return text
 
-    def described(error: failure.Failure) -> dict[str, Any]:
+    def described(error: failure.ErrorParts) -> dict[str, Any]:
         document = describe(error)
         ErrorReport.model_validate(document)
         return document
@@ -105,7 +105,7 @@ def reports_match_their_schemas() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(app, "_run", noted)
         patch.setattr("daq.cli.verb.json_text", spelled)
-        patch.setattr(failure.Failure, "document", described)
+        patch.setattr(failure.ErrorParts, "document", described)
         yield
 
 

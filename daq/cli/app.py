@@ -18,7 +18,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from daq.cli.failure import Failure, show_failure
+from daq.cli.failure import ErrorParts, show_failure
 from daq.cli.terminal import STARTED, WRITTEN, interruptible, remove_empty_folders, say_last
 from daq.cli.verb import HELP_NAMES, Job, Listed
 from daq.environment import software
@@ -158,7 +158,7 @@ def _run(words: list[str], json_wanted: bool) -> int:
     except (DaqError, DriverError, IdentificationError) as error:
         if isinstance(error, OutputFailed) and _kept():
             error.add_note(f"kept: {_kept()}")
-        failure = Failure.of(error)
+        failure = ErrorParts.of(error)
         show_failure(failure, json_wanted=json_wanted)
         return failure.exit_code
     except OSError as error:
@@ -192,7 +192,7 @@ def _usage_failed(error: Any, json_wanted: bool) -> int:
         found = f"{given[0]!r}: {found}"
         if re.fullmatch(r"[+-]?\d*,\d+", given[0]):
             remedy = f"write a decimal point: {given[0].replace(',', '.')}"
-    failure = Failure("UsageError", error.ctx.command_path, found, usage, remedy, ExitCode.USAGE)
+    failure = ErrorParts("UsageError", error.ctx.command_path, found, usage, remedy, ExitCode.USAGE)
     show_failure(failure, json_wanted=json_wanted)
     return ExitCode.USAGE
 
@@ -204,7 +204,7 @@ def _output_failed(error: OSError, json_wanted: bool) -> int:
         if not error.filename:
             failed.expected = "an output that takes what is printed"
             failed.remedy = f"only the printed output is lost: {_kept()}" if WRITTEN else "send it elsewhere"
-        show_failure(Failure.of(failed), json_wanted=json_wanted)
+        show_failure(ErrorParts.of(failed), json_wanted=json_wanted)
     try:
         sys.stdout.flush()
     except OSError:

@@ -79,14 +79,14 @@ def apply_verb(
     The bounds of the gates are in the cell's `policy: {apply: ...}`; see docs/reference/gates.md.
     """
     from daq.config.cell_file import load_cell
-    from daq.documents.calibration_file import decode, read
+    from daq.documents.calibration_file import decode_calibration, read_calibration_bytes
     from daq.writeback.file_target import FileTarget
     from daq.writeback.request import Request
 
     saving = saving_of(ram_only, save_unknown, drives=drives)
     declared, actor = load_cell(cell), applier(by)
-    content = read(calibration)
-    fitted = decode(content, str(calibration))
+    content = read_calibration_bytes(calibration)
+    fitted = decode_calibration(content, str(calibration))
     request = Request(
         fitted,
         datetime.now(UTC),
@@ -127,7 +127,7 @@ def apply_to(
 
     The write, with its entries in audit log and history, is done within `whole`.
     """
-    from daq.report.proposal import describe, show
+    from daq.report.proposal import proposal_document, show_proposal
     from daq.writeback.judgement import query_history
     from daq.writeback.target import apply, propose
 
@@ -137,17 +137,17 @@ def apply_to(
         edit = proposal.edit
         known = query_history(declared, edit.subject, request, edit.changes)
         if not json:
-            show(proposal, output_console(), known)
+            show_proposal(proposal, output_console(), known)
         try:
             if yes:
                 with whole or nullcontext(), write_output(edit.place) if edit.has_effect else nullcontext():
                     written = apply(proposal, request.now, audit=audit, who=str(actor))
         except CalibrationRefused:
             if json:
-                print_json(describe(proposal, None, known))
+                print_json(proposal_document(proposal, None, known))
             raise
     if json:
-        print_json(describe(proposal, written, known))
+        print_json(proposal_document(proposal, written, known))
     else:
         _show_outcome(proposal, written, audit, undo, yes=yes)
     if proposal.refusals:
@@ -380,7 +380,7 @@ def saving_of(ram_only: bool, save_unknown: bool, *, drives: bool = True) -> Sav
 @contextmanager
 def drives_on_the_bus(declared: Cell, saving: Saving) -> Iterator[DriveTarget]:
     """Open the drives of a cell, its buses locked; Ctrl-C and SIGTERM restore the values written until then."""
-    from daq.config.bus import cell_address, drive_axes
+    from daq.config.cell_buses import cell_address, drive_axes
     from daq.workflow.bus_lock import bus_lock
     from daq.writeback.drive_target import DriveTarget
     from drivers.canopen.network import CanopenNetwork

@@ -103,10 +103,10 @@ def export_urdf_verb(
     """
     from daq.cli.terminal import check_output, print_view, status
     from daq.config.cell_file import URDF, bundle
-    from daq.config.yaml_file import read_bytes
+    from daq.config.yaml_file import read_yaml_bytes
     from daq.documents.calibration_file import load_calibration
     from daq.environment import software
-    from daq.report.urdf import urdf_document, urdf_view
+    from daq.report.urdf_views import urdf_document, urdf_view
     from daq.workflow.fit import DOUBTFUL_PERCENT
     from daq.workflow.remaining_corrections import on_cell
     from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, require_solver, update_urdf
@@ -130,7 +130,7 @@ def export_urdf_verb(
             expected=f"at most {DOUBTFUL_PERCENT:g} %",
             remedy="fit again; `drivegain fit` lists what to check",
         )
-    content = bundle(given)[URDF] if urdf is None else read_bytes(given)
+    content = bundle(given)[URDF] if urdf is None else read_yaml_bytes(given)
     if out.exists() and out.read_bytes() == content:
         raise UsageError(str(out), found="the input URDF", expected="a file of its own", remedy="choose another name")
     parse_markup(content, str(given))  # before any other reader sees it

@@ -1,7 +1,8 @@
 """An error for the user: subject, found, expected and remedy, a line each, or one line of JSON under `--json`.
 
 The errors of `daq` carry the four parts. Those of `drivers` and `ident` say what was found; `ADVICE` adds what the
-command line expects there, and a remedy. Errors of the operating system on a bus are explained by their number.
+command line expects there, and a remedy, and `daq.advice` puts verbs in the place of functions. Errors of the operating
+system on a bus are explained by their number.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
+from daq.advice import for_command_line
 from daq.errors import DaqError, ExitCode, exit_code
 from daq.report.text import printable, spelled_bytes
 from drivers import errors as driver
@@ -148,7 +150,7 @@ _BY_NUMBER |= {
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
+class ErrorParts:
     """An error in its parts."""
 
     kind: str  #: class of the error
@@ -162,13 +164,17 @@ class Failure:
     powered: str = ""  #: axes that had power and are not confirmed without it
 
     @classmethod
-    def of(cls, error: Exception) -> Failure:
+    def of(cls, error: Exception) -> ErrorParts:
         """Take an error of `daq`, `drivers` or `ident` apart."""
         notes = getattr(error, "__notes__", ())
         labelled = {label: text for label, _, text in (note.partition(": ") for note in notes) if label in NOTES}
+        subject, found, expected, remedy = map(for_command_line, _parts(error))
         return cls(
             type(error).__name__,
-            *_parts(error),
+            subject,
+            found,
+            expected,
+            remedy,
             int(exit_code(type(error)) or ExitCode.UNEXPECTED),
             labelled,
             tuple(note for note in driver.stop_notes(error) if note.startswith(driver.WHILE)),
@@ -226,7 +232,7 @@ def _number(error: BaseException | None) -> int | None:
     return None
 
 
-def show_failure(failure: Failure, *, json_wanted: bool) -> None:
+def show_failure(failure: ErrorParts, *, json_wanted: bool) -> None:
     """Print an error on stderr; where that takes nothing, the exit code alone says it."""
     console = Console(stderr=True, soft_wrap=True)
     with suppress(OSError, ValueError):  # a full disk, a reader that has gone, a closed stream

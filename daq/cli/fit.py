@@ -216,7 +216,7 @@ def _fit_cases(request: FitRequest, folder: Path) -> None:
     from daq.documents.calibration_file import save_calibration
     from daq.files import replace_file
     from daq.report.fit import cases_document, cases_view
-    from daq.report.paper_tables import case_tables, page
+    from daq.report.paper_tables import case_tables, paper_page
     from daq.workflow.cases import CASES, calibration_of_case, fit_case, reduce_logs
 
     at_most_one(
@@ -251,7 +251,7 @@ def _fit_cases(request: FitRequest, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         for name, file in files.items():
             save_calibration(calibrations[name], file)
-        replace_file(page_file, page(f"Identification of {reduced.cell.name}", tables, marker=TABLES).encode())
+        replace_file(page_file, paper_page(f"Identification of {reduced.cell.name}", tables, marker=TABLES).encode())
     if request.json:
         print_json(cases_document(fits, calibrations))
     else:

@@ -72,13 +72,13 @@ def history_verb(
     from daq.ledger.ledger import Ledger, read_history, warn_if_broken
     from daq.ledger.watch import watch
     from daq.report.history import (
-        describe,
         describe_actions,
         describe_verification,
+        history_document,
         in_force,
         say_verification,
-        show,
         show_axis,
+        show_history,
     )
     from daq.writeback.file_access import resolve_links
 
@@ -118,7 +118,7 @@ def history_verb(
         resolve_links(declared.controller_path)
     console = output_console()
     if json:
-        document = describe(declared.name, history.entries, chosen, all_series, current)
+        document = history_document(declared.name, history.entries, chosen, all_series, current)
         print_json(document if checked is None else {**document, "audit": describe_verification(checked)})
     else:
         if checked is not None:
@@ -126,7 +126,7 @@ def history_verb(
         elif axis is not None:
             show_axis(chosen[0], all_series, actions, console)
         elif history.entries or not broken:
-            show(history.entries, all_series, actions, console)
+            show_history(history.entries, all_series, actions, console)
         say_written(console, plot, csv)
     if checked is not None:
         _require(ledger, checked)
@@ -230,11 +230,11 @@ def _acknowledge(ledger: Ledger, series: Series, who: str, why: str | None, sinc
 
 
 def _add(ledger: Ledger, file: Path, who: str, now: datetime) -> None:
-    from daq.documents.calibration_file import decode, read
+    from daq.documents.calibration_file import decode_calibration, read_calibration_bytes
     from daq.ledger.ledger import enter_calibration, verify_ledger
 
-    content = read(file)
-    calibration = decode(content, str(file))
+    content = read_calibration_bytes(file)
+    calibration = decode_calibration(content, str(file))
     if calibration.cell != ledger.cell.name:
         raise DataError(
             str(file),

@@ -25,7 +25,7 @@ TEMPLATES = (
 """Shipped files, and their names in the new folder."""
 
 
-def make_folder(folder: Path, *, simulated: bool = False) -> tuple[Path, ...]:
+def make_cell_folder(folder: Path, *, simulated: bool = False) -> tuple[Path, ...]:
     """Copy the templates into a new or empty folder, all of them or none; return the files."""
     import yaml
 
@@ -66,7 +66,7 @@ def init(
     simulated: Annotated[bool, typer.Option("--simulated", help="Use the bus of `drivegain simulate demo`.")] = False,
 ) -> None:
     """Create a folder for a new cell, with commented templates to fill in."""
-    for path in make_folder(folder, simulated=simulated):
+    for path in make_cell_folder(folder, simulated=simulated):
         typer.echo(path)
     say_next("drivegain", "scan", folder / "cells" / f"{folder.resolve().name}.yaml")
 

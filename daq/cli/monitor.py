@@ -32,11 +32,11 @@ def monitor_verb(
     from rich.live import Live
 
     from daq.cli.terminal import interruptible
-    from daq.config.bus import cell_address, drive_axes
+    from daq.config.cell_buses import cell_address, drive_axes
     from daq.config.cell_file import load_cell
     from daq.documents.calibration_file import load_calibration
     from daq.log.feed import Feed
-    from daq.report.bus import monitor_document, monitor_view
+    from daq.report.bus_views import monitor_document, monitor_view
     from daq.workflow.monitor import CellWatch
     from daq.workflow.validate import check_cell
     from drivers.canopen.network import CanopenNetwork

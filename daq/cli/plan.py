@@ -49,7 +49,7 @@ def plan_verb(
     from daq.workflow.nameplates import check_controller
     from daq.workflow.plan import plan
     from daq.workflow.plan_file import load_plan, save_plan
-    from ident.planning.verdict import verdicts
+    from ident.planning.gain_verdict import verdicts
 
     check_output(out, (cell,), "drivegain-plan")
     if preview is not None:

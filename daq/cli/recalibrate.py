@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from daq.advice import for_command_line
 from daq.cli.verb import JsonOption, Verb, judged_output, print_json
 from daq.errors import DaqError, ExitCode, UsageError, exit_code
 from drivers.errors import DriverError, all_notes, stop_notes
@@ -50,7 +51,7 @@ def recalibrate_verb(
             Level.ERROR,
             "failed",
             error=type(error).__name__,
-            text=str(error),
+            text=for_command_line(str(error)),
             notes=list(all_notes(error)),
         )
         if journal.form is Form.TEXT:

@@ -48,7 +48,7 @@ def record_verb(
     A run with losses is kept, marked invalid, and ends with exit code 4; `fit` refuses it.
     """
     from daq.cli.terminal import interruptible, progress_bar, say_last
-    from daq.config.bus import bus_loads
+    from daq.config.cell_buses import bus_loads
     from daq.config.cell_file import load_cell
     from daq.environment import login
     from daq.log.feed import Feed
@@ -165,7 +165,7 @@ def _is_unloaded(log: Path, declared: Cell) -> bool:
 
 def _before_motion(cell: Cell, plan: Path, not_weighed: bool) -> Iterator[str]:
     """Remarks for a person before the axes move."""
-    from daq.report.bus import load_lines
+    from daq.report.bus_views import load_lines
     from daq.report.plan_preview import find_preview
 
     if not_weighed:

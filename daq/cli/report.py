@@ -34,7 +34,7 @@ def report_verb(
 
     from daq.cli.terminal import check_folder, check_replaceable, print_view, write_output
     from daq.config.cell_file import load_cell
-    from daq.documents.calibration_file import decode, load_calibration, read
+    from daq.documents.calibration_file import decode_calibration, load_calibration, read_calibration_bytes
     from daq.files import replace_file
     from daq.report.certificate import certificate_document, certify, compare, without_controller
     from daq.report.certificate_page import certificate_page
@@ -44,8 +44,8 @@ def report_verb(
     page = out or calibration.with_suffix(".html")
     check_folder(page)
     check_replaceable(page, MARK, "page of drivegain")
-    content = read(calibration)
-    fitted = decode(content, str(calibration))
+    content = read_calibration_bytes(calibration)
+    fitted = decode_calibration(content, str(calibration))
     earlier = None if beside is None else load_calibration(beside)
     request = Request(fitted, datetime.now(UTC), file=calibration, content=content)
     if cell is None:

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from daq.config.cell import Cell
     from drivers.canopen.bus import BusAddress
     from drivers.canopen.network import CanopenNetwork
+    from drivers.canopen.node_scan import FoundNode
     from drivers.canopen.scale import ScaleReading
-    from drivers.canopen.scan import FoundNode
     from drivers.profiles.profile import Axis
 
 
@@ -38,10 +38,10 @@ def scan_verb(
     another master uses the bus, nothing is sent: exit code 12 or 5.
     """
     from daq.cli.terminal import print_view
-    from daq.config.bus import bus_parts, cell_address, drive_axes
+    from daq.config.cell_buses import bus_parts, cell_address, drive_axes
     from daq.config.cell_file import load_cell
     from daq.errors import ConfigurationInconsistent
-    from daq.report.bus import current_signals, scan_rows, scan_view
+    from daq.report.bus_views import current_signals, scan_rows, scan_view
     from daq.workflow.bus_lock import bus_lock
     from daq.workflow.nameplates import check_nameplates, nameplate_warnings
 
@@ -189,9 +189,10 @@ def explain_emcy_verb(
 
     For a manufacturer's own code only its class is known; the drive's manual has the rest.
     """
-    from drivers.canopen.emcy import CODES, explain
+    from daq.workflow.events import explain_error_code
+    from drivers.canopen.emcy import CODES
 
-    found = explain(read_code(code))
+    found = explain_error_code(read_code(code))
     if json:
         print_json({**asdict(found), "standard": found.code in CODES})
     else:

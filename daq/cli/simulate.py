@@ -16,7 +16,7 @@ from daq.files import read_regular
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from daq.simulation.demo import Outcome
+    from daq.simulation.demo import DemoOutcome
     from drivers.canopen.split_bus import BusPart
     from drivers.simulation.spec import CellSpec
 
@@ -214,9 +214,9 @@ def demo(
 
     from daq.cli.terminal import output_console, print_view, show_steps, write_output
     from daq.files import replace_file
-    from daq.report.proposal import show as show_proposal
+    from daq.report.proposal import show_proposal
     from daq.report.text import json_text
-    from daq.simulation.demo import ProgressReporter, Settings, demonstrate, summary
+    from daq.simulation.demo import ProgressReporter, Settings, demo_summary, demonstrate
     from daq.simulation.simulation_file import shipped_simulation
 
     began = time.monotonic()
@@ -224,7 +224,7 @@ def demo(
     with write_output(out):
         with show_steps() as stepper:
             outcome = demonstrate(settings, lambda: datetime.now(UTC), ProgressReporter(stepper.step, stepper.progress))
-        document = {**summary(outcome), "seconds": round(time.monotonic() - began, 1)}
+        document = {**demo_summary(outcome), "seconds": round(time.monotonic() - began, 1)}
         replace_file(out / "summary.json", json_text(document).encode())
     if json:
         print_json(document)
@@ -236,9 +236,9 @@ def demo(
     typer.echo(f"\nLogs, calibration.yaml, pictures, summary.json and report/report.html are in {out}.")
 
 
-def demo_view(outcome: Outcome) -> Iterator[RenderableType]:
+def demo_view(outcome: DemoOutcome) -> Iterator[RenderableType]:
     """Nodes on the bus, turns of the loop, errors before and after, the summary, and the gains beside the truth."""
-    from daq.report.bus import scan_rows, scan_table
+    from daq.report.bus_views import scan_rows, scan_table
     from daq.report.gains import gain_table
     from daq.report.residual import before_after_table, summary, turns_view
     from daq.report.text import Sentence

@@ -181,7 +181,7 @@ class Stepper(Protocol):
         """End the current step."""
 
 
-class _Lines:
+class _PrintedLines:
     """A line for each step as it ends, whole and at once, for a file or pipe."""
 
     def __init__(self) -> None:
@@ -227,7 +227,7 @@ def show_steps() -> Iterator[Stepper]:
     """Show progress on stderr, in a terminal as bars; the last step is ended unless an error is raised."""
     console = Console(stderr=True)
     if not console.is_terminal:
-        lines = _Lines()
+        lines = _PrintedLines()
         yield lines
         lines.end()
         return

@@ -54,7 +54,7 @@ def validate_verb(
     from daq.cli.terminal import check_output, print_view, status, write_output
     from daq.config.cell_file import load_cell
     from daq.files import replace_file
-    from daq.report.paper_tables import page
+    from daq.report.paper_tables import paper_page
     from daq.report.validation import (
         cross_document,
         draw_validations,
@@ -79,7 +79,7 @@ def validate_verb(
         tables = validation_tables(found, complete=True)
         with write_output(page_file):
             page_file.parent.mkdir(parents=True, exist_ok=True)
-            replace_file(page_file, page(f"Validation of {known.cell}", tables, marker=TABLES).encode())
+            replace_file(page_file, paper_page(f"Validation of {known.cell}", tables, marker=TABLES).encode())
     if json:
         print_json({**validation_document(known, found.validations, drawn), **cross_document(found)})
     else:

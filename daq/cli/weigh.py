@@ -28,7 +28,7 @@ def weigh_verb(
     from daq.cli.terminal import print_view, status
     from daq.config.cell_file import load_cell
     from daq.documents.calibration_file import load_calibration
-    from daq.report.weighing import weighed_document, weighed_view
+    from daq.report.weighing_views import weighed_document, weighed_view
     from daq.workflow.weigh import weigh_logs
 
     with status("weighing"):
@@ -63,7 +63,7 @@ def contact_verb(
     from daq.cli.terminal import print_view, status, write_output
     from daq.config.cell_file import load_cell
     from daq.documents.calibration_file import load_calibration
-    from daq.report.weighing import contact_document, contact_view, draw_contact
+    from daq.report.weighing_views import contact_document, contact_view, draw_contact
     from daq.workflow.weigh import contact_in
 
     picture = None

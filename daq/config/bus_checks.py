@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 
-from daq.config.bus import LARGEST_MEAN, bus_load, shortest_period_us, split_answers
 from daq.config.cell import KERNEL, RECORDER, Bus, PacingMode
+from daq.config.cell_buses import LARGEST_MEAN, bus_load, shortest_period_us, split_answers
 from daq.config.cell_schema import CellModel
 from daq.config.yaml_file import Fault, Location
 from drivers.profiles.profile import DriveProfile

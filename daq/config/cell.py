@@ -11,11 +11,11 @@ from typing import Annotated
 
 from pydantic import Field
 
-from daq.config.clearance import Clearance
-from daq.config.closed_chain import ClosedChain, robot_with
+from daq.config.cell_closures import ClosedChain, robot_with
 from daq.config.controller import Controller
 from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistoryPlace, Permission
 from daq.config.recalibration import Recalibration
+from daq.config.workspace import Clearance
 from daq.config.yaml_file import FileName, Name
 from drivers.profiles.profile import DriveProfile, Identity
 from ident.arrays import FloatArray
@@ -99,7 +99,7 @@ class Limits:
 
 
 @dataclass(frozen=True, slots=True)
-class Axis:
+class CellAxis:
     """One motor with its amplifier, and the joint of the same number."""
 
     name: str
@@ -166,7 +166,7 @@ class Cell:
     ratio: FloatArray  #: drive train R with q_motor = R q_joint (paper eq. 24), shape (n, n); rad/m, prismatic joints
     buses: tuple[Bus, ...]  #: buses of the amplifiers, usually one; empty in a cell that only imports recordings
     sync: Sync | None  #: sampling; None in such a cell
-    axes: tuple[Axis, ...]  #: n axes
+    axes: tuple[CellAxis, ...]  #: n axes
     payloads: tuple[WeighedPayload, ...]  #: bodies that can be mounted
     conditioning: Conditioning  #: the filters
     controller: Controller | None  #: destination of the gains, None without write-back
@@ -200,7 +200,7 @@ class Cell:
         return place.joinpath(*parts)
 
     @property
-    def wiring(self) -> tuple[tuple[Bus, tuple[Axis, ...]], ...]:
+    def wiring(self) -> tuple[tuple[Bus, tuple[CellAxis, ...]], ...]:
         """Each bus with its axes."""
         return tuple((bus, tuple(axis for axis in self.axes if axis.bus == bus.name)) for bus in self.buses)
 

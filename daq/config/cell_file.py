@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from daq.config.cell import MILLIMETRE, Axis, Cell, DeclaredEffect, Limits, WeighedPayload
+from daq.config.cell import MILLIMETRE, Cell, CellAxis, DeclaredEffect, Limits, WeighedPayload
+from daq.config.cell_closures import ClosedChain, chain_of, platform_frame
 from daq.config.cell_schema import AxisModel, CellModel, ConditioningModel, EffectModel, PayloadModel, ratio_of
 from daq.config.checks import check
-from daq.config.clearance import clearance_of
-from daq.config.closed_chain import ClosedChain, chain_of, platform_frame
 from daq.config.drive import drive_from_text
 from daq.config.hold import held_urdf
-from daq.config.yaml_file import parse_yaml, read_bytes, read_model
+from daq.config.workspace import clearance_of
+from daq.config.yaml_file import parse_yaml, read_model, read_yaml_bytes
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationMissing
 from drivers.profiles.profile import DriveProfile, Identity, TapPoint
@@ -40,7 +40,7 @@ def load_cell(path: Path | str) -> Cell:
     path = Path(path)
     sources = _sources(path)
     names = {name: str(source) for name, source in sources.items()}
-    return cell_from_bundle({name: read_bytes(source) for name, source in sources.items()}, path, names)
+    return cell_from_bundle({name: read_yaml_bytes(source) for name, source in sources.items()}, path, names)
 
 
 def bundle(path: Path) -> dict[str, bytes]:
@@ -49,7 +49,7 @@ def bundle(path: Path) -> dict[str, bytes]:
     Raises:
         ConfigurationError: a file is missing, or the cell file is not what its schema says.
     """
-    return {name: read_bytes(source) for name, source in _sources(path).items()}
+    return {name: read_yaml_bytes(source) for name, source in _sources(path).items()}
 
 
 def cell_from_bundle(
@@ -145,11 +145,11 @@ def _without(tree: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
 
 def _sources(path: Path) -> dict[str, Path]:
     """Locate the members of a cell's bundle on disk."""
-    model = read_model(parse_yaml(read_bytes(path), str(path)), CellModel)
+    model = read_model(parse_yaml(read_yaml_bytes(path), str(path)), CellModel)
     sources = {CELL: path, URDF: path.parent / model.robot.urdf}
     for drive in model.drives:
         profile = sources[f"{DRIVES}{drive}.yaml"] = _drive_path(path.parent, drive)
-        tree = parse_yaml(read_bytes(profile), str(profile)).tree
+        tree = parse_yaml(read_yaml_bytes(profile), str(profile)).tree
         if isinstance(tree, dict) and isinstance(eds := tree.get("eds"), str) and eds:  # the schema is checked later
             sources[f"{DRIVES}{drive}.eds"] = profile.parent / eds
     return sources
@@ -182,7 +182,7 @@ def _member(files: Mapping[str, bytes], member: str, names: Mapping[str, str]) -
     )
 
 
-def _axis(model: AxisModel, bus: str | None, profiles: Mapping[str, DriveProfile]) -> Axis:
+def _axis(model: AxisModel, bus: str | None, profiles: Mapping[str, DriveProfile]) -> CellAxis:
     limits, unit = model.limits, model.limits.unit
     # The schema requires exactly one of the three, the checks that it matches the kind of joint.
     gains = (model.nameplate_gain_nm_per_a, model.nameplate_gain_n_per_a, model.nameplate_gain)
@@ -190,7 +190,7 @@ def _axis(model: AxisModel, bus: str | None, profiles: Mapping[str, DriveProfile
     profile = None if model.drive is None else profiles[model.drive]
     # A gain by the actual current is another quantity, so its unit must show it.
     ampere = "A(actual)" if profile is not None and profile.tap is TapPoint.ACTUAL else "A"
-    return Axis(
+    return CellAxis(
         name=model.name,
         node_id=model.node_id,
         drive=model.drive,

@@ -14,11 +14,11 @@ import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from daq.config.cell import DEGREE, MILLIMETRE, Bus, JointUnit, MotionPolicy, Sync, UnnamedBus
-from daq.config.clearance import ClearanceSection, WorkspaceSection
-from daq.config.closed_chain import ChainModel, ClosureModel
+from daq.config.cell_closures import ChainModel, ClosureModel
 from daq.config.controller import Controller
 from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistorySection, Permission
 from daq.config.recalibration import RecalibrationSection
+from daq.config.workspace import ClearanceSection, WorkspaceSection
 from daq.config.yaml_file import FileName, Name, Positive, StrictModel, not_in_file
 from ident.arrays import FloatArray
 from ident.plausible import LEAD_MM, SPEED, within

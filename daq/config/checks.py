@@ -10,17 +10,17 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from daq.config.bodies import centre_faults, gyration_faults, moment_faults
 from daq.config.bus_checks import bus_faults, producer_faults
 from daq.config.cell import DEGREE, MILLIMETRE, joint_unit
+from daq.config.cell_closures import chain_faults, chain_of, mechanism_faults, platform_frame, robot_with
 from daq.config.cell_schema import AxisModel, CellModel, gain_joints, ratio_of
-from daq.config.clearance import clearance_faults
-from daq.config.closed_chain import chain_faults, chain_of, mechanism_faults, platform_frame, robot_with
 from daq.config.controller import controller_faults
 from daq.config.hold import mimic_faults
+from daq.config.impossible_bodies import centre_faults, gyration_faults, moment_faults
 from daq.config.policy import max_change_faults
 from daq.config.signers import signer_faults
-from daq.config.yaml_file import Document, Fault, Location, describe
+from daq.config.workspace import clearance_faults
+from daq.config.yaml_file import Document, Fault, Location, fault_texts
 from daq.errors import ConfigurationInconsistent
 from drivers.profiles.profile import DriveProfile
 from ident.errors import ModelError
@@ -85,7 +85,7 @@ def check(
     if robot is not None:
         faults += _frame_faults(model, urdf)
     if faults:
-        raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the cell file")
+        raise ConfigurationInconsistent(**fault_texts(document, faults), remedy="correct the cell file")
 
 
 def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:

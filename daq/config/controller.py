@@ -11,7 +11,7 @@ from typing import Annotated
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from daq.config.yaml_file import Fault, FileName, not_in_file
-from drivers.profiles.profile import Parameter, ParameterKind
+from drivers.profiles.profile import DriveParameter, ParameterKind
 
 _Factor = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -43,9 +43,9 @@ class GainObject:
     factor: _Factor = 1.0  #: number in the drive = gain × factor
 
     @property
-    def parameter(self) -> Parameter:
+    def parameter(self) -> DriveParameter:
         """The object for `drivers`."""
-        return Parameter(self.index, self.subindex, self.type)
+        return DriveParameter(self.index, self.subindex, self.type)
 
 
 _KEY, _KEY_AND_FACTOR = not_in_file("key"), not_in_file("key and factor")

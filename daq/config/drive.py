@@ -12,15 +12,15 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from daq.config.yaml_file import Fault, Positive, StrictModel, describe, parse_yaml, read_model
+from daq.config.yaml_file import Fault, Positive, StrictModel, fault_texts, parse_yaml, read_model
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent
 from drivers.profiles.profile import (
     Amplitude,
-    Basis,
     CurrentScale,
     DriveProfile,
     Fact,
+    FactBasis,
     Mapping,
     ObjectEntry,
     RatedMotor,
@@ -147,7 +147,7 @@ class SaveModel(StrictModel):
 class FactModel(StrictModel):
     """Evidence for a fact."""
 
-    basis: Basis
+    basis: FactBasis
     where: Text
 
 
@@ -235,7 +235,7 @@ def drive_from_text(text: bytes, name: str) -> DriveProfile:
         place = ("current_scale", "peak_current_a")
         expected = "the peak current of this size of drive [A]; no object of the drive reports it"
         raise ConfigurationInconsistent(
-            **describe(document, [Fault(place, "nothing", expected)]),
+            **fault_texts(document, [Fault(place, "nothing", expected)]),
             remedy="copy the profile to drives/ beside your cell file and enter it from the drive's data sheet",
         )
     return DriveProfile(

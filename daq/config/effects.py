@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from daq.config.yaml_file import Fault
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import ADDED, Effect, PlacedEffect, Side, check_settings, is_placeable
+from ident.effects.effect import ADDED, Effect, GearSide, PlacedEffect, check_settings, is_placeable
 from ident.errors import EffectRefused
 from ident.model.robot import Robot
 
@@ -50,6 +50,6 @@ def _places(effect: Effect, place: int, robot: Robot) -> str:
         return "an axis: it acts on a motor" if effect.with_motor else "a joint of a closed chain without a motor"
     if not effect.has_axis:
         return "the first axis: it acts on all motors alike"
-    if effect.side is Side.TWO_JOINTS:
+    if effect.side is GearSide.TWO_JOINTS:
         return "the pair the other way: on the axis of the lower number, with `other_axis` the higher"
     return "an axis that is revolute"

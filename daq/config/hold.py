@@ -7,7 +7,7 @@ from math import radians
 from xml.etree import ElementTree
 
 from daq.config.cell_schema import CellModel
-from daq.config.yaml_file import Document, Fault, describe
+from daq.config.yaml_file import Document, Fault, fault_texts
 from daq.errors import ConfigurationInconsistent
 from ident.errors import ModelError
 from ident.model.urdf import LINKAGE, Mimic, hold_joints, mimics_of
@@ -34,7 +34,7 @@ def held_urdf(document: Document, model: CellModel, urdf: str) -> str:
         found, _, expected = str(error).partition("; expected ")
         faults = [Fault(("hold",), found, expected or "joints of the URDF that are no axes, each with its position")]
     if faults:
-        raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the cell file")
+        raise ConfigurationInconsistent(**fault_texts(document, faults), remedy="correct the cell file")
     return fixed
 
 

@@ -10,7 +10,16 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
-from daq.config.yaml_file import Fault, FileName, Name, StrictModel, describe, parse_yaml, read_bytes, read_model
+from daq.config.yaml_file import (
+    Fault,
+    FileName,
+    Name,
+    StrictModel,
+    fault_texts,
+    parse_yaml,
+    read_model,
+    read_yaml_bytes,
+)
 from daq.errors import ConfigurationInconsistent
 
 Column = Annotated[str, Field(min_length=1)] | Annotated[int, Field(ge=1)]
@@ -202,7 +211,7 @@ def load_import(path: Path) -> ImportDescription:
     Raises:
         ConfigurationError: the file is missing or wrong.
     """
-    document = parse_yaml(read_bytes(path), str(path))
+    document = parse_yaml(read_yaml_bytes(path), str(path))
     wanted = read_model(document, ImportDescription)
     faults = []
     if wanted.rate_hz is not None and wanted.time is not None:
@@ -228,5 +237,5 @@ def load_import(path: Path) -> ImportDescription:
     if named and not wanted.table.header:
         faults.append(Fault(("table", "header"), f"false, and column {named[0]!r} by name", "column numbers from 1"))
     if faults:
-        raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the import description")
+        raise ConfigurationInconsistent(**fault_texts(document, faults), remedy="correct the import description")
     return wanted

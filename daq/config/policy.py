@@ -84,7 +84,7 @@ def max_change_faults(policy: ApplyPolicy, axes: Collection[str]) -> Iterator[Fa
             yield Fault(("policy", "apply", "max_change", name), f"axis {name!r}", f"one of {', '.join(axes)}")
 
 
-def judged(cell_file: Path, key: str, path: Path) -> Path:
+def policy_judged(cell_file: Path, key: str, path: Path) -> Path:
     """Resolve a path that a cell file names or implies, so far as its links can be trusted (`daq.files.follow_links`).
 
     Raises:
@@ -115,13 +115,13 @@ class HistorySection:
             ConfigurationInconsistent: it would, or a link in one of the names must not be followed.
         """
         folder, stem = cell_file.parent, cell_file.stem
-        store = judged(cell_file, "history.store", folder / (self.store or f"{stem}.history.sqlite"))
+        store = policy_judged(cell_file, "history.store", folder / (self.store or f"{stem}.history.sqlite"))
         for other in (cell_file, folder / (controller or cell_file.name)):
             if str(store) == os.path.realpath(other) or (store.exists() and other.exists() and store.samefile(other)):
                 where, found = f"{cell_file}: history.store", f"the same file as {other}"
                 expected, remedy = "a file of the history's own", "give it another name"
                 raise ConfigurationInconsistent(where, found=found, expected=expected, remedy=remedy)
-        audit = judged(cell_file, "history.audit", folder / (self.audit or f"{stem}.audit.jsonl"))
+        audit = policy_judged(cell_file, "history.audit", folder / (self.audit or f"{stem}.audit.jsonl"))
         return HistoryPlace(store, audit)
 
 

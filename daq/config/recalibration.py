@@ -9,7 +9,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from daq.config.policy import judged
+from daq.config.policy import policy_judged
 from daq.config.yaml_file import FilePath
 
 Argument = Annotated[str, Field(max_length=4000, pattern=r"^[^\x00]+$")]
@@ -126,6 +126,7 @@ class RecalibrationSection(_Bounds):
         return Recalibration(
             **{bound.name: getattr(self, bound.name) for bound in fields(_Bounds)},
             # Named after the cell file, as its history: two cells in one folder have separate sessions.
-            folder=self.folder or judged(cell_file, "recalibration.folder", cell_file.with_suffix(".recalibration")),
+            folder=self.folder
+            or policy_judged(cell_file, "recalibration.folder", cell_file.with_suffix(".recalibration")),
             working_folder=Path(os.path.realpath(cell_file.parent)),
         )

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from daq.config.cell import Axis, Cell
+from daq.config.cell import Cell, CellAxis
 from daq.config.cell_file import CELL, cell_from_bundle
 from daq.config.yaml_file import parse_yaml
 from daq.errors import ConfigurationInconsistent, LogsDiffer, SchemaMismatch
@@ -133,10 +133,10 @@ def _closing(cell: Cell) -> tuple[object, ...]:
     return () if chain is None else (chain.closures, chain.motors, chain.platform, chain.assembly_rad)
 
 
-def _differing_axes(own: Sequence[Axis], given: Sequence[Axis]) -> list[str]:
+def _differing_axes(own: Sequence[CellAxis], given: Sequence[CellAxis]) -> list[str]:
     """Name each key of the axes that differs, with its axes: `axes.limits (J1, J2)`."""
     sections = []
-    for field in fields(Axis):
+    for field in fields(CellAxis):
         pairs = zip(own, given, strict=True)
         differing = [one.name for one, other in pairs if getattr(one, field.name) != getattr(other, field.name)]
         if differing:
@@ -146,7 +146,7 @@ def _differing_axes(own: Sequence[Axis], given: Sequence[Axis]) -> list[str]:
 
 
 _KEYS = {"zero_offset_rad": "zero_offset", "profile": "drive profile", "unit": "limits"}
-"""Key of the cell file behind a field of `Axis` with another name."""
+"""Key of the cell file behind a field of `CellAxis` with another name."""
 
 
 def _joints(cell: Cell) -> tuple[str, ...]:
@@ -155,7 +155,7 @@ def _joints(cell: Cell) -> tuple[str, ...]:
     return joints if cell.chain is None else (*joints, f"with motors on {', '.join(cell.chain.motors)}")
 
 
-def _drive_of(own: Axis, given: Axis) -> tuple[tuple[str, int | None, int | None], ...]:
+def _drive_of(own: CellAxis, given: CellAxis) -> tuple[tuple[str, int | None, int | None], ...]:
     """Pairs of numbers that tell one drive from another; a number that one of the two leaves open is None."""
     first = own.identity
     second = given.identity
@@ -202,6 +202,6 @@ def _mismatch_of_drives(own: Cell | None, given: Cell, serials: Sequence[int | N
     return None
 
 
-def _serial(axis: Axis) -> int | None:
+def _serial(axis: CellAxis) -> int | None:
     """Serial number that a description gives to the drive of an axis; None where it leaves it open."""
     return None if axis.identity is None else axis.identity.serial

@@ -81,7 +81,7 @@ class Document:
         while known not in self.lines and known:
             known = known[:-1]
         line = self.lines.get(known)
-        return f"{self.name}{f':{line}' if line else ''}: {spell(path)}"
+        return f"{self.name}{f':{line}' if line else ''}: {yaml_text(path)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +218,7 @@ def not_in_file(kind: str) -> str:
     return _NOT_IN_FILE + kind
 
 
-def read_bytes(path: Path) -> bytes:
+def read_yaml_bytes(path: Path) -> bytes:
     """Read a configuration file of at most MAX_BYTES.
 
     Raises:
@@ -267,10 +267,10 @@ def read_model(document: Document, model: type[Model], folder: Path | None = Non
         if len(items) > len(faults):
             remedy += f" ({len(items) - len(faults)} more faults are not listed)"
         inner = [fault for fault in faults if fault.path not in outer]
-        raise SchemaMismatch(**describe(document, inner), remedy=remedy) from error
+        raise SchemaMismatch(**fault_texts(document, inner), remedy=remedy) from error
 
 
-def describe(document: Document, faults: list[Fault]) -> dict[str, str]:
+def fault_texts(document: Document, faults: list[Fault]) -> dict[str, str]:
     """Return subject, found and expected of an error with these faults, one a line."""
     if len(faults) == 1:
         only = faults[0]
@@ -280,7 +280,7 @@ def describe(document: Document, faults: list[Fault]) -> dict[str, str]:
     return {"subject": document.name, "found": f"{len(faults)} faults{''.join(shown)}{more}", "expected": "none"}
 
 
-def spell(path: Location) -> str:
+def yaml_text(path: Location) -> str:
     """Write a path as axes[3].limits.velocity_deg_s (counted from 0)."""
     text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
     return text.lstrip(".") or "the whole file"
@@ -292,7 +292,7 @@ def _convert(loader: _Loader, node: yaml.Node, path: Location, name: str, lines:
     lines[path] = line
     if node.tag not in _TAGS:
         raise YamlInvalid(
-            f"{name}:{line}: {spell(path)}",
+            f"{name}:{line}: {yaml_text(path)}",
             found=f"tag {node.tag.removeprefix('tag:yaml.org,2002:')}",
             expected="plain text, numbers, lists and mappings",
             remedy="remove the tag",
@@ -303,14 +303,14 @@ def _convert(loader: _Loader, node: yaml.Node, path: Location, name: str, lines:
             key = loader.construct_object(key_node) if isinstance(key_node, yaml.ScalarNode) else None
             if not isinstance(key, str):
                 raise YamlInvalid(
-                    f"{name}:{key_node.start_mark.line + 1}: {spell(path)}",
+                    f"{name}:{key_node.start_mark.line + 1}: {yaml_text(path)}",
                     found=f"key {key_node.value!r}",
                     expected="a key that is text",
                     remedy="quote it if this is intended",
                 )
             if key in mapping:
                 raise YamlInvalid(
-                    f"{name}:{key_node.start_mark.line + 1}: {spell((*path, key))}",
+                    f"{name}:{key_node.start_mark.line + 1}: {yaml_text((*path, key))}",
                     found=f"duplicate key {key!r}, first on line {lines[*path, key]}",
                     expected="each key once",
                     remedy="remove one of them",
@@ -323,7 +323,7 @@ def _convert(loader: _Loader, node: yaml.Node, path: Location, name: str, lines:
     value = loader.construct_object(node)
     if isinstance(value, int) and value.bit_length() > MAX_BITS:
         raise YamlInvalid(
-            f"{name}:{line}: {spell(path)}",
+            f"{name}:{line}: {yaml_text(path)}",
             found=f"an integer of {value.bit_length()} bits",
             expected=f"at most {MAX_BITS}",
             remedy="was a digit held down, or is this text? then quote it",

@@ -31,7 +31,7 @@ from daq.log.feed import (
     socket_names,
 )
 from daq.workflow.events import event_document
-from daq.workflow.prediction import Predictor, predictor_of
+from daq.workflow.live_prediction import Predictor, predictor_of
 from drivers.messages import CellEvent, EventKind
 from drivers.profiles.cia402 import ENABLED, FAULTY, decode
 from ident.arrays import FloatArray

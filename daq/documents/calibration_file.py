@@ -283,15 +283,15 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
 
     def check(content: bytes) -> None:
         # Compared as documents: NaN, for an axis that did not move, is not equal to itself.
-        if as_document(decode(content, str(path))) != as_document(calibration):
+        if as_document(decode_calibration(content, str(path))) != as_document(calibration):
             found, expected = "another content on reading back", "what was written"
             remedy = "check the disk; the file was not replaced"
             raise CalibrationUnreadable(str(path), found=found, expected=expected, remedy=remedy)
 
-    replace_file(path, encode(calibration), check=check)
+    replace_file(path, encode_calibration(calibration), check=check)
 
 
-def encode(calibration: Calibration) -> bytes:
+def encode_calibration(calibration: Calibration) -> bytes:
     """Return the content of the file."""
     body = as_document(calibration)
     document = {"format": "drivegain-calibration", "version": VERSION, **body, "digests": _digests(body)}
@@ -309,10 +309,10 @@ def load_calibration(path: Path) -> Calibration:
         CalibrationUnreadable: not a calibration of this version, or with a wrong key, type or number, with its line.
         CalibrationRefused: the content was edited, with the names of the edited sections.
     """
-    return decode(read(path), str(path))
+    return decode_calibration(read_calibration_bytes(path), str(path))
 
 
-def read(path: Path) -> bytes:
+def read_calibration_bytes(path: Path) -> bytes:
     """Read the content of a calibration's file, for callers that also need its digest.
 
     Raises:
@@ -326,7 +326,7 @@ def read(path: Path) -> bytes:
         raise CalibrationMissing(str(path), found=found, expected=wanted, remedy="check the name") from error
 
 
-def decode(content: bytes, name: str) -> Calibration:
+def decode_calibration(content: bytes, name: str) -> Calibration:
     """Decode a file's content; `name` is its name in messages. Raises as `load_calibration`."""
     try:
         document = parse_yaml(content, name)

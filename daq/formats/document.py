@@ -49,7 +49,7 @@ def format_of(name: str) -> ControllerFormat:
     return ControllerFormat.YAML
 
 
-def decode(content: bytes, name: str, format: ControllerFormat | None = None) -> ControllerDocument:  # noqa: A002
+def decode_document(content: bytes, name: str, format: ControllerFormat | None = None) -> ControllerDocument:  # noqa: A002
     """Parse a controller file; without a format, its name says it.
 
     Raises:
@@ -59,7 +59,7 @@ def decode(content: bytes, name: str, format: ControllerFormat | None = None) ->
     return reader(content, name)
 
 
-def read_bytes(path: Path) -> bytes:
+def read_controller_file(path: Path) -> bytes:
     """Read a controller file; a pipe or device is not waited for.
 
     Raises:

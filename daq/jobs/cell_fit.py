@@ -17,7 +17,7 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from daq.config.yaml_file import MAX_BYTES
-from daq.documents.calibration_file import as_document, decode, encode
+from daq.documents.calibration_file import as_document, decode_calibration, encode_calibration
 from daq.environment import software
 from daq.errors import (
     CalibrationUnreadable,
@@ -113,8 +113,8 @@ def fit_cell(cell: CellLogs, loop: Loop, created: datetime) -> Fitted | Failure:
                     )
             calibration = calibration_of(fitted, created)
             # Encoded and verified in the worker: that takes a tenth of the time of a fit.
-            content = encode(calibration)
-            if as_document(decode(content, cell.cell)) != as_document(calibration):
+            content = encode_calibration(calibration)
+            if as_document(decode_calibration(content, cell.cell)) != as_document(calibration):
                 raise CalibrationUnreadable(
                     cell.cell,
                     found="another content on reading back",

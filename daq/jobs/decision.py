@@ -6,7 +6,7 @@ import math
 from datetime import datetime
 
 from daq.config.policy import AppliedBy
-from daq.documents.calibration_file import read
+from daq.documents.calibration_file import read_calibration_bytes
 from daq.documents.session_state import Decision, JudgedGain, Outcome, Target
 from daq.errors import writing
 from daq.files import replace_file, sha256, sha256_of
@@ -45,7 +45,7 @@ def decide_outcome(context: JobContext, session: Session, calibration: Calibrati
         words = "the controller's file has these gains already: an earlier job of this session wrote it"
         context.journal.say(Level.NOTICE, words)
         return session.update(outcome=Outcome.APPLIED)
-    request = Request(calibration, now, file=path, content=read(path))
+    request = Request(calibration, now, file=path, content=read_calibration_bytes(path))
     proposal = context.tools.propose(FileTarget.of(context.cell), request)
     edit = proposal.edit
     decision = decision_of(proposal, known_of(history, str(resolve_links(context.target.file)), digest, edit.changes))

@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from daq.config.cell import Cell
-from daq.documents.calibration_file import encode
+from daq.documents.calibration_file import encode_calibration
 from daq.errors import DataError, HistoryUnreadable, evidence, writing
 from daq.files import fsync_folder
 from daq.ledger.audit import (
@@ -221,7 +221,7 @@ def enter_calibration(ledger: Ledger, calibration: Calibration, *, digest: str, 
             "sha256": digest,
             "cell": ledger.cell.name,
             "entered": iso(at),
-            "document": encode(calibration).decode(),
+            "document": encode_calibration(calibration).decode(),
             "figures": figures_of(calibration, digest, at),
         }
         _append(ledger, Draft(AuditAction.CALIBRATION_ENTERED, at, who, history_subject(ledger.cell.name), details))

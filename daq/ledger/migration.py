@@ -16,7 +16,7 @@ from datetime import datetime
 from pathlib import Path
 from urllib.parse import quote
 
-from daq.documents.calibration_file import decode
+from daq.documents.calibration_file import decode_calibration
 from daq.errors import DaqError, HistoryUnreadable
 from daq.ledger.audit import AuditAction, AuditEntry
 from daq.ledger.entry import Acknowledgement, Event, WriteAction, figures_of, iso, zoned
@@ -210,7 +210,7 @@ def _acknowledgement_flaws(noted: Acknowledgement, entry: AuditEntry) -> Iterato
 def _document_flaws(calibration: StoredCalibration) -> Iterator[str]:
     name = f"calibration {calibration.digest[:12]}…"
     try:
-        decode(calibration.document.encode(), f"document of {name}")
+        decode_calibration(calibration.document.encode(), f"document of {name}")
     except DaqError as error:
         yield f"{name}: its document is {error.found}, expected {error.expected}"
 
@@ -261,7 +261,7 @@ def _calibration_drafts(
     ]
     for one in (*without_figures, *lacking):
         try:
-            calibration = decode(one.document.encode(), f"document of calibration {one.digest[:12]}…")
+            calibration = decode_calibration(one.document.encode(), f"document of calibration {one.digest[:12]}…")
         except DaqError:
             continue  # reported wherever the history is read
         details = {

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from daq.config.cell import Axis, Cell
+from daq.config.cell import Cell, CellAxis
 from daq.errors import CurrentImplausible, DataError, PositionImplausible
 from ident.arrays import BoolArray, FloatArray
 
@@ -120,7 +120,7 @@ def _step_noise(changes: FloatArray, range_rad: float) -> float:
     return noise
 
 
-def _speed_limit(axis: Axis) -> str:
+def _speed_limit(axis: CellAxis) -> str:
     limit = axis.unit.spell(axis.limits.velocity)
     largest = axis.unit.spell(SPEED_MARGIN * axis.limits.velocity)
     return f"at most {largest}/s, {SPEED_MARGIN:g} times {limit}/s, the limit in the cell configuration"

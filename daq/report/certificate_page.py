@@ -9,9 +9,9 @@ from dataclasses import replace
 from daq.report.certificate import EARLIER, AxisRow, Certificate, Verdict, identity
 from daq.report.effect_names import WORDS, accepted_text, curve_of, size_text
 from daq.report.gains import MASS_HEADINGS, diagnosis_texts, mass_rows, partial_note, with_deviation
-from daq.report.html import element, figure, folded, listed, page, pair, paragraph, section, table, terms
+from daq.report.html import element, figure, folded, html_list, html_page, pair, paragraph, section, table, terms
 from daq.report.picture import QUANTITY
-from daq.report.svg import Interval, Line, before_after, chart, intervals
+from daq.report.svg import Interval, Line, before_after_drawing, chart, intervals
 from daq.report.text import SHOWN_SIGMAS, percent_text
 from ident.calibration import AcceptedEffect, Calibration
 from ident.estimators.estimate import RelativeError
@@ -48,7 +48,7 @@ def certificate_page(certificate: Certificate, consequence: str = "", details: S
         details: further folded sections, before those of the calibration itself.
     """
     calibration, look = certificate.calibration, _LOOK.get(certificate.verdict, "")
-    return page(
+    return html_page(
         f"Calibration of cell {calibration.cell}",
         (
             '<main class="sheet">',
@@ -89,7 +89,7 @@ def _warnings(certificate: Certificate) -> Iterator[str]:
     for one in certificate.comparison.refusals:
         failed.setdefault(f"found {one.found}; expected {one.expected}; {one.remedy}", []).append(one.subject)
     if texts or failed:
-        yield listed((*texts, *(f"{', '.join(subjects)}: {text}." for text, subjects in failed.items())))
+        yield html_list((*texts, *(f"{', '.join(subjects)}: {text}." for text, subjects in failed.items())))
 
 
 def _gains(certificate: Certificate) -> str:
@@ -155,7 +155,9 @@ def _errors(calibration: Calibration) -> Iterator[str]:
 def _beside(calibration: Calibration, before: RelativeError | None, after: RelativeError, unit: str) -> str:
     names = (*(gain.axis for gain in calibration.gains), "all")
     first = (math.nan,) * len(names) if before is None else (*before.axes, before.total)
-    return before_after(list(zip(names, first, (*after.axes, after.total), strict=True)), "Error of each axis", unit)
+    return before_after_drawing(
+        list(zip(names, first, (*after.axes, after.total), strict=True)), "Error of each axis", unit
+    )
 
 
 def _percent(percent: float) -> str:
@@ -268,7 +270,7 @@ def _since(certificate: Certificate) -> Iterator[str]:
         "Beside the earlier calibration",
         table("", ("axis", "earlier ± σ", "this one ± σ", "change [%]", "in σ of both", "verdict"), rows, "words"),
         pair((change, errors)),
-        listed((*effects, *facts)),
+        html_list((*effects, *facts)),
     )
 
 

@@ -32,18 +32,20 @@ from ident.calibration import Calibration, Parameter, PayloadMass
 from ident.discovery.evidence import Evidence, without_effects
 from ident.discovery.geometry_check import GeometryCheck
 from ident.effects.effect import PlacedEffect
-from ident.estimators.comparison import Comparison, EstimatorTrial
+from ident.estimators.comparison import EstimatorComparison, EstimatorTrial
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import misjudged_joints
 from ident.estimators.method import Method
-from ident.planning.verdict import GOOD_PERCENT, GainVerdict
+from ident.planning.gain_verdict import GOOD_PERCENT, GainVerdict
 
 TLS_APART_SIGMAS = 3.0
 TLS_APART_PERCENT = 2.0
 """Difference of a gain by the paper's total least squares from that by ml, in σ of ml and relative, that is printed."""
 
 
-def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | None) -> Iterator[RenderableType]:
+def fit_view(
+    found: CaseFit, calibration: Calibration, comparison: EstimatorComparison | None
+) -> Iterator[RenderableType]:
     """Gains and errors, what they rest on, and what the data cannot show; `comparison` is of all estimators."""
     fitted = found.fitted
     axes, estimate = fitted.cell.axis_names, fitted.estimate
@@ -111,7 +113,7 @@ def paper_note(axes: Sequence[str], estimate: Estimate, paper: Estimate, misjudg
     )
 
 
-def fit_document(found: CaseFit, calibration: Calibration, comparison: Comparison | None) -> dict[str, Any]:
+def fit_document(found: CaseFit, calibration: Calibration, comparison: EstimatorComparison | None) -> dict[str, Any]:
     """Build the object of `fit --json`."""
     fitted = found.fitted
     axes, paper = fitted.cell.axis_names, fitted.paper
@@ -304,7 +306,7 @@ def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> tuple[str, ...]:
     return ("Excitation:", *(f"  {gain.words(fitted.cell.axis_names[gain.axis])}" for gain in judged))
 
 
-def comparison_tables(comparison: Comparison, axes: tuple[str, ...]) -> tuple[Table, Table]:
+def comparison_tables(comparison: EstimatorComparison, axes: tuple[str, ...]) -> tuple[Table, Table]:
     """Gains by every estimator under the declared filters, and their spread between half and twice the cut-offs."""
     first = comparison.trials[0]
     filters = f"{first.position_cutoff_hz:g} Hz / {first.decimation_cutoff_hz:g} Hz"

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from daq.config.cell import Cell
 from daq.errors import ControllerUnfit
-from daq.formats.document import decode, read_bytes
+from daq.formats.document import decode_document, read_controller_file
 from daq.formats.scalar import Scalar, rewrite_gain
 from daq.ledger.audit import AuditEntry
 from daq.ledger.entry import Entry, Event, WriteAction, drives_of
@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def show(entries: Sequence[Entry], all_series: Sequence[Series], actions: Mapping[str, str], console: Console) -> None:
+def show_history(
+    entries: Sequence[Entry], all_series: Sequence[Series], actions: Mapping[str, str], console: Console
+) -> None:
     """The calibrations, a line each, with what was done with each by its digest; then each gain as it is now."""
     if not entries:
         console.print("The history is empty: no calibration was applied or entered yet.")
@@ -39,7 +41,7 @@ def show(entries: Sequence[Entry], all_series: Sequence[Series], actions: Mappin
         return
     console.print(calibration_table(entries, all_series, actions))
     console.print()
-    console.print(gain_table(all_series))
+    console.print(history_gain_table(all_series))
     say_alarms(all_series, console)
 
 
@@ -99,7 +101,7 @@ def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], ac
     return table
 
 
-def gain_table(all_series: Sequence[Series]) -> Table:
+def history_gain_table(all_series: Sequence[Series]) -> Table:
     """Each gain as it was found last, beside its baseline."""
     headings = ("axis", "gain ± σ", "nameplate", "since baseline %", "σ", "state", "unit")
     table = plain_table(headings, left=(0, 5, 6), wrap=(3,))
@@ -150,7 +152,7 @@ def axis_table(series: Series, actions: Mapping[str, str]) -> Table:
 _DRIFT = ("change_percent", "change_sigmas", "baseline", "baseline_std")
 
 
-def describe(
+def history_document(
     cell: str, entries: Sequence[Entry], chosen: Sequence[Series], all_series: Sequence[Series], in_force: str | None
 ) -> dict[str, Any]:
     """All of it for --json; `chosen` are the axes that were asked for."""
@@ -240,7 +242,7 @@ def in_force(cell: Cell, history: History) -> str | None:
         return history.in_force(drives_of(cell.name)) if controller.objects else None
     try:
         target = str(resolve_links(file))
-        scalars = decode(read_bytes(file), str(file), controller.format).locate(controller.keys)
+        scalars = decode_document(read_controller_file(file), str(file), controller.format).locate(controller.keys)
     except (ControllerUnfit, OSError):
         return None
     numbers = dict(zip(cell.axis_names, zip(scalars, controller.factors, strict=True), strict=True))

@@ -128,12 +128,12 @@ summary:focus-visible { outline: 3px solid var(--data); }
 )
 
 
-def page(title: str, body: Iterable[str]) -> str:
+def html_page(title: str, body: Iterable[str]) -> str:
     """Build a page without script; the pieces of the body come from the functions below, which escape every text."""
-    return document(title, MARK, _STYLE, "\n".join(body))
+    return html_document(title, MARK, _STYLE, "\n".join(body))
 
 
-def document(title: str, mark: str, style: str, body: str, script: str = "") -> str:
+def html_document(title: str, mark: str, style: str, body: str, script: str = "") -> str:
     """Build a document that opens no address and runs no script but the given one, whatever text the body holds.
 
     Args:
@@ -187,7 +187,7 @@ def folded(title: str, *body: str) -> str:
     return "\n".join(("<details>", element("summary", title), *body, "</details>"))
 
 
-def listed(texts: Iterable[str]) -> str:
+def html_list(texts: Iterable[str]) -> str:
     """Build a list of plain texts."""
     return f"<ul>{''.join(element('li', text) for text in texts)}</ul>"
 
@@ -232,10 +232,10 @@ def pair(figures: Iterable[str]) -> str:
 
 def spelled(text: str) -> str:
     """Escape markup and spell out invisible characters."""
-    return escape(visible(text))
+    return escape(visible_text(text))
 
 
-def visible(text: str) -> str:
+def visible_text(text: str) -> str:
     """Spell out invisible characters.
 
     HTML allows no control characters, and those that reverse the direction of writing (U+202E and others of category

@@ -15,7 +15,7 @@ from daq.config.cell_file import cell_from_bundle
 from daq.log.metadata import Timing
 from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import LogReader
-from daq.report.bus import current_signals
+from daq.report.bus_views import current_signals
 from daq.report.text import entry_lines, picked, printable
 from drivers.messages import EventKind
 

@@ -56,7 +56,7 @@ def case_tables(calibrations: Mapping[str, Calibration]) -> tuple[PaperTable, ..
     tables: list[PaperTable] = []
     for number, method in ((1, "IDIM-WLS"), (3, "IDIM-TLS")):
         pair = calibrations[f"case-{number}"], calibrations[f"case-{number + 1}"]
-        tables += [parameter_table(number, *pair, method), gain_table(number + 1, *pair, method)]
+        tables += [parameter_table(number, *pair, method), paper_gain_table(number + 1, *pair, method)]
     return tuple(tables)
 
 
@@ -90,7 +90,7 @@ def parameter_table(number: int, first: Calibration, second: Calibration, method
     )
 
 
-def gain_table(number: int, first: Calibration, second: Calibration, method: str) -> PaperTable:
+def paper_gain_table(number: int, first: Calibration, second: Calibration, method: str) -> PaperTable:
     """Build Table 2 or 4: a priori and identified gains, with the payload's drawing and with its mass alone."""
     rows = tuple(
         (
@@ -128,7 +128,7 @@ def condition_table(found: CrossValidation) -> PaperTable:
     )
 
 
-def error_table(found: CrossValidation) -> PaperTable:
+def paper_error_table(found: CrossValidation) -> PaperTable:
     """Build Table 6: relative error of each run and joint by every calibration."""
     labels, axes = tuple(found.calibrations), found.axes
     rows = []
@@ -210,7 +210,7 @@ def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -
     )
 
 
-def page(title: str, tables: Iterable[PaperTable], *, marker: str) -> str:
+def paper_page(title: str, tables: Iterable[PaperTable], *, marker: str) -> str:
     """Markdown page of tables; its first line names the kind of file, so that no other file is overwritten."""
     return f"<!-- format: {marker} -->\n# {title}\n\n" + "\n".join(table.markdown() for table in tables)
 

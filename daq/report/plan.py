@@ -11,7 +11,7 @@ from daq.config.cell import Cell, joint_unit
 from daq.workflow.experiment import Experiment
 from daq.workflow.plan import Plan
 from daq.workflow.plan_file import LONGEST_S
-from ident.planning.verdict import GOOD_PERCENT, Identifiability, Verdict
+from ident.planning.gain_verdict import GOOD_PERCENT, Identifiability, Visibility
 
 
 def plan_document(
@@ -59,7 +59,7 @@ def _nothing_hidden(judged: Identifiability) -> tuple[str, ...]:
 
 def _to_get_good(cell: Cell, made: Plan, judged: Identifiability) -> tuple[str, ...]:
     """Say what makes weak gains good; σ falls with the square root of the time."""
-    weak = [gain for gain in judged.gains if gain.verdict is not Verdict.GOOD]
+    weak = [gain for gain in judged.gains if gain.verdict is not Visibility.GOOD]
     if not weak:
         return ()
     seconds = made.duration_s * (max(gain.std_percent for gain in weak) / GOOD_PERCENT) ** 2

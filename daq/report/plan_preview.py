@@ -18,7 +18,7 @@ import numpy as np
 
 from daq.config.cell import Cell
 from daq.files import open_regular, sha256
-from daq.report.html import document, element, listed, palette, visible
+from daq.report.html import element, html_document, html_list, palette, visible_text
 from daq.workflow.experiment import PlannedMove, path_of
 from ident.arrays import FloatArray
 from ident.model.robot import poses
@@ -79,13 +79,13 @@ def preview_page(cell: Cell, moves: Sequence[PlannedMove], checker: Checker, pla
 <label><input id="swept" type="checkbox" checked> swept volume</label></div>
 <p>Drag to turn. Each link has the colour of the axis that moves it. Pale, with an outline: everywhere that a moving
 part comes; grey on the grid: its footprint. A square of the grid is {1000 * _GRID_M:.0f} mm.</p>
-{listed(_facts(cell, checker, drawn))}
+{html_list(_facts(cell, checker, drawn))}
 <h2>Clearance [mm]</h2>
 <canvas id="clearance"></canvas>
 <h2>Speed of each axis; full height is 100 % of its limit</h2>
 <canvas id="speed"></canvas>
 <script id="data" type="application/json">{data}</script>"""
-    return document(f"Plan for {cell.name}", f'{MARK}{sha256(plan)}">', _STYLE, body, script)
+    return html_document(f"Plan for {cell.name}", f'{MARK}{sha256(plan)}">', _STYLE, body, script)
 
 
 def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> dict[str, Any]:
@@ -113,10 +113,10 @@ def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> 
         "moves": len(moves),
         "origins_m": _rounded(origins, 3),
         "ends_m": _rounded(placed, 3),
-        "capsules": [{"name": visible(one.name), "link": one.link, "radius_m": one.radius_m} for one in capsules],
+        "capsules": [{"name": visible_text(one.name), "link": one.link, "radius_m": one.radius_m} for one in capsules],
         "boxes": [
             {
-                "name": visible(one.name),
+                "name": visible_text(one.name),
                 "lower_m": one.lower_m,
                 "upper_m": one.upper_m,
                 "obstacle": one is not checker.scene.workspace,
@@ -135,7 +135,7 @@ def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> 
         "clearance_mm": [round(value, 1) if np.isfinite(value) else None for value in clearance_mm.tolist()],
         "minimum_mm": 1000.0 * checker.scene.minimum_m,
         "speeds": [
-            {"name": visible(name), "values": _rounded(column, 1)}
+            {"name": visible_text(name), "values": _rounded(column, 1)}
             for name, column in zip(cell.axis_names, 100.0 * np.abs(speed / limits).T, strict=True)
         ],
     }

@@ -21,7 +21,7 @@ from daq.writeback.request import Edit, GainChange
 from daq.writeback.target import E, Proposal, Written
 
 
-def show(proposal: Proposal[E], console: Console, known: Spread = NOTHING) -> None:
+def show_proposal(proposal: Proposal[E], console: Console, known: Spread = NOTHING) -> None:
     """Print the change as a table and as a diff, judged by the history."""
     edit = proposal.edit
     console.print(change_table(edit.changes, known, _place(edit)))
@@ -56,7 +56,7 @@ def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING, place
     return table
 
 
-def describe(proposal: Proposal[E], written: Written | None, known: Spread = NOTHING) -> dict[str, Any]:
+def proposal_document(proposal: Proposal[E], written: Written | None, known: Spread = NOTHING) -> dict[str, Any]:
     """Make the document of a proposal and its outcome for `--json`."""
     edit = proposal.edit
     refusals = [refusal_document(refusal) for refusal in proposal.refusals]

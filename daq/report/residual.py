@@ -20,17 +20,17 @@ from daq.report.split_names import names_by_split
 from daq.report.text import Sentence, picked, plain_table
 from daq.workflow.fit import Fit
 from ident.calibration import AcceptedEffect, Calibration
-from ident.discovery.before_after import Account, BeforeAfter, Errors
+from ident.discovery.before_after import Account, BeforeAfter, RelativeErrors
+from ident.discovery.effect_verdict import EffectVerdict, Judgement
 from ident.discovery.gates import runs_to_leave_out
 from ident.discovery.gear_loss import CERTAIN, GearLoss, gear_losses, is_gear_loss
 from ident.discovery.loop import MAX_EFFECTS, Step
 from ident.discovery.noise_floor import CONFIDENCE, FloorSource
 from ident.discovery.search import Finding
-from ident.discovery.time_skew import Skew
-from ident.discovery.verdict import Judgement, Verdict
+from ident.discovery.time_skew import CurrentDelay
 from ident.drift.change import FALSE_ALARM
 from ident.effects.effect import PlacedEffect
-from ident.effects.geometry import is_correction
+from ident.effects.geometry_corrections import is_correction
 from ident.effects.signals import session_began_s
 from ident.effects.unnamed import is_unnamed
 from ident.estimators.estimate import RelativeError
@@ -384,7 +384,7 @@ def _holdout_verdict(fitted: Fit, account: Account) -> list[str]:
     return ["The effects raise the error of the held-out runs by more than its noise: no calibration was written."]
 
 
-def _skew_sentence(skew: Skew | None) -> Iterator[str]:
+def _skew_sentence(skew: CurrentDelay | None) -> Iterator[str]:
     """State a time skew that instruments confirm; nothing where they do not, or do not exist."""
     if skew is None or not skew.confirmed:
         return
@@ -397,7 +397,7 @@ def _skew_sentence(skew: Skew | None) -> Iterator[str]:
     )
 
 
-def _unconfirmed_skew(skew: Skew | None) -> Iterator[str]:
+def _unconfirmed_skew(skew: CurrentDelay | None) -> Iterator[str]:
     """Say why no time skew is stated."""
     if skew is None:
         yield (
@@ -411,7 +411,7 @@ def _unconfirmed_skew(skew: Skew | None) -> Iterator[str]:
         )
 
 
-def skew_document(skew: Skew | None) -> dict[str, Any]:
+def skew_document(skew: CurrentDelay | None) -> dict[str, Any]:
     """Return the keys `time_skew`, null unless instruments confirm it, and `time_skew_by_instruments`."""
     if skew is None:
         return {"time_skew": None, "time_skew_by_instruments": None}
@@ -474,7 +474,7 @@ def error_rows(account: Account) -> tuple[ErrorRow, ...]:
     )
 
 
-def _strictest_error(errors: Errors, place: int | None = None) -> tuple[RelativeError, str]:
+def _strictest_error(errors: RelativeErrors, place: int | None = None) -> tuple[RelativeError, str]:
     """Return the most independent error, and the data it is measured on.
 
     Args:
@@ -664,7 +664,7 @@ def _before_after(fitted: Fit, compared: BeforeAfter) -> dict[str, Any]:
     }
 
 
-def _errors(errors: Errors) -> dict[str, Any]:
+def _errors(errors: RelativeErrors) -> dict[str, Any]:
     left_out = errors.left_out_runs
     return {
         "relative_error_percent": error_document(errors.in_sample),
@@ -682,7 +682,7 @@ def _errors(errors: Errors) -> dict[str, Any]:
     }
 
 
-def _verdict(verdict: Verdict, axes: tuple[str, ...]) -> dict[str, Any]:
+def _verdict(verdict: EffectVerdict, axes: tuple[str, ...]) -> dict[str, Any]:
     return {
         **_placed(verdict.placed, axes),
         "judgement": verdict.judgement.value,

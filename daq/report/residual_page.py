@@ -13,7 +13,7 @@ from daq.report.certificate_page import certificate_page
 from daq.report.effect_names import effect_text, variable_text
 from daq.report.fit import coefficients, identifiability_notes, start_of
 from daq.report.gains import with_deviation
-from daq.report.html import MARK, figure, folded, listed, pair, paragraph, table
+from daq.report.html import MARK, figure, folded, html_list, pair, paragraph, table
 from daq.report.plots import draw_effect, draw_torques, drawn_axis, plot_ranking
 from daq.report.residual import (
     CANDIDATE_HEADINGS,
@@ -81,7 +81,7 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration, compa
         before = step.after
     sentences = (*declared_sentences(fitted), *summary(fitted, account, calibration.effects))
     details = (
-        folded("What was found, in sentences", listed(sentences)),
+        folded("What was found, in sentences", html_list(sentences)),
         folded(
             "Errors without and with the effects",
             table("Relative error ‖e‖/‖v‖ [%]", ("", *axes, "total"), errors, "names"),
@@ -100,7 +100,7 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration, compa
             pair(map(figure, draw_torques(before, fitted.cell))),
         ),
         _gains(fitted, account),
-        folded("Effects by their names in files and commands", listed(effect_sizes(calibration))),
+        folded("Effects by their names in files and commands", html_list(effect_sizes(calibration))),
         *(_turn(fitted, number, step) for number, step in enumerate(searched_steps(fitted), start=1)),
         _limits(fitted, calibration),
     )
@@ -202,7 +202,7 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
         in_words.append(f"Added to {axes[added.axis]}: {effect_text(added.effect, axes)}.")
     return folded(
         f"Search, turn {number}: what was tried",
-        listed((*turn_sentences(fitted, step), *in_words)),
+        html_list((*turn_sentences(fitted, step), *in_words)),
         ranking,
         table(f"Turn {number}: {CANDIDATES}", CANDIDATE_HEADINGS, candidate_rows(fitted, step, _SHOWN), "names"),
     )
@@ -228,4 +228,4 @@ def _limits(fitted: Fit, calibration: Calibration) -> str:
         "repeated moves its lower limit bounds any model's error (95 % confidence), often loosely: an error above it "
         "need not be an effect.",
     )
-    return folded("What these data can and cannot show", listed(limits))
+    return folded("What these data can and cannot show", html_list(limits))

@@ -75,7 +75,7 @@ def intervals(rows: Sequence[Interval], title: str, unit: str) -> str:
     return _drawing(parts, title, scale.bottom + _FOOT + (0.0 if to_scale else 17.0))
 
 
-def before_after(rows: Sequence[tuple[str, float, float]], title: str, unit: str) -> str:
+def before_after_drawing(rows: Sequence[tuple[str, float, float]], title: str, unit: str) -> str:
     """Draw each value before (hollow) and after (full), from zero; NaN for one that is not known."""
     most = _ROOM * max(_largest([v for _, *both in rows for v in both]), 1e-9)
     scale = _Scale(0.0, most, len(rows), _room(name for name, *_ in rows))
@@ -167,7 +167,7 @@ def chart(
 _STRETCHES = 2 * round(_WIDTH)  #: Two a unit of the drawing's width, the dots of a fine screen
 
 
-def visible(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+def visible_points(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Keep lowest and highest value of each stretch of a curve, and its gaps, so that no peak is lost.
 
     Args:
@@ -188,7 +188,7 @@ def visible(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _curve(x: FloatArray, y: FloatArray) -> str:
     steps, pen = [], "M"
-    for a, b in zip(*(column.tolist() for column in visible(x, y)), strict=True):
+    for a, b in zip(*(column.tolist() for column in visible_points(x, y)), strict=True):
         if math.isfinite(b):
             steps.append(f"{pen}{a:.1f} {b:.1f}")
             pen = "L"

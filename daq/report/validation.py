@@ -67,7 +67,7 @@ def validation_tables(found: CrossValidation, *, complete: bool) -> list[paper_t
     """Tables 5 to 8 of the paper; unless complete, Table 6 is left out where the table of errors shows the same."""
     return [
         paper_tables.condition_table(found),
-        *([paper_tables.error_table(found)] if complete or len(found.calibrations) > 1 else []),
+        *([paper_tables.paper_error_table(found)] if complete or len(found.calibrations) > 1 else []),
         *paper_tables.mass_tables(found),
     ]
 

@@ -13,8 +13,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from daq.config.bus import bus_address
 from daq.config.cell import Cell
+from daq.config.cell_buses import bus_address
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import as_document, save_calibration
 from daq.environment import shipped_configurations
@@ -34,7 +34,7 @@ from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.request import Request
 from daq.writeback.target import Proposal, Written, apply, propose
 from drivers.canopen.bus import open_bus
-from drivers.canopen.scan import FoundNode
+from drivers.canopen.node_scan import FoundNode
 from drivers.simulation.spec import CellSpec
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account, account
@@ -72,7 +72,7 @@ class ProgressReporter:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class DemoOutcome:
     """All that the demonstration found."""
 
     cell: Cell  #: declared
@@ -87,7 +87,7 @@ class Outcome:
     written: Written | None  #: what its copy got
 
 
-def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: ProgressReporter) -> Outcome:
+def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: ProgressReporter) -> DemoOutcome:
     """Scan, plan, record, identify, close the loop, and write a copy of the controller file.
 
     Args:
@@ -131,10 +131,10 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     changed = account(start_of(fitted), fitted.steps)
     (out / REPORT).mkdir(exist_ok=True)
     save_report(fitted, changed, calibration, out / REPORT, Comparison.of(proposal, cell.apply))
-    return Outcome(cell, nodes, plans, recorded, fitted, changed, calibration, truth, proposal, written)
+    return DemoOutcome(cell, nodes, plans, recorded, fitted, changed, calibration, truth, proposal, written)
 
 
-def summary(outcome: Outcome) -> dict[str, Any]:
+def demo_summary(outcome: DemoOutcome) -> dict[str, Any]:
     """The outcome as `summary.json` holds it."""
     before, after = outcome.fitted.identification, outcome.fitted.final
     errors = before.holdout_error, after.holdout_error

@@ -12,9 +12,18 @@ from xml.etree import ElementTree
 import numpy as np
 from pydantic import Field, model_validator
 
-from daq.config.bodies import centre_faults, gyration_faults, moment_faults
 from daq.config.cell import DEGREE, MILLIMETRE
-from daq.config.yaml_file import Document, Fault, Location, StrictModel, describe, parse_yaml, read_bytes, read_model
+from daq.config.impossible_bodies import centre_faults, gyration_faults, moment_faults
+from daq.config.yaml_file import (
+    Document,
+    Fault,
+    Location,
+    StrictModel,
+    fault_texts,
+    parse_yaml,
+    read_model,
+    read_yaml_bytes,
+)
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent, ConfigurationMissing, UsageError
 from drivers.simulation.faults import FaultKind, FaultSpec
@@ -76,10 +85,10 @@ def load_scenario(path: Path, axes: int, period_us: int) -> tuple[FaultSpec, ...
     Raises:
         ConfigurationError: the file is missing, wrong, or names an axis that the cell lacks.
     """
-    document = parse_yaml(read_bytes(path), str(path))
+    document = parse_yaml(read_yaml_bytes(path), str(path))
     model = read_model(document, ScenarioModel)
     if wrong := absent_axes(model.faults, axes):
-        raise ConfigurationInconsistent(**describe(document, wrong), remedy="correct the scenario file")
+        raise ConfigurationInconsistent(**fault_texts(document, wrong), remedy="correct the scenario file")
     return tuple(fault.spec(period_us) for fault in model.faults)
 
 
@@ -170,12 +179,12 @@ def load_simulation(path: Path, payload: str | None = None) -> CellSpec:
         ConfigurationError: the file is missing, wrong, or contradicts itself.
         UsageError: there is no such payload.
     """
-    document = parse_yaml(read_bytes(path), str(path))
+    document = parse_yaml(read_yaml_bytes(path), str(path))
     model = read_model(document, SimulationModel)
     _check(document, model)
-    urdf = read_bytes(path.parent / model.urdf).decode("utf-8", errors="replace")
+    urdf = read_yaml_bytes(path.parent / model.urdf).decode("utf-8", errors="replace")
     if model.closures and (wrong := [*_closed_chain_faults(model, urdf)]):
-        raise ConfigurationInconsistent(**describe(document, wrong), remedy="correct the simulation file")
+        raise ConfigurationInconsistent(**fault_texts(document, wrong), remedy="correct the simulation file")
     if payload is not None and payload not in model.payloads:
         raise UsageError(
             f"payload {payload!r}",
@@ -254,7 +263,7 @@ def _check(document: Document, model: SimulationModel) -> None:
     faults += absent_axes(model.faults, n)
     faults += _implausible(model)
     if faults:
-        raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the simulation file")
+        raise ConfigurationInconsistent(**fault_texts(document, faults), remedy="correct the simulation file")
 
 
 def _implausible(model: SimulationModel) -> Iterator[Fault]:

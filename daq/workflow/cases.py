@@ -16,11 +16,11 @@ from daq.workflow.declared_effects import refuse_effects
 from daq.workflow.diagnoses import named_causes
 from daq.workflow.fit import Fit, Reading, calibration_of, judged
 from ident.calibration import Calibration, Parameter, Source, factor_of
-from ident.equations.reduction import Reduction, reduce_runs
-from ident.equations.system import require_distinct
+from ident.equations.reduction import reduce_runs, regrouped
+from ident.equations.system import System, require_distinct
 from ident.estimators.comparison import Essential, essential
 from ident.estimators.estimate import Identification
-from ident.estimators.geometry import GeometryFinding
+from ident.estimators.geometry_estimate import GeometryFinding
 from ident.estimators.identify import each_run, estimate_with
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
@@ -57,8 +57,8 @@ class ReducedLogs:
     logs: tuple[Path, ...]  #: of the fit
     holdout: tuple[Path, ...]  #: those that it must not see
     sources: tuple[Source, ...]  #: all of them, with digests and roles
-    used: Reduction  #: rows of `logs`, reduced
-    unseen: Reduction  #: rows of `holdout`, reduced
+    used: System  #: of `logs`, in standard parameters
+    unseen: System  #: of `holdout`, likewise
     geometry: GeometryFinding | None = None  #: what redundant encoders say of the geometry
 
 
@@ -103,13 +103,15 @@ def fit_case(
         IdentificationError: see ident/estimators/identify.py.
     """
     payloads = tuple(payload_as(payload, logs.cell, known) for payload in logs.used.payloads)
-    used, unseen = replace(logs.used, payloads=payloads), replace(logs.unseen, payloads=payloads)
-    system = used.system(used.base(), used.payload_columns())
+    system = regrouped(replace(logs.used, payloads=payloads))
     require_distinct(system, gains=not gains_fixed)
     nameplate = np.array([axis.nameplate_gain for axis in logs.cell.axes])
     estimate = estimate_with(method, system, nameplate if gains_fixed else None)
-    rest = unseen.system(system.base, system.payload_columns) if unseen.runs else None
-    result = Identification(used.model, used.conditioning, system, rest, estimate)
+    rest = None
+    if logs.unseen.runs:
+        unseen = replace(logs.unseen, payloads=payloads)
+        rest = regrouped(unseen, system.base, system.payload_columns)
+    result = Identification(system.model, logs.cell.conditioning, system, rest, estimate)
     paper = None if gains_fixed else tls(system)
     start = Fit(
         cell=logs.cell,

@@ -13,7 +13,7 @@ from ident.arrays import FloatArray
 from ident.discovery.evidence import Evidence, coefficients_of
 from ident.discovery.geometry_check import GeometryCheck, check_geometry
 from ident.effects.effect import PlacedEffect
-from ident.effects.geometry import GravityDirection, LatePosition, ZeroOffset, is_correction, turned_gravity
+from ident.effects.geometry_corrections import GravityDirection, LatePosition, ZeroOffset, is_correction, turned_gravity
 from ident.errors import Diagnosis, TooFewMoves
 from ident.estimators.identify import estimate_with
 from ident.estimators.method import Method

@@ -14,8 +14,8 @@ The order of the judgements, causes before their traces:
    is said of a fit in a wrong geometry, because all of it would be wrong.
 4. What is named (`ident.estimators.diagnosis.diagnose`): gains, estimators, payloads, errors, torques, condition.
 5. Currents without a sign and exchanged ones, where 4. named a trace of them, or the gains are fixed.
-6. Zeros and lengths that the encoders contradict (`daq.workflow.geometry`), where there are more of them than degrees
-   of freedom: found before any torque is looked at, and named first.
+6. Zeros and lengths that the encoders contradict (`daq.workflow.geometry_diagnoses`), where there are more of them than
+   degrees of freedom: found before any torque is looked at, and named first.
 7. Small mistakes of the description (`daq.workflow.description`): zeros, mounting and late positions, by torque. They
    are named before 4. to 6., and where they are, no exchange of currents is looked for (`daq.workflow.fit.judged`).
 8. Each held-out log; first whether the geometry has changed since the fit (`ident.geometry_drift`).
@@ -32,16 +32,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.advice import for_command_line
 from daq.config.cell import Cell, model_of, robot_of
 from daq.workflow.description import drift_diagnosis
-from daq.workflow.geometry import geometry_diagnoses
+from daq.workflow.geometry_diagnoses import geometry_diagnoses
 from daq.workflow.validation import Validation
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import Calibration
+from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.equations.instants import Instants, read_instants
-from ident.equations.reduction import Reduction
+from ident.equations.reduction import regrouped
+from ident.equations.system import System
 from ident.errors import (
     ChannelsExchanged,
     Diagnosis,
@@ -62,14 +65,13 @@ from ident.estimators.payload_diagnosis import payload_diagnoses
 from ident.estimators.refusals import idle_joints
 from ident.estimators.turned_geometry import GEOMETRY, find_turned_geometry, is_confirmed
 from ident.geometry_drift import geometry_drift
-from ident.model.base import BaseParameters
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
 from ident.model.urdf import read_urdf
 from ident.prediction import as_calibrated, mounted_parameters, standard_parameters
 
 if TYPE_CHECKING:  # which asks for these diagnoses
-    from ident.estimators.geometry import GeometryFinding
+    from ident.estimators.geometry_estimate import GeometryFinding
 
 ReadLog = Callable[[Path], tuple[Run, Cell]]  #: Reads a log, and the description of its cell
 
@@ -122,7 +124,8 @@ def diagnose_fit(
         return (turned,)
     effort_limit = read_urdf(cell.urdf).effort_limit[list(robot_of(cell).axis_joints)]
     # Each held-out run is judged alone, as in a validation.
-    diagnoses = diagnose(replace(found, holdout=None), cell.axis_names, nameplate, effort_limit)
+    named = diagnose(replace(found, holdout=None), cell.axis_names, nameplate, effort_limit)
+    diagnoses = tuple(map(_for_command_line, named))
     suspect = any(one.name in TRACES_OF_CURRENTS for one in diagnoses)
     if suspect or found.estimate.gains_fixed:
         require_right_currents(recordings, each=suspect)
@@ -135,7 +138,12 @@ def nameplate_of(cell: Cell) -> FloatArray:
 
 
 def diagnose_run(
-    calibration: Calibration, validation: Validation, model: Model, run: Run, reduction: Reduction
+    calibration: Calibration,
+    validation: Validation,
+    model: Model,
+    run: Run,
+    standard: System,
+    conditioning: Conditioning,
 ) -> tuple[Diagnosis, ...]:
     """Judge a run that the fit of a calibration has not seen: scale and sign of its currents, its payload, its errors.
 
@@ -144,7 +152,8 @@ def diagnose_run(
         validation: what it predicts of the run, and what was measured.
         model: of the cell.
         run: as it was read.
-        reduction: of this run alone.
+        standard: equations of this run alone, in standard parameters (`reduce_runs`).
+        conditioning: the filters.
     """
     if any(one.name in GEOMETRY for one in calibration.diagnoses):
         return ()  # it predicts in a wrong geometry
@@ -152,9 +161,9 @@ def diagnose_run(
     axes = [gain.axis for gain in calibration.gains]
     use = validation.use
     carried = replace(run, payload=as_calibrated(calibration, run.payload, run.name))
-    data = differentiate(carried, model.drive_train, reduction.conditioning)
+    data = differentiate(carried, model.drive_train, conditioning)
     left_nm = validation.measured_nm - validation.predicted_nm
-    moved = geometry_drift(calibration, model, data, reduction.conditioning, left_nm, use)
+    moved = geometry_drift(calibration, model, data, conditioning, left_nm, use)
     if moved is not None:
         return (drift_diagnosis(moved, model, axes, runs),)
     size = _rms(validation.measured_nm, use)
@@ -163,18 +172,23 @@ def diagnose_run(
     used = use & ~idle[:, None]
     found = list(scale_diagnoses(validation.measured_nm, validation.predicted_nm, used, axes, runs))
     if run.payload is not None and not found:
-        found += _payload_diagnoses(calibration, run.payload, model, reduction)
-    errors = list(axis_error_diagnoses(size, left, idle, axes, runs))
+        found += _payload_diagnoses(calibration, run.payload, standard)
+    errors = list(map(_for_command_line, axis_error_diagnoses(size, left, idle, axes, runs)))
     if not errors and not any(one.name == "current-reversed" for one in found):
         return tuple(found)
     gains = np.array([gain.value for gain in calibration.gains])
-    turned = find_turned_geometry(model, read_instants(model, (run,), reduction.conditioning), gains)
+    turned = find_turned_geometry(model, read_instants(model, (run,), conditioning), gains)
     if turned is not None:
         return (turned.diagnosis(axes, runs),)
-    exchanged = exchanged_channels(model, (run,), reduction.conditioning, axes) if errors else None
+    exchanged = exchanged_channels(model, (run,), conditioning, axes) if errors else None
     if exchanged is not None:
         return (replace(exchanged, runs=runs),)
     return tuple(found or errors)
+
+
+def _for_command_line(diagnosis: Diagnosis) -> Diagnosis:
+    """The same diagnosis with a remedy that names verbs and options."""
+    return replace(diagnosis, remedy=for_command_line(diagnosis.remedy))
 
 
 def _rms(torque_nm: FloatArray, use: BoolArray) -> FloatArray:
@@ -183,9 +197,7 @@ def _rms(torque_nm: FloatArray, use: BoolArray) -> FloatArray:
     return np.asarray(np.sqrt(np.sum(torque_nm**2, axis=1, where=use) / rows))
 
 
-def _payload_diagnoses(
-    calibration: Calibration, payload: Payload, model: Model, reduction: Reduction
-) -> Iterator[Diagnosis]:
+def _payload_diagnoses(calibration: Calibration, payload: Payload, standard: System) -> Iterator[Diagnosis]:
     """Compare the payload of a run with that of its mounting in the calibration."""
     mounted = mounted_parameters(calibration, payload.mounting)
     unknown = tuple(
@@ -193,12 +205,10 @@ def _payload_diagnoses(
         for index, parameter in enumerate(LINK_PARAMETERS)
         if parameter not in payload.known and parameter in mounted
     )
-    names = tuple(column.name for column in model.columns)
-    every = BaseParameters(tuple(range(len(names))), np.eye(len(names)), names)
     of_payload = [mounted[LINK_PARAMETERS[index]].value for index in unknown]
-    values = np.concatenate((standard_parameters(calibration, model), of_payload))
+    values = np.concatenate((standard_parameters(calibration, standard.model), of_payload))
     gains = np.array([gain.value for gain in calibration.gains])
-    return payload_diagnoses(reduction.system(every, (unknown,)), gains, values)
+    return payload_diagnoses(regrouped(standard, standard.base, (unknown,)), gains, values)
 
 
 def not_repeated(stored: Iterable[Diagnosis], fresh: Iterable[Diagnosis]) -> Iterator[Diagnosis]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
-from drivers.canopen.emcy import remedy_of
+from daq.advice import for_command_line
+from drivers.canopen.emcy import ErrorCode, explain
 from drivers.messages import EventKind
 
 REMEDIES = {
@@ -32,10 +34,18 @@ def event_document(kind: EventKind, code: int, axis: str | None, text: str) -> d
         kind, code, text: as in `CellEvent`.
         axis: its name, None for the whole cell.
     """
-    remedy = remedy_of(code) if kind is EventKind.EMCY else REMEDIES.get(kind, "")
+    remedy = REMEDIES.get(kind, "")
+    if kind is EventKind.EMCY:
+        remedy = explain_error_code(code).remedy
     # The axis is shown beside the text.
     shown = text if axis is None else re.sub(rf"^{re.escape(axis)}( \(node \d+\))?: ", "", text)
     return {
         **{"axis": axis, "kind": kind.value, "code": code},
         **{"text": shown, "remedy": remedy, "alarm": kind in ALARMING},
     }
+
+
+def explain_error_code(code: int) -> ErrorCode:
+    """Meaning and first remedy of an error code of 16 bits, with the verb that resets the fault."""
+    found = explain(code)
+    return replace(found, remedy=for_command_line(found.remedy))

@@ -9,7 +9,7 @@ from itertools import cycle, pairwise
 import numpy as np
 
 from daq.config.cell import Cell, WeighedPayload, model_of
-from daq.config.clearance import DEFAULT_MINIMUM_M, Clearance
+from daq.config.workspace import DEFAULT_MINIMUM_M, Clearance
 from daq.errors import ConfigurationInconsistent
 from drivers.move import Trapezoid, synchronised
 from ident.arrays import BoolArray, FloatArray
@@ -26,9 +26,9 @@ from ident.planning.excitation import (
     nominal_payload,
     nominal_torque_limits,
     side_of_cube,
-    visible,
+    visible_base,
 )
-from ident.planning.verdict import ExtraMoves
+from ident.planning.gain_verdict import ExtraMoves
 
 LINK_RADIUS = 0.08
 """Radius of a guessed link, as a share of the length of the joint chain: 6 cm for an arm of the TX-40's size."""
@@ -218,7 +218,7 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
         "to row",
         *scene.remarks,
     )
-    design = Design(expectation, visible(model, fast_motion))
+    design = Design(expectation, visible_base(model, fast_motion))
     # A row counts when its filter window is so far from a standstill that enough of its weight is outside.
     filter_ = decimator(RATE_HZ, cell.conditioning.decimation_cutoff_hz)
     weight = np.cumsum(np.abs(filter_.taps)) / np.abs(filter_.taps).sum()
@@ -294,7 +294,7 @@ def paths_of(cell: Cell, moves: Sequence[PlannedMove]) -> tuple[Trapezoid, ...]:
     return tuple(path_of(cell, start, move) for start, move in zip(starts, moves[1:], strict=False))
 
 
-def duration_of(cell: Cell, moves: Sequence[PlannedMove]) -> float:
+def experiment_duration_s(cell: Cell, moves: Sequence[PlannedMove]) -> float:
     """From the first target to the end of the last dwell [s]."""
     return float(sum(path.duration_s for path in paths_of(cell, moves)) + sum(move.dwell_s for move in moves))
 

@@ -28,7 +28,7 @@ from daq.workflow.declared_effects import (
 )
 from daq.workflow.description import check_diagnoses, correction_diagnoses, geometry_beside, is_checked
 from daq.workflow.diagnoses import Recordings, diagnose_fit, named_causes
-from daq.workflow.geometry import encoder_misfit_of
+from daq.workflow.geometry_diagnoses import encoder_misfit_of
 from daq.workflow.remaining_corrections import with_described
 from daq.workflow.validate import diagnose_log
 from ident.arrays import FloatArray
@@ -39,19 +39,19 @@ from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
 from ident.discovery.acceptance import accept_on_holdout
 from ident.discovery.before_after import error_on, holdout_change
 from ident.discovery.evidence import Evidence, gather, without_effects
-from ident.discovery.geometry import evidence_with_geometry, geometry_covariance, with_geometry_covariance
 from ident.discovery.geometry_check import GeometryCheck
+from ident.discovery.geometry_covariance import evidence_with_geometry, geometry_covariance, with_geometry_covariance
 from ident.discovery.loop import Step, find_effects
 from ident.effects.friction import TemperatureFriction
 from ident.errors import Diagnosis, IdentificationError, PayloadUnseen
-from ident.estimators.comparison import Comparison, compare
+from ident.estimators.comparison import EstimatorComparison, try_estimators
 from ident.estimators.estimate import Estimate, Identification, RelativeError, of_squares
-from ident.estimators.geometry import GeometryFinding, Positions, estimate_geometry, thinned
+from ident.estimators.geometry_estimate import GeometryFinding, Positions, estimate_geometry, thinned
 from ident.estimators.identify import estimate_with, identify
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
 from ident.estimators.turned_geometry import GEOMETRY
-from ident.model.geometry_derivatives import corrected_model
+from ident.model.geometry_derivatives import model_with_geometry
 from ident.model.model import Model
 
 
@@ -371,7 +371,7 @@ def description_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
     return check_diagnoses(fitted.description, fitted.cell, fitted.identification.model)
 
 
-def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: None) -> Comparison:
+def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: None) -> EstimatorComparison:
     """Every estimator on the logs of a fit, which are read again for each filter.
 
     Raises:
@@ -386,7 +386,7 @@ def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: 
         )
     refuse_effects(fitted.cell, "--compare")
     found = fitted.identification
-    return compare(
+    return try_estimators(
         found.model,
         lambda: (load_run(log, fitted.cell, fitted.lossy)[0] for log in fitted.logs),
         found.conditioning,
@@ -460,7 +460,7 @@ def with_corrected_geometry(start: Fit) -> Fit:
     effects = declared_effects(cell)
     described = start.identification.estimate
     result = identify(
-        corrected_model(model, finding.changes),
+        model_with_geometry(model, finding.changes),
         (start.read(log)[0] for log in start.logs),
         cell.conditioning,
         holdout=(start.read(log)[0] for log in start.holdout),

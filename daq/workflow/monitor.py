@@ -17,15 +17,15 @@ from typing import Any
 
 import numpy as np
 
-from daq.config.bus import bus_loads_percent
 from daq.config.cell import Cell, PacingMode
+from daq.config.cell_buses import bus_loads_percent
 from daq.errors import LogIncomplete
 from daq.log.conversion import SiScaling, scaling
 from daq.log.feed import Feed, RunFacts, facts_of_recorder
 from daq.log.metadata import AxisReadback, Readback, RunStatistics
 from daq.workflow.bus_lock import bus_taken
-from daq.workflow.events import ALARMING
-from daq.workflow.prediction import Predictor, Recent, predictor_of
+from daq.workflow.events import ALARMING, explain_error_code
+from daq.workflow.live_prediction import Predictor, Recent, predictor_of
 from drivers.canopen.emcy import ErrorCode, explain, read_error_code
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.scale import read_scale
@@ -43,7 +43,7 @@ CHANGED_RATE = 0.1  #: Relative difference at which it is another one, beside lo
 
 
 @dataclass(frozen=True, slots=True)
-class _Source:
+class _SampleSource:
     """Origin and scale of the samples; when they change, curves and prediction begin anew."""
 
     reading: ReadingSource
@@ -89,7 +89,7 @@ class CellWatch:
         self._lockstep = cell.sync is not None and cell.sync.pacing is PacingMode.LOCKSTEP
         self._codes: dict[int, int] = {}  # last error code of each axis that is in fault
         self._facts: RunFacts | None = None
-        self._source: _Source | None = None
+        self._source: _SampleSource | None = None
         self._samples: list[Sample] = []  # since the last reading
         self._count, self._missing = 0, [0] * len(network.axes)
         self._cycles = range(0)  # of the run so far
@@ -175,7 +175,7 @@ class CellWatch:
             self._feed.event(CellEvent(time.time_ns(), axis, EventKind.EMCY, code, text))
 
     def _faults(self) -> dict[str, ErrorCode]:
-        return {self._cell.axis_names[axis]: explain(code) for axis, code in self._codes.items() if code}
+        return {self._cell.axis_names[axis]: explain_error_code(code) for axis, code in self._codes.items() if code}
 
     def _follow(self, reading: CellReading, recorder: bool) -> None:
         """Begin anew where the source of the samples has changed."""
@@ -190,7 +190,7 @@ class CellWatch:
             self._ampere = [value if isfinite(value) else None for value in run.current_per_unit]
         recorded = recorded or run is not None
         rate_hz = None if recorded else self._rate_hz(reading)
-        source = _Source(reading.source, recorded, rate_hz, tuple(self._ampere))
+        source = _SampleSource(reading.source, recorded, rate_hz, tuple(self._ampere))
         if source == self._source or (rate_hz is None and not recorded):
             return
         if self._source is not None:

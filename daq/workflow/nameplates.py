@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from daq.config.cell import Axis, Cell
-from daq.config.yaml_file import Fault, describe, parse_yaml
-from daq.config.yaml_file import read_bytes as read_configuration
+from daq.config.cell import Cell, CellAxis
+from daq.config.yaml_file import Fault, fault_texts, parse_yaml
+from daq.config.yaml_file import read_yaml_bytes as read_configuration
 from daq.errors import ConfigurationInconsistent, ControllerUnfit
-from daq.formats.document import decode, read_bytes
+from daq.formats.document import decode_document, read_controller_file
 from drivers.canopen.scale import ScaleReading, check_name_plate
 from drivers.profiles.profile import TapPoint
 from ident.model.model import DriveTrain
@@ -37,7 +37,7 @@ def check_controller(cell_file: Path, cell: Cell) -> None:
     if controller is None or file is None:
         return
     try:
-        numbers = decode(read_bytes(file), str(file), controller.format).locate(controller.keys)
+        numbers = decode_document(read_controller_file(file), str(file), controller.format).locate(controller.keys)
     except ControllerUnfit:
         return
     gains = [number.value / factor for number, factor in zip(numbers, controller.factors, strict=True)]
@@ -91,7 +91,7 @@ def nameplate_warnings(cell: Cell, readings: Sequence[ScaleReading | None]) -> t
     return grouped if note is None else (note, *grouped)
 
 
-def _comparable(axis: Axis) -> bool:
+def _comparable(axis: CellAxis) -> bool:
     """Whether the gain is per ampere, as the torque constant is."""
     return axis.profile is not None and axis.gain_unit.startswith(("Nm/A", "N/A"))
 
@@ -125,7 +125,7 @@ def _require_alike(cell_file: Path, cell: Cell, references: Sequence[Reference |
         found = f"{nameplate:g} {unit}, while it is {gain:.4g} {source}"
         faults.append(Fault(("axes", index, key), found, f"the same within a factor of {NAMEPLATE_RATIO:g}"))
     raise ConfigurationInconsistent(
-        **describe(document, faults),
+        **fault_texts(document, faults),
         remedy="correct the nameplate, the gear ratio or the other number: is one of them in another unit (mA, mNm), "
         "on the motor's side, or of another axis?",
     )

@@ -22,14 +22,14 @@ from daq.workflow.experiment import (
     RUNS,
     Experiment,
     PlannedMove,
-    duration_of,
+    experiment_duration_s,
     experiment_of,
     path_of,
     towards,
 )
 from drivers.move import Trapezoid
 from ident.arrays import FloatArray
-from ident.planning.verdict import verdicts
+from ident.planning.gain_verdict import verdicts
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,7 +351,7 @@ def plan(
         seed=seed,
         condition=found,
         predicted_std_percent=tuple(predicted.tolist()),
-        duration_s=duration_of(cell, draft.moves),
+        duration_s=experiment_duration_s(cell, draft.moves),
         moves=draft.moves,
         units=tuple(axis.unit for axis in cell.axes),
     )
@@ -363,4 +363,4 @@ def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
         replace(move, velocity=move.velocity * override, acceleration=move.acceleration * override**2)
         for move in plan_.moves
     )
-    return replace(plan_, duration_s=duration_of(cell, moves), moves=moves)
+    return replace(plan_, duration_s=experiment_duration_s(cell, moves), moves=moves)

@@ -10,10 +10,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from daq.config.cell import DEGREE, Cell, JointUnit, model_of
-from daq.config.yaml_file import StrictModel, parse_yaml, read_bytes, read_model
+from daq.config.yaml_file import StrictModel, parse_yaml, read_model, read_yaml_bytes
 from daq.errors import ConfigurationInconsistent
 from daq.files import replace_file
-from daq.workflow.experiment import PlannedMove, duration_of, paths_of, scene_of
+from daq.workflow.experiment import PlannedMove, experiment_duration_s, paths_of, scene_of
 from daq.workflow.plan import Plan
 from drivers.errors import MotionRefused
 from ident.arrays import FloatArray
@@ -83,7 +83,7 @@ def load_plan(path: Path, cell: Cell) -> Plan:
         ConfigurationError: the file is missing, is not what its schema says, a target lies outside the joint limits,
             the plan takes longer than an hour, or a way leaves the declared workspace or clearance.
     """
-    model = read_model(parse_yaml(read_bytes(path), str(path)), _Plan)
+    model = read_model(parse_yaml(read_yaml_bytes(path), str(path)), _Plan)
     if model.cell != cell.name:
         remedy = "make a plan for this cell: `drivegain plan CELL`"
         raise _refused(str(path), f"a plan for cell {model.cell!r}", f"one for {cell.name!r}", remedy)
@@ -92,7 +92,7 @@ def load_plan(path: Path, cell: Cell) -> Plan:
         remedy = "make the plan anew: `drivegain plan CELL`"
         raise _refused(f"{path}: predicted_std_percent", found, f"{len(cell.axes)}, one a gain", remedy)
     moves = tuple(_move(path, cell, number, move) for number, move in enumerate(model.moves))
-    duration_s = duration_of(cell, moves)
+    duration_s = experiment_duration_s(cell, moves)
     if duration_s > LONGEST_S:
         found = f"{duration_s:.0f} s of moves and dwells"
         remedy = "leave moves out, or raise velocity and acceleration"

@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from daq.config import cell as declared
-from daq.config.bus import bus_loads, cell_address, drive_axes, load_warnings, polling_fits, polling_warnings
 from daq.config.cell import Cell, joint_names
+from daq.config.cell_buses import bus_loads, cell_address, drive_axes, load_warnings, polling_fits, polling_warnings
 from daq.config.cell_file import bundle
 from daq.config.drive import shipped_profiles
 from daq.environment import software
 from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
 from daq.files import sha256
-from daq.formats.document import read_bytes
+from daq.formats.document import read_controller_file
 from daq.log.conversion import SiScaling, scaling
 from daq.log.feed import Feed, RunFacts
 from daq.log.metadata import Loss, RunInfo, RunStatistics, loss_reason, readback_of_drives
@@ -250,7 +250,7 @@ def controller_digest(cell: Cell) -> str | None:
     """Return the SHA-256 of the controller's file now; None if the cell names none or it cannot be read."""
     path = cell.controller_path
     try:
-        return None if path is None else sha256(read_bytes(path))
+        return None if path is None else sha256(read_controller_file(path))
     except ControllerUnfit:
         return None
 

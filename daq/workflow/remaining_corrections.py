@@ -1,8 +1,8 @@
 """A calibration that corrects the description of a robot, beside a description that was corrected since.
 
-A search corrects what the cell file says of zeros and of the mounting (`ident.effects.geometry`), and tells the
-operator to correct the cell file. Once that is done, a calibration of before must not correct the same number again: it
-keeps how the number was described, and what is left to correct is the difference.
+A search corrects what the cell file says of zeros and of the mounting (`ident.effects.geometry_corrections`), and tells
+the operator to correct the cell file. Once that is done, a calibration of before must not correct the same number
+again: it keeps how the number was described, and what is left to correct is the difference.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from daq.config.cell import Cell, model_of
-from daq.workflow.geometry import calibrated_model
+from daq.workflow.geometry_diagnoses import calibrated_model
 from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration
 from ident.effects.dictionary import GEOMETRY
 from ident.effects.effect import PlacedEffect
-from ident.effects.geometry import GravityDirection, ZeroOffset, turn_between, turned_gravity
+from ident.effects.geometry_corrections import GravityDirection, ZeroOffset, turn_between, turned_gravity
 from ident.model.model import Model
 from ident.prediction import placed_effect
 

@@ -15,7 +15,7 @@ from daq.formats.xml_document import Element, parse
 from ident.arrays import FloatArray
 from ident.calibration import Calibration
 from ident.effects.effect import Property
-from ident.effects.geometry import corrected_model
+from ident.effects.geometry_corrections import corrected_model
 from ident.model.bodies import Body
 from ident.model.model import Model
 from ident.physical.physical import (

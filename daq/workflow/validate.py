@@ -28,9 +28,9 @@ from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.effects.friction import TemperatureFriction
-from ident.effects.geometry import corrected_model
+from ident.effects.geometry_corrections import corrected_model
 from ident.effects.signals import REFERENCE_C
-from ident.equations.reduction import reduce_runs
+from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.rows import row_filter, row_masks
 from ident.errors import DataUnfit, Diagnosis, IdentificationError
 from ident.estimators.estimate import RelativeError, relative_error
@@ -303,21 +303,21 @@ def cross_validate(
                 found[label] = predicted(own, conditioning, own_model, log, run, described.digest)
         if first in found:
             validations.append(found[first])
-        condition, reduction = None, None
+        condition, standard = None, None
         with suppress(IdentificationError):
             corrected = corrected_model(model, corrections_of(first_own))
-            reduction = reduce_runs(corrected, (run,), conditioning)
+            standard = reduce_runs(corrected, (run,), conditioning)
             # A payload without columns of its own is part of the link that carries it.
-            system = reduction.system(reduction.base(), ((),) * len(reduction.payloads))
+            system = regrouped(standard, payload_columns=((),) * len(standard.payloads))
             condition = wls(system, _gains(calibrations[first])).condition
-        if reduction is not None and first in found and not found[first].is_judged:
-            diagnoses += diagnose_run(first_own, found[first], model, run, reduction)
+        if standard is not None and first in found and not found[first].is_judged:
+            diagnoses += diagnose_run(first_own, found[first], model, run, standard, conditioning)
         if run.payload is not None:
             # From the log, else from the cell, since a body weighs the same anywhere.
             of_cell = (body.mass_kg for body in described.payloads if body.name == run.payload.name)
             kg = run.payload.known.get("m", next(of_cell, None))
             loaded.append((log, run, run.payload, kg))
-        elif reduction is not None:
+        elif standard is not None:
             bare.append(run)
         runs.append(
             CheckedRun(
@@ -369,7 +369,8 @@ def diagnose_log(calibration: Calibration, log: Path, run: Run, described: Cell)
     validation = predicted(calibration, conditioning, model, log, run, described.digest)
     with suppress(IdentificationError):
         corrected = corrected_model(model, corrections_of(calibration))
-        return diagnose_run(calibration, validation, model, run, reduce_runs(corrected, (run,), conditioning))
+        standard = reduce_runs(corrected, (run,), conditioning)
+        return diagnose_run(calibration, validation, model, run, standard, conditioning)
     return ()
 
 

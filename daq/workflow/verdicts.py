@@ -15,7 +15,7 @@ from daq.workflow.fit import Fit
 from ident.data.dataset import differentiate
 from ident.model.bodies import LINK_PARAMETERS
 from ident.planning.excitation import Design, Excitation, Expectation, ExpectedPayload, effective_noise, recorded
-from ident.planning.verdict import GOOD_PERCENT, ExtraMoves, GainVerdict, verdicts
+from ident.planning.gain_verdict import GOOD_PERCENT, ExtraMoves, GainVerdict, verdicts
 
 
 def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:

@@ -29,7 +29,7 @@ from daq.writeback.request import Edit, GainChange, GateFinding, is_writable, re
 from daq.writeback.target import Written
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.parameters import ParameterValue, ParameterWrite, Saving, read_parameters, write_parameters
-from drivers.profiles.profile import Axis, Parameter, ParameterKind
+from drivers.profiles.profile import Axis, DriveParameter, ParameterKind
 from ident.calibration import Calibration, Gain
 
 _NAME = re.compile(r"([0-9]{8}T[0-9]{6}Z)(?:-([0-9]+))?\.json")
@@ -52,9 +52,9 @@ class DriveNote(StrictModel):
     new: _U32  #: its bits as they were to be
 
     @property
-    def parameter(self) -> Parameter:
+    def parameter(self) -> DriveParameter:
         """The object."""
-        return Parameter(self.index, self.subindex, self.type)
+        return DriveParameter(self.index, self.subindex, self.type)
 
 
 class DriveRecord(StrictModel):
@@ -312,7 +312,7 @@ class DriveTarget:
         parameters = write_parameters(self.network, edit.writes, self.saving, begin)
         return Written(edit, records[0], parameters)
 
-    def _recorded(self, path: Path, record: DriveRecord) -> list[tuple[Axis, Parameter]]:
+    def _recorded(self, path: Path, record: DriveRecord) -> list[tuple[Axis, DriveParameter]]:
         axes = {(axis.name, axis.node_id): axis for axis in self.network.axes}
         unknown_axes = [note.axis for note in record.drives if (note.axis, note.node_id) not in axes]
         if record.cell != self.cell.name or unknown_axes:

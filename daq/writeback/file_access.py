@@ -18,7 +18,7 @@ from pathlib import Path
 
 from daq.errors import CalibrationRefused, ControllerUnfit, OutputFailed
 from daq.files import follow_links, hold_lock, open_folder, replace_file
-from daq.formats.document import read_bytes
+from daq.formats.document import read_controller_file
 from daq.writeback.request import short_digest
 
 
@@ -122,7 +122,7 @@ class Backup:
         Raises:
             ControllerUnfit: it was changed, or cannot be read.
         """
-        content = read_bytes(self.path)
+        content = read_controller_file(self.path)
         if short_digest(content) != self.was:
             raise ControllerUnfit(
                 str(self.path),

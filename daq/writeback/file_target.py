@@ -20,7 +20,7 @@ from daq.config.cell import Cell
 from daq.config.controller import ControllerFormat
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
 from daq.files import fsync_folder, replace_file, sha256
-from daq.formats.document import decode, read_bytes
+from daq.formats.document import decode_document, read_controller_file
 from daq.formats.scalar import ControllerDocument, rewrite_gain
 from daq.writeback.file_access import back_up, backups, exclusive_writer, require_existing, resolve_links
 from daq.writeback.request import Edit, GainChange, GateFinding, is_writable, require_axes, short_digest
@@ -56,7 +56,7 @@ class FileEdit(Edit):
 
     def document(self, content: bytes) -> ControllerDocument:
         """Parse a content in the file's format."""
-        return decode(content, str(self.source or self.file), self.format)
+        return decode_document(content, str(self.source or self.file), self.format)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +116,8 @@ class FileTarget:
                 remedy="correct the cell configuration",
             )
         require_existing(self.file)
-        content = read_bytes(self.file)
-        now = decode(content, str(self.file), self.format)
+        content = read_controller_file(self.file)
+        now = decode_document(content, str(self.file), self.format)
         scalars = now.locate(tuple(self.keys[gain.axis] for gain in calibration.gains))
         changes = []
         for gain, scalar in zip(calibration.gains, scalars, strict=True):
@@ -147,7 +147,7 @@ class FileTarget:
     def plan_rollback(self) -> FileEdit:
         """See `Target.plan_rollback`: the newest backup that differs from the file."""
         target = Path(self.subject)
-        before = read_bytes(target) if target.exists() else None
+        before = read_controller_file(target) if target.exists() else None
         found = backups(target)
         # A writer that was killed before it replaced the file leaves a backup of the present content.
         others = [one for one in found if before is None or one.was != short_digest(before)]
@@ -178,7 +178,7 @@ class FileTarget:
         """See `Target.lock`."""
         target = resolve_links(self.file)
         with exclusive_writer(target):
-            found = None if edit.before is None and not target.exists() else read_bytes(target)
+            found = None if edit.before is None and not target.exists() else read_controller_file(target)
             if (str(target), found) != (edit.subject, edit.before):
                 raise ControllerChanged(
                     str(self.file),

@@ -14,7 +14,7 @@ from datetime import datetime
 from pathlib import Path
 
 from daq.config.policy import ApplyPolicy
-from daq.documents.calibration_file import encode
+from daq.documents.calibration_file import encode_calibration
 from daq.errors import CalibrationRefused, UsageError
 from daq.files import sha256
 from ident.calibration import Calibration, Gain
@@ -43,7 +43,7 @@ class Request:
     @property
     def signed(self) -> bytes:
         """The bytes that a signature must cover."""
-        return encode(self.calibration) if self.content is None else self.content
+        return encode_calibration(self.calibration) if self.content is None else self.content
 
     @property
     def evidence(self) -> dict[str, object]:

@@ -41,7 +41,7 @@ _PAUSE_NS = 200_000
 _CLOCK_STEP_NS = 1_000_000  #: A larger difference between two bursts is no slewing: the wall clock was set
 
 
-class Kind(IntEnum):
+class RecordKind(IntEnum):
     """Kind of a record."""
 
     READY = 0
@@ -55,8 +55,8 @@ RECORD = struct.Struct("=qqQQQIBB??8s")
 
 Time at which the kernel received the frame, by the wall clock [ns since 1970] and by the monotonic clock [ns]; a note
 has 0, and the monotonic time at which nothing was left to receive. Frames lost so far in the socket's buffer, before
-it, and in the backlog; identifier and flags of struct can_frame; `Kind`; bytes of data; whether it was sent by this
-very socket, and by any program of this machine; eight bytes.
+it, and in the backlog; identifier and flags of struct can_frame; `RecordKind`; bytes of data; whether it was sent by
+this very socket, and by any program of this machine; eight bytes.
 """
 
 
@@ -206,7 +206,7 @@ class Capture:
         poller.register(self._bus, select.POLLIN)
         poller.register(self._out, 0)
         bus_number, out_number = self._bus.fileno(), self._out.fileno()
-        self._note(Kind.READY)
+        self._note(RecordKind.READY)
         look_ns, ended = self._now_ns + LOOK_NS, False
         while not (ended and not self._backlog):
             poller.modify(self._out, select.POLLOUT if self._backlog else 0)
@@ -216,12 +216,14 @@ class Capture:
             if bus_number in ready:
                 number = self.receive()
                 if number:
-                    self._note(Kind.END, number)
+                    self._note(RecordKind.END, number)
                     poller.unregister(self._bus)
                     ended = True
             elif not ready:
                 self._empty_ns = self._now_ns = time.monotonic_ns()
-                self._note(Kind.LOSSES)  # the parent distinguishes a silent bus from a capture process that was stopped
+                self._note(
+                    RecordKind.LOSSES
+                )  # the parent distinguishes a silent bus from a capture process that was stopped
                 # A frame reports the drops before it, and there may be none: ask the socket itself.
                 with suppress(OSError):  # before Linux 4.12 the next frame reports it
                     counters = self._bus.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size)
@@ -266,10 +268,10 @@ class Capture:
             self._reported_drops = self._counts
             own, local = bool(flags & MSG_OWN), bool(flags & MSG_LOCAL)
             head = (stamp_ns, monotonic_ns, *self._reported_drops)
-            self._backlog += RECORD.pack(*head, can_id, Kind.FRAME, length, own, local, payload)
+            self._backlog += RECORD.pack(*head, can_id, RecordKind.FRAME, length, own, local, payload)
         return number
 
-    def _note(self, kind: Kind, number: int = 0) -> None:
+    def _note(self, kind: RecordKind, number: int = 0) -> None:
         """Append a note to the backlog, even when that is full: notes are few."""
         self._reported_drops = self._counts
         self._backlog += RECORD.pack(0, self._empty_ns, *self._reported_drops, number, kind, 0, False, False, bytes(8))
@@ -296,7 +298,7 @@ class Capture:
                     sent = self._out.send(waiting[:_SEND_BYTES], socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
                 del self._backlog[:sent]
             if self._reported_drops != self._counts:
-                self._note(Kind.LOSSES)
+                self._note(RecordKind.LOSSES)
         except BlockingIOError:
             pass
         except OSError:
@@ -304,7 +306,7 @@ class Capture:
         return True
 
 
-def main(arguments: list[str]) -> None:
+def run_capture(arguments: list[str]) -> None:
     """Capture from one inherited socket to the other."""
     # The parent handles Ctrl-C: it stops the axes first, and needs the frames for that.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -317,4 +319,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_capture(sys.argv[1:])

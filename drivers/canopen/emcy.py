@@ -47,17 +47,17 @@ class ErrorCode:
 
 def explain(code: int) -> ErrorCode:
     """Return meaning and first remedy of an error code of 16 bits."""
-    return ErrorCode(code, f"{code:04X}h", describe(code), remedy_of(code))
+    return ErrorCode(code, f"{code:04X}h", describe_error_code(code), remedy_of(code))
 
 
 def remedy_of(code: int) -> str:
     """Return what to try first for an error code; the drive's manual says more."""
     first = "check brake, load and collision; use slower moves" if code >> 8 in (0x84, 0x85, 0x86) else ""
     first = first or _REMEDIES.get(code >> 12, "see the drive's manual")
-    return f"{first}; then reset the fault with `drivegain scan CELL --reset-faults`"
+    return f"{first}; then reset the fault with `CanopenNetwork.reset_faults`"
 
 
-def describe(code: int) -> str:
+def describe_error_code(code: int) -> str:
     """Describe an error code of 16 bits; for a code that is in no standard, its class."""
     if code in CODES:
         return CODES[code]

@@ -16,7 +16,7 @@ from typing import Protocol
 import can
 
 from drivers.canopen.bus import bus_errors, send_burst
-from drivers.canopen.emcy import describe
+from drivers.canopen.emcy import describe_error_code
 from drivers.canopen.sdo import SDO_ANSWER, SDO_REQUEST, Clock, ObjectAccess, SdoPolicy, SynchronousSdoClient
 from drivers.canopen.socketcan import CapturedMessage, receive_only
 from drivers.canopen.split_bus import BUS_OFF, BUS_OFF_REASON, CellAddress, open_cell_bus
@@ -293,7 +293,7 @@ class Link:
             code, register, data = struct.unpack("<HB5s", message.data)
             # CiA 301: codes 00xxh report the end of an error.
             kind = EventKind.EMCY if code & 0xFF00 else EventKind.EMCY_RESET
-            text = f"EMCY {code:04X}h {describe(code)}, error register {register:02X}h, data {data.hex()}"
+            text = f"EMCY {code:04X}h {describe_error_code(code)}, error register {register:02X}h, data {data.hex()}"
             self._events.append((node_id, kind, code, text))
         elif service == SDO_ANSWER:
             self.answered[node_id] += 1

@@ -15,11 +15,11 @@ import can
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import HEARTBEAT, LISTEN_S, LSS, Link, NmtCommand, NmtState, command_name, never
 from drivers.canopen.needs import Profiles
+from drivers.canopen.node_scan import FoundNode, answering, free_ids, read_identity, scan_link
 from drivers.canopen.pdo import CONTROLWORD, HEARTBEAT_MS, STATUSWORD, AxisPdos, wanted_pdos
 from drivers.canopen.scale import ScaleReading, read_scale
-from drivers.canopen.scan import FoundNode, answering, free_ids, read_identity, scan_link
 from drivers.canopen.sdo import SDO_REQUEST, Clock, SdoPolicy
-from drivers.canopen.setup import AxisSetup, Guard, producer_of, read_consumers
+from drivers.canopen.setup import AxisSetup, HeartbeatGuard, producer_of, read_consumers
 from drivers.canopen.split_bus import CellAddress, open_cell_bus
 from drivers.errors import (
     POWERED,
@@ -260,7 +260,9 @@ class CanopenNetwork:
         if self.link.own_id is None:
             self._take_recorder_id([value for entries in consumers for _, value in entries or ()])
         new = {
-            axis.node_id: AxisSetup(self.link, axis, Guard(self.link.objects(axis.node_id), entries, self.was_ours))
+            axis.node_id: AxisSetup(
+                self.link, axis, HeartbeatGuard(self.link.objects(axis.node_id), entries, self.was_ours)
+            )
             for axis, entries in zip(self.axes, consumers, strict=True)
             if axis.node_id not in self._setups
         }

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.pdo import STATUSWORD, read_record, wanted_pdos
+from drivers.canopen.pdo import STATUSWORD, read_pdo_record, wanted_pdos
 from drivers.canopen.sdo import SdoPolicy
 from drivers.canopen.setup import CONSUMERS
 from drivers.errors import DriverError, NodeError, ObjectAccessError, ParameterRefused, ParametersMixed
 from drivers.profiles.cia402 import POWERLESS, decode
-from drivers.profiles.profile import Axis, Identity, Mapping, ObjectEntry, Parameter
+from drivers.profiles.profile import Axis, DriveParameter, Identity, Mapping, ObjectEntry
 
 SAVE_TIMEOUT_S = 10.0  #: Drives write their whole memory, which takes 0.4 s and more, and answer when it is done
 
@@ -40,7 +40,7 @@ class ParameterValue:
 
     axis: Axis
     identity: Identity
-    parameter: Parameter
+    parameter: DriveParameter
     word: int
 
     @property
@@ -54,7 +54,7 @@ class ParameterWrite:
     """A parameter to write; `word` holds its bits."""
 
     axis: Axis
-    parameter: Parameter
+    parameter: DriveParameter
     word: int
 
 
@@ -63,13 +63,15 @@ class ParameterChange:
     """A parameter that was written: its bits before and after, and whether the drive saved it."""
 
     axis: str
-    parameter: Parameter
+    parameter: DriveParameter
     old: int
     new: int
     saved: bool
 
 
-def read_parameters(network: CanopenNetwork, wanted: Sequence[tuple[Axis, Parameter]]) -> tuple[ParameterValue, ...]:
+def read_parameters(
+    network: CanopenNetwork, wanted: Sequence[tuple[Axis, DriveParameter]]
+) -> tuple[ParameterValue, ...]:
     """Read a parameter of each axis; changes nothing.
 
     Args:
@@ -176,7 +178,7 @@ def recording_leftover(network: CanopenNetwork, axis: Axis) -> str:
     except ValueError:
         return ""  # this drive cannot be recorded
     for ours in pdos.feedback + pdos.setpoints:
-        found = read_record(access, ours.direction, ours.number)
+        found = read_pdo_record(access, ours.direction, ours.number)
         if found is not None and (found.entries, found.transmission) == (ours.entries, ours.transmission):
             return str(found)
     return ""
@@ -216,10 +218,10 @@ def _require_savable(network: CanopenNetwork, axis: Axis, saving: Saving) -> Non
     save = axis.profile.save
     if save is None:
         reason = f"is not described in its profile {axis.profile.name}"
-        remedy = "describe it there, or write to its RAM alone (--ram-only): the gain is then lost with its power"
+        remedy = "describe it there, or write to its RAM alone (`Saving.RAM`): the gain is then lost with its power"
     elif save.mapping is Mapping.UNKNOWN and saving is Saving.KNOWN:
         reason = f"may store more than the gain ({axis.profile.name}: {axis.profile.save_semantics})"
-        remedy = "write to its RAM alone (--ram-only), or let it save all the same (--save-unknown)"
+        remedy = "write to its RAM alone (`Saving.RAM`), or let it save all the same (`Saving.ANY`)"
     elif save.mapping is not Mapping.SEPARATE and (left := recording_leftover(network, axis)):
         reason = f"would keep settings of a recording that was killed ({left})"
         remedy = "switch the drive off and on, so that it starts with its own settings, and try again"

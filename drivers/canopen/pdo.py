@@ -91,7 +91,7 @@ def pack(entries: Sequence[ObjectEntry], most_bytes: int = PDO_BYTES) -> tuple[t
     return tuple(tuple(pdo) for pdo in pdos)
 
 
-def layout(entries: Sequence[ObjectEntry]) -> struct.Struct:
+def record_struct(entries: Sequence[ObjectEntry]) -> struct.Struct:
     """Return the payload of a PDO: little endian, at constant offsets."""
     return struct.Struct("<" + "".join(_CODES[entry.bits, entry.signed] for entry in entries))
 
@@ -140,7 +140,7 @@ class AxisPdos:
         for record in self.setpoints:
             if all(mapped in entries for mapped in record.entries):
                 pdo = [entries[mapped] for mapped in record.entries]
-                yield record.cob_id & 0x7FF, layout(pdo).pack(*(values[entry] for entry in pdo))
+                yield record.cob_id & 0x7FF, record_struct(pdo).pack(*(values[entry] for entry in pdo))
 
 
 def wanted_pdos(
@@ -198,7 +198,7 @@ def _carrying(needed: set[int], found: Sequence[PdoRecord]) -> tuple[PdoRecord, 
     return tuple(replace(record, transmission=SYNCHRONOUS) for record in used)
 
 
-def payload_of(record: PdoRecord, entries: Sequence[ObjectEntry]) -> tuple[struct.Struct, tuple[ObjectEntry, ...]]:
+def record_payload(record: PdoRecord, entries: Sequence[ObjectEntry]) -> tuple[struct.Struct, tuple[ObjectEntry, ...]]:
     """Return the layout of a TPDO, and those of the given objects that it carries, in its order; it skips others."""
     known = {word(entry): entry for entry in entries}
     codes = [
@@ -221,7 +221,7 @@ def _entry(count: ObjectEntry, subindex: int) -> ObjectEntry:
     return ObjectEntry(count.index, subindex, 32, signed=False)
 
 
-def read_record(access: ObjectAccess, direction: Direction, number: int) -> PdoRecord | None:
+def read_pdo_record(access: ObjectAccess, direction: Direction, number: int) -> PdoRecord | None:
     """Read one PDO of a drive; None when the drive has no such PDO."""
     cob_id, transmission, count = _parameters(direction, number)
     identifier = access.read_optional(cob_id)
@@ -234,7 +234,7 @@ def read_record(access: ObjectAccess, direction: Direction, number: int) -> PdoR
     return PdoRecord(direction, number, identifier, access.read(transmission), entries)
 
 
-def write_record(access: ObjectAccess, record: PdoRecord) -> None:
+def write_pdo_record(access: ObjectAccess, record: PdoRecord) -> None:
     """Write what differs of one PDO, read it back and compare.
 
     Drives accept only this order: COB-ID not valid, count 0, entries, transmission type, count, COB-ID valid. A drive
@@ -244,7 +244,7 @@ def write_record(access: ObjectAccess, record: PdoRecord) -> None:
         SetupRefused: a step was aborted, or the PDO reads back differently.
     """
     cob_id, transmission, count = _parameters(record.direction, record.number)
-    before = read_record(access, record.direction, record.number)
+    before = read_pdo_record(access, record.direction, record.number)
     if before == record:
         return
     off = (record.cob_id if before is None else before.cob_id) | NOT_VALID
@@ -269,7 +269,7 @@ def write_record(access: ObjectAccess, record: PdoRecord) -> None:
             fixed = entry == cob_id and error.abort_code == READ_ONLY and as_before
             if not fixed:
                 raise SetupRefused(access, f"{record.name}: writing {value:#x} to {entry}: {error.reason}") from error
-    found = read_record(access, record.direction, record.number)
+    found = read_pdo_record(access, record.direction, record.number)
     if (
         found is None
         or (found.entries, found.transmission) != (record.entries, record.transmission)
@@ -285,9 +285,9 @@ def turn_off(access: ObjectAccess, record: PdoRecord) -> None:
         SetupRefused: the drive refuses both.
     """
     try:
-        write_record(access, replace(record, cob_id=record.cob_id | NOT_VALID))
+        write_pdo_record(access, replace(record, cob_id=record.cob_id | NOT_VALID))
     except SetupRefused as refused:
         try:
-            write_record(access, replace(record, entries=()))
+            write_pdo_record(access, replace(record, entries=()))
         except SetupRefused:
             raise refused from refused.__cause__

@@ -30,10 +30,10 @@ from drivers.canopen.pdo import (
     PdoRecord,
     fixed_feedback,
     fixed_setpoints,
-    read_record,
+    read_pdo_record,
     turn_off,
     wanted_pdos,
-    write_record,
+    write_pdo_record,
 )
 from drivers.canopen.scale import ScaleReading
 from drivers.canopen.sdo import ObjectAccess
@@ -70,7 +70,7 @@ def read_consumers(access: ObjectAccess) -> Consumers | None:
     return tuple(found)
 
 
-class Guard:
+class HeartbeatGuard:
     """The watch of an amplifier over the recorder, by an entry of its 1016h (`consumers`).
 
     The entry is free, or `left_over` shows that it watches a killed recorder.
@@ -141,7 +141,7 @@ class Guard:
 class AxisSetup:
     """The settings of one amplifier; each step keeps the original value first, so a half-done setup can be undone."""
 
-    def __init__(self, link: Link, axis: Axis, guard: Guard) -> None:
+    def __init__(self, link: Link, axis: Axis, guard: HeartbeatGuard) -> None:
         self.guard = guard  #: How the amplifier watches the recorder
         self._link = link
         self._axis = axis
@@ -166,7 +166,7 @@ class AxisSetup:
         if access.read_optional(PROFILE_DECELERATION) is None:
             self._absent = (PROFILE_DECELERATION,)  # such a drive brakes with its profile acceleration
         for direction in Direction:
-            read = (read_record(access, direction, number) for number in range(PDOS))
+            read = (read_pdo_record(access, direction, number) for number in range(PDOS))
             self._found[direction] = tuple(record for record in read if record is not None)
         self.pdos = self._wanted(PDO_BYTES)
 
@@ -221,7 +221,7 @@ class AxisSetup:
         for before in found:
             if before.number in wanted:
                 self._pdos_before.setdefault(before.name, before)
-                write_record(self._access, wanted[before.number])
+                write_pdo_record(self._access, wanted[before.number])
             elif not before.cob_id & NOT_VALID:
                 self._pdos_before.setdefault(before.name, before)
                 turn_off(self._access, before)  # a drive's default PDOs would come between ours
@@ -264,7 +264,7 @@ class AxisSetup:
     def _restoring(self) -> Iterator[tuple[str, Callable[[], object]]]:
         """Yield the steps that restore all settings, and their names; the heartbeat last."""
         for record in self._pdos_before.values():
-            yield record.name, partial(write_record, self._access, record)
+            yield record.name, partial(write_pdo_record, self._access, record)
         if self._mode is not None:
             yield "6060h", partial(self._access.write, MODE_OF_OPERATION, self._mode)
         yield "1016h", self.guard.disarm

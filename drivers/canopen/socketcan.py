@@ -25,7 +25,7 @@ from typing import NamedTuple
 import can
 
 from drivers.canopen import capture
-from drivers.canopen.capture import FRAME, RECORD, Kind
+from drivers.canopen.capture import FRAME, RECORD, RecordKind
 
 RECEIVE_BUFFER_BYTES = 4 << 20  #: The kernel's default of 208 KiB holds 43 ms of a full bus; a busy machine needs more
 START_S = 20.0  #: Time for the capture process to start; a loaded machine is slow to start an interpreter
@@ -277,11 +277,11 @@ class SocketcanBus(BurstBus):
         monotonic_ns = self.read_until_ns
         for record in RECORD.iter_unpack(memoryview(chunk)[:whole]):
             kernel_ns, monotonic_ns, *lost, can_id, kind, length, own, local, data = record
-            if kind == Kind.FRAME:
+            if kind == RecordKind.FRAME:
                 received.append(self._message(kernel_ns, monotonic_ns, can_id, data[:length], own, local))
-            elif kind == Kind.READY:
+            elif kind == RecordKind.READY:
                 ready = True
-            elif kind == Kind.END:
+            elif kind == RecordKind.END:
                 end = _reason(can_id)
         losses, until_ns = Losses(*lost), max(monotonic_ns, self.read_until_ns)
         # No call from here on: the state changes whole, or not at all.

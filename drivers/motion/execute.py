@@ -37,7 +37,7 @@ from drivers.profiles.cia402 import (
     POWERLESS,
     STATUS_SETPOINT_ACKNOWLEDGE,
     STATUS_TARGET_REACHED,
-    Command,
+    ControlCommand,
     Goal,
     State,
     decode,
@@ -48,7 +48,7 @@ from drivers.stream.cycles import LARGEST_LAG_NS, nothing_to_send
 from drivers.stream.stream import MAX_MISSING_CYCLES, SyncStream
 from drivers.stream.watch import FrozenData
 
-_NEW_SETPOINT = Command.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
+_NEW_SETPOINT = ControlCommand.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,7 +266,7 @@ class _Execution:
     def _handshake(self, number: int, moving: Sequence[int]) -> Iterator[Sample]:
         """Set and clear the new set-point of all axes, each with the same SYNC, and wait for the acknowledgements."""
         bit = STATUS_SETPOINT_ACKNOWLEDGE
-        for wanted, controlword in ((bit, _NEW_SETPOINT), (0, int(Command.ENABLE_OPERATION))):
+        for wanted, controlword in ((bit, _NEW_SETPOINT), (0, int(ControlCommand.ENABLE_OPERATION))):
             waiting = list(moving)
             for _ in range(self._cycles(self._bounds.acknowledge_s)):
                 for axis in waiting:

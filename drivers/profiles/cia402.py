@@ -54,7 +54,7 @@ def decode(statusword: int) -> State:
     return _STATES[statusword & STATE_BITS]
 
 
-class Command(IntEnum):
+class ControlCommand(IntEnum):
     """Bits 0–3 and 7 of the controlword (6040h)."""
 
     DISABLE_VOLTAGE = 0x00
@@ -76,26 +76,32 @@ class Goal(Enum):
 
 _PATHS = {
     Goal.OPERATION_ENABLED: {
-        State.SWITCH_ON_DISABLED: Command.SHUTDOWN,
-        State.READY_TO_SWITCH_ON: Command.SWITCH_ON,
-        State.SWITCHED_ON: Command.ENABLE_OPERATION,
-        State.OPERATION_ENABLED: Command.ENABLE_OPERATION,
+        State.SWITCH_ON_DISABLED: ControlCommand.SHUTDOWN,
+        State.READY_TO_SWITCH_ON: ControlCommand.SWITCH_ON,
+        State.SWITCHED_ON: ControlCommand.ENABLE_OPERATION,
+        State.OPERATION_ENABLED: ControlCommand.ENABLE_OPERATION,
     },
     # One step at a time: voltage is removed only after the drive has stopped and its brake could close.
-    Goal.SWITCH_ON_DISABLED: {State.OPERATION_ENABLED: Command.DISABLE_OPERATION, State.SWITCHED_ON: Command.SHUTDOWN},
-    Goal.QUICK_STOP: {State.OPERATION_ENABLED: Command.QUICK_STOP, State.QUICK_STOP_ACTIVE: Command.QUICK_STOP},
+    Goal.SWITCH_ON_DISABLED: {
+        State.OPERATION_ENABLED: ControlCommand.DISABLE_OPERATION,
+        State.SWITCHED_ON: ControlCommand.SHUTDOWN,
+    },
+    Goal.QUICK_STOP: {
+        State.OPERATION_ENABLED: ControlCommand.QUICK_STOP,
+        State.QUICK_STOP_ACTIVE: ControlCommand.QUICK_STOP,
+    },
 }
 
 
-def next_command(state: State, goal: Goal) -> Command:
+def next_command(state: State, goal: Goal) -> ControlCommand:
     """Return the next command on the path from a state to a goal.
 
     From FAULT, and from every state without a path, it is DISABLE VOLTAGE. A fault is left by ``FAULT_RESET_SEQUENCE``
     alone, so nothing re-enables an axis by itself. DISABLE VOLTAGE is also a harmless first controlword for drives that
     show statusword 0000h until they receive one.
     """
-    return _PATHS[goal].get(state, Command.DISABLE_VOLTAGE)
+    return _PATHS[goal].get(state, ControlCommand.DISABLE_VOLTAGE)
 
 
-FAULT_RESET_SEQUENCE = (Command.DISABLE_VOLTAGE, Command.FAULT_RESET, Command.DISABLE_VOLTAGE)
+FAULT_RESET_SEQUENCE = (ControlCommand.DISABLE_VOLTAGE, ControlCommand.FAULT_RESET, ControlCommand.DISABLE_VOLTAGE)
 """Bit 7 acts on its rising edge; the sequence ends in SWITCH ON DISABLED, never in OPERATION ENABLED."""

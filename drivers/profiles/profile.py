@@ -31,7 +31,7 @@ class TapPoint(Enum):
     ACTUAL = "actual"
 
 
-class Basis(Enum):
+class FactBasis(Enum):
     """Evidence for a fact of a profile, the strongest first.
 
     EDS: the manufacturer's electronic data sheet. MANUAL: the manufacturer's text, read. STANDARD: required by CiA 301
@@ -135,7 +135,7 @@ class Fact:
     """Evidence for one key of a profile."""
 
     about: str  #: key of the profile
-    basis: Basis  #: kind of evidence
+    basis: FactBasis  #: kind of evidence
     where: str  #: document and section, EDS object, or the missing evidence
 
 
@@ -248,7 +248,7 @@ _CODES = {
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
+class DriveParameter:
     """One number in a drive's object dictionary, integer or floating point."""
 
     index: int

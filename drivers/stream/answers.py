@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from struct import Struct
 
-from drivers.canopen.pdo import AxisPdos, feedback_entries, payload_of, wanted_pdos
+from drivers.canopen.pdo import AxisPdos, feedback_entries, record_payload, wanted_pdos
 from drivers.profiles.profile import Axis
 
 
@@ -54,7 +54,7 @@ def slots_of(axes: Sequence[Axis], pdos: Sequence[AxisPdos] | None = None) -> di
     for number, (axis, used) in enumerate(zip(axes, pdos or tuple(map(wanted_pdos, axes)), strict=True)):
         entries = feedback_entries(axis)
         for record in used.feedback:
-            form, carried = payload_of(record, entries)
+            form, carried = record_payload(record, entries)
             columns = tuple(entries.index(entry) * len(axes) + number for entry in carried)
             slots[record.cob_id & 0x7FF] = Slot(number, 1 << len(slots), form.size, form, columns)
     return slots

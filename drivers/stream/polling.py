@@ -2,8 +2,8 @@
 
 Nothing waits for an answer. At most one request is on its way; it is sent in a cycle without set-points, and its answer
 is taken from the frames that the stream reads anyway. SDO has a lower priority than SYNC and PDOs, so a request or an
-answer delays the frames of a cycle by its own length at most; `daq.config.bus` decides whether a period has room for
-both. A lost answer is a missing reading, and so is an abort: the object is read again at its next turn, unless the
+answer delays the frames of a cycle by its own length at most; `daq.config.cell_buses` decides whether a period has room
+for both. A lost answer is a missing reading, and so is an abort: the object is read again at its next turn, unless the
 drive says that it has none.
 """
 

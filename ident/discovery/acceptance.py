@@ -4,7 +4,7 @@
 of proof is on the effect:
 
 1. every effect is taken out of the model in turn, everything else is refitted, and both models predict the held-out
-   runs; `judge` compares their errors on every motor;
+   runs; `judge_change` compares their errors on every motor;
 2. of what is refuted, the worst leaves, the rest is fitted and judged again: beside it, others may have seemed harmful;
 3. then of what is undecided, the least certain leaves likewise, because two effects of which either does the work seem
    useless, each beside the other;
@@ -23,14 +23,14 @@ import numpy as np
 
 from ident.discovery.before_after import error_on, squares_left
 from ident.discovery.candidates import ColumnCache
+from ident.discovery.effect_verdict import EffectVerdict, Judgement, judge_change
 from ident.discovery.error_change import ErrorChange, change_of_errors
 from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import Gates
 from ident.discovery.joining import UNFITTED, linearised
 from ident.discovery.loop import Step, end_search
-from ident.discovery.verdict import Judgement, Verdict, judge
 from ident.effects.effect import PlacedEffect
-from ident.effects.geometry import is_correction
+from ident.effects.geometry_corrections import is_correction
 from ident.estimators.estimate import RelativeError
 from ident.estimators.identify import estimate_with
 
@@ -67,7 +67,7 @@ def accept_on_holdout(
     if len(found.effects) == found.declared:
         return tuple(steps)
     names = axes or [joint.name for joint in start.model.robot.places]
-    verdicts: dict[PlacedEffect, Verdict] = {}
+    verdicts: dict[PlacedEffect, EffectVerdict] = {}
     judged_model = found
     last = steps[-1]
     while True:
@@ -91,7 +91,7 @@ def accept_on_holdout(
 def _judged(
     start: Evidence,
     found: Evidence,
-    verdicts: dict[PlacedEffect, Verdict],
+    verdicts: dict[PlacedEffect, EffectVerdict],
     *,
     write_undecided: bool,
     progress: Callable[[str], None],
@@ -150,7 +150,7 @@ def compare_on_holdout(start: Evidence, before: Evidence, after: Evidence) -> Er
     )
 
 
-def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> Verdict:
+def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> EffectVerdict:
     """Judge an effect beside the others; together with them where they cannot be fitted without it."""
     is_needed = False
     try:
@@ -161,8 +161,8 @@ def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> Verdic
     change = compare_on_holdout(start, without, current)
     # A correction of the description changes all motors: that its own falls is no more than friction there does.
     has_motor = placed.axis < len(change.motors) and placed.effect.has_axis and not is_correction(placed)
-    judgement, reason = judge(change, placed.axis if has_motor else None)
-    return Verdict(
+    judgement, reason = judge_change(change, placed.axis if has_motor else None)
+    return EffectVerdict(
         placed=placed,
         judgement=judgement,
         reason=reason,
@@ -173,7 +173,7 @@ def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> Verdic
     )
 
 
-def _leaving(judged: Sequence[Verdict], *, write_undecided: bool) -> Verdict | None:
+def _leaving(judged: Sequence[EffectVerdict], *, write_undecided: bool) -> EffectVerdict | None:
     """The worst of what is refuted; then the least certain of what is undecided, unless that is to be written."""
     refuted = [one for one in judged if one.judgement is Judgement.REFUTED]
     if refuted:

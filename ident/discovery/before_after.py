@@ -45,8 +45,8 @@ from ident.arrays import FloatArray, IntArray
 from ident.discovery.error_change import PairedChange, compare_by_move
 from ident.discovery.evidence import Evidence, Uncorrected, with_effects
 from ident.discovery.loop import Step
-from ident.discovery.noise_floor import NoiseFloor, noise_floors
-from ident.discovery.time_skew import Skew, time_skew
+from ident.discovery.noise_floor import MotorNoiseFloor, noise_floors
+from ident.discovery.time_skew import CurrentDelay, time_skew
 from ident.drift.change import FALSE_ALARM
 from ident.effects.effect import PlacedEffect
 from ident.equations.currents import whitening_transform
@@ -58,7 +58,7 @@ from ident.equations.linearisation import (
     linearise,
     scatter_of,
 )
-from ident.equations.rows import Observation
+from ident.equations.observation import Observation
 from ident.errors import IdentificationError
 from ident.estimators.estimate import Estimate, RelativeError, of_squares
 from ident.estimators.identify import estimate_with
@@ -148,7 +148,7 @@ def error_left_out(folds: Folds) -> CurrentError:
 
 
 @dataclass(frozen=True, slots=True)
-class LeftOutRun:
+class RunError:
     """One run of the fit, predicted by the others; `error` is None where they cannot be fitted, with the reason."""
 
     run: str  #: its name
@@ -157,28 +157,28 @@ class LeftOutRun:
 
 
 @dataclass(frozen=True, slots=True)
-class LeftOutRuns:
+class RunErrors:
     """Errors on each run of the fit, left out in turn."""
 
-    runs: tuple[LeftOutRun, ...]  #: in the order of the fit
+    runs: tuple[RunError, ...]  #: in the order of the fit
     together: RelativeError | None  #: over the rows of all runs that could be predicted; None without any
 
 
-def left_out_runs(evidence: Evidence, weights_nm_a: FloatArray) -> LeftOutRuns:
+def left_out_runs(evidence: Evidence, weights_nm_a: FloatArray) -> RunErrors:
     """Refit everything without each run of the fit in turn, and predict that run.
 
     The only run with the known payload, or the only one without, cannot be left out: it is listed with the reason.
     """
-    runs: list[LeftOutRun] = []
+    runs: list[RunError] = []
     errors: list[CurrentError] = []
     for index, data in enumerate(evidence.fit_runs):
         try:
             errors.append(_error_without(evidence, index))
         except IdentificationError as error:
-            runs.append(LeftOutRun(data.name, None, str(error)))
+            runs.append(RunError(data.name, None, str(error)))
         else:
-            runs.append(LeftOutRun(data.name, errors[-1].relative(weights_nm_a)))
-    return LeftOutRuns(tuple(runs), reduce(add, errors).relative(weights_nm_a) if errors else None)
+            runs.append(RunError(data.name, errors[-1].relative(weights_nm_a)))
+    return RunErrors(tuple(runs), reduce(add, errors).relative(weights_nm_a) if errors else None)
 
 
 def _error_without(evidence: Evidence, left_out: int) -> CurrentError:
@@ -221,12 +221,12 @@ def _in_order(bare: Observation, order: Sequence[int]) -> Observation:
 
 
 @dataclass(frozen=True, slots=True)
-class Errors:
+class RelativeErrors:
     """Errors of one model [%]; None where not requested, or without held-out runs."""
 
     in_sample: RelativeError  #: on the rows of the fit
     cross_validated: RelativeError  #: on moves left out of one step of the fit
-    left_out_runs: LeftOutRuns | None  #: on runs left out of a fit of their own
+    left_out_runs: RunErrors | None  #: on runs left out of a fit of their own
     holdout: RelativeError | None  #: on runs that no fit and no search has seen
 
 
@@ -254,7 +254,7 @@ class Assessment:
     """One model on its data."""
 
     effects: tuple[PlacedEffect, ...]  #: in the model
-    errors: Errors  #: of the model
+    errors: RelativeErrors  #: of the model
     gains: FloatArray  #: drive gains [Nm at the joint per A], shape (m,)
     gains_std: FloatArray  #: their σ, shape (m,)
     choice_std: FloatArray  #: the part of it that comes from the choice of the effects, shape (m,)
@@ -290,8 +290,8 @@ class BeforeAfter:
 
     added: tuple[PlacedEffect, ...]  #: effects of the second model only
     removed: tuple[PlacedEffect, ...]  #: effects of the first model only
-    before: Errors  #: errors of the first
-    after: Errors  #: errors of the second
+    before: RelativeErrors  #: errors of the first
+    after: RelativeErrors  #: errors of the second
     gains: tuple[GainShift, ...]  #: one a motor
 
 
@@ -299,7 +299,7 @@ class BeforeAfter:
 class Account:
     """Change by a whole search for effects."""
 
-    floors: tuple[NoiseFloor | None, ...]  #: noise of each motor's current, None where it is not known
+    floors: tuple[MotorNoiseFloor | None, ...]  #: noise of each motor's current, None where it is not known
     left_a: FloatArray  #: `left_on` the rows of the fit after the last turn [A]
     #: Error that this noise alone would leave on the rows of the fit [%]: an estimate, at most the error of either
     #: model; NaN where it is not known or refuted.
@@ -312,7 +312,7 @@ class Account:
     total: BeforeAfter  #: change from the declared model to the last one
     holdout_change: PairedChange | None  #: of the squared error on held-out rows, None without any
     #: Delay of the currents after the positions, beside the effects of the last model; None where no instruments exist.
-    skew: Skew | None = None
+    skew: CurrentDelay | None = None
 
 
 def account(
@@ -353,8 +353,8 @@ def account(
     left_a = left_on(end.after.training, end.after.estimate)
     progress("time skew by instruments from the demanded motion")
     skew = time_skew(end.after)
-    known: list[NoiseFloor | None] = []
-    least: list[NoiseFloor | None] = []
+    known: list[MotorNoiseFloor | None] = []
+    least: list[MotorNoiseFloor | None] = []
     for floor, left in zip(floors, left_a, strict=True):
         if floor is None or floor.is_refuted(left):
             known.append(None)
@@ -363,7 +363,7 @@ def account(
             known.append(floor)
             least.append(replace(floor, noise_a=floor.least_a) if floor.is_bound else None)
 
-    def error_of(noises: Sequence[NoiseFloor | None], before: Observation, after: Observation) -> RelativeError:
+    def error_of(noises: Sequence[MotorNoiseFloor | None], before: Observation, after: Observation) -> RelativeError:
         """Error by noise alone on some rows; a model that leaves less by chance is at the floor."""
         left = np.fmin(left_on(before, start.estimate), left_on(after, end.after.estimate))
         return floor_on(before, start.estimate, capped(noises, left)).relative(weights_nm_a)
@@ -389,7 +389,7 @@ def account(
     )
 
 
-def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns | None = None) -> Assessment:
+def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: RunErrors | None = None) -> Assessment:
     """Compute the errors and gains of one model, identified by ``ml``.
 
     Raises:
@@ -411,7 +411,7 @@ def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns |
         moves = Moves(folds.cluster_hessian, folds.cluster_score, problem.scale, runs)
     return Assessment(
         effects=evidence.effects,
-        errors=Errors(
+        errors=RelativeErrors(
             in_sample=error_on(evidence.training, estimate).relative(weights_nm_a),
             cross_validated=error_left_out(folds).relative(weights_nm_a),
             left_out_runs=left_out,
@@ -453,7 +453,7 @@ def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
     )
 
 
-def capped(floors: Sequence[NoiseFloor | None], left_a: FloatArray) -> tuple[NoiseFloor | None, ...]:
+def capped(floors: Sequence[MotorNoiseFloor | None], left_a: FloatArray) -> tuple[MotorNoiseFloor | None, ...]:
     """Lower each floor to what a model leaves on the rows it is shown for [A, root mean square], shape (m,)."""
     return tuple(
         None if floor is None else replace(floor, noise_a=float(np.fmin(floor.noise_a, left)))
@@ -461,7 +461,7 @@ def capped(floors: Sequence[NoiseFloor | None], left_a: FloatArray) -> tuple[Noi
     )
 
 
-def floor_on(observation: Observation, estimate: Estimate, floors: Sequence[NoiseFloor | None]) -> CurrentError:
+def floor_on(observation: Observation, estimate: Estimate, floors: Sequence[MotorNoiseFloor | None]) -> CurrentError:
     """Error that noise alone would leave on some rows under an estimate; NaN for a motor whose noise is not known."""
     use, seen = observation.motor_use, _currents(observation, estimate)
     noise_a = np.array([np.nan if floor is None else floor.noise_a for floor in floors])

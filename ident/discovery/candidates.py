@@ -24,11 +24,12 @@ from ident.data.dataset import Dataset
 from ident.discovery.few_moves import FEW_MOVES, MoveScores, moves_behind, without_most_leverage
 from ident.discovery.noise_floor import noise_floors
 from ident.effects.effect import Effect, PlacedEffect, at_joints, columns_at, effect_columns, is_placeable
-from ident.effects.geometry import GeometryEffect
+from ident.effects.geometry_corrections import GeometryEffect
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.linearisation import Folds, Linearisation, MotorRows, cut_into_folds, linearise
-from ident.equations.rows import Observation, decimate_rows
+from ident.equations.observation import Observation
+from ident.equations.rows import decimate_rows
 from ident.estimators.estimate import Estimate
 from ident.model.model import Model
 from ident.model.robot import Motion
@@ -85,13 +86,13 @@ class SearchProblem:
             if is_placeable(effect, axis, self.model.robot)
         ]
         trials = self.trials(torque(effect, axis) for _, effect in placed)
-        members: dict[int, list[tuple[Effect, Trial]]] = {}
+        members: dict[int, list[tuple[Effect, CandidateTrial]]] = {}
         for (number, effect), trial in zip(placed, trials, strict=True):
             if trial is not None:
                 members.setdefault(number, []).append((effect, trial))
         return tuple(FamilyTrials(axis, tuple(found)) for found in members.values())
 
-    def trials(self, torques: Iterable[FloatArray]) -> tuple[Trial | None, ...]:
+    def trials(self, torques: Iterable[FloatArray]) -> tuple[CandidateTrial | None, ...]:
         """Test candidates given by their joint torques (m, p, r); None where the model contains them already."""
         problem, to_motor = self.folds.linearisation, self.model.drive_train.to_motor
         return _scored(self.folds, ((torque.shape[1], problem.felt(torque, to_motor)) for torque in torques))
@@ -121,7 +122,7 @@ class FamilyTrials:
     """Trials of one family on one axis."""
 
     axis: int  #: index
-    members: tuple[tuple[Effect, Trial], ...]  #: settings and their trials, at least one
+    members: tuple[tuple[Effect, CandidateTrial], ...]  #: settings and their trials, at least one
 
     def nested(self) -> FloatArray:
         """‖e‖² of each fold and motor, shape (folds, m), with the setting chosen by the other folds alone."""
@@ -130,7 +131,7 @@ class FamilyTrials:
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class CandidateTrial:
     """Result of testing one candidate."""
 
     coefficients: FloatArray  #: in-sample, in the unit of the columns, shape (p,)
@@ -144,7 +145,7 @@ class Trial:
     rest: MoveScores | None = None
 
 
-def shares_explained(search_problem: SearchProblem, trials: Sequence[Trial | None]) -> list[float]:
+def shares_explained(search_problem: SearchProblem, trials: Sequence[CandidateTrial | None]) -> list[float]:
     """Share of a motor's squared residual that each trial explains, of the motor that it affects most."""
     problem = search_problem.folds.linearisation
     left = np.bincount(problem.motor, problem.residual**2)
@@ -261,7 +262,9 @@ def _pieces(observation: Observation) -> tuple[IntArray, IntArray]:
     return pieces, move[used[at]]
 
 
-def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[slice]) -> tuple[Trial | None, ...]:
+def score_candidates(
+    folds: Folds, columns: FloatArray, candidates: Sequence[slice]
+) -> tuple[CandidateTrial | None, ...]:
     """Project columns off all declared directions, gains included, and measure what they explain.
 
     Args:
@@ -277,9 +280,9 @@ def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[sli
     return _scored(folds, zip(map(len, parts), felt, strict=True))
 
 
-def _scored(folds: Folds, candidates: Iterable[tuple[int, Felt]]) -> tuple[Trial | None, ...]:
+def _scored(folds: Folds, candidates: Iterable[tuple[int, Felt]]) -> tuple[CandidateTrial | None, ...]:
     """Test candidates, each given by its number of columns and these, in batches of equal numbers."""
-    trials: dict[int, Trial | None] = {}
+    trials: dict[int, CandidateTrial | None] = {}
     waiting: dict[int, dict[int, Felt]] = {}
 
     def score(width: int) -> None:
@@ -295,7 +298,7 @@ def _scored(folds: Folds, candidates: Iterable[tuple[int, Felt]]) -> tuple[Trial
     return tuple(trials[number] for number in range(len(trials)))
 
 
-def _scored_together(folds: Folds, width: int, candidates: Sequence[Felt]) -> tuple[Trial | None, ...]:
+def _scored_together(folds: Folds, width: int, candidates: Sequence[Felt]) -> tuple[CandidateTrial | None, ...]:
     """Test c candidates with the same number of columns p.
 
     Everything is computed from products that are summed block by block, so that no candidate needs a pass over the rows
@@ -354,7 +357,7 @@ def _scored_together(folds: Folds, width: int, candidates: Sequence[Felt]) -> tu
     score = cluster_score.sum(axis=0)
     rests = [_rest(folds, made, place, gram[:, place]) for place in range(len(candidates))]
     return tuple(
-        Trial(
+        CandidateTrial(
             coefficients=fitted[place],
             fallen=fallen[place],
             training_fall=training[:, place],

@@ -17,11 +17,12 @@ from ident.data.demand import as_demanded, with_demand
 from ident.data.run import Run
 from ident.discovery.gates import own_unknowns, values_of
 from ident.effects.effect import PlacedEffect, effect_torque
-from ident.effects.geometry import GeometryEffect, corrected_dataset, corrected_model, is_correction
+from ident.effects.geometry_corrections import GeometryEffect, corrected_dataset, corrected_model, is_correction
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Signals, fitted_signals, session_began_s
-from ident.equations.reduction import reduce_runs
-from ident.equations.rows import Observation, RunRows, observe, on_demanded_motion, rows_of
+from ident.equations.observation import Observation, observe, on_demanded_motion
+from ident.equations.reduction import reduce_built, regrouped
+from ident.equations.rows import rows_of
 from ident.equations.system import System
 from ident.estimators.estimate import Estimate, Identification, RelativeError
 from ident.estimators.identify import estimate_with
@@ -54,7 +55,7 @@ class Evidence:
     effects: tuple[PlacedEffect, ...]  #: in the model, in the order of their columns
     estimate: Estimate  #: of the training rows
     declared: int = 0  #: how many of the effects, the first ones, the cell declares: no search takes them out
-    #: Effects whose applied part has corrected model, runs and rows (`ident.effects.geometry`).
+    #: Effects whose applied part has corrected model, runs and rows (`ident.effects.geometry_corrections`).
     corrections: tuple[PlacedEffect, ...] = ()
     uncorrected: Uncorrected | None = None  #: as they were before; None where nothing was corrected
     _identification: list[Identification] = field(default_factory=list, init=False, repr=False, compare=False)
@@ -128,11 +129,10 @@ def with_corrections(before: Evidence, corrections: tuple[PlacedEffect, ...]) ->
     model = corrected_model(given.model, corrections)
     datasets = tuple(corrected_dataset(data, corrections) for data in given.datasets)
     conditioning = before.conditioning
-    rows = [RunRows(data, tuple(rows_of(model, data, conditioning))) for data in datasets]
-    fitted = len(datasets) - before.held_out
-    reduction = reduce_runs(model, rows[:fitted], conditioning, payloads=before.training.payloads)
-    system = reduction.system(reduction.base(), reduction.payload_columns())
-    observation = observe(model, rows, conditioning, system)
+    rows = [tuple(rows_of(model, data, conditioning)) for data in datasets]
+    of_fit = zip(datasets[: len(datasets) - before.held_out], rows, strict=False)
+    system = regrouped(reduce_built(model, of_fit, payloads=before.training.payloads))
+    observation = observe(model, datasets, conditioning, system, rows)
     training, holdout = _split_holdout(observation, before.held_out)
     return replace(
         before,

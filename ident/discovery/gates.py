@@ -25,7 +25,7 @@ from ident.discovery.candidates import UNSEEN, SearchProblem
 from ident.discovery.error_change import ErrorChange, change_of_errors
 from ident.effects.effect import Effect, PlacedEffect
 from ident.equations.linearisation import RIDGE, Folds, cut_into_folds, sum_of_squares
-from ident.equations.rows import Observation
+from ident.equations.observation import Observation
 from ident.estimators.estimate import Estimate
 from ident.model.model import Column
 

@@ -21,7 +21,7 @@ from ident.discovery.loop import Step
 from ident.effects.effect import Effect
 from ident.effects.friction import LoadFriction
 from ident.effects.transmission import Efficiency
-from ident.equations.rows import Observation
+from ident.equations.observation import Observation
 from ident.estimators.estimate import Estimate
 
 CERTAIN = 2.0  #: Standard deviations of the loss that count against the gain

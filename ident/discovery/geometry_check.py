@@ -1,9 +1,9 @@
 """Whether the description of a robot is wrong, beside a fit: without a search, and without correcting anything.
 
 Zeros of joints, the direction of gravity and late positions are tested on the rows of a fit
-(`ident.effects.geometry`). Where one of them passes, it must also explain more of what is left out than each named
-effect of one axis does, or most of it beside the best of these: a spring that the model lacks explains a part of what a
-wrong zero does, and friction that it lacks on another axis does not.
+(`ident.effects.geometry_corrections`). Where one of them passes, it must also explain more of what is left out than
+each named effect of one axis does, or most of it beside the best of these: a spring that the model lacks explains a
+part of what a wrong zero does, and friction that it lacks on another axis does not.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ident.discovery.gates import Gates
 from ident.discovery.search import Finding, rank_families
 from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import Effect, is_placeable
-from ident.effects.geometry import GravityDirection, ZeroOffset, turned_gravity
+from ident.effects.geometry_corrections import GravityDirection, ZeroOffset, turned_gravity
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.rows import at_rows
 

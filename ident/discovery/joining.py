@@ -29,7 +29,7 @@ from ident.discovery.gates import (
     without_effects_of,
 )
 from ident.discovery.refinement import refine_together
-from ident.discovery.rotor import refined_rotor
+from ident.discovery.rotor_search import refined_rotor
 from ident.discovery.search import EffectKey, Finding, effect_key, is_better, rank_families
 from ident.discovery.structure import is_inadequate
 from ident.effects.effect import Effect, PlacedEffect

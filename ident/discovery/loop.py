@@ -14,6 +14,7 @@ from ident.arrays import FloatArray
 from ident.discovery.balancer import propose_balancers
 from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, score_candidates
 from ident.discovery.choice import choice_covariance, is_small
+from ident.discovery.effect_verdict import EffectVerdict
 from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import (
     Gates,
@@ -40,7 +41,7 @@ from ident.discovery.joining import (
 )
 from ident.discovery.resonance import propose_resonances
 from ident.discovery.ripple import propose_orders
-from ident.discovery.rotor import declared_forms, propose_rotors
+from ident.discovery.rotor_search import declared_forms, propose_rotors
 from ident.discovery.search import (
     EffectKey,
     Finding,
@@ -51,7 +52,6 @@ from ident.discovery.search import (
     refine_setting,
 )
 from ident.discovery.structure import MIN_MOVES_FOR_STRUCTURE, detection_limits_nm, find_structure, is_inadequate
-from ident.discovery.verdict import Verdict
 from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.position import Counterbalance
@@ -79,7 +79,7 @@ class Step:
     #: σ of each gain [Nm/A] from the choice of the effects, contained in that of `after`, shape (m,); last turn only.
     choice_std: FloatArray | None = None
     declared: bool = False  #: the cell declares the effect that joined: it was not searched for
-    verdicts: tuple[Verdict, ...] = ()  #: of held-out runs on each effect that was found; last turn only
+    verdicts: tuple[EffectVerdict, ...] = ()  #: of held-out runs on each effect that was found; last turn only
 
     def ranked(self, count: int) -> tuple[Finding, ...]:
         """The best findings on named effects, and the accepted one wherever it ranks."""

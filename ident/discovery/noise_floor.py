@@ -84,7 +84,7 @@ class FloorSource(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class NoiseFloor:
+class MotorNoiseFloor:
     """Noise of one motor's current, and whether it bounds the error of a model."""
 
     noise_a: float  #: estimate of σ of the current in the observation's rows [A]
@@ -122,7 +122,7 @@ def noise_floors(
     datasets: Sequence[Dataset],
     conditioning: Conditioning,
     sources: Sequence[FloorSource] = tuple(FloorSource),
-) -> tuple[NoiseFloor | None, ...]:
+) -> tuple[MotorNoiseFloor | None, ...]:
     """Estimate the noise of each motor's current in rows.
 
     Args:
@@ -139,7 +139,7 @@ def noise_floors(
     for data in datasets:
         row_filter(data, conditioning)
     parts_of = {FloorSource.STANDSTILL: _dwells, FloorSource.REPEATED_MOVES: _pairs}
-    floors: list[NoiseFloor | None] = []
+    floors: list[MotorNoiseFloor | None] = []
     for motor in range(datasets[0].current_a.shape[1]):
         made = [_floor(tuple(parts_of[source](datasets, conditioning, motor)), source) for source in sources]
         known = [floor for floor in made if floor is not None]
@@ -151,7 +151,7 @@ def noise_floors(
     return tuple(floors)
 
 
-def _floor(parts: Sequence[_Part], source: FloorSource) -> NoiseFloor | None:
+def _floor(parts: Sequence[_Part], source: FloorSource) -> MotorNoiseFloor | None:
     """Weighted median of the parts, None if they are too few or too short."""
     fewest = MIN_DWELLS if source is FloorSource.STANDSTILL else MIN_PAIRS
     total = sum(part.weight for part in parts)
@@ -162,7 +162,7 @@ def _floor(parts: Sequence[_Part], source: FloorSource) -> NoiseFloor | None:
     order = np.argsort(likely)
     share = np.cumsum(weight[order]) / total
     middle = likely[order][int(np.searchsorted(share, 0.5))]
-    return NoiseFloor(float(np.sqrt(middle)), source, len(parts), float(total))
+    return MotorNoiseFloor(float(np.sqrt(middle)), source, len(parts), float(total))
 
 
 def _dwells(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) -> Iterator[_Part]:
@@ -225,7 +225,7 @@ def _stretches(flags: BoolArray) -> list[slice]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Chain:
+class _MoveChain:
     """Repetitions of one move of a motor, as they followed each other."""
 
     data: Dataset  #: run of the last one
@@ -241,7 +241,7 @@ def _repetitions(datasets: Sequence[Dataset], motor: int) -> Iterator[tuple[tupl
     moved = np.any([data.moving.any(axis=0) for data in datasets], axis=0)
     travel = np.max([np.ptp(data.position_rad, axis=0) for data in datasets], axis=0)
     scale = np.where(moved, 1.0 / np.where(moved, travel, 1.0), 0.0)  # an axis that rests throughout has no path
-    chains: list[_Chain] = []
+    chains: list[_MoveChain] = []
     ends = np.empty((0, 2, len(scale)))  # of the last move of each chain
     for data in sorted(datasets, key=lambda data: data.started_s or 0.0):
         for part in _stretches(data.motor_moving[:, motor] & data.valid[:, motor]):
@@ -251,18 +251,18 @@ def _repetitions(datasets: Sequence[Dataset], motor: int) -> Iterator[tuple[tupl
             for index in near:
                 difference = _difference(chains[index], data, part, motor, scale)
                 if difference is not None:
-                    chains[index] = _Chain(data, part, (*chains[index].differences, difference))
+                    chains[index] = _MoveChain(data, part, (*chains[index].differences, difference))
                     ends[index] = end
                     break
             else:
-                chains.append(_Chain(data, part, ()))
+                chains.append(_MoveChain(data, part, ()))
                 ends = np.concatenate((ends, end[None]))
     for chain in chains:
         if chain.differences:
             yield chain.differences, chain.data.rate_hz
 
 
-def _difference(chain: _Chain, data: Dataset, part: slice, motor: int, scale: FloatArray) -> FloatArray | None:
+def _difference(chain: _MoveChain, data: Dataset, part: slice, motor: int, scale: FloatArray) -> FloatArray | None:
     """A move minus the last one of a chain: current [A] and accelerations of all axes, shape (1 + m, k).
 
     None if it is no repetition.

@@ -12,7 +12,7 @@ import numpy as np
 import scipy  # loads scipy.optimize when it is first used
 
 from ident.arrays import FloatArray
-from ident.discovery.candidates import SearchProblem, Trial
+from ident.discovery.candidates import CandidateTrial, SearchProblem
 from ident.effects.effect import Effect, setting_range
 
 MOST_TRIALS = 80  #: Of settings, in one refinement
@@ -21,7 +21,7 @@ CLOSE_ENOUGH = 1e-3  #: Change of a setting at which the simplex stops
 DIGITS = 4  #: Of a setting, as a calibration shows it
 
 
-def is_strictly_possible(effect: Effect, trial: Trial) -> bool:
+def is_strictly_possible(effect: Effect, trial: CandidateTrial) -> bool:
     """Whether every coefficient is inside its possible values, without tolerance."""
     return all(
         column.least <= value <= column.largest

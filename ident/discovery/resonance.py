@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray
-from ident.discovery.candidates import SearchProblem, Trial, shares_explained
+from ident.discovery.candidates import CandidateTrial, SearchProblem, shares_explained
 from ident.discovery.gates import Gates
 from ident.effects.effect import Effect
 from ident.effects.signals import Signals, curvature
@@ -113,7 +113,9 @@ def _compliances(inertia_kg_m2: float, frequencies_hz: Sequence[float]) -> tuple
     return tuple(float(f"{1.0 / (inertia_kg_m2 * (2.0 * np.pi * hz) ** 2):.4g}") for hz in frequencies_hz)
 
 
-def _tried(search_problem: SearchProblem, axis: int, bent: Callable[[Signals], FloatArray]) -> tuple[Trial | None, ...]:
+def _tried(
+    search_problem: SearchProblem, axis: int, bent: Callable[[Signals], FloatArray]
+) -> tuple[CandidateTrial | None, ...]:
     """Test twists by their torque on the joint itself, −M_jj δ̈: a sixth of the work of all joints on a six-axis arm."""
     conditioning, runs = search_problem.observation.conditioning, search_problem.runs
     rows = [

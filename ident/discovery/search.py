@@ -29,13 +29,13 @@ import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
 
 from ident.arrays import BoolArray, FloatArray
-from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial
+from ident.discovery.candidates import CandidateTrial, FamilyTrials, SearchProblem
 from ident.discovery.few_moves import FEW_MOVES, FEWEST_MOVES, ByMove, is_tested_on_others, moves_behind, what_to_record
 from ident.discovery.gates import SIGMAS, Gates, impossible
 from ident.discovery.refinement import refine_together
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import FORMS, Effect, PlacedEffect, is_placeable
-from ident.effects.geometry import GeometryEffect
+from ident.effects.geometry_corrections import GeometryEffect
 
 EffectKey = tuple[str, int, tuple[float, ...]]
 
@@ -292,7 +292,7 @@ def _judge(
     )
 
 
-def _ruled_out(effect: Effect, trial: Trial, fewest: int) -> str:
+def _ruled_out(effect: Effect, trial: CandidateTrial, fewest: int) -> str:
     """Which coefficients are impossible; of a form with more of them than the fewest of its family, without tolerance.
 
     Two that are nearly collinear each hide in their σ, however certain both together are.
@@ -301,13 +301,13 @@ def _ruled_out(effect: Effect, trial: Trial, fewest: int) -> str:
     return impossible(effect.coefficients, trial.coefficients, _sigma(trial), tolerance)
 
 
-def _sigma(trial: Trial) -> FloatArray:
+def _sigma(trial: CandidateTrial) -> FloatArray:
     """σ of the coefficients, G⁻¹XᵀXG⁻¹ over moves (Liang & Zeger, 1986), shape (p,)."""
     spread = trial.scatter @ np.linalg.pinv(trial.gram.sum(axis=0))
     return np.asarray(np.sqrt(np.sum(spread**2, axis=0)))
 
 
-def _max_t(trials: tuple[Trial, ...], rng: np.random.Generator, draws: int) -> FloatArray:
+def _max_t(trials: tuple[CandidateTrial, ...], rng: np.random.Generator, draws: int) -> FloatArray:
     """Probability of each candidate's Wald statistic under random signs of the moves, for the largest of all.
 
     A candidate that rests on few moves has a heavy tail, and would hide every other one: it competes with all, but the

@@ -25,7 +25,7 @@ SETTLED = 0.1  #: Share of σ below which another refit is not worth its time
 
 
 @dataclass(frozen=True, slots=True)
-class Skew:
+class CurrentDelay:
     """Delay of current samples after position samples, common to all motors; negative where currents are early."""
 
     seconds: float  #: by instruments [s]
@@ -36,7 +36,7 @@ class Skew:
     is_in_model: bool  #: whether the search accepted it, or the cell declares it
 
 
-def time_skew(evidence: Evidence) -> Skew | None:
+def time_skew(evidence: Evidence) -> CurrentDelay | None:
     """Estimate the time skew beside everything else in a model, without a search.
 
     Args:
@@ -63,7 +63,7 @@ def time_skew(evidence: Evidence) -> Skew | None:
     return found
 
 
-def _beside(evidence: Evidence, placed: PlacedEffect) -> Skew | None:
+def _beside(evidence: Evidence, placed: PlacedEffect) -> CurrentDelay | None:
     """Refit with the skew in the model, and judge it; None where it cannot be fitted."""
     try:
         refitted = with_effects(evidence, (*evidence.effects, placed))
@@ -72,7 +72,7 @@ def _beside(evidence: Evidence, placed: PlacedEffect) -> Skew | None:
     return _judged(refitted, placed, is_in_model=False)
 
 
-def _judged(evidence: Evidence, placed: PlacedEffect, *, is_in_model: bool) -> Skew | None:
+def _judged(evidence: Evidence, placed: PlacedEffect, *, is_in_model: bool) -> CurrentDelay | None:
     """Judge the skew of a model by instruments; None without any, or where nothing can be fitted by them."""
     try:
         estimate = by_instruments(evidence)
@@ -82,7 +82,7 @@ def _judged(evidence: Evidence, placed: PlacedEffect, *, is_in_model: bool) -> S
         return None
     seconds, std = _of(estimate, placed)
     fit_seconds, fit_std = _of(evidence.estimate, placed)
-    return Skew(
+    return CurrentDelay(
         seconds=seconds,
         std=std,
         fit_seconds=fit_seconds,

@@ -437,7 +437,7 @@ def trend_statistic(values: FloatArray, stds: FloatArray, dispersion: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class GainTrend:
     """Line through all calibrations of one gain."""
 
     start: float  #: value at the first calibration [unit of the gain]
@@ -446,7 +446,7 @@ class Line:
     slope_std: float  #: its σ
 
 
-def fit_line(values: FloatArray, stds: FloatArray) -> Line:
+def fit_line(values: FloatArray, stds: FloatArray) -> GainTrend:
     """Fit a line by weighted least squares to values of shape (n,), n ≥ 2, oldest first, σ > 0."""
     weights = 1.0 / stds**2
     total = float(weights.sum())
@@ -455,7 +455,7 @@ def fit_line(values: FloatArray, stds: FloatArray) -> Line:
     spread = float(weights @ (places - middle) ** 2)
     slope = float(weights @ ((places - middle) * (values - mean))) / spread
     start_std = math.sqrt(1.0 / total + middle**2 / spread)
-    return Line(mean - slope * middle, start_std, slope, 1.0 / math.sqrt(spread))
+    return GainTrend(mean - slope * middle, start_std, slope, 1.0 / math.sqrt(spread))
 
 
 def _bounded(stds: FloatArray, scale: float) -> FloatArray:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident.effects import electrical, friction, geometry, position, transmission
+from ident.effects import electrical, friction, geometry_corrections, position, transmission
 from ident.effects.effect import Effect
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Periodic, Smooth
@@ -67,11 +67,11 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
 """One family a row, with the values of its searched parameters that the search tries."""
 
 GEOMETRY: tuple[tuple[Effect, ...], ...] = (
-    (geometry.ZeroOffset(),),
-    (geometry.GravityDirection(),),
-    (geometry.LatePosition(),),
+    (geometry_corrections.ZeroOffset(),),
+    (geometry_corrections.GravityDirection(),),
+    (geometry_corrections.LatePosition(),),
 )
-"""What the description may have wrong: such an effect corrects it (`ident.effects.geometry`)."""
+"""What the description may have wrong: such an effect corrects it (`ident.effects.geometry_corrections`)."""
 
 UNNAMED: tuple[Effect, ...] = (Periodic(), *(Smooth(variable) for variable in Abscissa))
 """Terms that fit anything: what a calibration holds where structure was found that no name explains."""

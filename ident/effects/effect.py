@@ -26,7 +26,7 @@ from ident.model.model import Column, DriveTrain, Model
 from ident.model.robot import JointKind, Robot
 
 
-class Side(Enum):
+class GearSide(Enum):
     """Where the torque acts.
 
     JOINT: on the joint. MOTOR: on the motor of that number, and through R on all joints that it turns. TWO_JOINTS: on
@@ -98,19 +98,19 @@ class Effect(ABC):
         """Name, unit and possible values of each linear parameter."""
 
     @property
-    def side(self) -> Side:
+    def side(self) -> GearSide:
         """Where the torque acts."""
-        return Side.JOINT
+        return GearSide.JOINT
 
     @property
     def has_axis(self) -> bool:
         """Whether it is on an axis; what acts on all alike is placed on the first one for order only."""
-        return self.side is not Side.ALL_MOTORS
+        return self.side is not GearSide.ALL_MOTORS
 
     @property
     def needs_inertia(self) -> bool:
         """Whether it needs the mass matrix."""
-        return self.side is Side.ALL_JOINTS
+        return self.side is GearSide.ALL_JOINTS
 
     @property
     def needs_revolute(self) -> bool:
@@ -135,7 +135,7 @@ class Effect(ABC):
     @property
     def is_rate(self) -> bool:
         """Whether the torque is a derivative in time, which a filter makes much smaller."""
-        return self.side is Side.ALL_JOINTS or self.declares in {Property.RATE_OF_TORQUE, Property.RATE_OF_LOAD}
+        return self.side is GearSide.ALL_JOINTS or self.declares in {Property.RATE_OF_TORQUE, Property.RATE_OF_LOAD}
 
     @property
     def forms(self) -> tuple[Self, ...]:
@@ -295,13 +295,13 @@ def at_joints(effect: Effect, axis: int, columns: FloatArray, drive_train: Drive
     """Convert an effect's columns, shape (p, k) or (joints, p, k), to torques of all axes, shape (m, p, k)."""
     if axis >= len(drive_train.ratio):
         return columns
-    if effect.side is Side.MOTOR:
+    if effect.side is GearSide.MOTOR:
         return np.asarray(drive_train.direction[axis][:, None, None] * columns[None])
-    if effect.side is Side.ALL_JOINTS:
+    if effect.side is GearSide.ALL_JOINTS:
         return columns
-    if effect.side is Side.ALL_MOTORS:
+    if effect.side is GearSide.ALL_MOTORS:
         return np.asarray(np.einsum("ij,ipk->jpk", drive_train.direction, columns))
-    joints = [axis, int(effect.settings["other_axis"]) - 1] if effect.side is Side.TWO_JOINTS else [axis]
+    joints = [axis, int(effect.settings["other_axis"]) - 1] if effect.side is GearSide.TWO_JOINTS else [axis]
     torque = np.zeros((len(drive_train.ratio), *columns.shape[-2:]))
     torque[joints] = columns
     return torque
@@ -317,4 +317,4 @@ def is_placeable(effect: Effect, axis: int, robot: Robot) -> bool:
         return False
     if not effect.has_axis:
         return axis == 0
-    return effect.side is not Side.TWO_JOINTS or axis + 1 < int(effect.settings["other_axis"]) <= robot.axis_count
+    return effect.side is not GearSide.TWO_JOINTS or axis + 1 < int(effect.settings["other_axis"]) <= robot.axis_count

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from ident.arrays import FloatArray
-from ident.effects.effect import Effect, Property, Range, Side, Switch
+from ident.effects.effect import Effect, GearSide, Property, Range, Switch
 from ident.effects.signals import Abscissa, Signals
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
@@ -30,7 +30,7 @@ class Saturation(Effect):
     """
 
     name = "saturation"
-    side = Side.MOTOR
+    side = GearSide.MOTOR
     declares = Property.ODD_IN_CURRENT
     abscissa = Abscissa.CURRENT
 
@@ -62,7 +62,7 @@ class Cogging(Effect):
     """
 
     name = "cogging"
-    side = Side.MOTOR
+    side = GearSide.MOTOR
     declares = Property.PERIODIC_IN_MOTOR_ANGLE
     abscissa = Abscissa.MOTOR_ANGLE
     coefficients = (Column("cosine", "Nm"), Column("sine", "Nm"))
@@ -85,7 +85,7 @@ class Lag(Effect):
     """
 
     name = "lag"
-    side = Side.MOTOR
+    side = GearSide.MOTOR
     declares = Property.RATE_OF_TORQUE
     abscissa = Abscissa.TORQUE_RATE
     coefficients = (Column("time", "s", least=-EARLIEST_S),)
@@ -110,7 +110,7 @@ class TimeSkew(Effect):
     """
 
     name = "time-skew"
-    side = Side.ALL_MOTORS
+    side = GearSide.ALL_MOTORS
     declares = Property.RATE_OF_TORQUE
     abscissa = Abscissa.TORQUE_RATE
     coefficients = (Column("time", "s"),)

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.effects.effect import AxisNumber, Effect, Property, Range, Sense, Side, Switch
+from ident.effects.effect import AxisNumber, Effect, GearSide, Property, Range, Sense, Switch
 from ident.effects.rotor import loss_columns
 from ident.effects.signals import REFERENCE_C, Abscissa, Signals, distance_since_reversal
 from ident.model.model import Column
@@ -264,7 +264,7 @@ class Coupling(Effect):
     """
 
     name = "coupling"
-    side = Side.TWO_JOINTS
+    side = GearSide.TWO_JOINTS
     declares = Property.ODD_IN_VELOCITY
     abscissa = Abscissa.OTHER_VELOCITY
     coefficients = (Column("dry", "Nm", least=0.0), Column("viscous", "Nm/(rad/s)", least=0.0))

@@ -11,7 +11,7 @@ import numpy as np
 
 from ident.arrays import FloatArray, IntArray
 from ident.data.dataset import Dataset
-from ident.equations.rows import Observation
+from ident.equations.observation import Observation
 from ident.estimators.estimate import Estimate
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import JOINT_COLUMNS, Model

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from ident.arrays import FloatArray
-from ident.effects.effect import AxisNumber, Effect, Property, Range, Side, Switch
+from ident.effects.effect import AxisNumber, Effect, GearSide, Property, Range, Switch
 from ident.effects.rotor import loss_columns
 from ident.effects.signals import Abscissa, Signals, curvature
 from ident.model.model import Column
@@ -35,7 +35,7 @@ class Backlash(Effect):
     """
 
     name = "backlash"
-    side = Side.ALL_JOINTS
+    side = GearSide.ALL_JOINTS
     declares = Property.ODD_IN_LOAD
     abscissa = Abscissa.LOAD
     coefficients = (Column("half gap", "rad", least=0.0),)
@@ -137,7 +137,7 @@ class Elasticity(Effect):
     """
 
     name = "elasticity"
-    side = Side.ALL_JOINTS
+    side = GearSide.ALL_JOINTS
     declares = Property.RATE_OF_LOAD
     abscissa = Abscissa.LOAD_CURVATURE
     coefficients = (Column("compliance", "rad/Nm", least=0.0),)
@@ -240,7 +240,7 @@ class InertialCoupling(Effect):
     """
 
     name = "inertial-coupling"
-    side = Side.TWO_JOINTS
+    side = GearSide.TWO_JOINTS
     declares = Property.INDEPENDENT_OF_VELOCITY
     abscissa = Abscissa.OTHER_VELOCITY
     coefficients = (Column("inertia", "kg m²"),)
@@ -271,9 +271,9 @@ class Ripple(Effect):
     of_joint: Switch = 0  #: 1 where θ is the joint's angle, which differs where a motor turns with several joints
 
     @property
-    def side(self) -> Side:
+    def side(self) -> GearSide:
         """Motor, or joint where the angle is the joint's."""
-        return Side.JOINT if self.of_joint else Side.MOTOR
+        return GearSide.JOINT if self.of_joint else GearSide.MOTOR
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k)."""

@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.effects.effect import AxisNumber, Effect, Property, Range, Side, Switch
+from ident.effects.effect import AxisNumber, Effect, GearSide, Property, Range, Switch
 from ident.effects.signals import Abscissa, Signals
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
@@ -45,9 +45,9 @@ class Smooth(Effect):
     other_axis: AxisNumber = 0  #: number of the other axis, from 1, where x is its velocity; else 0
 
     @property
-    def side(self) -> Side:
+    def side(self) -> GearSide:
         """Motor where the variable is the motor's, else joint."""
-        return Side.MOTOR if self.variable in MOTOR_VARIABLES else Side.JOINT
+        return GearSide.MOTOR if self.variable in MOTOR_VARIABLES else GearSide.JOINT
 
     @property
     def name(self) -> str:
@@ -95,7 +95,7 @@ class Periodic(Effect):
     """
 
     name = "periodic-motor-angle"
-    side = Side.MOTOR
+    side = GearSide.MOTOR
     declares = Property.PERIODIC_IN_MOTOR_ANGLE
     abscissa = Abscissa.MOTOR_ANGLE
     coefficients = tuple(Column(f"{part} {order}", "Nm") for order in PERIODIC_ORDERS for part in ("cosine", "sine"))

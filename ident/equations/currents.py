@@ -5,7 +5,7 @@ payload need of each motor, W χ + W_uL χ_uL + W_kL χ_kL through T (DriveTrain
 
     e = T_D (V g − τ),    V = diag(v),    T_D = D⁻¹.
 
-Each motor has an equation of its own then, and a triangle of its rows says all (`OwnCurrents`).
+Each motor has an equation of its own then, and a triangle of its rows says all (`Currents`).
 
 A redundantly driven robot has more motors than degrees of freedom: motors can work against each other. This internal
 preload λ moves nothing and is not known, V g = τ + N λ with N the null space of Aᵀ (`ident.model.closed_chain`). The
@@ -21,7 +21,6 @@ measured ones their noise would make the gains smaller (errors in variables; Gol
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -35,18 +34,30 @@ LONG = 20  #: So many rows a column are reduced to a triangle first
 
 
 @dataclass(frozen=True, slots=True)
-class Whitened:
-    """e = drive g − linear χ − known, all rows below each other, in units of the noise.
+class Currents:
+    """e = V g − W χ − W_kL χ_kL, all motors' rows below each other; each row holds the current of its motor alone.
 
-    Each row has noise of one; with preload cov e = P, and ‖e‖² is still that of the likelihood, as P is a projection.
+    Whitened, each row has noise of one; with preload cov e = P, and ‖e‖² is still that of the likelihood, as P is a
+    projection.
     """
 
-    drive: FloatArray  #: per unit of each gain, shape (rows, m)
-    linear: FloatArray  #: per unit of each parameter, shape (rows, p)
-    known: FloatArray  #: of known payloads, shape (rows,)
+    drive: FloatArray  #: V, per unit of each gain, shape (k, m)
+    linear: FloatArray  #: W and W_uL, per unit of each parameter, shape (k, p)
+    known: FloatArray  #: W_kL χ_kL, shape (k,)
+    motor: IntArray  #: of each row, ascending, shape (k,)
+    rows: IntArray  #: equations of each motor, of which these may be the triangle, shape (m,)
+
+    @classmethod
+    def of_motors(cls, triangles: Triangles) -> Currents:
+        """Take apart the motors' rows [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i]."""
+        motor = np.repeat(np.arange(len(triangles.factors)), [len(factor) for factor in triangles.factors])
+        stacked = np.concatenate(triangles.factors)
+        drive = np.zeros((len(stacked), len(triangles.factors)))
+        drive[np.arange(len(stacked)), motor] = stacked[:, 0]
+        return cls(drive, stacked[:, 1:-1], stacked[:, -1], motor, triangles.rows)
 
     def residual(self, gains: FloatArray, parameters: FloatArray) -> FloatArray:
-        """e, shape (rows,)."""
+        """e, shape (k,)."""
         return np.asarray(self.drive @ gains - self.linear @ parameters - self.known)
 
     def parameters(self, gains: FloatArray) -> FloatArray:
@@ -57,29 +68,25 @@ class Whitened:
         factor = triangle_of(np.vstack((self.linear.T, right)))
         return solve(factor[:, :-1], factor[:, -1])[0]
 
-
-class Currents(ABC):
-    """Equations of m currents in (g, χ)."""
-
-    @property
-    @abstractmethod
-    def rows(self) -> IntArray:
-        """Equations of each motor, shape (m,)."""
-
-    @abstractmethod
-    def whitened(self, gains: FloatArray, noise: FloatArray) -> Whitened:
-        """Equations in units of the noise.
+    def whitened(self, gains: FloatArray, noise: FloatArray) -> Currents:
+        """The equations in units of the noise.
 
         Args:
             gains: of each motor, for D, shape (m,).
             noise: σ of each current [A], shape (m,).
         """
+        unit = (gains * noise)[self.motor]
+        drive = self.drive / unit[:, None]
+        linear = self.linear / unit[:, None]
+        return Currents(drive, linear, self.known / unit, self.motor, self.rows)
 
-    @abstractmethod
-    def corrected(self, gains: FloatArray, noise: FloatArray, whitened: Whitened, residual: FloatArray) -> FloatArray:
-        """Drive columns with the corrected currents, shape (rows, m): the derivative of e to each gain."""
+    def corrected(self, gains: FloatArray, noise: FloatArray, whitened: Currents, residual: FloatArray) -> FloatArray:
+        """Drive columns with the corrected currents, shape (k, m): the derivative of e to each gain."""
+        del noise
+        corrected = whitened.drive.copy()
+        corrected[np.arange(len(residual)), self.motor] -= residual / gains[self.motor]
+        return corrected
 
-    @abstractmethod
     def noise(
         self, gains: FloatArray, parameters: FloatArray, free: int = 0, before: FloatArray | None = None
     ) -> FloatArray:
@@ -88,12 +95,20 @@ class Currents(ABC):
         Args:
             gains, parameters: of the estimate.
             free: number of estimated parameters, which are shared among the motors.
-            before: σ so far, for one round; None for as many rounds as it takes.
+            before: σ so far, for one round; None for as many rounds as it takes. The root mean square of v − τ/g needs
+                none.
         """
+        del before
+        current_a = self.residual(gains, parameters) / gains[self.motor]
+        square_sum = np.bincount(self.motor, current_a**2, minlength=len(gains))
+        square_sum[self.rows == 0] = 1.0
+        return np.asarray(np.sqrt(square_sum / np.maximum(self.rows - free / len(gains), 1.0)))
 
-    @abstractmethod
     def cost(self, gains: FloatArray, parameters: FloatArray, noise: FloatArray) -> float:
-        """Cost that an estimate makes least: −log L up to constants, and with preload for this σ alone."""
+        """Cost that an estimate makes least: Σ r_i log ‖e_i‖, with each σ_i at its optimum; with preload for this σ."""
+        del noise
+        size = self.noise(gains, parameters) * np.sqrt(np.maximum(self.rows, 1.0))
+        return float(self.rows @ np.log(size))
 
     def settled(self, gains: FloatArray, free: int) -> tuple[FloatArray, FloatArray]:
         """χ and σ of each current [A] for given gains, shapes (p,) and (m,): a fixed point of a few rounds."""
@@ -109,97 +124,54 @@ class Currents(ABC):
 
 
 @dataclass(frozen=True, slots=True)
-class OwnCurrents(Currents):
-    """Each motor's equation holds its own current alone."""
-
-    triangles: Triangles  #: of each motor's rows [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i]
-
-    @property
-    def rows(self) -> IntArray:
-        """Equations of each motor, shape (m,)."""
-        return self.triangles.rows
-
-    def whitened(self, gains: FloatArray, noise: FloatArray) -> Whitened:
-        """Scale each triangle by 1/(g σ)."""
-        factors = self.triangles.factors
-        scaled = [factor / scale for factor, scale in zip(factors, gains * noise, strict=True)]
-        stacked = np.concatenate(scaled)
-        drive = np.zeros((len(stacked), len(factors)))
-        motor = np.repeat(np.arange(len(factors)), [len(factor) for factor in factors])
-        drive[np.arange(len(stacked)), motor] = stacked[:, 0]
-        return Whitened(drive, stacked[:, 1:-1], stacked[:, -1])
-
-    def corrected(self, gains: FloatArray, noise: FloatArray, whitened: Whitened, residual: FloatArray) -> FloatArray:
-        """Put the predicted current in place of the measured one."""
-        del noise
-        out = whitened.drive.copy()
-        motor = np.repeat(np.arange(len(gains)), [len(factor) for factor in self.triangles.factors])
-        out[np.arange(len(motor)), motor] -= residual / gains[motor]
-        return out
-
-    def noise(
-        self, gains: FloatArray, parameters: FloatArray, free: int = 0, before: FloatArray | None = None
-    ) -> FloatArray:
-        """Root mean square of v − τ/g, which needs no rounds."""
-        del before
-        gamma = 1.0 / gains
-        vectors = (np.concatenate(([1.0], -g * parameters, [-g])) for g in gamma)
-        size = np.array(
-            [float(np.sum((f @ vector) ** 2)) for f, vector in zip(self.triangles.factors, vectors, strict=True)]
-        )
-        size[self.rows == 0] = 1.0
-        return np.asarray(np.sqrt(size / np.maximum(self.rows - free / len(gamma), 1.0)))
-
-    def cost(self, gains: FloatArray, parameters: FloatArray, noise: FloatArray) -> float:
-        """Σ r_i log ‖e_i‖, with each σ_i at its optimum."""
-        del noise
-        size = self.noise(gains, parameters) * np.sqrt(np.maximum(self.rows, 1.0))
-        return float(self.rows @ np.log(size))
-
-
-@dataclass(frozen=True, slots=True)
 class PreloadedCurrents(Currents):
-    """Motors that can work against each other: the rows of all of them, r a motor."""
+    """Motors that can work against each other: as many rows a motor, r, each with the currents of all."""
 
-    drive: FloatArray  #: V, torque at each axis per unit of each gain, without preload, shape (r, m, m)
-    linear: FloatArray  #: W and W_uL, shape (r, m, p)
-    known: FloatArray  #: W_kL χ_kL, shape (r, m)
-    preload: FloatArray  #: N, orthonormal, shape (r, m, m − d)
+    preload: FloatArray  #: N of each row of a motor, orthonormal, shape (r, m, m − d)
 
     @classmethod
     def of_rows(cls, rows: Sequence[FloatArray], preload: FloatArray) -> PreloadedCurrents:
-        """Sort the motors' rows [V_i | W_i | known_i], each of shape (r, m + p + 1).
+        """Take apart the motors' rows [V_i | W_i | known_i], each of shape (r, m + p + 1).
 
         Args:
             rows: of each motor.
             preload: N of each row, shape (r, m, m − d).
         """
-        stacked = np.stack(rows, axis=1)
         count = len(rows)
-        return cls(stacked[:, :, :count], stacked[:, :, count:-1], stacked[:, :, -1], preload)
-
-    @property
-    def rows(self) -> IntArray:
-        """Equations of each motor, shape (m,)."""
-        return np.full(self.drive.shape[1], len(self.drive))
+        stacked = np.concatenate(rows)
+        motor = np.repeat(np.arange(count), len(preload))
+        equations = np.full(count, len(preload))
+        return cls(stacked[:, :count], stacked[:, count:-1], stacked[:, -1], motor, equations, preload)
 
     def transform(self, gains: FloatArray, noise: FloatArray) -> FloatArray:
         """T_D of each row, shape (r, m, m)."""
         return whitening_transform(self.preload, gains, noise)
 
-    def whitened(self, gains: FloatArray, noise: FloatArray) -> Whitened:
-        """Take the most likely preload out of the rows, motor by motor below each other."""
+    def whitened(self, gains: FloatArray, noise: FloatArray) -> Currents:
+        """Take the most likely preload out of the rows."""
         transform = self.transform(gains, noise)
-        parts = transform @ self.drive, transform @ self.linear, (transform @ self.known[:, :, None])
-        drive, linear, known = (np.swapaxes(part, 0, 1).reshape(-1, part.shape[2]) for part in parts)
-        return Whitened(drive, linear, known[:, 0])
-
-    def corrected(self, gains: FloatArray, noise: FloatArray, whitened: Whitened, residual: FloatArray) -> FloatArray:
-        """Take the corrections σ e out of the measured currents."""
         count = len(gains)
-        corrections = noise[:, None] * residual.reshape(count, -1)
-        felt = np.swapaxes(self.transform(gains, noise), 0, 1)  # (m, r, m): a motor's current, without preload
-        return np.asarray(whitened.drive - (felt * corrections.T).reshape(-1, count))
+
+        def without_preload(columns: FloatArray) -> FloatArray:
+            # Σ_j (T_D)_rij X_jrc of each motor i and row r
+            of_motors = columns.reshape(count, len(transform), -1)
+            torque = np.einsum("rij,jrc->irc", transform, of_motors, optimize=True)
+            return np.asarray(torque).reshape(columns.shape)
+
+        return Currents(
+            without_preload(self.drive),
+            without_preload(self.linear),
+            without_preload(self.known),
+            self.motor,
+            self.rows,
+        )
+
+    def corrected(self, gains: FloatArray, noise: FloatArray, whitened: Currents, residual: FloatArray) -> FloatArray:
+        """Take the corrections σ e out of the measured currents."""
+        corrections = noise[:, None] * residual.reshape(len(gains), -1)
+        # (T_D)_rij c_jr: what the correction of motor j changes in the row of motor i
+        change = np.einsum("rij,jr->irj", self.transform(gains, noise), corrections)
+        return np.asarray(whitened.drive - change.reshape(whitened.drive.shape))
 
     def noise(
         self, gains: FloatArray, parameters: FloatArray, free: int = 0, before: FloatArray | None = None
@@ -212,13 +184,15 @@ class PreloadedCurrents(Currents):
         if before is None:
             noise = np.ones(len(gains))
             for _ in range(ROUNDS):
-                before, noise = noise, self.noise(gains, parameters, free, noise)
+                before = noise
+                noise = self.noise(gains, parameters, free, noise)
                 if np.allclose(before, noise, rtol=1e-10):
                     break
             return noise
         residual = self.whitened(gains, before).residual(gains, parameters).reshape(len(gains), -1)
-        shown = np.einsum("rii->i", self.transform(gains, before) * (gains * before))
-        return np.asarray(before * np.sqrt(np.sum(residual**2, axis=1) / np.maximum(shown - free / len(gains), 1.0)))
+        visible = np.einsum("rii->i", self.transform(gains, before) * (gains * before))
+        square_sum = np.sum(residual**2, axis=1)
+        return np.asarray(before * np.sqrt(square_sum / np.maximum(visible - free / len(gains), 1.0)))
 
     def cost(self, gains: FloatArray, parameters: FloatArray, noise: FloatArray) -> float:
         """½ ‖e‖², for this σ."""

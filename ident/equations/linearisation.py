@@ -17,7 +17,7 @@ from scipy import linalg
 
 from ident.arrays import FloatArray, IntArray
 from ident.equations.currents import PreloadedCurrents, whitening_transform
-from ident.equations.rows import Observation
+from ident.equations.observation import Observation
 from ident.equations.run_scatter import RunScatter
 from ident.equations.system import System
 from ident.errors import TooFewMoves

@@ -1,267 +1,361 @@
 """Runs, one after the other, reduced to triangles: the observation matrix is never held whole (TSQR).
 
-Rows are reduced in the standard columns [V | W_st], separately for each payload mounting. The same triangles serve
-every choice of base parameters and of known payload parameters, because a payload has the columns of the link that
-carries it, in the rows in which it was mounted.
+`reduce_rows` makes every `System`. Its unknowns are at first those of the columns that the rows have, and all ten
+parameters of the payload of each mounting; `System.holding` then gives some of them a value. The rows of `reduce_runs`
+have the standard parameters: `regrouped` chooses base parameters among them, and moves what is known of the payloads to
+W_kL χ_kL. So the same triangles serve every such choice.
+
+A payload has the columns of the link that carries it, in the rows in which it was mounted: triangles hold them once,
+separately for each mounting.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.arrays import FloatArray, IntArray
+from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.conditioning import Conditioning
-from ident.data.dataset import differentiate
+from ident.data.dataset import Dataset, differentiate
 from ident.data.demand import with_demand
 from ident.data.run import Run
-from ident.equations.instants import Instants, instants_of
-from ident.equations.rows import CHUNK_ROWS, Rows, RunRows, rows_of
-from ident.equations.system import System
+from ident.equations.rows import CHUNK_ROWS, Rows, motor_columns, rows_of
+from ident.equations.system import Equations, System
 from ident.equations.triangles import Triangles, qr_update, triangle
 from ident.errors import DataUnfit
 from ident.model.base import SMALLEST_COLUMN, BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, Payload
-from ident.model.model import Column, Model
+from ident.model.model import Column, DriveTrain, Model
 
 MAX_CLUSTERS = 256
 """Moves of very long data are joined with their neighbours: 256 clusters estimate the scatter as well as 3000."""
 
+BODY = len(LINK_PARAMETERS)  #: Parameters of a payload
 
-@dataclass(frozen=True, slots=True)
-class Cluster:
-    """The motor rows of one move, or of several that follow each other in one run."""
-
-    mounting: int  #: index into the payloads, −1 without load
-    run: int  #: index into the runs
-    #: For each motor i the rows, or where they are many their triangle, of [v_i | (T W_st)_i], the columns that the
-    #: motor's equation can hold (``Layout.motor``); with instruments [v_i | (T W_st)_i | (T Z_st)_i]. Of a redundantly
-    #: driven robot always the rows, with the torques per unit of all gains, V_i, in place of v_i.
-    factors: tuple[FloatArray, ...]
-    preload: FloatArray  #: N of these rows, shape (rows, m, m − d); empty where no motor works against another
+ReadRun = tuple[str, Payload | None, Iterable[Rows]]  #: Name of a run, what was mounted, and its rows, piece by piece
 
 
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Columns of [v_1 … v_m | W_st] that each joint's or motor's equation holds."""
-
-    joint: tuple[IntArray, ...]  #: for each joint, indices into [V | W_st], ascending
-    motor: tuple[IntArray, ...]  #: for each motor, indices of W_st; its own current comes before them
-
-
-@dataclass(frozen=True, slots=True)
-class Reduction:
-    """Triangles of several runs in standard columns."""
-
-    model: Model  #: the declared model
-    conditioning: Conditioning  #: the filters that the rows went through
-    payloads: tuple[Payload, ...]  #: one for each mounting
-    runs: tuple[str, ...]  #: names of the runs
-    #: For each mounting, −1 (without load) first, the triangle of each joint's rows.
-    joints: tuple[tuple[FloatArray, ...], ...]
-    joint_rows: IntArray  #: equations of each joint, shape (m,)
-    motor_rows: IntArray  #: equations of each motor, shape (m,)
-    clusters: tuple[Cluster, ...]  #: in the order of the runs
-    instrumented: bool = False  #: the clusters hold instruments, made of the demanded motion
-    kept: tuple[RunRows, ...] = ()  #: the runs with all their rows, where they were asked for
-    instants: tuple[Instants, ...] = ()  #: a few rows of each run, where they were asked for
-
-    def base(self) -> BaseParameters:
-        """The base parameters that these rows show.
-
-        Raises:
-            DataUnfit: a joint never moves.
-        """
-        for joint, rows in enumerate(self.joint_rows):
-            if not rows:
-                reason = f"{self.model.robot.axes[joint].name} never moves faster than its standstill speed in any run"
-                raise DataUnfit(", ".join(self.runs), reason)
-        names = tuple(column.name for column in self.model.columns)
-        return base_parameters(np.concatenate([self._standard(index) for index in range(len(self.joints))]), names)
-
-    def _standard(self, index: int) -> FloatArray:
-        """W_st of all joints' triangles of a mounting (0: without load), columns spread out."""
-        count, columns = self.model.robot.axis_count, layout(self.model).joint
-        return np.concatenate(
-            [_widened(f, c, count + len(self.model.columns)) for f, c in zip(self.joints[index], columns, strict=True)]
-        )[:, count:]
-
-    def payload_columns(self) -> tuple[tuple[int, ...], ...]:
-        """For each mounting, its unknown parameters that these rows see, as indices of LINK_PARAMETERS."""
-        chosen: list[tuple[int, ...]] = []
-        for index, payload in enumerate(self.payloads):
-            flange = self._standard(index + 1)[:, self.model.flange]
-            norms = np.linalg.norm(flange, axis=0)
-            # On a platform that never turns, most of the ten are rounding errors beside the mass.
-            shown = norms > SMALLEST_COLUMN * norms.max(initial=0.0)
-            unknown = tuple(i for i, name in enumerate(LINK_PARAMETERS) if name not in payload.known and shown[i])
-            names = tuple(LINK_PARAMETERS[i] for i in unknown)
-            seen = base_parameters(flange[:, list(unknown)], names).independent if unknown else ()
-            chosen.append(tuple(unknown[i] for i in seen))
-        return tuple(chosen)
-
-    def system(self, base: BaseParameters, payload_columns: tuple[tuple[int, ...], ...]) -> System:
-        """Eq. (17) with these base parameters and unknown payload parameters."""
-        plan, count, standard = layout(self.model), self.model.robot.axis_count, len(self.model.columns)
-        leading = len(base.independent)
-        width = leading + sum(map(len, payload_columns)) + 1
-
-        def chosen(rows: FloatArray, mounting: int) -> FloatArray:
-            """[W | W_uL | W_kL χ_kL] among the standard columns."""
-            out = np.zeros((len(rows), width))
-            out[:, :leading] = rows[:, list(base.independent)]
-            if mounting >= 0:
-                flange, first = rows[:, self.model.flange], leading + sum(map(len, payload_columns[:mounting]))
-                indices = list(payload_columns[mounting])
-                out[:, first : first + len(indices)] = flange[:, indices]
-                out[:, -1] = flange @ self.payloads[mounting].known_parameters
-            return out
-
-        joints = []
-        for joint in range(count):
-            parts = []
-            for index, factors in enumerate(self.joints):
-                spread = _widened(factors[joint], plan.joint[joint], count + standard)
-                parts.append(np.concatenate((spread[:, :count], -chosen(spread[:, count:], index - 1)), axis=1))
-            joints.append(triangle(parts, count + width))
-
-        lead = count if self.model.is_redundant else 1
-
-        def part(cluster: Cluster, number: int) -> list[FloatArray]:
-            """The columns of each motor's equation in one of the parts of a cluster's rows: W_st, Z_st."""
-            return [
-                chosen(
-                    _widened(rows[:, lead + number * len(c) : lead + (number + 1) * len(c)], c, standard),
-                    cluster.mounting,
-                )
-                for rows, c in zip(cluster.factors, plan.motor, strict=True)
-            ]
-
-        clusters = tuple(
-            tuple(np.concatenate((rows[:, :lead], own), 1) for rows, own in zip(c.factors, part(c, 0), strict=True))
-            for c in self.clusters
-        )
-        instruments = tuple(tuple(part(c, 1)) for c in self.clusters) if self.instrumented else ()
-        motors = tuple(triangle((cluster[motor] for cluster in clusters), lead + width) for motor in range(count))
-        named = zip(base.names, base.independent, strict=True)
-        return System(
-            model=self.model,
-            base=base,
-            columns=tuple(Column(name, self.model.columns[index].unit) for name, index in named),
-            payloads=self.payloads,
-            payload_columns=payload_columns,
-            runs=self.runs,
-            joints=Triangles(tuple(joints), self.joint_rows),
-            motors=Triangles(motors, self.motor_rows),
-            clusters=clusters,
-            cluster_runs=tuple((cluster.run, cluster.mounting) for cluster in self.clusters),
-            instruments=instruments,
-            preload=tuple(c.preload for c in self.clusters) if self.model.is_redundant else (),
-        )
-
-
-def layout(model: Model) -> Layout:
-    """Columns of [V | W_st] that each joint's or motor's equation can hold (Model.support through T)."""
-    support, train = model.support, model.drive_train
-    current = np.ones_like(train.direction) if model.is_redundant else train.direction.T != 0.0
-    mixed = (np.abs(train.to_motor) > 0.0).astype(np.int64) @ support.astype(np.int64) > 0
-    return Layout(
-        joint=tuple(np.flatnonzero(np.concatenate((v, w))) for v, w in zip(current, support, strict=True)),
-        motor=tuple(np.flatnonzero(row) for row in mixed),
-    )
+def rows_of_runs(
+    model: Model,
+    runs: Iterable[Run],
+    conditioning: Conditioning,
+    *,
+    instruments: bool = False,
+    chunk_rows: int = CHUNK_ROWS,
+) -> Iterator[tuple[Dataset, Iterable[Rows]]]:
+    """Differentiate runs one after the other and build their rows; arguments and errors are those of `reduce_runs`."""
+    for run in runs:
+        data = differentiate(run, model.drive_train, conditioning)
+        if instruments:
+            data = with_demand(data, model.drive_train, conditioning)
+        yield data, rows_of(model, data, conditioning, chunk_rows)
 
 
 def reduce_runs(
     model: Model,
-    runs: Iterable[Run | RunRows],
+    runs: Iterable[Run],
     conditioning: Conditioning,
     *,
     payloads: Sequence[Payload] = (),
     instruments: bool = False,
-    keep_rows: bool = False,
-    keep_instants: bool = False,
     chunk_rows: int = CHUNK_ROWS,
-) -> Reduction:
-    """Reduce runs one after the other; no more than one of them is held, unless their rows are asked for.
+) -> System:
+    """Reduce runs one after the other; no more than one of them is held.
 
     Args:
         model: the declared model.
-        runs: read while they are reduced, or the rows already built of them; a mounting that several share has one set
-            of unknowns.
+        runs: read while they are reduced; a mounting that several share has one set of unknowns.
         conditioning: the filters.
         payloads: known beforehand; others are added as runs bring them.
         instruments: keep those of the demanded motion beside the rows; where it is not known, the recorded one serves.
-        keep_rows: keep all runs and their rows, for `observe`.
-        keep_instants: keep a few rows of each run, for hypotheses about its geometry.
         chunk_rows: rows built at once; the result does not depend on it.
+
+    Returns:
+        the equations in the standard parameters, and the ten of each payload.
 
     Raises:
         DataUnfit: a run is unfit, leaves no usable row, or contradicts another about a mounting.
     """
-    count, plan = model.robot.axis_count, layout(model)
     instruments = instruments and not model.is_redundant
-    width = tuple(len(columns) for columns in plan.joint)
-    seen_payloads = list(payloads)
-    joints = [[np.zeros((c, c)) for c in width] for _ in range(len(seen_payloads) + 1)]
-    joint_rows, motor_rows = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
-    names: list[str] = []
-    clusters: list[Cluster] = []
-    kept: list[RunRows] = []
-    instants: list[Instants] = []
-    known = False
-    for run in runs:
-        data = run.data if isinstance(run, RunRows) else differentiate(run, model.drive_train, conditioning)
-        mounting = mounting_index(data.payload, seen_payloads, data.name)
-        joints += [[np.zeros((c, c)) for c in width] for _ in range(len(seen_payloads) + 1 - len(joints))]
-        if keep_instants:
-            chosen = instants_of(model, data, conditioning)
-            instants += [] if chosen is None else [chosen]
-        if instruments:
-            data = with_demand(data, model.drive_train, conditioning)
-            known |= data.demanded is not None
-        moves: dict[int, list[tuple[list[FloatArray], FloatArray]]] = {}
-        built: Iterable[Rows] = (
-            run.pieces if isinstance(run, RunRows) else rows_of(model, data, conditioning, chunk_rows)
-        )
-        if keep_rows:
-            kept.append(RunRows(data, tuple(built)))
-            built = kept[-1].pieces
-        for rows in built:
-            for joint, used in enumerate(rows.use):
-                own = plan.joint[joint][plan.joint[joint] < count]
-                if model.is_redundant:
-                    current = rows.drive[joint][:, used]
-                else:
-                    current = model.drive_train.direction[own, joint, None] * rows.current[own][:, used]
-                standard = rows.standard[joint][plan.joint[joint][len(own) :] - count][:, used]
-                columns = np.concatenate((current, standard))
-                joints[mounting + 1][joint] = qr_update(joints[mounting + 1][joint], columns)
-            joint_rows += rows.use.sum(axis=1)
-            motor_rows += rows.motor_use.sum(axis=1)
-            for move, parts in _motor_rows(model, rows, plan, instruments=instruments).items():
-                moves.setdefault(move, []).append(parts)
-        for pieces in moves.values():
-            clusters.append(_cluster(mounting, len(names), pieces))
-            if len(clusters) > 2 * MAX_CLUSTERS:
-                clusters = _joined(clusters)
-        names.append(data.name)
-    if len(clusters) > MAX_CLUSTERS:
-        clusters = _joined(clusters)
-    return Reduction(
-        model=model,
-        conditioning=conditioning,
-        payloads=tuple(seen_payloads),
-        runs=tuple(names),
-        joints=tuple(tuple(factors) for factors in joints),
-        joint_rows=joint_rows,
-        motor_rows=motor_rows,
-        clusters=tuple(clusters),
-        instrumented=known,
-        kept=tuple(kept),
-        instants=tuple(instants),
+    built = rows_of_runs(model, runs, conditioning, instruments=instruments, chunk_rows=chunk_rows)
+    return reduce_built(model, built, payloads=payloads, instruments=instruments)
+
+
+def reduce_built(
+    model: Model,
+    runs: Iterable[tuple[Dataset, Iterable[Rows]]],
+    *,
+    payloads: Sequence[Payload] = (),
+    instruments: bool = False,
+) -> System:
+    """Reduce runs whose rows are built; arguments, result and errors are those of `reduce_runs`."""
+    columns = np.arange(len(model.columns))
+    return reduce_rows(
+        standard_equations(model, payloads),
+        ((data.name, data.payload, pieces) for data, pieces in runs),
+        support=model.support,
+        flange=columns[model.flange],
+        instruments=instruments and not model.is_redundant,
+        compact=True,
     )
+
+
+def standard_equations(model: Model, payloads: Sequence[Payload] = (), runs: Sequence[str] = ()) -> Equations:
+    """The unknowns before any regrouping: every standard parameter, and none of the payloads."""
+    names = tuple(column.name for column in model.columns)
+    every = BaseParameters(tuple(range(len(names))), np.eye(len(names)), names)
+    return Equations(model, every, model.columns, tuple(payloads), ((),) * len(payloads), tuple(runs))
+
+
+# From rows to triangles
+
+
+def reduce_rows(
+    unknowns: Equations,
+    runs: Iterable[ReadRun],
+    *,
+    support: BoolArray,
+    flange: IntArray,
+    instruments: bool = False,
+    compact: bool = False,
+) -> System:
+    """Build W_tot (eq. 17) from rows, as triangles.
+
+    Args:
+        unknowns: model and columns of the robot; payloads known beforehand.
+        runs: read one after the other; their columns are those of ``unknowns``, and perhaps others for ``flange``.
+        support: mask of the columns that each joint has, shape (m, c).
+        flange: which columns are those of the link that carries the payload, shape (10,); none without payloads.
+        instruments: keep those of the demanded motion beside the rows.
+        compact: reduce the motors' rows of a move to a triangle, and join moves where there are very many.
+
+    Returns:
+        equations with all ten parameters of each payload among the unknowns, and no torque that is known.
+
+    Raises:
+        DataUnfit: a run is unfit, leaves no usable row, or contradicts another about a mounting.
+    """
+    reducer = _Reducer(unknowns, support, flange, instruments, compact)
+    for name, payload, pieces in runs:
+        reducer.add(name, payload, pieces)
+        if compact and len(reducer.clusters) > 2 * MAX_CLUSTERS:
+            reducer.clusters = _joined(reducer.clusters)
+    if compact and len(reducer.clusters) > MAX_CLUSTERS:
+        reducer.clusters = _joined(reducer.clusters)
+    return reducer.system()
+
+
+@dataclass(frozen=True, slots=True)
+class _Cluster:
+    """Motor rows of one move, or of several that follow each other in one run, in the columns that each motor has."""
+
+    mounting: int  #: index into the payloads, −1 without load
+    run: int  #: index into the runs
+    #: For each motor the rows, or where they are many their triangle, of [v_i | (T W)_i], with instruments
+    #: [v_i | (T W)_i | (T Z)_i]. Of a redundantly driven robot always the rows, with the torques per unit of all gains,
+    #: V_i, in place of v_i.
+    factors: tuple[FloatArray, ...]
+    preload: FloatArray  #: N of these rows, shape (rows, m, m − d); empty where no motor works against another
+
+
+class _Reducer:
+    """Triangles of the rows so far, in the columns that each joint and each motor has."""
+
+    def __init__(
+        self, unknowns: Equations, support: BoolArray, flange: IntArray, instruments: bool, compact: bool
+    ) -> None:
+        self.unknowns = unknowns
+        self.flange = flange
+        self.instruments = instruments
+        self.compact = compact
+        self.model = model = unknowns.model
+        self.leading = unknowns.leading
+        self.columns = support.shape[1]
+        self.of_joint = [np.flatnonzero(row) for row in _support_with_currents(model, support)]
+        self.of_motor = [np.flatnonzero(row) for row in motor_support(model.drive_train, support)]
+        self.payloads = list(unknowns.payloads)
+        self.names: list[str] = []
+        #: By mounting, −1 without load, the triangle of each joint's rows [V | W].
+        self.joints: dict[int, list[FloatArray]] = {}
+        self.joint_rows = np.zeros(unknowns.axis_count, dtype=np.int64)
+        self.motor_rows = np.zeros(unknowns.axis_count, dtype=np.int64)
+        self.clusters: list[_Cluster] = []
+        self.has_demanded_motion = False
+
+    def add(self, name: str, payload: Payload | None, pieces: Iterable[Rows]) -> None:
+        """Fold in the rows of a run."""
+        mounting = mounting_index(payload, self.payloads, name)
+        empty = [np.zeros((len(columns), len(columns))) for columns in self.of_joint]
+        factors = self.joints.setdefault(mounting, empty)
+        moves: dict[int, list[_Cluster]] = {}
+        for rows in pieces:
+            for joint, columns in enumerate(self.of_joint):
+                factors[joint] = qr_update(factors[joint], _rows_of_joint(self.model, rows, joint, columns))
+            self.joint_rows += rows.use.sum(axis=1)
+            self.motor_rows += rows.motor_use.sum(axis=1)
+            self.has_demanded_motion |= rows.instrument is not rows.standard
+            numbers = np.unique(rows.move[rows.motor_use.any(axis=0)])
+            if not len(numbers):
+                continue  # every motor at standstill
+            by_motor = [self._by_move(rows, motor, numbers) for motor in range(len(self.of_motor))]
+            for move, own in zip(numbers.tolist(), zip(*by_motor, strict=True), strict=True):
+                counted = rows.motor_use[0] & (rows.move == move)
+                preload = rows.preload[:, :, counted].transpose(2, 0, 1)
+                moves.setdefault(move, []).append(_Cluster(mounting, len(self.names), own, preload))
+        for parts in moves.values():
+            self.clusters.append(parts[0] if len(parts) == 1 and not self.compact else _merged(parts))
+        self.names.append(name)
+
+    def _by_move(self, rows: Rows, motor: int, moves: IntArray) -> list[FloatArray]:
+        """[v_i | (T W)_i] of a motor, with instruments [v_i | (T W)_i | (T Z)_i], in the rows of each move."""
+        to_motor = self.model.drive_train.to_motor[motor]
+        held = self.of_motor[motor]
+        parts = [rows.drive[motor] if self.model.is_redundant else rows.current[motor][None]]
+        parts.append(_held_columns(to_motor, rows.standard, held))
+        if self.instruments:
+            parts.append(_held_columns(to_motor, rows.instrument, held))
+        used = np.flatnonzero(rows.motor_use[motor])
+        used = used[np.argsort(rows.move[used], kind="stable")]
+        columns = np.concatenate(parts)[:, used]
+        ends = np.searchsorted(rows.move[used], moves[1:])
+        return [own.T for own in np.split(columns, ends, axis=1)]
+
+    def system(self) -> System:
+        """The equations with all columns; those that a joint or motor does not have are zero."""
+        return System(
+            model=self.model,
+            base=self.unknowns.base,
+            columns=self.unknowns.columns,
+            payloads=tuple(self.payloads),
+            payload_columns=(tuple(range(BODY)),) * len(self.payloads),
+            runs=tuple(self.names),
+            joints=Triangles(tuple(map(self._joint, range(len(self.of_joint)))), self.joint_rows),
+            motors=Triangles(tuple(map(self._motor, range(len(self.of_motor)))), self.motor_rows),
+            clusters=tuple(self._of_cluster(one, self._currents) for one in self.clusters),
+            cluster_runs=tuple((one.run, one.mounting) for one in self.clusters),
+            instruments=self._all_instruments(),
+            preload=tuple(one.preload for one in self.clusters) if self.model.is_redundant else (),
+        )
+
+    def _joint(self, joint: int) -> FloatArray:
+        """[V | −W | −W_L of each mounting | 0] of a joint: the triangles of all mountings below each other."""
+        count = len(self.of_joint)
+        columns = self.of_joint[joint]
+        motors = np.count_nonzero(columns < count)
+        parts: list[FloatArray] = [np.empty((0, count + self._width))]
+        for mounting, factors in self.joints.items():
+            rows = factors[joint]
+            currents = np.zeros((len(rows), count))
+            currents[:, columns[:motors]] = rows[:, :motors]
+            linear = self._linear(rows[:, motors:], columns[motors:] - count, mounting)
+            parts.append(np.concatenate((currents, -linear), axis=1))
+        return np.concatenate(parts)
+
+    def _motor(self, motor: int) -> FloatArray:
+        """[v_i | W | W_L of each mounting | 0] of a motor: the triangles of all mountings below each other."""
+        width = self.leading + len(self.of_motor[motor])
+        parts: list[FloatArray] = [np.empty((0, self.leading + self._width))]
+        for mounting in self.joints:
+            rows = [one.factors[motor][:, :width] for one in self.clusters if one.mounting == mounting]
+            parts.append(self._currents(triangle(rows, width), motor, mounting))
+        return np.concatenate(parts)
+
+    @property
+    def _width(self) -> int:
+        """Number of the columns of [W | W_L of each mounting | 0]."""
+        return len(self.unknowns.columns) + BODY * len(self.payloads) + 1
+
+    def _all_instruments(self) -> tuple[tuple[FloatArray, ...], ...]:
+        """Instruments of each cluster; empty where the demanded motion of no run is known."""
+        if not self.has_demanded_motion:
+            return ()
+        return tuple(self._of_cluster(one, self._instruments) for one in self.clusters)
+
+    def _of_cluster(
+        self, cluster: _Cluster, columns: Callable[[FloatArray, int, int], FloatArray]
+    ) -> tuple[FloatArray, ...]:
+        return tuple(columns(rows, motor, cluster.mounting) for motor, rows in enumerate(cluster.factors))
+
+    def _currents(self, rows: FloatArray, motor: int, mounting: int) -> FloatArray:
+        """[v_i | W | W_L of each mounting | 0] from the columns that a motor has."""
+        held = self.of_motor[motor]
+        linear = self._linear(rows[:, self.leading : self.leading + len(held)], held, mounting)
+        return np.concatenate((rows[:, : self.leading], linear), axis=1)
+
+    def _instruments(self, rows: FloatArray, motor: int, mounting: int) -> FloatArray:
+        """[Z | Z_L of each mounting | 0] from the columns that a motor has."""
+        held = self.of_motor[motor]
+        return self._linear(rows[:, self.leading + len(held) :], held, mounting)
+
+    def _linear(self, rows: FloatArray, held: IntArray, mounting: int) -> FloatArray:
+        """[W | W_L of each mounting | 0] from some of the columns."""
+        robot = len(self.unknowns.columns)
+        every = np.zeros((len(rows), self.columns))
+        every[:, held] = rows
+        out = np.zeros((len(rows), self._width))
+        out[:, :robot] = every[:, :robot]
+        if mounting >= 0:
+            first = robot + BODY * mounting
+            out[:, first : first + BODY] = every[:, self.flange]
+        return out
+
+
+def _support_with_currents(model: Model, support: BoolArray) -> BoolArray:
+    """Mask of the columns of [V | W] that each joint has, shape (m, m + c)."""
+    direction = model.drive_train.direction
+    currents = np.ones_like(direction, dtype=np.bool_) if model.is_redundant else direction.T != 0.0
+    return np.concatenate((currents, support), axis=1)
+
+
+def motor_support(train: DriveTrain, support: BoolArray) -> BoolArray:
+    """Mask of the columns of W that the equation of each motor has, from those of each joint, both of shape (m, c)."""
+    mixed = np.abs(train.to_motor) > 0.0
+    return np.asarray(mixed.astype(np.int64) @ support.astype(np.int64) > 0)
+
+
+def _rows_of_joint(model: Model, rows: Rows, joint: int, columns: IntArray) -> FloatArray:
+    """The given columns of [V | W] of a joint, in the rows that count, columns first."""
+    used = rows.use[joint]
+    motors = columns[columns < len(rows.use)]
+    if model.is_redundant:
+        currents = rows.drive[joint][:, used]
+    else:
+        currents = model.drive_train.direction[motors, joint, None] * rows.current[motors][:, used]
+    standard = columns[len(motors) :] - len(rows.use)
+    return np.concatenate((currents, rows.standard[joint][np.ix_(standard, used)]))
+
+
+def _held_columns(to_motor: FloatArray, columns: FloatArray, held: IntArray) -> FloatArray:
+    """(T W)_i in the columns that a motor has, from those of all joints, shape (m, c, r)."""
+    return motor_columns(to_motor, lambda joint: columns[joint][held])
+
+
+def _merged(parts: Sequence[_Cluster]) -> _Cluster:
+    """One cluster of several parts of a run: triangles, or with preload all rows."""
+    first = parts[0]
+    preload = np.concatenate([one.preload for one in parts])
+    of_motors = zip(*(one.factors for one in parts), strict=True)
+    if preload.size:
+        return replace(first, factors=tuple(map(np.concatenate, of_motors)), preload=preload)
+    factors = tuple(triangle(own, own[0].shape[1]) for own in of_motors)
+    return replace(first, factors=factors, preload=preload[:0])
+
+
+def _joined(clusters: list[_Cluster]) -> list[_Cluster]:
+    """Neighbours of one run joined in pairs."""
+    joined: list[_Cluster] = []
+    index = 0
+    while index < len(clusters):
+        pair = clusters[index : index + 2]
+        if len(pair) == 2 and pair[0].run == pair[1].run:
+            joined.append(_merged(pair))
+        else:
+            joined.append(pair[0])
+            pair = pair[:1]
+        index += len(pair)
+    return joined
 
 
 def mounting_index(payload: Payload | None, payloads: list[Payload], run: str) -> int:
@@ -285,51 +379,85 @@ def mounting_index(payload: Payload | None, payloads: list[Payload], run: str) -
     return len(payloads) - 1
 
 
-def _motor_rows(
-    model: Model, rows: Rows, plan: Layout, *, instruments: bool
-) -> dict[int, tuple[list[FloatArray], FloatArray]]:
-    """Rows [v_i | (T W_st)_i] of each motor, with instruments (T Z_st)_i too, and N, parted by move."""
-    to_motor = model.drive_train.to_motor
-    by_motor = []
-    for motor, held in enumerate(plan.motor):
-        joints = np.flatnonzero(to_motor[motor])
-        parts_of = (rows.standard, rows.instrument) if instruments else (rows.standard,)
-        mixed = [sum(to_motor[motor, joint] * part[joint][held] for joint in joints) for part in parts_of]
-        own = rows.drive[motor] if model.is_redundant else rows.current[motor][None]
-        by_motor.append(np.concatenate((own, *map(np.asarray, mixed))))
-    parts: dict[int, tuple[list[FloatArray], FloatArray]] = {}
-    for move in np.unique(rows.move):
-        here = rows.motor_use & (rows.move == move)
-        if here.any():
-            own_rows = [columns[:, used].T for columns, used in zip(by_motor, here, strict=True)]
-            parts[int(move)] = own_rows, rows.preload[:, :, here[0]].transpose(2, 0, 1)
-    return parts
+# Unknowns of a system in standard parameters
 
 
-def _cluster(mounting: int, run: int, pieces: list[tuple[list[FloatArray], FloatArray]]) -> Cluster:
-    preload = np.concatenate([one for _, one in pieces])
-    factors = zip(*(rows for rows, _ in pieces), strict=True)
-    if preload.size:
-        return Cluster(mounting, run, tuple(np.concatenate(parts) for parts in factors), preload)
-    return Cluster(mounting, run, tuple(triangle(parts, parts[0].shape[1]) for parts in factors), preload[:0])
+def regrouped(
+    standard: System,
+    base: BaseParameters | None = None,
+    payload_columns: tuple[tuple[int, ...], ...] | None = None,
+) -> System:
+    """Eq. (17) of a system in the standard parameters and the ten of each payload.
+
+    Args:
+        standard: of `reduce_runs`.
+        base: the base parameters; those that its rows show, when None.
+        payload_columns: the unknown parameters of each payload, as indices of LINK_PARAMETERS; those that its rows show
+            when None.
+
+    Raises:
+        DataUnfit: a joint never moves, where the base parameters are looked for.
+    """
+    if base is None:
+        base = shown_base(standard)
+    if payload_columns is None:
+        payload_columns = shown_payload_columns(standard)
+    count = len(standard.columns)
+    given = {index: 0.0 for index in range(count) if index not in base.independent}
+    found = standard.holding(given | payload_values(standard.payloads, payload_columns, count))
+    names = zip(base.names, found.columns, strict=True)
+    return replace(found, base=base, columns=tuple(Column(name, column.unit) for name, column in names))
 
 
-def _joined(clusters: list[Cluster]) -> list[Cluster]:
-    """Neighbours of one run joined in pairs."""
-    joined: list[Cluster] = []
-    index = 0
-    while index < len(clusters):
-        pair = clusters[index : index + 2]
-        if len(pair) == 2 and pair[0].run == pair[1].run:
-            joined.append(_cluster(pair[0].mounting, pair[0].run, [(list(one.factors), one.preload) for one in pair]))
-            index += 2
-        else:
-            joined.append(pair[0])
-            index += 1
-    return joined
+def payload_values(
+    payloads: Sequence[Payload], payload_columns: Sequence[Sequence[int]], first: int
+) -> dict[int, float]:
+    """Values of the payloads' parameters that are no unknowns, zero where not known, for `System.holding`.
+
+    Args:
+        payloads: of the system.
+        payload_columns: the unknown parameters of each, as indices of LINK_PARAMETERS.
+        first: index of the first payload's first parameter among the unknowns.
+    """
+    values: dict[int, float] = {}
+    for mounting, (payload, unknown) in enumerate(zip(payloads, payload_columns, strict=True)):
+        for index, value in enumerate(payload.known_parameters.tolist()):
+            if index not in unknown:
+                values[first + BODY * mounting + index] = value
+    return values
 
 
-def _widened(factor: FloatArray, columns: IntArray, width: int) -> FloatArray:
-    out = np.zeros((len(factor), width))
-    out[:, columns] = factor
-    return out
+def shown_base(standard: System) -> BaseParameters:
+    """The base parameters that a system in standard parameters shows.
+
+    Raises:
+        DataUnfit: a joint never moves.
+    """
+    for joint, rows in enumerate(standard.joints.rows):
+        if not rows:
+            reason = f"{standard.model.robot.axes[joint].name} never moves faster than its standstill speed in any run"
+            raise DataUnfit(", ".join(standard.runs), reason)
+    names = tuple(column.name for column in standard.columns)
+    return base_parameters(_linear_columns(standard)[:, : len(names)], names)
+
+
+def shown_payload_columns(standard: System) -> tuple[tuple[int, ...], ...]:
+    """For each mounting, its unknown parameters that a system in standard parameters shows (LINK_PARAMETERS)."""
+    columns = _linear_columns(standard)
+    chosen: list[tuple[int, ...]] = []
+    for mounting, payload in enumerate(standard.payloads):
+        first = len(standard.columns) + BODY * mounting
+        flange = columns[:, first : first + BODY]
+        norms = np.linalg.norm(flange, axis=0)
+        # On a platform that never turns, most of the ten are rounding errors beside the mass.
+        shown = norms > SMALLEST_COLUMN * norms.max(initial=0.0)
+        unknown = tuple(i for i, name in enumerate(LINK_PARAMETERS) if name not in payload.known and shown[i])
+        names = tuple(LINK_PARAMETERS[i] for i in unknown)
+        seen = base_parameters(flange[:, list(unknown)], names).independent if unknown else ()
+        chosen.append(tuple(unknown[i] for i in seen))
+    return tuple(chosen)
+
+
+def _linear_columns(standard: System) -> FloatArray:
+    """[W | W_L of each mounting] of all joints below each other."""
+    return np.concatenate([-factor[:, standard.axis_count : -1] for factor in standard.joints.factors])

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.equations.currents import Currents, OwnCurrents, PreloadedCurrents
+from ident.equations.currents import Currents, PreloadedCurrents
 from ident.equations.triangles import Triangles, singular_values, solve, triangle
 from ident.errors import DataUnfit, PayloadMissing, RankDeficient
 from ident.model.base import BaseParameters, base_parameters
@@ -39,6 +39,11 @@ class Equations:
         return len(self.drive_train.ratio)
 
     @property
+    def leading(self) -> int:
+        """How many columns of the motors' rows belong to currents: the own one, or with preload those of all motors."""
+        return self.axis_count if self.model.is_redundant else 1
+
+    @property
     def unknowns(self) -> tuple[Column, ...]:
         """χ, then χ_uL of each mounting: everything linear that is estimated beside the gains."""
         return self.columns + tuple(
@@ -52,7 +57,7 @@ class Equations:
 class System(Equations):
     """The equations of several runs as triangles, W_tot = [V | −W | −W_uL | −W_kL χ_kL]."""
 
-    joints: Triangles  #: triangle of each joint's rows of W_tot, c = m + p + 1 columns
+    joints: Triangles  #: of each joint's rows of W_tot, c = m + p + 1 columns
     #: Triangle of each motor's rows [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], p + 2 columns: the equation g_i v_i =
     #: (T W χ + T W_kL χ_kL)_i holds one current alone.
     motors: Triangles
@@ -66,11 +71,6 @@ class System(Equations):
     instruments: tuple[tuple[FloatArray, ...], ...] = ()
     #: Of a redundantly driven robot, N of each cluster's rows, shapes (rows, m, m − d); of others empty.
     preload: tuple[FloatArray, ...] = ()
-
-    @property
-    def leading(self) -> int:
-        """How many columns of the motors' rows belong to currents: the own one, or with preload those of all motors."""
-        return self.axis_count if self.model.is_redundant else 1
 
     def weighted_singular_values(self, solution: FloatArray, free: int, *, gains: bool) -> FloatArray:
         """Singular values of W_r with rows of a joint divided by its residual's deviation (paper Table 5).
@@ -105,7 +105,7 @@ class System(Equations):
     def currents(self) -> Currents:
         """The motors' equations, for maximum likelihood."""
         if not self.model.is_redundant:
-            return OwnCurrents(self.motors)
+            return Currents.of_motors(self.motors)
         rows = [np.concatenate(own) for own in zip(*self.clusters, strict=True)]
         return PreloadedCurrents.of_rows(rows, np.concatenate(self.preload))
 
@@ -115,26 +115,35 @@ class System(Equations):
         return any(bool(np.any(factor[:, -1])) for factor in self.joints.factors)
 
     def holding(self, values: Mapping[int, float]) -> System:
-        """Give some parameters a value: their columns join W_kL χ_kL.
+        """Give some unknowns a value: their columns join W_kL χ_kL.
 
         Args:
-            values: by index into ``columns``; zero takes a parameter out of the model (paper §4.2).
+            values: by index into ``unknowns``; zero takes a parameter out of the model (paper §4.2).
         """
-        given = np.array([values.get(index, 0.0) for index in range(len(self.columns))])
-        kept = [index for index in range(len(self.unknowns) + 1) if index not in values]
+        every = len(self.unknowns)
+        given = np.array([values.get(index, 0.0) for index in range(every)])
+        kept = [index for index in range(every + 1) if index not in values]
+
+        moved = np.flatnonzero(given)
 
         def held(rows: FloatArray, first: int) -> FloatArray:
-            linear = rows[:, first:].copy()
-            linear[:, -1] += linear[:, : len(given)] @ given
-            return np.concatenate((rows[:, :first], linear[:, kept]), axis=1)
+            chosen = rows[:, [*range(first), *(first + index for index in kept)]]
+            chosen[:, -1] += rows[:, first + moved] @ given[moved]
+            return chosen
 
         def folded(triangles: Triangles, first: int) -> Triangles:
             factors = (held(factor, first) for factor in triangles.factors)
             return Triangles(tuple(triangle((f,), f.shape[1]) for f in factors), triangles.rows)
 
+        payload_columns: list[tuple[int, ...]] = []
+        first = len(self.columns)
+        for indices in self.payload_columns:
+            payload_columns.append(tuple(own for place, own in enumerate(indices, first) if place not in values))
+            first += len(indices)
         return replace(
             self,
             columns=tuple(column for index, column in enumerate(self.columns) if index not in values),
+            payload_columns=tuple(payload_columns),
             joints=folded(self.joints, self.axis_count),
             motors=folded(self.motors, self.leading),
             clusters=tuple(tuple(held(rows, self.leading) for rows in cluster) for cluster in self.clusters),

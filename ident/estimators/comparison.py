@@ -10,7 +10,7 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
-from ident.equations.reduction import reduce_runs
+from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.system import System
 from ident.errors import IdentificationError
 from ident.estimators.estimate import Estimate
@@ -52,7 +52,7 @@ class EstimatorTrial:
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class EstimatorComparison:
     """All trials, those of the declared filters first."""
 
     trials: tuple[EstimatorTrial, ...]
@@ -71,12 +71,12 @@ class Comparison:
         return np.asarray(100.0 * np.ptp(values, axis=0) / np.abs(values.mean(axis=0)))
 
 
-def compare(
+def try_estimators(
     model: Model,
     runs: Callable[[], Iterable[Run]],
     conditioning: Conditioning,
     progress: Callable[[str], None] = lambda _: None,
-) -> Comparison:
+) -> EstimatorComparison:
     """Run every estimator under the declared filters, and under half and twice their cut-offs.
 
     Args:
@@ -97,8 +97,7 @@ def compare(
         )
         progress(f"estimators under {filters.position_cutoff_hz:g} Hz / {filters.decimation_cutoff_hz:g} Hz")
         try:
-            reduction = reduce_runs(model, runs(), filters, instruments=True)
-            system = reduction.system(reduction.base(), reduction.payload_columns())
+            system = regrouped(reduce_runs(model, runs(), filters, instruments=True))
         except IdentificationError as error:
             if factor == 1.0:
                 raise
@@ -120,7 +119,7 @@ def compare(
                     relative_error_percent=estimate.relative_error(system).total,
                 )
             )
-    return Comparison(tuple(trials))
+    return EstimatorComparison(tuple(trials))
 
 
 def _failed(estimator: str, filters: Conditioning, error: IdentificationError) -> EstimatorTrial:

@@ -23,8 +23,8 @@ from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.data.unsigned_current import missing_sign, one_sided_currents, unsigned_currents
-from ident.equations.reduction import layout
-from ident.equations.rows import rows_of
+from ident.equations.reduction import motor_support
+from ident.equations.rows import motor_columns, rows_of
 from ident.equations.system import System
 from ident.equations.triangles import qr_update, triangle
 from ident.errors import CurrentUnsigned, DataUnfit, Diagnosis, IdentificationError
@@ -212,7 +212,7 @@ def scale_diagnoses(
 
 
 @dataclass(frozen=True, slots=True)
-class CurrentScale:
+class TorqueScale:
     """Scale of the torque of an axis, from its current, beside the predicted one."""
 
     ratio: float  #: by least squares; NaN without torque
@@ -220,7 +220,7 @@ class CurrentScale:
     left: float  #: what no scale explains, relative to the measured torque (root mean squares)
 
 
-def current_scale(measured_nm: FloatArray, predicted_nm: FloatArray) -> CurrentScale:
+def current_scale(measured_nm: FloatArray, predicted_nm: FloatArray) -> TorqueScale:
     """Fit measured = ratio · predicted over the rows of one axis, shape (r,) each."""
     products = measured_nm * predicted_nm
     squares = predicted_nm**2
@@ -228,20 +228,20 @@ def current_scale(measured_nm: FloatArray, predicted_nm: FloatArray) -> CurrentS
     square = float(squares.sum())
     size = float(np.sum(measured_nm**2))
     if product == 0.0 or len(products) < SCALE_BLOCKS:
-        return CurrentScale(np.nan, np.nan, 1.0)
+        return TorqueScale(np.nan, np.nan, 1.0)
     starts = np.arange(SCALE_BLOCKS) * len(products) // SCALE_BLOCKS
     others = (product - np.add.reduceat(products, starts)) / (square - np.add.reduceat(squares, starts))
     std = float(np.sqrt((SCALE_BLOCKS - 1) * np.var(others)))
     left = float(np.sqrt(max(0.0, 1.0 - product**2 / (square * size))))
-    return CurrentScale(product / square, std, left)
+    return TorqueScale(product / square, std, left)
 
 
-_OF_LEAST_SQUARES = "use --method ml: noise in the currents makes the gains of least squares too small"
+_OF_LEAST_SQUARES = 'use `method="ml"`: noise in the currents makes the gains of least squares too small'
 REMEDIES_OF_DISAGREEMENT = {
     Method.LS: _OF_LEAST_SQUARES,
     Method.WLS: _OF_LEAST_SQUARES,
-    Method.TLS: "use --method ml: an effect that the model lacks, or a parameter that these moves hardly show, bends "
-    "tls more; `drivegain residual` looks for effects",
+    Method.TLS: 'use `method="ml"`: an effect that the model lacks, or a parameter that these moves hardly show, bends '
+    "tls more; `find_effects` looks for effects",
 }
 """What to do where an estimator's gain is far from that of ml; iv need not agree with it (`diagnose`)."""
 
@@ -306,7 +306,7 @@ def axis_error_diagnoses(
                 found,
                 f"some 3 to 15 %, below {LARGEST_AXIS_ERROR_PERCENT:g} %",
                 "look for what contradicts the model on this axis: its current channel and sign, gear ratio, payload, "
-                "friction or an effect that is not declared (`drivegain residual`)",
+                "friction or an effect that is not declared (`find_effects`)",
             )
 
 
@@ -471,8 +471,8 @@ def channel_evidence(model: Model, runs: Iterable[Run], conditioning: Conditioni
         DataUnfit: as of `ident.equations.reduction.reduce_runs`.
     """
     count = model.robot.axis_count
-    motor_columns = layout(model).motor
-    to_motor = model.drive_train.to_motor
+    train = model.drive_train
+    support = motor_support(train, model.support)
     factors: list[list[FloatArray | None]] = [[None] * CHANNEL_BLOCKS for _ in range(count)]
     seen = np.zeros(count)
     for run_number, run in enumerate(runs):
@@ -480,10 +480,9 @@ def channel_evidence(model: Model, runs: Iterable[Run], conditioning: Conditioni
         for rows in rows_of(model, data, conditioning):
             block_of_row = (rows.move + run_number) % CHANNEL_BLOCKS
             for motor, used in enumerate(rows.motor_use):
-                joints = np.flatnonzero(to_motor[motor])
-                mixed = np.sum([to_motor[motor, joint] * rows.standard[joint] for joint in joints], axis=0)
+                mixed = motor_columns(train.to_motor[motor], rows.standard.__getitem__)
                 payload = mixed[model.flange] * (run.payload is not None)  # one body for all mountings will do
-                columns = np.concatenate((mixed[motor_columns[motor]], payload, rows.current))
+                columns = np.concatenate((mixed[support[motor]], payload, rows.current))
                 for block in np.unique(block_of_row[used]).tolist():
                     chosen = columns[:, used & (block_of_row == block)]
                     factors[motor][block] = qr_update(factors[motor][block], chosen)

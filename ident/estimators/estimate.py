@@ -13,7 +13,7 @@ if TYPE_CHECKING:  # a calibration has relative errors, and reading one needs no
     from ident.data.conditioning import Conditioning
     from ident.data.dataset import Dataset
     from ident.equations.instants import Instants
-    from ident.equations.rows import Observation
+    from ident.equations.observation import Observation
     from ident.equations.system import System
     from ident.estimators.method import Method
     from ident.model.model import Column, Model

@@ -10,9 +10,12 @@ import numpy as np
 
 from ident.arrays import FloatArray, as_array, require_kind
 from ident.data.conditioning import Conditioning
+from ident.data.dataset import Dataset
 from ident.data.run import Run
-from ident.equations.reduction import reduce_runs
-from ident.equations.rows import observe
+from ident.equations.instants import Instants, instants_of
+from ident.equations.observation import observe
+from ident.equations.reduction import reduce_built, regrouped, rows_of_runs
+from ident.equations.rows import Rows
 from ident.equations.system import System, require_distinct
 from ident.errors import DataUnfit, IdentificationError, ModelError
 from ident.estimators.diagnosis import require_explained_currents
@@ -73,12 +76,16 @@ def identify(
             raise ModelError(f"fixed_gains is {fixed_gains.tolist()}; expected no zero: such a motor moves nothing")
     axes = axes or [joint.name for joint in model.robot.axes]
     used = with_signed_currents(each_run(runs), model, conditioning, axes)
-    reduction = reduce_runs(
-        model, used, conditioning, instruments=method is Method.IV, keep_rows=keep_rows, keep_instants=True
+    instants: list[Instants] = []
+    kept: list[BuiltRun] = []
+    built = rows_of_runs(model, used, conditioning, instruments=method is Method.IV and not model.is_redundant)
+    with_instants = noting_instants(built, model, conditioning, instants)
+    standard = reduce_built(
+        model, keeping(with_instants, kept) if keep_rows else with_instants, instruments=method is Method.IV
     )
-    if not reduction.runs:
+    if not standard.runs:
         raise DataUnfit("", "no run was given; expected one without load and one with a weighed payload")
-    system = reduction.system(reduction.base(), reduction.payload_columns())
+    system = regrouped(standard)
     require_distinct(system, gains=fixed_gains is None)
     estimate = estimate_with(method, system, fixed_gains)
     jackknifed = estimate
@@ -95,13 +102,37 @@ def identify(
         idle = idle_joints(model, *joint_torques(system, estimate))
         require_plausible(jackknifed, estimate.relative_error(system), axes, idle)
     left_out = with_signed_currents(each_run(holdout, system.payloads), model, conditioning, axes)
-    rest = reduce_runs(model, left_out, conditioning, payloads=system.payloads, keep_rows=keep_rows)
-    unseen = rest.system(system.base, system.payload_columns) if rest.runs else None
-    found = Identification(model, conditioning, system, unseen, estimate, instants=reduction.instants)
+    built = rows_of_runs(model, left_out, conditioning)
+    rest = reduce_built(model, keeping(built, kept) if keep_rows else built, payloads=system.payloads)
+    unseen = regrouped(rest, system.base, system.payload_columns) if rest.runs else None
+    found = Identification(model, conditioning, system, unseen, estimate, instants=tuple(instants))
     if not keep_rows:
         return found
-    kept = (*reduction.kept, *rest.kept)
-    return replace(found, gathered=(tuple(run.data for run in kept), observe(model, kept, conditioning, system)))
+    datasets = tuple(data for data, _ in kept)
+    observation = observe(model, datasets, conditioning, system, [rows for _, rows in kept])
+    return replace(found, gathered=(datasets, observation))
+
+
+BuiltRun = tuple[Dataset, Sequence[Rows]]  #: A differentiated run and its rows, piece by piece
+
+
+def noting_instants(
+    built: Iterable[tuple[Dataset, Iterable[Rows]]], model: Model, conditioning: Conditioning, noted: list[Instants]
+) -> Iterator[tuple[Dataset, Iterable[Rows]]]:
+    """Yield runs, and note a few rows of each, for hypotheses about its geometry."""
+    for data, pieces in built:
+        instants = instants_of(model, data, conditioning)
+        if instants is not None:
+            noted.append(instants)
+        yield data, pieces
+
+
+def keeping(built: Iterable[tuple[Dataset, Iterable[Rows]]], kept: list[BuiltRun]) -> Iterator[BuiltRun]:
+    """Yield runs, and keep each with all its rows."""
+    for data, pieces in built:
+        rows = tuple(pieces)
+        kept.append((data, rows))
+        yield data, rows
 
 
 def each_run(runs: Iterable[Run], payloads: tuple[Payload, ...] | None = None) -> Iterator[Run]:

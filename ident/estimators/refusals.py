@@ -96,7 +96,7 @@ def require_roles(gains: FloatArray, nameplate: FloatArray) -> None:
             "all drive gains",
             found=numbers_text(gains),
             expected=f"the signs of the nameplate: {numbers_text(nameplate)}",
-            remedy="were the payload's run and the run without load exchanged (look at `drivegain info` of each log), "
+            remedy="were the payload's run and the run without load exchanged (look at `Run.payload` of each run), "
             "or do all currents count the other way?",
         )
 

@@ -179,7 +179,7 @@ def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: Floa
     declared = model.robot.gravity_m_s2
     as_declared = weighed.directed(declared)
     start = first_fit(model, as_declared, reference)
-    before = judge(as_declared, start, reference)
+    before = judge_motor(as_declared, start, reference)
     judged = _reversed_geometries(model, instants, before, start, reference)
     turned = _turned_gravity(weighed, declared, start, reference)
     if turned is not None:
@@ -261,7 +261,7 @@ def _reversed_geometries(
         falls = np.log(before.floored_error / fitted)
         if np.sum(falls) < LEAST_FALL:  # prediction is never better than the fit: most hypotheses end here
             continue
-        judged.append(replace(judge(products, opposite, reference), reversed_axis=axis))
+        judged.append(replace(judge_motor(products, opposite, reference), reversed_axis=axis))
     return judged
 
 
@@ -460,7 +460,7 @@ class Judged:
         return count
 
 
-def judge(products: Products, start: MotorFit, reference: FloatArray) -> Judged:
+def judge_motor(products: Products, start: MotorFit, reference: FloatArray) -> Judged:
     """Fit a hypothesis, and predict each part of the moves from the others.
 
     Args:

@@ -20,7 +20,7 @@ STEP = 1e-4
 torque, and rounding in poses that are closed to 1e-12 is as small."""
 
 
-def corrected_model(model: Model, changes: Iterable[GeometryChange]) -> Model:
+def model_with_geometry(model: Model, changes: Iterable[GeometryChange]) -> Model:
     """Return the model of a robot with other zeros and lengths.
 
     Raises:
@@ -67,5 +67,5 @@ def unit_of(model: Model, parameter: GeometryParameter) -> float:
 
 def _torque(model: Model, motion: Motion, standard: FloatArray, change: GeometryChange) -> FloatArray:
     """Torque at each axis of a robot with another geometry [Nm or N], shape (m, k)."""
-    _, _, whole = corrected_model(model, (change,)).torques(motion, standard)
+    _, _, whole = model_with_geometry(model, (change,)).torques(motion, standard)
     return whole

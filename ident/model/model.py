@@ -79,7 +79,8 @@ class Column:
     unit: str  #: of its value
     least: float = -np.inf  #: smallest value that physics allows
     largest: float = np.inf  #: largest value that physics allows
-    #: Value that its column was linearised about: a fit finds the difference from it (`ident.effects.geometry`).
+    #: Value that its column was linearised about: a fit finds the difference from it
+    #: (`ident.effects.geometry_corrections`).
     about: float = 0.0
 
     def at(self, kind: JointKind) -> Column:

@@ -101,7 +101,7 @@ def effective_noise(noise_a: FloatArray, lag_one: float) -> FloatArray:
     return np.asarray(noise_a * np.sqrt((1.0 + lag_one) / (1.0 - lag_one)))
 
 
-def visible(model: Model, motion: Motion) -> BaseParameters:
+def visible_base(model: Model, motion: Motion) -> BaseParameters:
     """Return the base parameters that are identifiable from a motion."""
     # The dry friction of a joint at rest is undetermined (see the standstill mask).
     columns = model.regressor(motion) * (motion.velocity_rad_s.T != 0.0)[:, None, :]

@@ -11,7 +11,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from daq.config.bus import bus_address
+from daq.config.cell_buses import bus_address
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.simulation.simulation_file import load_simulation, shipped_simulation

@@ -30,7 +30,7 @@ FRAME = struct.Struct("=IB3x8s")
 SDO_REQUEST, SDO_ANSWER, SYNC = 0x600, 0x580, 0x080
 ANSWER_S = 1.0
 POLL_S = 0.01
-USED = ("daq.cli.record", "daq.cli.scan", "daq.cli.simulate", "daq.report.bus", "daq.workflow.record")
+USED = ("daq.cli.record", "daq.cli.scan", "daq.cli.simulate", "daq.report.bus_views", "daq.workflow.record")
 
 
 def warm_up(simulation: Path) -> None:

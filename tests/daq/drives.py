@@ -12,12 +12,12 @@ from pathlib import Path
 import can
 
 from daq.cli.apply import Applier, apply_to, drives_on_the_bus
-from daq.config.bus import drive_axes
 from daq.config.cell import Bus, Cell
+from daq.config.cell_buses import drive_axes
 from daq.config.cell_file import load_cell
 from daq.config.controller import Controller, GainObject
 from daq.config.policy import HistoryPlace
-from daq.documents.calibration_file import encode
+from daq.documents.calibration_file import encode_calibration
 from daq.simulation.simulation_file import load_simulation
 from daq.writeback.request import Request
 from drivers.canopen.bus import BusAddress, open_bus
@@ -150,7 +150,7 @@ def apply_in_drives(
             base=base,
             appliers=ACTOR.names,
             file=Path("calibration.yaml"),
-            content=encode(calibration),
+            content=encode_calibration(calibration),
         ),
         actor=ACTOR,
         audit=cell.history.audit,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from daq.config.cell_file import load_cell
-from daq.documents.calibration_file import encode
+from daq.documents.calibration_file import encode_calibration
 from daq.environment import shipped_configurations
 from daq.ledger.audit import AuditAction, AuditEntry, append
 from daq.ledger.history import History
@@ -49,7 +49,7 @@ def calibration_of(week: int, factors: tuple[float, ...] = (1.0,) * 6) -> Calibr
 
 def digest_of(calibration: Calibration) -> str:
     """SHA-256 of its file."""
-    return hashlib.sha256(encode(calibration)).hexdigest()
+    return hashlib.sha256(encode_calibration(calibration)).hexdigest()
 
 
 def ledger_in(folder: Path) -> Ledger:

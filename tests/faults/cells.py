@@ -9,7 +9,7 @@ from pathlib import Path
 
 import can
 
-from daq.config.bus import drive_axes
+from daq.config.cell_buses import drive_axes
 from daq.config.cell_file import load_cell
 from daq.simulation.simulation_file import load_simulation
 from drivers.canopen.bus import BusAddress, open_bus

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from daq.cli.app import main
-from daq.config.bus import bus_address
+from daq.config.cell_buses import bus_address
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
 from daq.log.conversion import load_run

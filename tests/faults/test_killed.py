@@ -26,7 +26,7 @@ from canopen import ObjectDictionary
 from canopen.objectdictionary import UNSIGNED16, UNSIGNED32, ODVariable
 from numpy.typing import NDArray
 
-from daq.config.bus import drive_axes
+from daq.config.cell_buses import drive_axes
 from daq.config.cell_file import load_cell
 from daq.simulation.simulation_file import load_simulation
 from drivers.canopen.bus import BusAddress, open_bus

@@ -12,7 +12,7 @@ import can
 import pytest
 
 from daq.cli.app import main
-from daq.config.bus import bus_address
+from daq.config.cell_buses import bus_address
 from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent, ConfigurationMissing, ExitCode, SchemaMismatch
 from daq.log.feed import LARGEST_PACKET, Feed, ProgramEnd, connected, read_packet

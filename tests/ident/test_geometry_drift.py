@@ -15,7 +15,7 @@ from ident.data.run import Run
 from ident.discovery.evidence import Evidence
 from ident.discovery.loop import with_declared
 from ident.effects.effect import PlacedEffect
-from ident.effects.geometry import GravityDirection, rotation_by
+from ident.effects.geometry_corrections import GravityDirection, rotation_by
 from ident.equations.rows import decimate_rows, row_masks
 from ident.geometry_drift import GeometryDrift, geometry_drift
 from ident.model.model import Model

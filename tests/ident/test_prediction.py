@@ -17,7 +17,7 @@ from ident.data.run import Run
 from ident.discovery.evidence import Evidence, gather, with_effects
 from ident.discovery.gates import own_unknowns
 from ident.effects.dictionary import EFFECTS, UNNAMED
-from ident.effects.effect import ALL_AXES, Effect, PlacedEffect, Side, check_settings
+from ident.effects.effect import ALL_AXES, Effect, GearSide, PlacedEffect, check_settings
 from ident.effects.electrical import Cogging, Lag, Saturation, TimeSkew
 from ident.effects.friction import LoadFriction, NonlinearViscous, Stribeck, WarmUp
 from ident.effects.position import Spring
@@ -257,7 +257,7 @@ def test_settings_that_no_effect_has_are_refused(
 def test_an_effect_of_an_earlier_version_is_that_of_first_order(
     identified: Evidence, effect: Effect, coefficient: str
 ) -> None:
-    axis = ALL_AXES if effect.side is Side.ALL_MOTORS else "J3"
+    axis = ALL_AXES if effect.side is GearSide.ALL_MOTORS else "J3"
     earlier = AcceptedEffect(effect.name, axis, {}, (Parameter(coefficient, 2e-4, 1e-5, ""),), 1.0, 1.0)
     placed, values = placed_effect(earlier, calibrated(identified))
     assert (placed.effect, values.tolist()) == (effect, [2e-4])

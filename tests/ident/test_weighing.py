@@ -16,7 +16,7 @@ from ident.estimators.estimate import RelativeError
 from ident.model.bodies import LINK_PARAMETERS, Payload, body_of
 from ident.model.robot import Motion, Place
 from ident.planning.excitation import Excitation
-from ident.planning.verdict import ExtraMoves
+from ident.planning.gain_verdict import ExtraMoves
 from ident.weighing import RowsToWeigh, Scale, WeighedBody, moves_that_help, rows_to_weigh, weigh, weigh_rows
 from tests.ident.recordings import FloatArray, Truth
 from tests.ident.weighed import AXIS, WeighedCell, a_body, noisy_run, weighed_cell

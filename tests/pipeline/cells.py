@@ -12,8 +12,8 @@ from typing import Any
 import yaml
 
 from daq.cli.app import main
-from daq.config.bus import bus_address
 from daq.config.cell import Cell
+from daq.config.cell_buses import bus_address
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import ExitCode

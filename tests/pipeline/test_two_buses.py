@@ -13,8 +13,8 @@ import can
 import pytest
 
 from daq.cli.app import main
-from daq.config.bus import bus_parts, cell_address, drive_axes
 from daq.config.cell import Cell
+from daq.config.cell_buses import bus_parts, cell_address, drive_axes
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
 from daq.simulation.simulation_file import load_simulation, shipped_simulation

@@ -24,7 +24,7 @@ import numpy as np
 
 from daq.cli.app import main as drivegain
 from daq.config.cell import Cell
-from daq.config.closed_chain import robot_with
+from daq.config.cell_closures import robot_with
 from daq.errors import ExitCode
 from drivers.simulation.spec import CellSpec
 from ident.model.closed_chain import assemble

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from daq.simulation.demo import ProgressReporter, Settings, demonstrate, summary
+from daq.simulation.demo import ProgressReporter, Settings, demo_summary, demonstrate
 from daq.simulation.simulation_file import shipped_simulation
 
 OUT = Path("out/gain-study")
@@ -25,7 +25,7 @@ def one(seed: int) -> dict[str, Any]:
     quiet = ProgressReporter(lambda _: None, lambda _done, _total, _remark: None)
     settings = Settings(OUT / str(seed), shipped_simulation("clean"), seed, DURATION_S)
     outcome = demonstrate(settings, lambda: datetime.now(UTC), quiet)
-    reported = summary(outcome)
+    reported = demo_summary(outcome)
     ml = [gain["error_percent"] for gain in reported["gains"]]
     tls = [100.0 * (gain["paper_tls"] / gain["truth"] - 1.0) for gain in reported["gains"]]
     return {

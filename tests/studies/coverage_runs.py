@@ -22,8 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from daq.config.bus import bus_address
 from daq.config.cell import Cell
+from daq.config.cell_buses import bus_address
 from daq.config.cell_file import load_cell
 from daq.log.conversion import load_run
 from daq.workflow.plan import Plan, plan

@@ -22,7 +22,7 @@ from ident.data.run import Run
 from ident.data.unsigned_current import unsigned_currents
 from ident.discovery.evidence import gather
 from ident.effects.effect import PlacedEffect
-from ident.effects.geometry import rotation_by
+from ident.effects.geometry_corrections import rotation_by
 from ident.equations.instants import read_instants
 from ident.errors import CurrentUnsigned, IdentificationError
 from ident.estimators import diagnosis, payload_diagnosis, turned_geometry

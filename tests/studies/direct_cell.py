@@ -20,15 +20,15 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.config.bus import drive_axes
 from daq.config.cell import Cell
+from daq.config.cell_buses import drive_axes
 from daq.log.conversion import SiScaling, moves, scaling
 from daq.log.metadata import AxisReadback, Readback
 from daq.workflow.plan import Plan
 from daq.workflow.record import motor_limits, motor_moves
 from drivers.canopen.needs import MODE_OF_OPERATION
 from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.pdo import SETPOINT_PDOS, Direction, records, wanted_pdos, write_record
+from drivers.canopen.pdo import SETPOINT_PDOS, Direction, records, wanted_pdos, write_pdo_record
 from drivers.canopen.sdo import ObjectAccess
 from drivers.canopen.setup import PROFILE_POSITION_MODE
 from drivers.messages import CellEvent, Sample
@@ -259,6 +259,6 @@ class _DirectAccess:
         """Act as `CanopenNetwork.prepare` does on a node that has just been powered on: it needs no SYNC for that."""
         self.node.boot(0.0)
         for record in records(Direction.RPDO, self.node_id, SETPOINT_PDOS):
-            write_record(cast(ObjectAccess, self), record)
+            write_pdo_record(cast(ObjectAccess, self), record)
         self.write(MODE_OF_OPERATION, PROFILE_POSITION_MODE)
         self.node.command_nmt(NmtCommand.START, 0.0)

@@ -32,7 +32,7 @@ from ident.arrays import FloatArray
 from ident.discovery.evidence import Evidence, by_instruments, gather
 from ident.discovery.loop import find_effects
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import PlacedEffect, Side
+from ident.effects.effect import GearSide, PlacedEffect
 from ident.estimators.estimate import Estimate
 from ident.estimators.identify import identify
 from tests.studies.blind_cells import blind_cases, confusion
@@ -309,7 +309,7 @@ def _true(effect: UndeclaredEffect) -> str:
 
 def _placed(placed: PlacedEffect) -> str:
     axes = sorted({placed.axis + 1, int(placed.effect.settings.get("other_axis", 0)) or placed.axis + 1})
-    axes = axes if placed.effect.side is Side.TWO_JOINTS else [placed.axis + 1]
+    axes = axes if placed.effect.side is GearSide.TWO_JOINTS else [placed.axis + 1]
     return f"{placed.effect.name} on {'+'.join(f'J{axis}' for axis in axes)}"
 
 

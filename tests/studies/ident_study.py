@@ -22,7 +22,7 @@ from daq.config.cell_file import load_cell
 from daq.log.conversion import load_run
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
-from ident.equations.reduction import reduce_runs
+from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.system import System
 from ident.estimators.comparison import ESTIMATORS
 from ident.estimators.least_squares import wls
@@ -87,8 +87,7 @@ def score(logs: StudyLogs, model: Model, conditioning: Conditioning) -> dict[str
 
 def _system(model: Model, runs: Sequence[Run], conditioning: Conditioning, *, instruments: bool = False) -> System:
     """Equations of some runs; `iv` needs the instruments."""
-    reduction = reduce_runs(model, runs, conditioning, instruments=instruments)
-    return reduction.system(reduction.base(), reduction.payload_columns())
+    return regrouped(reduce_runs(model, runs, conditioning, instruments=instruments))
 
 
 def _mass(system: System, gains: FloatArray) -> float:

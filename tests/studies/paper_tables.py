@@ -21,7 +21,7 @@ import numpy as np
 import yaml
 
 from daq.cli import main as drivegain
-from daq.config.bus import bus_address
+from daq.config.cell_buses import bus_address
 from daq.config.cell_file import load_cell
 from daq.report.paper_tables import PaperTable, percent
 from daq.workflow.plan_file import load_plan

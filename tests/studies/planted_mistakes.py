@@ -21,7 +21,7 @@ from ident.discovery.candidates import prepare_search
 from ident.discovery.evidence import Evidence
 from ident.discovery.gates import own_unknowns, values_of
 from ident.effects.effect import PlacedEffect
-from ident.equations.rows import observe
+from ident.equations.observation import observe
 from ident.model.robot import JointKind
 
 GRAVITY_M_S2 = 9.81

@@ -20,7 +20,7 @@ from ident.data.run import Run
 from ident.discovery.evidence import Evidence, gather, with_effects
 from ident.discovery.loop import Step, find_effects
 from ident.effects.effect import PlacedEffect
-from ident.equations.rows import Observation
+from ident.equations.observation import Observation
 from ident.estimators.estimate import Estimate, RelativeError, of_squares
 from ident.estimators.identify import identify
 from ident.estimators.method import Method

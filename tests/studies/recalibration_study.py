@@ -32,7 +32,7 @@ from pathlib import Path
 import numpy as np
 
 from daq.cli.simulate import MountedFile
-from daq.config.bus import bus_address
+from daq.config.cell_buses import bus_address
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import DaqError

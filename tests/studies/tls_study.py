@@ -21,7 +21,7 @@ from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from drivers.simulation.spec import UndeclaredEffect
 from ident.arrays import FloatArray
-from ident.equations.reduction import reduce_runs
+from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.system import System
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import Scaling, parameters_over_noise, tls, wls
@@ -91,8 +91,7 @@ def errors_of(task: CaseTask) -> CellErrors:
     cell = load_cell(CELL)
     make_runs(task, cell)
     runs = [run_of(raw, cell) for raw in read_runs(task.path)]
-    reduction = reduce_runs(model_of(cell), runs, cell.conditioning)
-    system = reduction.system(reduction.base(), reduction.payload_columns())
+    system = regrouped(reduce_runs(model_of(cell), runs, cell.conditioning))
     true_gains = np.array([axis.gain_nm_per_a for axis in world_cell(task.seed, WORLD).bare.axes])
     estimates = {name: estimator(system) for name, estimator in ESTIMATORS.items()}
     title = ", ".join(f"{effect.name} on {cell.axis_names[effect.axis]}" for effect in task.effects)

@@ -20,7 +20,7 @@ import pytest
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.needs import HEARTBEAT_TIME, MODE_OF_OPERATION
 from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.pdo import STATUSWORD, feedback_entries, read_record
+from drivers.canopen.pdo import STATUSWORD, feedback_entries, read_pdo_record
 from drivers.canopen.pdo import Direction as PdoDirection
 from drivers.profiles.cia402 import State, decode
 from drivers.profiles.profile import Axis, Identity
@@ -74,7 +74,7 @@ def test_they_are_found_with_identity_name_and_state() -> None:
 
 def test_they_are_mapped_started_streamed_from_and_given_back(figure: Callable[[str], None]) -> None:
     with CanopenNetwork(ADDRESS, AXES) as network:
-        before = [read_record(network.link.objects(node), PdoDirection.TPDO, 0) for node in NODES]
+        before = [read_pdo_record(network.link.objects(node), PdoDirection.TPDO, 0) for node in NODES]
         network.prepare()
         assert network.ampere_per_unit() == (0.002, 0.002)
         begun = time.monotonic()
@@ -102,7 +102,7 @@ def test_they_are_mapped_started_streamed_from_and_given_back(figure: Callable[[
     with CanopenNetwork(ADDRESS, AXES) as network:
         for node, record in zip(NODES, before, strict=True):
             access = network.link.objects(node)
-            assert read_record(access, PdoDirection.TPDO, 0) == record
+            assert read_pdo_record(access, PdoDirection.TPDO, 0) == record
             assert access.read(MODE_OF_OPERATION) == 8
             assert access.read(HEARTBEAT_TIME) == 0
             assert decode(access.read(STATUSWORD)) is State.SWITCH_ON_DISABLED
@@ -112,7 +112,7 @@ def test_the_mapping_is_that_of_the_driver_while_it_is_used() -> None:
     with CanopenNetwork(ADDRESS, AXES) as network:
         network.prepare()
         for axis in AXES:
-            record = read_record(network.link.objects(axis.node_id), PdoDirection.TPDO, 0)
+            record = read_pdo_record(network.link.objects(axis.node_id), PdoDirection.TPDO, 0)
             assert record is not None
             words = tuple(entry.index << 16 | entry.subindex << 8 | entry.bits for entry in feedback_entries(axis))
             assert (record.cob_id, record.transmission, record.entries) == (0x180 + axis.node_id, 1, words)

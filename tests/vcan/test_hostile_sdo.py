@@ -9,7 +9,7 @@ from collections.abc import Callable
 import pytest
 
 from drivers.canopen.bus import BusAddress
-from drivers.canopen.scan import NODE_S, SCAN_POLICY, scan
+from drivers.canopen.node_scan import NODE_S, SCAN_POLICY, scan
 from tests.drivers.hostile import HOSTILE, Answer, Hostile
 from tests.drivers.scripted import ScriptedNode
 from tests.vcan.devices import devices

@@ -6,7 +6,7 @@ import math
 import unicodedata
 from collections.abc import Iterator
 
-from daq.config.cell import Axis
+from daq.config.cell import CellAxis
 from daq.errors import SignatureInvalid
 from daq.writeback.gates.gate import GateContext
 from daq.writeback.request import GainChange, GateFinding, parse_base, short_digest
@@ -114,7 +114,7 @@ def _keeps_sign(change: GainChange) -> bool:
     return change.new * change.old > 0 and change.new * change.nameplate > 0
 
 
-def _axes_of_cell(context: GateContext) -> Iterator[tuple[Gain, Axis]]:
+def _axes_of_cell(context: GateContext) -> Iterator[tuple[Gain, CellAxis]]:
     declared = {} if context.cell is None else {axis.name: axis for axis in context.cell.axes}
     for gain in context.calibration.gains:
         if gain.axis in declared:

@@ -24,7 +24,7 @@ from daq.cli.app import main
 from daq.cli.apply import entered_masses, tightened
 from daq.config.cell_file import load_cell
 from daq.config.policy import ApplyPolicy
-from daq.documents.calibration_file import decode, encode, save_calibration
+from daq.documents.calibration_file import decode_calibration, encode_calibration, save_calibration
 from daq.environment import login
 from daq.errors import ExitCode, UsageError
 from daq.files import sha256
@@ -164,7 +164,10 @@ def test_the_audit_says_who_what_and_from_which_logs(bench: Bench) -> None:
     before = bench.controller.read_bytes()
     assert bench.apply("--yes") == ExitCode.OK
     begun, applied, entered = read(bench.audit)
-    assert entered.details["document"] == encode(decode(bench.calibration.read_bytes(), "")).decode()
+    assert (
+        entered.details["document"]
+        == encode_calibration(decode_calibration(bench.calibration.read_bytes(), "")).decode()
+    )
     assert (begun.action, begun.who, begun.subject) == (
         AuditAction.APPLY_BEGUN,
         login(),
@@ -401,7 +404,7 @@ def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
 
     assert fourth()["change_sigmas"] == pytest.approx(-2.31 / (DISPERSION * 0.03684))  # entered by hand: exact
     assert bench.apply("--yes") == ExitCode.OK
-    known = decode(bench.calibration.read_bytes(), "")
+    known = decode_calibration(bench.calibration.read_bytes(), "")
     gain = known.gains[3]
     moved = replace(gain, value=gain.value * 1.015)
     save_calibration(replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration)
@@ -426,7 +429,7 @@ def test_the_base_of_a_dry_run_writes_that_change_and_no_other(
     assert bench.apply("--json") == ExitCode.OK
     assert json.loads(capsys.readouterr().out)["base"] == base
     # Another calibration under the same name.
-    known = decode(fitted, "")
+    known = decode_calibration(fitted, "")
     moved = replace(known.gains[3], value=known.gains[3].value * 1.01)
     save_calibration(replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration)
     assert bench.apply("--yes", "--base", base) == ExitCode.CALIBRATION_REFUSED
@@ -459,7 +462,7 @@ def test_the_base_of_a_dry_run_writes_that_change_and_no_other(
 def test_a_dry_run_of_a_file_that_changed_since_the_recording_reports_the_way_on(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    known = decode(bench.calibration.read_bytes(), "")
+    known = decode_calibration(bench.calibration.read_bytes(), "")
     digest = hashlib.sha256(bench.controller.read_bytes()).hexdigest()
     save_calibration(with_recordings(known, controller_sha256=digest), bench.calibration)
     bench.controller.write_bytes(bench.controller.read_bytes() + b"# seen by K.\n")

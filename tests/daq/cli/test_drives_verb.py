@@ -13,7 +13,7 @@ import typer
 
 from daq.cli.apply import rollback_drives, saving_of
 from daq.config.cell import Cell
-from daq.documents.calibration_file import encode
+from daq.documents.calibration_file import encode_calibration
 from daq.errors import BusTaken, CalibrationRefused, UsageError
 from daq.ledger.audit import AuditAction, read
 from daq.ledger.ledger import Ledger, read_history
@@ -87,7 +87,7 @@ def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: p
     assert evidence["configuration_sha256"] == demo_calibration().configuration_sha256
     assert evidence["calibration"] == {
         "file": str(Path("calibration.yaml").absolute()),
-        "sha256": hashlib.sha256(encode(demo_calibration())).hexdigest(),
+        "sha256": hashlib.sha256(encode_calibration(demo_calibration())).hexdigest(),
         "cell": "demo",
         "created": demo_calibration().created,
         "software": demo_calibration().software,
@@ -100,7 +100,7 @@ def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: p
     # The two entries that record how the writes ended.
     assert {event.audit for event in history.events} == {entry.sha256 for entry in read(cell.history.audit)[1::3]}
     _back(cell)
-    assert read_history(ledger).in_force() == hashlib.sha256(encode(demo_calibration())).hexdigest()
+    assert read_history(ledger).in_force() == hashlib.sha256(encode_calibration(demo_calibration())).hexdigest()
 
 
 @pytest.mark.usefixtures("simulation")

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daq.advice import for_command_line
 from daq.cli.app import main
 from daq.cli.scan import read_code
 from daq.errors import ExitCode
@@ -41,7 +42,8 @@ def test_codes_of_the_standards_and_of_makers(
     document = json.loads(capsys.readouterr().out)
     assert (document["code"], document["standard"]) == (read_code(code), standard)
     assert words in document["text"]
-    assert document["remedy"] == remedy_of(read_code(code))
+    assert document["remedy"] == for_command_line(remedy_of(read_code(code)))
+    assert document["remedy"].endswith("then reset the fault with `drivegain scan CELL --reset-faults`")
 
 
 @pytest.mark.parametrize("code", ["", "8g11", "12345", "-1", "0x", "eight"])

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from daq.cli.app import main
-from daq.cli.failure import ADVICE, Failure, show_failure
+from daq.cli.failure import ADVICE, ErrorParts, show_failure
 from daq.errors import DataError, ExitCode, OutputFailed
 from drivers.canopen.bus import bus_errors
 from drivers.errors import BusError, DriveFault, DriverError
@@ -38,7 +38,7 @@ def test_every_error_of_drivers_and_of_the_science_has_a_remedy(kind: type[Excep
         object.__setattr__(error, name, name)
     if kind is BusError:
         object.__setattr__(error, "address", "socketcan:can0")
-    failure = Failure.of(error)
+    failure = ErrorParts.of(error)
     assert all((failure.error, failure.found, failure.expected, failure.do))
     assert all(label in dict(line[:2] for line in failure.lines()) for label in ("error", "expected", "do"))
 
@@ -66,7 +66,7 @@ def test_advice_names_verbs_that_exist(capsys: pytest.CaptureFixture[str]) -> No
 def test_an_error_of_the_operating_system_is_explained(number: int, found: str, remedy: str) -> None:
     with pytest.raises(BusError) as caught, bus_errors("socketcan:can0"):
         raise OSError(number, os.strerror(number))
-    failure = Failure.of(caught.value)
+    failure = ErrorParts.of(caught.value)
     assert failure.error == "bus socketcan:can0"
     assert found in failure.found
     assert remedy in failure.do
@@ -91,7 +91,7 @@ def test_a_refused_connection_names_the_command_that_starts_a_cell(
 def test_a_program_gets_one_object_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     error = DataError("a\nb\udcff", found="x", expected="y", remedy="z")
     error.add_note("kept: c.mcap")
-    show_failure(Failure.of(error), json_wanted=True)
+    show_failure(ErrorParts.of(error), json_wanted=True)
     (line,) = capsys.readouterr().err.splitlines()
     assert json.loads(line) == {
         **{"error": "a\nb\udcff", "found": "x", "expected": "y", "do": "z"},
@@ -99,9 +99,9 @@ def test_a_program_gets_one_object_a_line(capsys: pytest.CaptureFixture[str]) ->
     }
     stop = DriveFault(3, "fault")
     stop.add_note("while stopping: J3 (node 3) does not answer")
-    assert "axes" not in Failure.of(stop).document()
+    assert "axes" not in ErrorParts.of(stop).document()
     stop.add_note("not confirmed without power: J3 (node 3)")
-    assert Failure.of(stop).document()["axes"] == "J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop"
+    assert ErrorParts.of(stop).document()["axes"] == "J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop"
 
 
 def test_what_a_stop_could_not_confirm_is_shown_though_a_later_error_hides_its_cause() -> None:
@@ -110,7 +110,7 @@ def test_what_a_stop_could_not_confirm_is_shown_though_a_later_error_hides_its_c
     later.__context__ = stop = DriveFault(3, "fault")
     stop.add_note("while stopping: J3 (node 3) does not answer")
     stop.add_note("not confirmed without power: J3 (node 3)")
-    document = Failure.of(later).document()
+    document = ErrorParts.of(later).document()
     assert document["axes"] == "J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop"
     assert document["unconfirmed"] == ["while stopping: J3 (node 3) does not answer"]
 
@@ -118,7 +118,7 @@ def test_what_a_stop_could_not_confirm_is_shown_though_a_later_error_hides_its_c
 def test_an_error_that_is_its_own_cause_is_explained() -> None:
     error = BusError("socketcan:can0", "gone")
     error.__cause__ = error
-    assert Failure.of(error).exit_code == ExitCode.DEVICE_FAULT
+    assert ErrorParts.of(error).exit_code == ExitCode.DEVICE_FAULT
 
 
 @pytest.mark.parametrize("json_option", [[], ["--json"]])

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from daq.cli.app import main
-from daq.cli.failure import Failure, show_failure
+from daq.cli.failure import ErrorParts, show_failure
 from daq.config.yaml_file import MAX_EXPLAINED, StrictModel, parse_yaml, read_model
 from daq.errors import ExitCode, OutputFailed, SchemaMismatch
 from daq.log.metadata import (
@@ -140,10 +140,10 @@ def test_a_disk_that_is_full_from_the_start_leaves_nothing(tmp_path: Path, monke
 def test_a_stop_that_was_not_confirmed_is_shouted(capsys: pytest.CaptureFixture[str]) -> None:
     error = DriveFault(3, "fault")
     error.add_note("while stopping: node 3: object 6041h:00: no answer")
-    show_failure(Failure.of(error), json_wanted=False)
+    show_failure(ErrorParts.of(error), json_wanted=False)
     assert "emergency stop" not in capsys.readouterr().err  # it was stopped, and confirmed by other means
     error.add_note("not confirmed without power: node 3")
-    show_failure(Failure.of(error), json_wanted=False)
+    show_failure(ErrorParts.of(error), json_wanted=False)
     output = capsys.readouterr().err
     assert "node 3: object 6041h:00: no answer" in output
     assert "emergency stop" in output
@@ -151,7 +151,7 @@ def test_a_stop_that_was_not_confirmed_is_shouted(capsys: pytest.CaptureFixture[
 
 
 def test_a_stop_that_was_confirmed_is_not(capsys: pytest.CaptureFixture[str]) -> None:
-    show_failure(Failure.of(DriveFault(3, "fault")), json_wanted=False)
+    show_failure(ErrorParts.of(DriveFault(3, "fault")), json_wanted=False)
     assert "emergency" not in capsys.readouterr().err
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
-from daq.documents.calibration_file import encode
+from daq.documents.calibration_file import encode_calibration
 from daq.errors import ExitCode
 from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
@@ -60,7 +60,7 @@ def test_nonsense_is_refused_by_every_verb_before_anything_is_written(
 ) -> None:
     calibration: Calibration = replace(_demo, **{"filter": FILTER, **changes})
     path, out = cell.parent / "calibration.yaml", cell.parent / "out"
-    path.write_bytes(encode(calibration))  # which computes the digests of this content
+    path.write_bytes(encode_calibration(calibration))  # which computes the digests of this content
     controller = load_cell(cell).controller_path
     assert controller is not None
     before, kept = controller.read_bytes(), sorted(cell.parent.iterdir())

@@ -19,20 +19,21 @@ from hypothesis import strategies as st
 from rich.console import Console
 from rich.table import Table
 
+from daq.advice import for_command_line
 from daq.cli.app import main
-from daq.config.bus import answer_us, bus_loads_percent, drive_axes
 from daq.config.cell import Cell, PacingMode, model_of
+from daq.config.cell_buses import answer_us, bus_loads_percent, drive_axes
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
 from daq.log.feed import Feed, RunFacts
-from daq.report.bus import monitor_document, monitor_view, prediction_view
 from daq.report.bus_schemas import MonitorReport
+from daq.report.bus_views import monitor_document, monitor_view, prediction_view
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.bus_lock import bus_lock, bus_taken
-from daq.workflow.events import event_document
+from daq.workflow.events import event_document, explain_error_code
 from daq.workflow.monitor import CellWatch, WatchedCell, joint_positions
 from drivers.canopen.bus import BusAddress, open_bus
-from drivers.canopen.emcy import explain, remedy_of
+from drivers.canopen.emcy import remedy_of
 from drivers.canopen.link import Link
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
@@ -597,7 +598,7 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
     assert "10 positions a second are too few" in document["prediction"]["remark"]
     assert [axis["prediction"] for axis in document["axes"]] == [None] * 6
     assert [axis["fault"] is not None for axis in document["axes"]] == [False, False, True, False, False, False]
-    assert document["axes"][2]["fault"] == asdict(explain(0x7305))
+    assert document["axes"][2]["fault"] == asdict(explain_error_code(0x7305))
     out = io.StringIO()
     Console(file=out, width=200).print(monitor_view(document))
     assert "J3 is in fault: 7305h incremental sensor 1 fault; check the plugs and cables of encoder" in out.getvalue()
@@ -608,7 +609,7 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
         bus.coming.append((bus.clock.now_ns, _frame(0x700 + node, b"\x05")))
     (notice,) = (one for one in monitor_document(CELL, watch.read(0.5))["notices"] if one["alarm"])
     assert notice == event_document(EventKind.EMCY, 0x3210, "J2", notice["text"])
-    assert notice["text"].startswith("EMCY 3210h") and notice["remedy"] == remedy_of(0x3210)
+    assert notice["text"].startswith("EMCY 3210h") and notice["remedy"] == for_command_line(remedy_of(0x3210))
 
 
 def test_each_reading_publishes_the_load_of_the_buses(

@@ -19,17 +19,17 @@ from rich.console import Console
 
 from daq.cli import main
 from daq.cli.scan import no_answer
-from daq.config.bus import bus_address, drive_axes
 from daq.config.cell import Cell
+from daq.config.cell_buses import bus_address, drive_axes
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.errors import ExitCode
 from daq.log.reader import read_log
-from daq.report.bus import scan_rows, scan_table, scan_view
+from daq.report.bus_views import scan_rows, scan_table, scan_view
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.bus import open_bus
 from drivers.canopen.link import BEATS_KEPT, Link
-from drivers.canopen.scan import FoundNode
+from drivers.canopen.node_scan import FoundNode
 from drivers.canopen.sdo import SdoPolicy
 from drivers.messages import EventKind
 from drivers.profiles.profile import Identity

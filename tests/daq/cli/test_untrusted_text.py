@@ -20,7 +20,7 @@ from daq.jobs.fleet_report import FIRST_COLUMNS, fleet_csv, fleet_document
 from daq.ledger.ledger import read_history
 from daq.ledger.watch import Series, watch
 from daq.report.history import csv_text, plot_history
-from daq.report.proposal import show
+from daq.report.proposal import show_proposal
 from daq.report.text import inert, printable, terminal_lines, terminal_text
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.request import Request
@@ -116,7 +116,7 @@ def _proposal(folder: Path, unit: str) -> Proposal[FileEdit]:
 @pytest.mark.parametrize("unit", ["[/]", "[red]Nm/A", "Nm\x1b[2J", "\x9b2J"])
 def test_a_unit_neither_commands_the_terminal_nor_is_markup(unit: str, tmp_path: Path) -> None:
     shown = io.StringIO()
-    show(_proposal(tmp_path, unit), Console(file=shown, width=200, force_terminal=False))
+    show_proposal(_proposal(tmp_path, unit), Console(file=shown, width=200, force_terminal=False))
     assert "\x1b" not in shown.getvalue()
     assert "\x9b" not in shown.getvalue()
     assert unit.replace("\x1b", "\\x1b").replace("\x9b", "\\x9b") in shown.getvalue()

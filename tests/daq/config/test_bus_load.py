@@ -12,7 +12,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from daq.config.bus import (
+from daq.config.cell import PacingMode, Sync
+from daq.config.cell_buses import (
     LARGEST_MEAN,
     SETPOINTS,
     answer_us,
@@ -26,10 +27,9 @@ from daq.config.bus import (
     split_answers,
     usual_bits,
 )
-from daq.config.cell import PacingMode, Sync
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.environment import shipped_configurations
-from daq.report.bus import load_lines
+from daq.report.bus_views import load_lines
 from drivers.motion.execute import execute
 from drivers.move import Move
 from drivers.profiles.profile import DriveProfile, ObjectEntry

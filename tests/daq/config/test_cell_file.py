@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daq.config.bus import bus_address, bus_parts, cell_address, drive_axes
 from daq.config.cell import PacingMode, model_of
+from daq.config.cell_buses import bus_address, bus_parts, cell_address, drive_axes
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.config.drive import drive_from_text
 from daq.environment import shipped_configurations

@@ -13,7 +13,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.config.controller import Controller, ControllerFormat, GainObject
 from daq.errors import ConfigurationError
-from drivers.profiles.profile import Parameter, ParameterKind
+from drivers.profiles.profile import DriveParameter, ParameterKind
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 KEYS = "[a, {key: b, factor: 1000.0}, {key: c, factor: -1.0}, d, e, f]"
@@ -78,7 +78,7 @@ def test_a_cell_without_a_bus_has_no_objects(tmp_path: Path) -> None:
 
 @given(st.sampled_from(ParameterKind), st.floats(-5e9, 5e9))
 def test_a_parameter_holds_the_nearest_number_or_refuses(kind: ParameterKind, value: float) -> None:
-    parameter = Parameter(0x2003, 1, kind)
+    parameter = DriveParameter(0x2003, 1, kind)
     lowest, highest = {
         ParameterKind.I16: (-(2**15), 2**15 - 1),
         ParameterKind.U16: (0, 2**16 - 1),
@@ -104,4 +104,4 @@ def test_a_parameter_holds_the_nearest_number_or_refuses(kind: ParameterKind, va
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e39])
 def test_what_is_no_number_is_refused(value: float) -> None:
     with pytest.raises(ValueError, match=r"no number|does not fit"):
-        Parameter(0x2003, 2, ParameterKind.F32).word(value)
+        DriveParameter(0x2003, 2, ParameterKind.F32).word(value)

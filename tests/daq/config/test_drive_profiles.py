@@ -16,21 +16,21 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from daq.cli.app import main
-from daq.config.bus import bus_address
 from daq.config.cell import Cell
+from daq.config.cell_buses import bus_address
 from daq.config.cell_file import load_cell
 from daq.config.drive import SCALE_KEYS, drive_from_text
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent, ExitCode, SchemaMismatch
 from daq.log.conversion import load_run
 from daq.log.reader import read_log
-from daq.report.bus import current_signals
+from daq.report.bus_views import current_signals
 from daq.simulation.simulation_file import load_simulation
 from daq.workflow.nameplates import actual_current_note
 from daq.workflow.plan_file import load_plan
 from daq.workflow.record import RecordingRequest, record
 from drivers.canopen.bus import open_bus
-from drivers.profiles.profile import Basis, DriveProfile, ObjectEntry, ScaleForm, TapPoint
+from drivers.profiles.profile import DriveProfile, FactBasis, ObjectEntry, ScaleForm, TapPoint
 from drivers.simulation.amplifier import AmplifierSet
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.spec import Dialect, UndeclaredEffect
@@ -86,7 +86,7 @@ def test_a_shipped_profile_is_whole_and_every_fact_has_a_source(name: str) -> No
     }  # fmt: skip
     assert profile.save_semantics
     # A fact with a data sheet as its basis is one that the tests below look up.
-    assert (name in SHEETS) is any(fact.basis is Basis.EDS for fact in profile.facts)
+    assert (name in SHEETS) is any(fact.basis is FactBasis.EDS for fact in profile.facts)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -13,7 +13,7 @@ from daq.cli.app import main
 from daq.config.cell import Cell
 from daq.config.cell_file import bundle, load_cell
 from daq.config.same_cell import correction_of, differing_sections, mismatch
-from daq.documents.calibration_file import decode, encode, save_calibration
+from daq.documents.calibration_file import decode_calibration, encode_calibration, save_calibration
 from daq.errors import ExitCode, LogsDiffer
 from daq.log.conversion import load_run
 from daq.workflow.fit import Reading
@@ -184,7 +184,7 @@ def test_a_correction_is_said_once_for_logs_that_share_a_description(
     assert found == [("robot.gravity_m_s2",)] * 2
     # As the calibration keeps it.
     calibration = replace(demo_calibration(), sources=tuple(reading.sources))
-    again: tuple[Source, ...] = decode(encode(calibration), "calibration.yaml").sources
+    again: tuple[Source, ...] = decode_calibration(encode_calibration(calibration), "calibration.yaml").sources
     assert again == tuple(reading.sources)
 
 

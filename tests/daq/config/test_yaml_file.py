@@ -15,7 +15,7 @@ from pydantic import Field
 from daq.config.cell_schema import CellModel
 from daq.config.drive import DriveModel
 from daq.config.import_description import ImportDescription
-from daq.config.yaml_file import MAX_BYTES, StrictModel, parse_yaml, read_bytes, read_model
+from daq.config.yaml_file import MAX_BYTES, StrictModel, parse_yaml, read_model, read_yaml_bytes
 from daq.errors import ConfigurationError, ConfigurationMissing, SchemaMismatch, YamlInvalid
 from daq.simulation.simulation_file import SimulationModel
 
@@ -146,7 +146,7 @@ def test_a_pipe_or_a_device_is_refused_at_once(tmp_path: Path) -> None:
     # Opened for reading as usual, the one would be waited for, and the other never end.
     for path in (tmp_path / "pipe", Path("/dev/zero")):
         with pytest.raises(ConfigurationMissing, match="no regular file"):
-            read_bytes(path)
+            read_yaml_bytes(path)
 
 
 def test_of_a_file_that_is_too_large_little_is_read(tmp_path: Path) -> None:
@@ -154,20 +154,20 @@ def test_of_a_file_that_is_too_large_little_is_read(tmp_path: Path) -> None:
     with path.open("wb") as stream:
         stream.truncate(2**40)  # a hole: it would fill the memory, not the disk
     with pytest.raises(ConfigurationMissing, match=f"more than {MAX_BYTES} bytes"):
-        read_bytes(path)
+        read_yaml_bytes(path)
     with path.open("wb") as stream:
         stream.truncate(MAX_BYTES)
-    assert len(read_bytes(path)) == MAX_BYTES
+    assert len(read_yaml_bytes(path)) == MAX_BYTES
 
 
 def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationMissing, match="directory"):
-        read_bytes(tmp_path)
+        read_yaml_bytes(tmp_path)
 
 
 def test_a_missing_file_of_the_command_line_is_sought_in_the_current_folder(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationMissing, match="on a command line to the current folder"):
-        read_bytes(tmp_path / "none.yaml")
+        read_yaml_bytes(tmp_path / "none.yaml")
 
 
 @pytest.mark.parametrize("text", ["0x" + "f" * 9999, "0x1" + "0" * 16, "9" * 4000, "-" + "9" * 4000, "9" * 9999])

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from daq.advice import for_command_line
 from daq.cli.app import main
 from daq.config.cell import Cell
 from daq.console.live import Live
@@ -169,7 +170,11 @@ def test_a_monitor_is_shown_until_a_recorder_begins_and_again_after_it(cell: Cel
         watching.event(CellEvent(0, 2, EventKind.EMCY, 0x7305, "J3 (node 3): EMCY 7305h"))
         live.wait(lambda: live.events.end == 1)
         (event,) = live.events.since(0)
-        assert (event["axis"], event["text"], event["remedy"]) == ("J3", "EMCY 7305h", remedy_of(0x7305))
+        assert (event["axis"], event["text"], event["remedy"]) == (
+            "J3",
+            "EMCY 7305h",
+            for_command_line(remedy_of(0x7305)),
+        )
     assert watching.remark == feed.remark == ""
 
 

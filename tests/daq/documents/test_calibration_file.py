@@ -13,7 +13,13 @@ import pytest
 from hypothesis import given, settings
 
 from daq.documents import calibration_file
-from daq.documents.calibration_file import as_document, decode, encode, load_calibration, save_calibration
+from daq.documents.calibration_file import (
+    as_document,
+    decode_calibration,
+    encode_calibration,
+    load_calibration,
+    save_calibration,
+)
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, exit_code
 from ident.calibration import Calibration, PayloadMass
 from tests.daq.calibrations import calibrations, demo_calibration
@@ -30,17 +36,17 @@ def path(tmp_path: Path) -> Path:
 @settings(max_examples=150, deadline=None)
 @given(calibrations)
 def test_every_calibration_comes_back_as_it_was_written(calibration: Calibration) -> None:
-    content = encode(calibration)
-    assert decode(content, "calibration.yaml") == calibration
+    content = encode_calibration(calibration)
+    assert decode_calibration(content, "calibration.yaml") == calibration
     # Whatever the texts in it, libyaml writes the bytes of PyYAML, or leaves it to PyYAML.
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(calibration_file, "_QuickDumper", calibration_file._Dumper)
-        assert encode(calibration) == content
+        assert encode_calibration(calibration) == content
 
 
 def test_libyaml_writes_what_a_fit_writes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration_file, "_Dumper", None)
-    assert decode(encode(demo_calibration()), "calibration.yaml") == demo_calibration()
+    assert decode_calibration(encode_calibration(demo_calibration()), "calibration.yaml") == demo_calibration()
 
 
 def test_a_saved_calibration_is_the_only_file_left(path: Path) -> None:
@@ -177,9 +183,9 @@ def test_an_impossible_payload_mass_is_refused(key: str, value: Any) -> None:
     calibration = demo_calibration()
     slopes = [gain.value / 4.59 for gain in calibration.gains]
     disc = PayloadMass.of("disc", 4.59, slopes, calibration.gains)
-    content = encode(dataclasses.replace(calibration, payload_mass=(disc,)))
-    assert decode(content, "calibration.yaml").payload_mass == (disc,)
+    content = encode_calibration(dataclasses.replace(calibration, payload_mass=(disc,)))
+    assert decode_calibration(content, "calibration.yaml").payload_mass == (disc,)
     impossible = dataclasses.replace(disc, **{key: value})
-    content = encode(dataclasses.replace(calibration, payload_mass=(impossible,)))
+    content = encode_calibration(dataclasses.replace(calibration, payload_mass=(impossible,)))
     with pytest.raises(CalibrationUnreadable, match="payload_mass"):
-        decode(content, "calibration.yaml")
+        decode_calibration(content, "calibration.yaml")

@@ -16,8 +16,8 @@ from typing import Any
 import yaml
 
 from daq.cli.simulate import MountedFile
-from daq.config.bus import bus_address
 from daq.config.cell import Cell
+from daq.config.cell_buses import bus_address
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.jobs.context import Tools

@@ -12,8 +12,8 @@ import pytest
 
 import daq.jobs.drives
 import daq.workflow.record
-from daq.config.bus import bus_address
 from daq.config.cell import PacingMode
+from daq.config.cell_buses import bus_address
 from daq.jobs.drives import check_drives
 from drivers.canopen.bus import open_bus
 from drivers.errors import BusBusy, StateRefused

@@ -22,7 +22,7 @@ from daq.config.cell_file import load_cell
 from daq.config.policy import HistoryPlace
 from daq.documents.calibration_file import save_calibration
 from daq.files import sha256_of
-from daq.formats.document import decode as read_controller
+from daq.formats.document import decode_document as read_controller
 from daq.formats.scalar import rewrite_gain
 from daq.jobs.session import Basis, begin
 from daq.jobs.session import save as save_session

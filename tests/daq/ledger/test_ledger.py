@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
-from daq.documents.calibration_file import decode, encode
+from daq.documents.calibration_file import decode_calibration, encode_calibration
 from daq.errors import DataError, OutputFailed, exit_code
 from daq.ledger.audit import AuditAction, append, read, verify
 from daq.ledger.entry import Acknowledgement, WriteAction, iso, utc
@@ -60,8 +60,8 @@ def test_a_calibration_comes_back_as_it_was(ledger: Ledger) -> None:
     (entry,) = read_history(ledger).entries
     (entered,) = read(ledger.audit)
     document = str(entered.details["document"]).encode()
-    assert document == encode(given_)
-    assert decode(document, "document") == given_
+    assert document == encode_calibration(given_)
+    assert decode_calibration(document, "document") == given_
     assert entry.gains == given_.gains
     assert (entry.digest, entry.cell, entry.method, entry.rows) == (digest, "demo", "ml", 14400)
     assert (entry.error_percent, entry.holdout_percent) == (3.2, 3.3)

@@ -19,7 +19,7 @@ import pytest
 import yaml
 
 from daq.cli.app import main
-from daq.documents.calibration_file import as_document, decode, encode, save_calibration
+from daq.documents.calibration_file import as_document, decode_calibration, encode_calibration, save_calibration
 from daq.errors import (
     ExitCode,
     LogCorrupt,
@@ -257,7 +257,7 @@ def test_the_reader_is_reported_and_the_calibration_says_so(
 def test_nothing_of_it_reaches_a_controller() -> None:
     good = demo_calibration()
     partial = replace(good, sources=(good.sources[0], replace(good.sources[1], partial=True)))
-    again = decode(encode(partial), "calibration.yaml")
+    again = decode_calibration(encode_calibration(partial), "calibration.yaml")
     assert again == partial
     edit, now = Edit(subject="", before=b"", after=b""), datetime(2025, 1, 2, tzinfo=UTC)
     assert not check_gates(GateContext(Request(good, now), edit))
@@ -266,13 +266,15 @@ def test_nothing_of_it_reaches_a_controller() -> None:
 
 
 def test_calibrations_of_earlier_versions_have_no_partial_sources() -> None:
-    document = yaml.safe_load(encode(demo_calibration()))
+    document = yaml.safe_load(encode_calibration(demo_calibration()))
     for source in document["sources"]:
         del source["partial"]
     document["digests"]["sources"] = hashlib.sha256(
         json.dumps(document["sources"], sort_keys=True, separators=(",", ":")).encode()
     ).hexdigest()
-    assert decode(yaml.safe_dump(document, sort_keys=False).encode(), "calibration.yaml") == demo_calibration()
+    assert (
+        decode_calibration(yaml.safe_dump(document, sort_keys=False).encode(), "calibration.yaml") == demo_calibration()
+    )
 
 
 def test_apply_ends_with_3(tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]) -> None:

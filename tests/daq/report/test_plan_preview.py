@@ -15,9 +15,9 @@ import pytest
 
 from daq.config.cell import Cell, model_of
 from daq.config.cell_file import load_cell
-from daq.config.clearance import Clearance
+from daq.config.workspace import Clearance
 from daq.report.plan_preview import STEP_S, find_preview, preview_data, preview_page
-from daq.workflow.experiment import PlannedMove, duration_of, scene_of
+from daq.workflow.experiment import PlannedMove, experiment_duration_s, scene_of
 from daq.workflow.plan import Plan
 from daq.workflow.plan_file import check_approach
 from drivers.errors import MotionRefused
@@ -57,7 +57,7 @@ def test_the_rows_pass_through_every_target_at_its_time(cell: Cell, drawn: dict[
     np.testing.assert_allclose(chains[-1], at[-1], atol=0.001)
     second = [row for row, number in enumerate(drawn["move"]) if number == 2]
     assert np.abs(chains[second] - at[1]).max(axis=(1, 2)).min() < 0.001
-    assert drawn["time_s"][-1] == pytest.approx(duration_of(cell, MOVES), abs=2 * STEP_S)
+    assert drawn["time_s"][-1] == pytest.approx(experiment_duration_s(cell, MOVES), abs=2 * STEP_S)
     # Half of its limits at most, and the slowest axis of each move at just that.
     speeds = np.array([axis["values"] for axis in drawn["speeds"]])
     assert 45.0 < speeds.max() <= 50.1

@@ -16,7 +16,7 @@ from rich.console import Console
 
 from daq.report.gains import gain_table, plot_gains, torque_sentences, with_deviation
 from daq.report.plots import plot_residual, plot_torques
-from daq.report.svg import Line, before_after, chart, ranking, sheet, visible
+from daq.report.svg import Line, before_after_drawing, chart, ranking, sheet, visible_points
 from ident.calibration import Gain
 from ident.data.torque_channel import TorqueSlope
 from tests.daq.calibrations import AXES, demo_calibration
@@ -90,7 +90,7 @@ def test_no_peak_and_no_gap_is_lost_on_the_way_to_the_drawing(samples: int, plac
     x, column = np.linspace(0.0, 1.0, samples), np.zeros(samples)
     column[round(place * (samples - 1))] = 1.0
     column[round(0.6 * samples) : round(0.7 * samples)] = np.nan
-    kept, values = visible(x, column)
+    kept, values = visible_points(x, column)
     assert len(kept) <= 3000
     assert np.all(np.diff(kept) >= 0.0)
     assert np.nanmax(values) == 1.0
@@ -117,7 +117,7 @@ def test_a_chart_draws_its_values_to_scale_and_breaks_at_gaps() -> None:
 
 def test_a_name_of_any_length_leaves_the_scale_free() -> None:
     for name in ("J1", "shoulder_lift_joint", "a name that is longer than all the room there is"):
-        drawn = ElementTree.fromstring(before_after([(name, 3.0, 2.0)], "t", "%"))
+        drawn = ElementTree.fromstring(before_after_drawing([(name, 3.0, 2.0)], "t", "%"))
         left = min(float(one.attrib["x1"]) for one in drawn.iter("line"))
         (shown,) = (one for one in drawn.iter("text") if one.text == name)
         assert float(shown.attrib.get("textLength", 8.5 * len(name))) < left

@@ -30,7 +30,7 @@ from daq.errors import EffectsRefuted, ExitCode, OutputFailed, UsageError
 from daq.report import residual_page as residual_page_module
 from daq.report.effect_names import WORDS, effect_text, named_size, other_axis
 from daq.report.fit_schemas import ResidualReport
-from daq.report.html import page, paragraph, table
+from daq.report.html import html_page, paragraph, table
 from daq.report.plots import draw_fit
 from daq.report.residual import (
     _gear_sentence,
@@ -49,19 +49,19 @@ from daq.workflow import fit as fit_module
 from daq.workflow.fit import Fit, calibration_of, fit
 from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.discovery import before_after as before_after_module
-from ident.discovery.before_after import Account, Errors, account
+from ident.discovery.before_after import Account, RelativeErrors, account
 from ident.discovery.error_change import PairedChange
 from ident.discovery.evidence import with_effects
 from ident.discovery.gear_loss import GearLoss
 from ident.discovery.joining import SetAside
 from ident.discovery.loop import Step
-from ident.discovery.noise_floor import FloorSource, NoiseFloor
+from ident.discovery.noise_floor import FloorSource, MotorNoiseFloor
 from ident.discovery.search import Finding
-from ident.discovery.time_skew import Skew
+from ident.discovery.time_skew import CurrentDelay
 from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import Coupling, LoadFriction
-from ident.effects.geometry import GravityDirection, ZeroOffset
+from ident.effects.geometry_corrections import GravityDirection, ZeroOffset
 from ident.effects.position import Spring
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Periodic, Smooth
@@ -157,7 +157,7 @@ def closed(shelved: Shelf) -> Closed:
 def test_an_axis_that_rests_in_the_held_out_runs_has_the_error_of_moves_left_out(closed: Closed) -> None:
     """‖e‖/‖v‖ of nothing is no number."""
 
-    def resting(errors: Errors) -> Errors:
+    def resting(errors: RelativeErrors) -> RelativeErrors:
         assert errors.holdout is not None
         axes = tuple(math.nan if axis == SPRING.axis else error for axis, error in enumerate(errors.holdout.axes))
         return replace(errors, holdout=RelativeError(axes, errors.holdout.total))
@@ -368,10 +368,10 @@ def test_what_to_check_comes_first(closed: Closed) -> None:
 def test_a_noise_floor_above_the_error_of_the_model_is_reported_with_its_cause(closed: Closed) -> None:
     left_a = closed.account.left_a
     floors = (
-        NoiseFloor(4.0 * float(left_a[0]), FloorSource.STANDSTILL, 20, 100.0),
-        NoiseFloor(2.0 * float(left_a[1]), FloorSource.REPEATED_MOVES, 20, 100.0),
-        NoiseFloor(0.9 * float(left_a[2]), FloorSource.REPEATED_MOVES, 12, 100.0, is_bound=True),
-        NoiseFloor(0.9 * float(left_a[3]), FloorSource.STANDSTILL, 12, 100.0),
+        MotorNoiseFloor(4.0 * float(left_a[0]), FloorSource.STANDSTILL, 20, 100.0),
+        MotorNoiseFloor(2.0 * float(left_a[1]), FloorSource.REPEATED_MOVES, 20, 100.0),
+        MotorNoiseFloor(0.9 * float(left_a[2]), FloorSource.REPEATED_MOVES, 12, 100.0, is_bound=True),
+        MotorNoiseFloor(0.9 * float(left_a[3]), FloorSource.STANDSTILL, 12, 100.0),
         *(None,) * 2,
     )
     refuted = Closed(closed.fitted, replace(closed.account, floors=floors))
@@ -389,7 +389,7 @@ def test_a_noise_floor_above_the_error_of_the_model_is_reported_with_its_cause(c
 
 def test_a_time_skew_is_stated_only_where_instruments_confirm_it(closed: Closed) -> None:
     """Least squares are certain of −3 ms in each of these."""
-    biased = Skew(4e-5, 6e-5, fit_seconds=-3e-3, fit_std=4e-4, confirmed=False, is_in_model=False)
+    biased = CurrentDelay(4e-5, 6e-5, fit_seconds=-3e-3, fit_std=4e-4, confirmed=False, is_in_model=False)
     confirmed = replace(biased, seconds=-2e-3, confirmed=True)
     sentence = "Currents were sampled 2.00 ± 0.06 ms before the positions, the same on every axis"
     for skew, stated in ((None, False), (biased, False), (confirmed, True)):
@@ -457,7 +457,7 @@ def _with_three_effects(closed: Closed) -> Closed:
         turns=turns,
         total=replace(closed.account.total, gains=gains),
         holdout_change=PairedChange(1.3, 1.0, 20),
-        skew=Skew(-2e-3, 6e-5, fit_seconds=-3e-3, fit_std=4e-4, confirmed=True, is_in_model=False),
+        skew=CurrentDelay(-2e-3, 6e-5, fit_seconds=-3e-3, fit_std=4e-4, confirmed=True, is_in_model=False),
     )
     odd = Diagnosis("payload-differs", ("loaded-2",), (), "a body", "another", "was it turned?")
     return Closed(replace(closed.fitted, steps=steps, diagnoses=(odd,)), account)
@@ -787,7 +787,7 @@ def test_a_folder_that_takes_no_file_is_refused_before_any_work(
 
 @pytest.mark.parametrize("unseen", ["\x1b", "\u202e", "\u2066", "\u200b", "\x00", "\x85", "\u2028", "\ud800"])
 def test_what_is_not_seen_is_spelt_out(unseen: str) -> None:
-    text = page(f"a{unseen}b", [paragraph(f"{unseen}"), table(unseen, [unseen] * 2, [[unseen, unseen]])])
+    text = html_page(f"a{unseen}b", [paragraph(f"{unseen}"), table(unseen, [unseen] * 2, [[unseen, unseen]])])
     assert unseen not in text
     assert f"<title>a\\u{ord(unseen):04x}b</title>" in text
     text.encode()

@@ -25,10 +25,21 @@ from daq.jobs.cell_fit import Failure, Summary
 from daq.jobs.fleet import FleetRow
 from daq.ledger.ledger import read_history
 from daq.ledger.watch import Series, watch
-from daq.report import bus, fit, gains, history, paper_tables, proposal, residual, urdf, validation, weighing
+from daq.report import (
+    bus_views,
+    fit,
+    gains,
+    history,
+    paper_tables,
+    proposal,
+    residual,
+    urdf_views,
+    validation,
+    weighing_views,
+)
 from daq.report.log import log_lines
 from daq.report.text import WholeTable
-from daq.workflow.prediction import RecentCurrent
+from daq.workflow.live_prediction import RecentCurrent
 from daq.workflow.validation import DataUse
 from daq.writeback.judgement import NOTHING
 from daq.writeback.request import GainChange
@@ -36,7 +47,7 @@ from ident.calibration import Gain
 from ident.data.conditioning import Conditioning
 from ident.data.torque_channel import TorqueSlope
 from ident.discovery.loop import Step
-from ident.estimators.comparison import ESTIMATORS, Comparison, EstimatorTrial
+from ident.estimators.comparison import ESTIMATORS, EstimatorComparison, EstimatorTrial
 from ident.estimators.estimate import RelativeError
 from tests.daq.calibrations import demo_calibration
 from tests.daq.histories import fill, ledger_in
@@ -75,7 +86,7 @@ def _scan(cell: Cell, _: Any) -> Iterator[RenderableType]:
         "enabled": True,
         "verdict": "belongs on right, in fault",
     }
-    yield bus.scan_table([{"bus": f"bus-{n % 2}", "node_id": 101 + n, "axis": AXES[n], **row} for n in range(14)])
+    yield bus_views.scan_table([{"bus": f"bus-{n % 2}", "node_id": 101 + n, "axis": AXES[n], **row} for n in range(14)])
 
 
 def _monitor(cell: Cell, _: Any) -> Iterator[RenderableType]:
@@ -96,13 +107,13 @@ def _monitor(cell: Cell, _: Any) -> Iterator[RenderableType]:
     axes = [{"axis": name, "position": -179.123 - n, **axis} for n, name in enumerate(AXES)]
     document = {"cell": "demo", "source": "asked", "recorder": False, "axes": axes, "notices": [], "buses": []}
     known = {"prediction": {"payload": "disc", "remark": ""}, "frames_per_s": 12345.0, "sync_hz": 1000.0}
-    yield bus.monitor_view({**document, **known})
+    yield bus_views.monitor_view({**document, **known})
 
 
 def _comparison(cell: Cell, _: Any) -> Iterable[RenderableType]:
     values = np.array([gain.value for gain in GAINS])
     trials = tuple(EstimatorTrial(name, 40.0, 20.0, values, np.full(14, 12.34), 123.45) for name in ESTIMATORS)
-    return fit.comparison_tables(Comparison(trials), AXES)
+    return fit.comparison_tables(EstimatorComparison(trials), AXES)
 
 
 def _turns(cell: Cell, _: Any) -> Iterator[RenderableType]:
@@ -155,7 +166,7 @@ def _weighed(cell: Cell, _: Any) -> Iterator[RenderableType]:
         identifiable=np.ones(10, dtype=bool),
     )
     found: Any = SimpleNamespace(cell=cell, body=body, declared_kg=12.3, bare=(), help=())
-    return weighing.weighed_view(found)
+    return weighing_views.weighed_view(found)
 
 
 def _contact(cell: Cell, _: Any) -> Iterator[RenderableType]:
@@ -175,7 +186,7 @@ def _contact(cell: Cell, _: Any) -> Iterator[RenderableType]:
         contacts=(contact,) * 20,
         time_s=np.arange(9.0),
     )
-    return weighing.contact_view(found, cell)
+    return weighing_views.contact_view(found, cell)
 
 
 def _urdf(cell: Cell, _: Any) -> Iterator[RenderableType]:
@@ -188,7 +199,7 @@ def _urdf(cell: Cell, _: Any) -> Iterator[RenderableType]:
     )
     robot: Any = SimpleNamespace(parameters=parameters, prior=SimpleNamespace(assumed=()))
     updated: Any = SimpleNamespace(links={axis: f"link-of-{axis}" for axis in AXES}, merged=())
-    return urdf.urdf_view(CALIBRATION, robot, dict.fromkeys(AXES, update), updated, None)
+    return urdf_views.urdf_view(CALIBRATION, robot, dict.fromkeys(AXES, update), updated, None)
 
 
 def _fleet(cell: Cell, _: Any) -> Iterator[RenderableType]:
@@ -215,9 +226,9 @@ def _paper(cell: Cell, _: Any) -> Iterator[RenderableType]:
 
 
 EXAMPLES: dict[str, Callable[[Cell, Any], Iterable[RenderableType]]] = {
-    "bus.monitor_view": _monitor,
-    "bus.prediction_view": _monitor,
-    "bus.scan_table": _scan,
+    "bus_views.monitor_view": _monitor,
+    "bus_views.prediction_view": _monitor,
+    "bus_views.scan_table": _scan,
     "fit.comparison_tables": _comparison,
     "fit.error_table": lambda _cell, _: [fit.error_table("Error", AXES, {"held out, before": ERROR})],
     "fleet_report.fleet_view": _fleet,
@@ -225,14 +236,14 @@ EXAMPLES: dict[str, Callable[[Cell, Any], Iterable[RenderableType]]] = {
     "gains.torque_table": lambda _cell, _: [gains.torque_table([TorqueSlope(-1250.0, 0.0123, 98765)] * 14, GAINS)],
     "history.axis_table": lambda _cell, known: [history.axis_table(known[1][3], known[2])],
     "history.calibration_table": lambda _cell, known: [history.calibration_table(*known)],
-    "history.gain_table": lambda _cell, known: [history.gain_table(known[1])],
+    "history.history_gain_table": lambda _cell, known: [history.history_gain_table(known[1])],
     "paper_tables.view": _paper,
     "proposal.change_table": _changes,
     "residual.turns_view": _turns,
-    "urdf.urdf_view": _urdf,
+    "urdf_views.urdf_view": _urdf,
     "validation.validation_view": _validation,
-    "weighing.contact_view": _contact,
-    "weighing.weighed_view": _weighed,
+    "weighing_views.contact_view": _contact,
+    "weighing_views.weighed_view": _weighed,
 }
 """One for each function that makes a table, by file and name."""
 

@@ -12,8 +12,8 @@ from daq.report.fit_schemas import VerdictEntry
 from daq.report.residual import _verdict, verdict_sentences
 from daq.workflow.fit import Fit, Undecided
 from ident.calibration import AcceptedEffect
+from ident.discovery.effect_verdict import EffectVerdict, Judgement
 from ident.discovery.error_change import ErrorChange, PairedChange
-from ident.discovery.verdict import Judgement, Verdict
 from ident.effects.effect import PlacedEffect
 from ident.effects.position import Spring
 from ident.estimators.estimate import RelativeError
@@ -22,13 +22,13 @@ AXES = ("J1", "J2")
 NO_CHANGE = ErrorChange(PairedChange(-1.0, 1.0, 9), (PairedChange(-1.0, 1.0, 9),) * 2, np.ones(2))
 
 
-def _judged(judgement: Judgement, *, written: bool) -> Verdict:
+def _judged(judgement: Judgement, *, written: bool) -> EffectVerdict:
     before = RelativeError((3.0, 4.0), 3.5)
     after = RelativeError((3.0, 3.9), 3.4)
-    return Verdict(PlacedEffect(Spring(), 1), judgement, "because", NO_CHANGE, before, after, written=written)
+    return EffectVerdict(PlacedEffect(Spring(), 1), judgement, "because", NO_CHANGE, before, after, written=written)
 
 
-def _said(verdict: Verdict) -> list[str]:
+def _said(verdict: EffectVerdict) -> list[str]:
     """The sentences of a fit, of which only the verdicts and the names of the axes count."""
     fitted = SimpleNamespace(steps=(SimpleNamespace(verdicts=(verdict,)),), cell=SimpleNamespace(place_names=AXES))
     return list(verdict_sentences(cast(Fit, fitted)))

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from daq.config.bus import answer_us, frame_bits
 from daq.config.cell import DEGREE, MILLIMETRE, joint_unit, model_of
+from daq.config.cell_buses import answer_us, frame_bits
 from daq.config.cell_file import load_cell
 from daq.config.cell_schema import gain_joints
 from daq.environment import shipped_configurations

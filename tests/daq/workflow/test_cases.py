@@ -18,7 +18,7 @@ from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.environment import shipped_configurations
 from daq.errors import LogsDiffer
 from daq.log.reader import LossyLogs
-from daq.report.paper_tables import condition_table, error_table, gain_table, mass_tables, parameter_table
+from daq.report.paper_tables import condition_table, mass_tables, paper_error_table, paper_gain_table, parameter_table
 from daq.workflow import fit as fit_module
 from daq.workflow import validate as validate_module
 from daq.workflow.cases import CASES, ReducedLogs, calibration_of_case, essential_fit, fit_case, reduce_logs
@@ -255,12 +255,12 @@ def test_the_tables_have_the_papers_form(calibrations: dict[str, Calibration], f
     assert rows["mx:a"][2] == "—"  # given in case 3
     assert rows["mx:a"][4] != "—"  # found in case 4
     assert rows["‖ρ‖/‖Y‖"][1].endswith(" %")
-    gains = gain_table(4, calibrations["case-3"], calibrations["case-4"], "IDIM-TLS")
+    gains = paper_gain_table(4, calibrations["case-3"], calibrations["case-4"], "IDIM-TLS")
     assert [row[:2] for row in gains.rows[:2]] == [("J1", "32.96"), ("J2", "32.96")]
     expected = np.mean([abs(gain.change_percent) for gain in calibrations["case-4"].gains])
     assert float(gains.rows[-1][-1]) == pytest.approx(expected, abs=0.006)
     assert len(condition_table(found).headings) == 1 + 5
-    errors = error_table(found)
+    errors = paper_error_table(found)
     assert len(errors.rows) == 3 * 6 + 1
     of_ml = [run.errors["ml"].axes for run in found.runs if run.errors]
     assert float(errors.rows[-1][errors.headings.index("ml")]) == pytest.approx(np.mean(of_ml), abs=0.006)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from daq.config.cell_file import load_cell
-from daq.documents.calibration_file import decode, encode
+from daq.documents.calibration_file import decode_calibration, encode_calibration
 from daq.environment import shipped_configurations
 from daq.report.validation import cross_document, validation_view
 from daq.workflow import fit as fit_module
@@ -131,4 +131,4 @@ def test_exchanged_currents_in_a_held_out_run_are_named(shelf: Shelf) -> None:
 def test_a_calibration_keeps_what_was_said_of_its_fit(shelf: Shelf) -> None:
     made = calibration_of(fit(FIT, method=Method.WLS), WHEN)
     assert {one.name for one in made.diagnoses} == {"estimators-disagree"}
-    assert decode(encode(made), "calibration.yaml").diagnoses == made.diagnoses
+    assert decode_calibration(encode_calibration(made), "calibration.yaml").diagnoses == made.diagnoses

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from daq.cli.app import main
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
-from daq.documents.calibration_file import as_document, decode, encode
+from daq.documents.calibration_file import as_document, decode_calibration, encode_calibration
 from daq.environment import shipped_configurations
 from daq.errors import ExitCode, UsageError
 from daq.log.conversion import load_run
@@ -143,7 +143,7 @@ def test_a_hold_out_is_distinguished_better_than_by_a_wrong_nameplate_and_no_wor
     ratio = held.total / nameplate.total
     assert (0.99 < ratio < 1.005) if nameplate_is_true else (ratio < 0.97)
     assert all(math.isfinite(axis) for axis in nameplate.axes)
-    assert decode(encode(found), "c.yaml") == found
+    assert decode_calibration(encode_calibration(found), "c.yaml") == found
     assert as_document(found)["nameplate_holdout_error_percent"] is not None
     assert found.recording_configuration_sha256 == cell.recording_digest
     assert _refused(found) == []
@@ -238,7 +238,7 @@ def test_a_delay_of_all_axes_is_predicted_from_the_file(with_effect: Fit) -> Non
     step = replace(first, accepted=replace(first.accepted, effect=TimeSkew(), axis=0), after=delayed)
     made = calibration_of(replace(with_effect, steps=(step,)), NOW)
     assert [effect.axis for effect in made.effects] == [ALL_AXES]
-    read, data = decode(encode(made), "c.yaml"), delayed.datasets[0]
+    read, data = decode_calibration(encode_calibration(made), "c.yaml"), delayed.datasets[0]
     torque = decimate_rows(data, delayed.conditioning, predict_torque(read, delayed.model, data).T)
     fitted = delayed.estimate.predicted_torque(delayed.training)[:, : torque.shape[1]]
     assert np.max(np.abs(torque - fitted)) < 1e-3 * np.max(np.abs(fitted))

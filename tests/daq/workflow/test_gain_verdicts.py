@@ -18,7 +18,7 @@ from daq.workflow import verdicts as verdicts_module
 from daq.workflow.fit import Fit, fit
 from daq.workflow.verdicts import gain_verdicts, needed_verdicts
 from ident.data.run import Run
-from ident.planning.verdict import GOOD_PERCENT, Verdict
+from ident.planning.gain_verdict import GOOD_PERCENT, Visibility
 from tests.ident.recordings import MOUNTED, record, tx40_truth
 
 
@@ -47,7 +47,7 @@ def test_the_deviations_are_the_fits_own_and_weak_gains_get_advice(fitted: Fit) 
     own = 100.0 * estimate.gains_std / np.abs(estimate.gains)
     assert [gain.std_percent for gain in found] == pytest.approx(own.tolist())
     assert (not needed_verdicts(fitted)) == bool(np.all(own <= GOOD_PERCENT))
-    weak = [gain for gain in found if gain.verdict is not Verdict.GOOD]
+    weak = [gain for gain in found if gain.verdict is not Visibility.GOOD]
     assert weak
     for gain in weak:
         assert gain.advice is not None

@@ -21,15 +21,15 @@ from daq.report.controller_schemas import CertificateReport
 from daq.report.text import json_text
 from daq.workflow import fit as fitting
 from daq.workflow.fit import Fit, calibration_of, fit, with_corrected_geometry
-from daq.workflow.geometry import calibrated_model, encoder_misfit_of, geometry_diagnoses
+from daq.workflow.geometry_diagnoses import calibrated_model, encoder_misfit_of, geometry_diagnoses
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.discovery.evidence import gather, with_effects
-from ident.discovery.geometry import evidence_with_geometry
+from ident.discovery.geometry_covariance import evidence_with_geometry
 from ident.effects.effect import PlacedEffect
 from ident.effects.position import Spring
 from ident.errors import ModelError
-from ident.estimators.geometry import GeometryEstimate, GeometryFinding
+from ident.estimators.geometry_estimate import GeometryEstimate, GeometryFinding
 from ident.model.closed_chain import positions, reach
 from ident.model.geometry import GeometryKind, GeometryParameter, described_length
 from tests.conftest import CHECKOUT

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
-from daq.config.clearance import Clearance
+from daq.config.workspace import Clearance
 from daq.errors import ConfigurationInconsistent, UsageError
 from daq.workflow.experiment import Experiment, experiment_of, paths_of
 from daq.workflow.plan import Plan, plan, slowed

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from daq.cli import main
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
-from daq.config.clearance import Clearance
+from daq.config.workspace import Clearance
 from daq.errors import ConfigurationInconsistent, ExitCode, SchemaMismatch
 from daq.report.plan_preview import find_preview
 from daq.workflow.plan import Plan, plan

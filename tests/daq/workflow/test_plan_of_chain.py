@@ -16,7 +16,7 @@ from daq.report.plan import plan_document, plan_text
 from daq.report.plan_preview import preview_page
 from daq.workflow.experiment import RUNS, Experiment, experiment_of, paths_of
 from daq.workflow.plan import Plan, plan
-from ident.planning.verdict import Hidden, verdicts
+from ident.planning.gain_verdict import Hidden, verdicts
 
 SECONDS = 12.0
 

@@ -11,7 +11,7 @@ import pytest
 from daq.config.cell import Cell, model_of
 from daq.config.cell_file import load_cell
 from daq.errors import LogsDiffer
-from daq.workflow.prediction import LEAST_S, RECENT_S, Predictor, Recent, Rows, predictor_of
+from daq.workflow.live_prediction import LEAST_S, RECENT_S, PredictedRows, Predictor, Recent, predictor_of
 from daq.workflow.validate import conditioning_of
 from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.data.dataset import differentiate
@@ -103,12 +103,12 @@ def test_nothing_is_predicted_at_standstill_and_a_gap_begins_anew(cell: Cell) ->
     assert (after.band > 0.0).all()
 
 
-def _rows(residual: float, seconds: float, motors: int = 2) -> Rows:
+def _rows(residual: float, seconds: float, motors: int = 2) -> PredictedRows:
     """Rows of one residual in the first motor, with a band of 1; the others rest."""
     count = round(50.0 * seconds)
     column = np.full((count, motors), np.nan)
     column[:, 0] = residual
-    return Rows(np.arange(count), 0.0 * column, column, np.ones(motors))
+    return PredictedRows(np.arange(count), 0.0 * column, column, np.ones(motors))
 
 
 def test_an_axis_is_judged_by_the_last_ten_seconds_in_which_it_moved() -> None:

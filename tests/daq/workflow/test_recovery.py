@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from daq.cli.failure import Failure
+from daq.cli.failure import ErrorParts
 from daq.config.cell_file import load_cell
 from daq.config.policy import Permission
 from daq.errors import ExitCode, exit_code
@@ -36,14 +36,14 @@ def permit(rig: Rig, **policy: str) -> None:
     rig.cell_file.write_text(f"{rig.cell_file.read_text()}\npolicy:\n{lines}")
 
 
-def refused(rig: Rig, *, unguarded: bool = True) -> Failure:
+def refused(rig: Rig, *, unguarded: bool = True) -> ErrorParts:
     """The recording is refused, and nothing had power."""
     with pytest.raises(MotionRefused) as caught:
         rig.run(unguarded=unguarded)
     assert not rig.out.exists()
     assert not any(node.powered_cycles for node in rig.bus.nodes)
     assert exit_code(type(caught.value)) == ExitCode.USAGE
-    return Failure.of(caught.value)
+    return ErrorParts.of(caught.value)
 
 
 def test_an_axis_beyond_its_limit_is_a_persons_business(outside: Rig) -> None:

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from daq.config.cell import Cell, model_of
 from daq.config.cell_file import load_cell
-from daq.documents.calibration_file import decode, encode
+from daq.documents.calibration_file import decode_calibration, encode_calibration
 from daq.workflow.remaining_corrections import on_cell, with_described
 from ident.calibration import AcceptedEffect, Calibration, Parameter
-from ident.effects.geometry import corrected_model, turn_between, turned_gravity
+from ident.effects.geometry_corrections import corrected_model, turn_between, turned_gravity
 from ident.prediction import corrections_of
 from tests.daq.calibrations import demo_calibration
 
@@ -83,7 +83,7 @@ def test_a_calibration_of_before_corrects_as_a_whole(cell: Cell) -> None:
 
 def test_what_was_described_is_kept_in_the_file(cell: Cell) -> None:
     known = with_described(_calibration(_zero(), _gravity()), cell)
-    read = decode(encode(known), "calibration.yaml")
+    read = decode_calibration(encode_calibration(known), "calibration.yaml")
     assert [one.described for one in read.effects] == [one.described for one in known.effects]
     assert known.effects[0].described == (cell.axes[1].zero_offset_rad,)
 

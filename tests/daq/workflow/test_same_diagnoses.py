@@ -18,7 +18,7 @@ from rich.console import Console
 from daq.cli.fit import say_after_fit
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
-from daq.documents.calibration_file import decode, encode
+from daq.documents.calibration_file import decode_calibration, encode_calibration
 from daq.log.reader import LossyLogs
 from daq.report.certificate import certify, without_controller
 from daq.report.certificate_page import certificate_page
@@ -211,7 +211,7 @@ def test_the_same_is_said_by_every_verb(
     assert said(fitted.diagnoses) == ({expected} if expected else set())
     assert texts(verbs["fit_logs"]()) == texts(fitted.diagnoses)
     assert said(verbs["residual"]()) == said(fitted.diagnoses)
-    calibration = decode(encode(calibration_of(fitted, WHEN)), "calibration.yaml")
+    calibration = decode_calibration(encode_calibration(calibration_of(fitted, WHEN)), "calibration.yaml")
     assert texts(calibration.diagnoses) == texts(fitted.diagnoses)
     for given in (logs, holdout, [*logs, *holdout]):
         assert texts(cross_validate({"one": calibration}, given).diagnoses) == texts(fitted.diagnoses)

@@ -20,7 +20,7 @@ from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.errors import ExitCode
 from daq.report.fit_schemas import WeighReport
 from daq.report.text import json_text
-from daq.report.weighing import contact_document, contact_view, weighed_document, weighed_view
+from daq.report.weighing_views import contact_document, contact_view, weighed_document, weighed_view
 from daq.workflow.validate import warn_of_fitted
 from daq.workflow.weigh import Weighed
 from ident.calibration import AcceptedEffect, Parameter

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
 from daq.errors import ControllerUnfit
-from daq.formats.document import decode
+from daq.formats.document import decode_document
 from daq.formats.scalar import spell
 from daq.formats.yaml_document import YamlDocument
 from daq.ledger.audit import AuditAction, read
@@ -99,7 +99,7 @@ def test_only_the_numbers_meant_change(case: _Case, data: st.DataObject) -> None
             max_size=len(case.keys),
         )
     )
-    file = decode(case.text(case.numbers).encode(), "robot.yaml")
+    file = decode_document(case.text(case.numbers).encode(), "robot.yaml")
     found = file.locate(case.keys)
     assert [scalar.text for scalar in found] == list(case.numbers)
     assert [scalar.value for scalar in found] == [float(number) for number in case.numbers]
@@ -242,7 +242,7 @@ def test_what_is_written_for_a_tagged_number_is_a_number_to_both_readers(text: s
 
 def test_bytes_that_are_no_utf8_are_refused() -> None:
     with pytest.raises(ControllerUnfit, match="byte 5 that is not UTF-8"):
-        decode(b"a: 1 \xff", "robot.yaml")
+        decode_document(b"a: 1 \xff", "robot.yaml")
 
 
 @pytest.mark.parametrize(

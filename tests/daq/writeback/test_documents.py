@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from daq.config.controller import ControllerFormat
 from daq.errors import ControllerUnfit
 from daq.formats.dcf_document import DcfDocument
-from daq.formats.document import FORMATS, MAX_BYTES, decode, format_of, read_bytes
+from daq.formats.document import FORMATS, MAX_BYTES, decode_document, format_of, read_controller_file
 from daq.formats.json_document import JsonDocument
 from daq.formats.scalar import ControllerDocument, rewrite_gain
 from daq.formats.xml_document import XmlDocument
@@ -199,7 +199,7 @@ def _dcf_tree(content: bytes) -> object:
 @given(data=st.data())
 def test_only_the_numbers_meant_change(kind: ControllerFormat, data: st.DataObject) -> None:
     case = data.draw(CASES[kind])
-    document = decode(case.content(case.numbers), "robot", kind)
+    document = decode_document(case.content(case.numbers), "robot", kind)
     assert document.content == case.content(case.numbers)
     found = document.locate(case.keys)
     assert [scalar.text for scalar in found] == list(case.numbers)
@@ -216,7 +216,7 @@ def test_only_the_numbers_meant_change(kind: ControllerFormat, data: st.DataObje
     assert changed.content == case.content(spelt)
     assert [scalar.text for scalar in changed.locate(case.keys)] == list(spelt)
     assert document.with_values({}).content == document.content
-    decode(changed.content, "robot", kind).check_against(document, spelling)
+    decode_document(changed.content, "robot", kind).check_against(document, spelling)
 
 
 @pytest.mark.parametrize(
@@ -235,7 +235,7 @@ def test_another_reader_sees_the_new_numbers_and_nothing_else_new(
 ) -> None:
     """The readers are none of those with which the document proves itself, and know nothing of its keys."""
     case = data.draw(cases)
-    document = decode(case.content(case.numbers), "robot", kind)
+    document = decode_document(case.content(case.numbers), "robot", kind)
     marks = tuple(str(70000 + i) for i in range(len(case.keys)))
     changed = document.with_values(dict(zip(case.keys, marks, strict=True)))
     seen, expected = repr(tree(changed.content)), repr(tree(document.content))
@@ -245,7 +245,7 @@ def test_another_reader_sees_the_new_numbers_and_nothing_else_new(
         assert seen != expected
     # Each mark put back to a common blank, and the old numbers too, the two are the same.
     blank = case.content(tuple("70000" for _ in marks))
-    assert tree(decode(blank, "robot", kind).content) == tree(
+    assert tree(decode_document(blank, "robot", kind).content) == tree(
         changed.with_values(dict.fromkeys(case.keys, "70000")).content
     )
 
@@ -255,13 +255,13 @@ def test_another_reader_sees_the_new_numbers_and_nothing_else_new(
 @given(data=st.data())
 def test_any_other_difference_is_found(kind: ControllerFormat, data: st.DataObject) -> None:
     case = data.draw(CASES[kind].filter(lambda case: bool(case.keys)))
-    document = decode(case.content(case.numbers), "robot", kind)
+    document = decode_document(case.content(case.numbers), "robot", kind)
     spelling = dict.fromkeys(case.keys, "7000")
     content = document.with_values(spelling).content
     at = data.draw(st.integers(0, len(content) - 1))
     other = bytes([data.draw(st.integers(1, 126).filter(lambda byte: byte != content[at]))])
     with pytest.raises(ControllerUnfit):
-        decode(content[:at] + other + content[at + 1 :], "robot", kind).check_against(document, spelling)
+        decode_document(content[:at] + other + content[at + 1 :], "robot", kind).check_against(document, spelling)
 
 
 @pytest.mark.parametrize("kind", list(ControllerFormat), ids=lambda kind: kind.value)
@@ -271,7 +271,7 @@ def test_any_other_difference_is_found(kind: ControllerFormat, data: st.DataObje
 )
 def test_whatever_is_in_the_file_it_is_refused_in_words(kind: ControllerFormat, begin: bytes, noise: bytes) -> None:
     with pytest.raises(ControllerUnfit, match=r"nothing was written|is this the right file"):
-        decode(begin + noise, "robot", kind).locate(("6076.nowhere",))
+        decode_document(begin + noise, "robot", kind).locate(("6076.nowhere",))
 
 
 @pytest.mark.parametrize(
@@ -350,13 +350,13 @@ def test_a_number_in_xml_that_cannot_be_changed_alone_is_refused(text: str, key:
 )
 def test_xml_that_is_not_safe_or_none_is_refused(content: bytes, says: str) -> None:
     with pytest.raises(ControllerUnfit) as caught:
-        decode(content, "robot.xml")
+        decode_document(content, "robot.xml")
     assert says in str(caught.value)
 
 
 def test_deep_and_wide_xml_takes_no_recursion() -> None:
     deep = b"<R><G>1.5</G>" + b"<a>" * 20_000 + b"</a>" * 20_000 + b"<b/>" * 20_000 + b"</R>"
-    assert b"<G>2.5000</G>" in decode(deep, "robot.xml").with_values({"R/G": "2.5000"}).content
+    assert b"<G>2.5000</G>" in decode_document(deep, "robot.xml").with_values({"R/G": "2.5000"}).content
 
 
 _DCF = """\
@@ -552,7 +552,7 @@ def test_the_same_number_stays_as_the_human_wrote_it() -> None:
 @pytest.mark.parametrize("name", ["Elmo_cob.dcf", "ElmoSimplIQ_cob.dcf", "Schunk_0_63_cob.dcf", "pilz_prbt_0_1.dcf"])
 def test_a_real_device_configuration_changes_in_one_number_alone(shared_data: Path, name: str) -> None:
     content = (shared_data / "eds" / name).read_bytes()
-    document = decode(content, name)
+    document = decode_document(content, name)
     heartbeat = "1017"
     (scalar,) = document.locate((heartbeat,))
     changed = document.with_values({heartbeat: "123"}).content
@@ -563,7 +563,7 @@ def test_a_real_device_configuration_changes_in_one_number_alone(shared_data: Pa
 
 @pytest.mark.parametrize("name", ["maxon_epos4.eds", "ros2_canopen_cia402_slave.eds"])
 def test_a_real_data_sheet_has_no_value_to_change(shared_data: Path, name: str) -> None:
-    document = decode((shared_data / "eds" / name).read_bytes(), name)
+    document = decode_document((shared_data / "eds" / name).read_bytes(), name)
     with pytest.raises(ControllerUnfit, match="without ParameterValue"):
         document.locate(("1017",))
 
@@ -593,7 +593,10 @@ def test_every_format_has_a_reader_and_suffixes_of_its_own() -> None:
 
 
 def test_the_configuration_may_give_the_format_instead() -> None:
-    kinds: list[ControllerDocument] = [decode(b"<a/>", "a.cfg", ControllerFormat.XML), decode(b"a: 1", "a.cfg")]
+    kinds: list[ControllerDocument] = [
+        decode_document(b"<a/>", "a.cfg", ControllerFormat.XML),
+        decode_document(b"a: 1", "a.cfg"),
+    ]
     assert [type(kind) for kind in kinds] == [XmlDocument, YamlDocument]
 
 
@@ -611,8 +614,8 @@ def test_only_a_regular_file_of_bounded_size_is_read(tmp_path: Path) -> None:
         (tmp_path / "none", "no such file"),
     ):
         with pytest.raises(ControllerUnfit, match=says):
-            read_bytes(path)
+            read_controller_file(path)
     link = tmp_path / "link.yaml"
     link.symlink_to(tmp_path / "there.yaml")
     (tmp_path / "there.yaml").write_bytes(b"a: 1\n")
-    assert read_bytes(link) == b"a: 1\n"
+    assert read_controller_file(link) == b"a: 1\n"

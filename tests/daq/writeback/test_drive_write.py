@@ -407,7 +407,7 @@ def test_a_drive_that_still_waits_for_a_recorder_is_not_saved(
 def test_a_save_of_which_nothing_is_known_is_refused_unless_asked_for(address: BusAddress, tmp_path: Path) -> None:
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation:
-        with pytest.raises(ParameterRefused, match=r"J1 \(node 1\): .*--ram-only.*--save-unknown"):
+        with pytest.raises(ParameterRefused, match=r"J1 \(node 1\): .*`Saving\.RAM`.*`Saving\.ANY`"):
             _write(cell, address, mapping=Mapping.UNKNOWN)
         assert _gains(simulation) == IN_DRIVES
         assert all(change.saved for change in _write(cell, address, Saving.ANY, Mapping.UNKNOWN).parameters)

@@ -16,7 +16,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.config.cell_schema import PolicyModel
 from daq.config.policy import AppliedBy, ApplyPolicy, HoldOut
-from daq.documents.calibration_file import encode
+from daq.documents.calibration_file import encode_calibration
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, exit_code
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, read
@@ -54,7 +54,7 @@ class Scene:
 
     def propose(self) -> Proposal[FileEdit]:
         """Sign, and work out the change."""
-        content = encode(self.calibration)
+        content = encode_calibration(self.calibration)
         if self.file is not None:
             self.file.write_bytes(content)
             for name in self.signed:

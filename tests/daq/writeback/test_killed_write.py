@@ -23,8 +23,8 @@ from pathlib import Path
 
 import pytest
 
-from daq.documents.calibration_file import encode
-from daq.formats.document import decode
+from daq.documents.calibration_file import encode_calibration
+from daq.formats.document import decode_document
 from daq.ledger.audit import AuditAction, AuditVerdict, Content, verify
 from daq.writeback.file_access import backups
 from daq.writeback.file_target import FileTarget
@@ -56,7 +56,7 @@ def _request(gain: float) -> Request:
         holdout_error_percent=RelativeError((3.2,), 3.2),
         nameplate_holdout_error_percent=RelativeError((4.2,), 4.2),
     )
-    return Request(calibration, NOW, content=encode(calibration))
+    return Request(calibration, NOW, content=encode_calibration(calibration))
 
 
 State = frozenset[tuple[str, int, bytes]]
@@ -241,7 +241,7 @@ def _check(place: Place, before: bytes | None, after: bytes | None) -> Content:
     content = place.content()
     assert content in {before, after}
     if content is not None:
-        decode(content, "x.yaml").locate(tuple(KEYS.values()))
+        decode_document(content, "x.yaml").locate(tuple(KEYS.values()))
         assert stat.S_IMODE(place.file.stat().st_mode) == 0o640
     verdict = verify(place.audit)
     assert verdict.holds

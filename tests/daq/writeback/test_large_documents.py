@@ -10,7 +10,7 @@ from daq.config.yaml_file import MAX_BYTES as MAX_CELL_BYTES
 from daq.config.yaml_file import parse_yaml
 from daq.errors import ControllerUnfit, YamlInvalid
 from daq.formats import yaml_document as limits
-from daq.formats.document import decode
+from daq.formats.document import decode_document
 
 GAIN = "drives: {J1: {gain: 32.96}}\n"
 LARGE = {
@@ -25,13 +25,13 @@ LARGE = {
 def test_yaml_that_would_take_minutes_is_refused_at_once(text: str) -> None:
     began = time.process_time()
     with pytest.raises(ControllerUnfit, match="nothing was written"):
-        decode(text.encode(), "controller.yaml").locate(("drives.J1.gain",))
+        decode_document(text.encode(), "controller.yaml").locate(("drives.J1.gain",))
     assert time.process_time() - began < 2.0
 
 
 def test_yaml_within_the_bounds_is_read_and_rewritten() -> None:
     text = GAIN + "more:\n" + "- 1.5\n" * 5000 + "# a comment\n" * 10_000
-    document = decode(text.encode(), "controller.yaml")
+    document = decode_document(text.encode(), "controller.yaml")
     assert document.with_values({"drives.J1.gain": "33.1"}).text == text.replace("32.96", "33.1")
 
 

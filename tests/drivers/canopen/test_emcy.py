@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canopen.emcy import CODES, describe, remedy_of
+from drivers.canopen.emcy import CODES, describe_error_code, remedy_of
 
 
 @pytest.mark.parametrize(
@@ -23,13 +23,13 @@ from drivers.canopen.emcy import CODES, describe, remedy_of
     ],
 )
 def test_a_code_has_the_text_of_its_standard_or_of_its_class(code: int, text: str) -> None:
-    assert describe(code) == text
+    assert describe_error_code(code) == text
 
 
 @given(st.integers(0, 0xFFFF))
 def test_every_code_says_something(code: int) -> None:
-    assert describe(code)
-    assert (describe(code) == CODES.get(code)) == (code in CODES)
+    assert describe_error_code(code)
+    assert (describe_error_code(code) == CODES.get(code)) == (code in CODES)
 
 
 def test_every_code_has_a_remedy_of_its_class() -> None:
@@ -37,4 +37,4 @@ def test_every_code_has_a_remedy_of_its_class() -> None:
     assert remedy_of(0x8611).startswith("check brake, load and collision")
     assert remedy_of(0x8130).startswith("check the bus's cable")
     assert remedy_of(0xFF01).startswith("see the drive's manual")
-    assert all("--reset-faults" in remedy_of(code) for code in CODES)
+    assert all("`CanopenNetwork.reset_faults`" in remedy_of(code) for code in CODES)

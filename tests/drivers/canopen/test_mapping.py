@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canopen.pdo import SETPOINT_PDOS, Direction, layout, pack, records, word
+from drivers.canopen.pdo import SETPOINT_PDOS, Direction, pack, record_struct, records, word
 from drivers.profiles.profile import ObjectEntry
 
 entries = st.builds(
@@ -44,7 +44,7 @@ def test_layout_decodes_what_a_drive_would_send(objects: list[ObjectEntry], data
             value.to_bytes(entry.bits // 8, "little", signed=entry.signed)
             for value, entry in zip(values, pdo, strict=True)
         )
-        assert list(layout(pdo).unpack(payload)) == values
+        assert list(record_struct(pdo).unpack(payload)) == values
 
 
 def test_what_cannot_be_packed_is_refused() -> None:

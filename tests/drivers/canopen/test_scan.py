@@ -12,7 +12,7 @@ import pytest
 
 from drivers.canopen.link import Link
 from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.scan import SCAN_S, scan, scan_link
+from drivers.canopen.node_scan import SCAN_S, scan, scan_link
 from drivers.errors import BusBusy, DriveFault, ObjectAccessError, SetupRefused
 from drivers.profiles.profile import ObjectEntry
 from drivers.stream.stream import SyncStream
@@ -266,7 +266,7 @@ def test_a_scan_beside_another_master_sends_nothing(name: str) -> None:
 
 def test_the_scan_of_the_library_beside_another_master_sends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     network, bus = cell(2)
-    monkeypatch.setattr("drivers.canopen.scan.Link", lambda *_: network.link)
+    monkeypatch.setattr("drivers.canopen.node_scan.Link", lambda *_: network.link)
     bus.inject(sync())
     with pytest.raises(BusBusy, match="a SYNC"):
         scan("virtual:scripted")

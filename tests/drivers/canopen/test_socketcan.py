@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.canopen.bus import BusAddress
-from drivers.canopen.capture import RECORD, Capture, DropCounter, Kind, MonotonicTime
+from drivers.canopen.capture import RECORD, Capture, DropCounter, MonotonicTime, RecordKind
 from drivers.canopen.link import SYNC_COB_ID, Link
 from drivers.canopen.sdo import SdoPolicy
 from drivers.canopen.socketcan import (
@@ -50,7 +50,7 @@ records = st.tuples(
     u64,
     u64,
     st.integers(0, 2**32 - 1),
-    st.sampled_from(Kind).map(int),
+    st.sampled_from(RecordKind).map(int),
     st.integers(0, 8),
     st.booleans(),
     st.booleans(),
@@ -204,7 +204,7 @@ def test_a_full_backlog_is_counted_to_the_frame() -> None:
             except BlockingIOError:
                 break
         reported = list(RECORD.iter_unpack(chunks))
-        got = sum(kind == Kind.FRAME for *_, kind, _length, _own, _local, _data in reported)
+        got = sum(kind == RecordKind.FRAME for *_, kind, _length, _own, _local, _data in reported)
         assert got < sent
         lost = [backlog_dropped for _, _, _, _, backlog_dropped, *_ in reported]
         assert got + lost[-1] == sent

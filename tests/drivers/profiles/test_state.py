@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.profiles.cia402 import FAULT_RESET_SEQUENCE, POWERLESS, Command, Goal, State, decode, next_command
+from drivers.profiles.cia402 import FAULT_RESET_SEQUENCE, POWERLESS, ControlCommand, Goal, State, decode, next_command
 
 STATES = tuple(state for state in State if state is not State.UNKNOWN)
 
@@ -84,7 +84,7 @@ def test_every_way_ends_at_its_goal(state: State, goal: Goal) -> None:
 def test_a_state_that_the_standard_does_not_name_is_not_known_to_be_without_power() -> None:
     state = decode(0x0001)
     assert state not in POWERLESS
-    assert next_command(state, Goal.QUICK_STOP) is Command.DISABLE_VOLTAGE
+    assert next_command(state, Goal.QUICK_STOP) is ControlCommand.DISABLE_VOLTAGE
 
 
 def test_a_fault_reset_ends_without_power() -> None:
@@ -92,4 +92,4 @@ def test_a_fault_reset_ends_without_power() -> None:
     for command in FAULT_RESET_SEQUENCE:
         state = transition(state, command)
     assert state is State.SWITCH_ON_DISABLED
-    assert FAULT_RESET_SEQUENCE[0] & Command.FAULT_RESET == 0  # otherwise there is no rising edge
+    assert FAULT_RESET_SEQUENCE[0] & ControlCommand.FAULT_RESET == 0  # otherwise there is no rising edge

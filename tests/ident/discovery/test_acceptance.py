@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from ident.data.dataset import Dataset
 from ident.discovery import acceptance
 from ident.discovery.acceptance import accept_on_holdout, compare_on_holdout
+from ident.discovery.effect_verdict import EffectVerdict, Judgement
 from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.loop import Step
 from ident.discovery.search import Finding
-from ident.discovery.verdict import Judgement, Verdict
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import AsymmetricViscous, Stribeck
 from ident.effects.position import Spring
@@ -69,7 +69,7 @@ def _steps(start: Evidence, effects: tuple[PlacedEffect, ...]) -> tuple[Step, ..
     return (*turns, Step((), (), np.zeros(3), None, after))
 
 
-def _by_place(step: Step) -> dict[PlacedEffect, Verdict]:
+def _by_place(step: Step) -> dict[PlacedEffect, EffectVerdict]:
     return {verdict.placed: verdict for verdict in step.verdicts}
 
 
@@ -134,7 +134,7 @@ def test_effects_that_are_no_better_together_than_none_are_not_written(
 ) -> None:
     """Even where no single one was refuted: here because the judge was bribed."""
     start = _planted(small, small_truth, _only_in(("run0", "run1", "run2"), _asymmetric))
-    monkeypatch.setattr(acceptance, "judge", lambda *_: (Judgement.CONFIRMED, "bribed"))
+    monkeypatch.setattr(acceptance, "judge_change", lambda *_: (Judgement.CONFIRMED, "bribed"))
     (*_, last) = accept_on_holdout(start, _steps(start, (ASYMMETRIC,)), axes=NAMES)
     assert last.after.effects == ()
     (verdict,) = last.verdicts

@@ -25,7 +25,7 @@ from ident.discovery.before_after import (
 )
 from ident.discovery.evidence import Evidence, gather, with_effects, without_effects
 from ident.discovery.loop import Step
-from ident.discovery.noise_floor import FloorSource, NoiseFloor
+from ident.discovery.noise_floor import FloorSource, MotorNoiseFloor
 from ident.effects.effect import PlacedEffect
 from ident.effects.electrical import Saturation
 from ident.effects.position import Spring
@@ -227,7 +227,7 @@ def test_a_left_out_run_is_predicted_by_the_others_alone(
 
 
 def test_the_noise_floor_is_relative_to_the_same_currents(start: Evidence) -> None:
-    floors = (NoiseFloor(0.05, FloorSource.STANDSTILL, 20, 100.0),) * 5 + (None,)
+    floors = (MotorNoiseFloor(0.05, FloorSource.STANDSTILL, 20, 100.0),) * 5 + (None,)
     error = floor_on(start.training, start.estimate, floors).relative(start.estimate.gains)
     used = start.training.motor_use[0]
     rms_a = np.sqrt(np.mean(start.training.current[0, used] ** 2))
@@ -239,7 +239,7 @@ def test_the_noise_floor_is_relative_to_the_same_currents(start: Evidence) -> No
 def test_a_refuted_floor_bounds_no_error(start: Evidence, after: Evidence, monkeypatch: pytest.MonkeyPatch) -> None:
     left_a = left_on(after.training, after.estimate)
     factors = np.array([0.9, 1.1, 2.0, 0.9, 1.1, 2.0])  # of what the model leaves; these floors are known to 9 %
-    floors = tuple(NoiseFloor(float(noise_a), FloorSource.STANDSTILL, 20, 100.0) for noise_a in factors * left_a)
+    floors = tuple(MotorNoiseFloor(float(noise_a), FloorSource.STANDSTILL, 20, 100.0) for noise_a in factors * left_a)
     monkeypatch.setattr(before_after_module, "noise_floors", lambda *_: floors)
     made = account(start, [Step((), (), np.zeros(6), None, after)])
     assert made.floors == floors
@@ -257,7 +257,7 @@ def test_no_floor_exceeds_the_error_on_the_same_rows(
     """The floors are a tenth above what the model leaves, and known to 9 %: the model is at the floor."""
     left_a = left_on(after.training, after.estimate)
     floors = tuple(
-        NoiseFloor(1.1 * float(left), FloorSource.REPEATED_MOVES, 20, 100.0, is_bound=True) for left in left_a
+        MotorNoiseFloor(1.1 * float(left), FloorSource.REPEATED_MOVES, 20, 100.0, is_bound=True) for left in left_a
     )
     monkeypatch.setattr(before_after_module, "noise_floors", lambda *_: floors)
     made = account(start, [Step((), (), np.zeros(6), None, after)])

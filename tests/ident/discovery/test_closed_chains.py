@@ -18,7 +18,7 @@ from ident.discovery.candidates import prepare_search
 from ident.discovery.evidence import gather, with_effects
 from ident.discovery.gates import own_unknowns, without_effects_of
 from ident.discovery.loop import find_effects
-from ident.discovery.noise_floor import FloorSource, NoiseFloor
+from ident.discovery.noise_floor import FloorSource, MotorNoiseFloor
 from ident.effects.effect import PlacedEffect
 from ident.effects.position import Spring
 from ident.equations.rows import row_filter, row_masks
@@ -147,7 +147,7 @@ def test_internal_preload_is_no_error() -> None:
     assert 0.8 * errors.cross_validated.total < errors.in_sample.total < errors.cross_validated.total
     # e shows three of four shares of the noise: what it leaves, divided by these, is the noise of the currents.
     assert left_on(rows, estimate) == pytest.approx(estimate.axis_noise, rel=0.02)
-    floors = [NoiseFloor(float(noise), FloorSource.STANDSTILL, 20, 1e4) for noise in estimate.axis_noise]
+    floors = [MotorNoiseFloor(float(noise), FloorSource.STANDSTILL, 20, 1e4) for noise in estimate.axis_noise]
     floor = floor_on(rows, estimate, floors).relative(estimate.gains)
     assert floor.axes == pytest.approx(errors.in_sample.axes, rel=0.02)
     search_problem = search_problem_of(evidence)

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from ident.discovery.effect_verdict import Judgement, judge_change
 from ident.discovery.error_change import (
     FEWEST_BLOCKS,
     ErrorChange,
@@ -16,7 +17,6 @@ from ident.discovery.error_change import (
     compare_by_block,
     compare_by_move,
 )
-from ident.discovery.verdict import Judgement, judge
 
 FloatArray = NDArray[np.float64]
 ROWS = 20  #: Of a move
@@ -36,7 +36,7 @@ def _change(by_move: FloatArray, level: float = 1.0) -> ErrorChange:
 
 def test_a_fall_that_is_more_than_noise_is_confirmed() -> None:
     change = _change(np.random.default_rng(0).normal(-5.0, 3.0, (20, MOTORS)))
-    assert judge(change)[0] is Judgement.CONFIRMED
+    assert judge_change(change)[0] is Judgement.CONFIRMED
 
 
 def test_a_fall_of_the_motor_that_the_effect_names_is_a_fall() -> None:
@@ -45,9 +45,9 @@ def test_a_fall_of_the_motor_that_the_effect_names_is_a_fall() -> None:
     by_move[:, 1:] -= by_move[:, 1:].mean(axis=0) - 0.01
     by_move[:, 0] = np.random.default_rng(8).normal(-0.5, 0.5, 20)
     change = _change(by_move)
-    assert judge(change)[0] is Judgement.UNDECIDED
-    assert judge(change, 0)[0] is Judgement.CONFIRMED
-    assert judge(change, 1)[0] is Judgement.UNDECIDED
+    assert judge_change(change)[0] is Judgement.UNDECIDED
+    assert judge_change(change, 0)[0] is Judgement.CONFIRMED
+    assert judge_change(change, 1)[0] is Judgement.UNDECIDED
 
 
 def test_a_fall_in_all_blocks_but_one_is_a_fall() -> None:
@@ -95,7 +95,7 @@ def test_noise_falls_once_in_twenty_also_with_heavy_tails(freedom: int) -> None:
 def test_noise_is_confirmed_once_in_ten_at_most() -> None:
     """The total and the motor that an effect names are judged at half the level each, by means that mostly agree."""
     rng = np.random.default_rng(12)
-    found = [judge(_change(rng.normal(0.0, 0.05, (8, MOTORS))), 0)[0] for _ in range(600)]
+    found = [judge_change(_change(rng.normal(0.0, 0.05, (8, MOTORS))), 0)[0] for _ in range(600)]
     assert 0.02 <= np.mean([judgement is Judgement.CONFIRMED for judgement in found]) <= 0.10
 
 
@@ -109,7 +109,7 @@ def test_joined_blocks_are_enough_to_judge_by() -> None:
 
 def test_a_rise_that_is_more_than_noise_is_refuted() -> None:
     change = _change(np.random.default_rng(0).normal(5.0, 3.0, (20, MOTORS)))
-    judgement, reason = judge(change)
+    judgement, reason = judge_change(change)
     assert judgement is Judgement.REFUTED
     assert "rises by" in reason
 
@@ -117,12 +117,12 @@ def test_a_rise_that_is_more_than_noise_is_refuted() -> None:
 def test_harm_on_another_motor_refutes_what_helps_in_total() -> None:
     by_move = np.random.default_rng(1).normal(0.0, 1.0, (20, MOTORS))
     by_move[:, 0] -= 10.0
-    assert judge(_change(by_move))[0] is Judgement.CONFIRMED
+    assert judge_change(_change(by_move))[0] is Judgement.CONFIRMED
     by_move[:, 2] += 3.0
     change = _change(by_move)
     assert change.total.rise < 0.0
     assert change.worse_motors == (2,)
-    judgement, reason = judge(change)
+    judgement, reason = judge_change(change)
     assert judgement is Judgement.REFUTED
     assert "motor 3" in reason
 
@@ -134,13 +134,13 @@ def test_a_rise_below_a_hundredth_of_the_error_refutes_nothing() -> None:
     assert change.total.is_rise
     assert not change.is_rise
     assert change.worse_motors == ()
-    assert judge(change)[0] is Judgement.UNDECIDED
+    assert judge_change(change)[0] is Judgement.UNDECIDED
 
 
 @pytest.mark.parametrize("rise", [-8.0, 60.0])
 def test_two_moves_confirm_nothing_and_let_no_doubled_error_pass(rise: float) -> None:
     by_move = np.full((2, MOTORS), rise) + np.array([[0.0], [0.1]])
-    judgement, reason = judge(_change(by_move))
+    judgement, reason = judge_change(_change(by_move))
     assert judgement is Judgement.UNDECIDED
     assert "2 independent blocks" in reason
 
@@ -152,7 +152,7 @@ def test_a_motor_that_may_be_much_worse_is_not_confirmed() -> None:
     by_move[:2, 1] = 80.0, 30.0
     change = _change(by_move)
     assert change.worse_motors == ()
-    judgement, reason = judge(change, 0)
+    judgement, reason = judge_change(change, 0)
     assert judgement is Judgement.UNDECIDED
     assert "motor 2" in reason
 
@@ -196,4 +196,4 @@ def test_a_change_is_no_rise_and_fall_at_once(rise: float, std: float, moves: in
 def test_one_block_that_outweighs_the_others_is_no_proof() -> None:
     by_move = np.zeros((FEWEST_BLOCKS * 4, MOTORS))
     by_move[3] = -100.0
-    assert judge(_change(by_move, 100.0))[0] is Judgement.UNDECIDED
+    assert judge_change(_change(by_move, 100.0))[0] is Judgement.UNDECIDED

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial, score_candidates
+from ident.discovery.candidates import CandidateTrial, FamilyTrials, SearchProblem, score_candidates
 from ident.discovery.evidence import Evidence
 from ident.discovery.few_moves import FEW_MOVES, FEWEST_MOVES, LEVERAGE, RECORD, moves_behind
 from ident.discovery.gates import Gates
@@ -58,7 +58,7 @@ def _column(rng: np.random.Generator, large: int, others: float) -> FloatArray:
     return np.asarray(np.repeat(size, ROWS) * rng.normal(size=MOVES * ROWS))
 
 
-def _trial(rng: np.random.Generator, coefficient: float, *, large: int, others: float) -> Trial:
+def _trial(rng: np.random.Generator, coefficient: float, *, large: int, others: float) -> CandidateTrial:
     column = _column(rng, large, others)
     folds = _folds(rng, coefficient * column)
     sorted_column = column[folds.linearisation.source, None]
@@ -67,7 +67,7 @@ def _trial(rng: np.random.Generator, coefficient: float, *, large: int, others: 
     return trial
 
 
-def _judged(problem: SearchProblem, *trials: Trial) -> list[Finding]:
+def _judged(problem: SearchProblem, *trials: CandidateTrial) -> list[Finding]:
     """Findings of a saturation in the order of the trials, which are given the shapes of a robot with three motors."""
     shaped = [replace(one, held_out=np.zeros((8, 3)), fallen=np.ones(3)) for one in trials]
     families = [FamilyTrials(0, ((Saturation(), one),)) for one in shaped]

@@ -17,7 +17,7 @@ from ident.discovery.gates import Gates
 from ident.discovery.geometry_check import GeometryCheck, check_geometry
 from ident.discovery.loop import Step, find_effects
 from ident.effects.effect import PlacedEffect
-from ident.effects.geometry import GravityDirection, LatePosition, ZeroOffset, rotation_by
+from ident.effects.geometry_corrections import GravityDirection, LatePosition, ZeroOffset, rotation_by
 from ident.model.model import Model
 from ident.prediction import predict_current
 from ident.weighing import weigh

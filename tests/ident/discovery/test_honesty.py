@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, Trial, score_candidates
+from ident.discovery.candidates import CandidateTrial, ColumnCache, FamilyTrials, SearchProblem, score_candidates
 from ident.discovery.evidence import Evidence
 from ident.discovery.gates import Gates
 from ident.discovery.search import rank_effects, rank_families
@@ -186,14 +186,14 @@ def test_a_family_known_from_another_axis_competes_with_its_own_name(small: Evid
     assert sum(related[key] for key in plain) < sum(plain.values())
 
 
-def _noise_trial(rng: np.random.Generator, moves: int, columns: int, rows: int = 8) -> Trial:
+def _noise_trial(rng: np.random.Generator, moves: int, columns: int, rows: int = 8) -> CandidateTrial:
     """A candidate on noise alone, in moves of different loudness."""
     x = rng.normal(size=(moves, rows, columns)) * rng.uniform(0.5, 2.0, size=(moves, 1, 1))
     e = rng.normal(size=(moves, rows)) + 0.7 * rng.normal(size=(moves, 1))
     gram = np.einsum("mra,mrb->mab", x, x)
     score = np.einsum("mra,mr->ma", x, e)
     coefficients = np.linalg.solve(gram.sum(axis=0), score.sum(axis=0))
-    return Trial(
+    return CandidateTrial(
         coefficients=coefficients,
         fallen=np.array([float(score.sum(axis=0) @ coefficients)]),
         training_fall=np.zeros(8),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ident.data.conditioning import decimator
 from ident.data.dataset import Dataset, differentiate
-from ident.discovery.noise_floor import FloorSource, NoiseFloor, noise_floors
+from ident.discovery.noise_floor import FloorSource, MotorNoiseFloor, noise_floors
 from tests.ident.recordings import CONDITIONING, MOUNTED, Truth, record
 
 FloatArray = NDArray[np.float64]
@@ -73,7 +73,7 @@ def repeated(small_truth: Truth) -> tuple[Dataset, ...]:
     return tuple(run(number) for number in range(3))
 
 
-def _all(floors: tuple[NoiseFloor | None, ...]) -> tuple[NoiseFloor, ...]:
+def _all(floors: tuple[MotorNoiseFloor | None, ...]) -> tuple[MotorNoiseFloor, ...]:
     known = tuple(floor for floor in floors if floor is not None)
     assert len(known) == len(floors)
     return known
@@ -266,7 +266,7 @@ def test_other_paths_payloads_and_rates_are_no_repetition(repeated: tuple[Datase
 
 
 def test_a_floor_far_above_the_error_of_a_model_is_refuted() -> None:
-    floor = NoiseFloor(0.12, FloorSource.STANDSTILL, 10, 80.0)
+    floor = MotorNoiseFloor(0.12, FloorSource.STANDSTILL, 10, 80.0)
     assert floor.std_percent == pytest.approx(9.9, abs=0.1)
     assert floor.is_refuted(0.09)
     assert not floor.is_refuted(0.1)

@@ -18,7 +18,7 @@ from ident.discovery.gates import Gates
 from ident.discovery.loop import find_effects
 from ident.discovery.search import rank_effects, rank_families
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import Effect, PlacedEffect, Side
+from ident.effects.effect import Effect, GearSide, PlacedEffect
 from ident.effects.electrical import Lag, Saturation
 from ident.errors import RankDeficient, TooFewMoves
 from ident.estimators.identify import identify
@@ -296,7 +296,7 @@ def _with(arm: Arm, planted: Planted) -> Evidence:
     def torque(data: Dataset) -> FloatArray:
         made = planted.torque(replace(arm.signals[data.name], axis=planted.axis))
         on_all = made if made.ndim == 2 else acting_on(planted.axis, len(arm.truth.gains), made)
-        if _family(planted.family)[0].side in {Side.MOTOR, Side.ALL_MOTORS}:
+        if _family(planted.family)[0].side in {GearSide.MOTOR, GearSide.ALL_MOTORS}:
             return np.asarray(arm.truth.model.drive_train.direction.T @ on_all)
         return on_all
 

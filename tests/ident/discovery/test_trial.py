@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ident.discovery.candidates import Trial, score_candidates
+from ident.discovery.candidates import CandidateTrial, score_candidates
 from ident.discovery.search import _drawn_numbers, _drawn_wald
 from ident.equations.linearisation import Jacobian, Linearisation, cut_into_folds
 from tests.ident.recordings import whole
@@ -51,7 +51,7 @@ def _fit(columns: FloatArray, target: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.lstsq(columns, target, rcond=None)[0])
 
 
-def _written_out(problem: Linearisation, columns: FloatArray, count: int = 8) -> Trial:
+def _written_out(problem: Linearisation, columns: FloatArray, count: int = 8) -> CandidateTrial:
     """The same by projection and by one whole refit a fold."""
     j, e = whole(problem.jacobian), problem.residual
     left = columns - j @ _fit(j, columns)
@@ -71,7 +71,7 @@ def _written_out(problem: Linearisation, columns: FloatArray, count: int = 8) ->
         training.append(float(np.sum(without**2) - np.sum((e[~out] - both[~out] @ fitted) ** 2)))
         held.append(by_motor(e - both @ fitted, out))
     moves = [problem.cluster == move for move in range(MOVES)]
-    return Trial(
+    return CandidateTrial(
         coefficients=coefficients,
         fallen=np.array(by_motor(e, everything)) - np.array(by_motor(after, everything)),
         training_fall=np.array(training),
@@ -82,9 +82,9 @@ def _written_out(problem: Linearisation, columns: FloatArray, count: int = 8) ->
     )
 
 
-def _agree(found: Trial | None, expected: Trial) -> None:
+def _agree(found: CandidateTrial | None, expected: CandidateTrial) -> None:
     assert found is not None
-    for name in set(Trial.__slots__) - {"rest"}:
+    for name in set(CandidateTrial.__slots__) - {"rest"}:
         wanted = getattr(expected, name)
         scale = float(np.max(np.abs(wanted)))
         assert getattr(found, name) == pytest.approx(wanted, rel=1e-8, abs=1e-8 * scale), name

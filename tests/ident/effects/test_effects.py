@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ident.discovery.structure import VARIABLES
 from ident.effects.dictionary import EFFECTS, GEOMETRY
-from ident.effects.effect import Effect, PlacedEffect, Property, Side, at_joints, is_placeable
+from ident.effects.effect import Effect, GearSide, PlacedEffect, Property, at_joints, is_placeable
 from ident.effects.electrical import Cogging, Lag, Saturation, TimeSkew
 from ident.effects.friction import AsymmetricViscous, Coupling, LoadFriction, PositionFriction, Stribeck
 from ident.effects.position import Hinge, Spring
@@ -182,7 +182,9 @@ def test_every_property_can_be_refuted_and_is_claimed_by_someone() -> None:
 def test_columns_are_as_many_as_coefficients_and_belong_to_their_axes(effect: Effect) -> None:
     signals, strange = random_signals(5), random_signals(6)
     columns = effect.columns(signals, 0)
-    joints = {Side.TWO_JOINTS: (2,), Side.ALL_JOINTS: (JOINTS,), Side.ALL_MOTORS: (JOINTS,)}.get(effect.side, ())
+    joints = {GearSide.TWO_JOINTS: (2,), GearSide.ALL_JOINTS: (JOINTS,), GearSide.ALL_MOTORS: (JOINTS,)}.get(
+        effect.side, ()
+    )
     assert columns.shape == (*joints, len(effect.coefficients), SAMPLES)
     assert np.all(np.isfinite(columns))
     constant = np.array(
@@ -200,7 +202,7 @@ def test_columns_are_as_many_as_coefficients_and_belong_to_their_axes(effect: Ef
         return replace(signals, **arrays)
 
     own = [0, int(effect.settings["other_axis"]) - 1] if effect.settings.get("other_axis") else [0]
-    own = list(range(JOINTS)) if effect.side is Side.ALL_MOTORS else own
+    own = list(range(JOINTS)) if effect.side is GearSide.ALL_MOTORS else own
     assert np.array_equal(effect.columns(changed([axis for axis in range(JOINTS) if axis not in own]), 0), columns)
     # What depends on the clock alone is the same on all axes.
     of_the_clock = effect.declares is Property.SMOOTH and effect.abscissa in {Abscissa.TIME, Abscissa.SESSION}

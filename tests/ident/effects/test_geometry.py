@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate, planned
 from ident.effects.effect import PlacedEffect, is_placeable
-from ident.effects.geometry import (
+from ident.effects.geometry_corrections import (
     GeometryEffect,
     GravityDirection,
     LatePosition,

@@ -13,8 +13,8 @@ from numpy.testing import assert_allclose
 from ident.data.run import Run
 from ident.discovery.evidence import Evidence, gather
 from ident.equations import reduction as reduction_module
-from ident.equations.reduction import Reduction, layout, reduce_runs
-from ident.equations.rows import OBSERVATION_ROWS
+from ident.equations.observation import OBSERVATION_ROWS
+from ident.equations.reduction import motor_support, reduce_runs, regrouped
 from ident.equations.system import System
 from ident.equations.triangles import triangle
 from ident.estimators.estimate import Estimate
@@ -28,14 +28,10 @@ SMALL = replace(CONDITIONING, standstill_rad_s=CONDITIONING.standstill_rad_s[:3]
 """For the arm of three axes."""
 
 
-def _system(reduction: Reduction) -> System:
-    return reduction.system(reduction.base(), reduction.payload_columns())
-
-
 @pytest.fixture(scope="module")
 def whole(truth: Truth, noisy_runs: tuple[Run, ...]) -> System:
     """In pieces of the usual length."""
-    return _system(reduce_runs(truth.model, noisy_runs, CONDITIONING))
+    return regrouped(reduce_runs(truth.model, noisy_runs, CONDITIONING))
 
 
 def test_the_triangles_are_those_of_the_rows(noisy: Evidence, whole: System) -> None:
@@ -51,7 +47,7 @@ def test_the_triangles_are_those_of_the_rows(noisy: Evidence, whole: System) -> 
 @pytest.fixture(scope="module")
 def small_estimate(small_truth: Truth, small_runs: tuple[Run, ...]) -> Estimate:
     """Estimate from a run of the three-axis arm without load and one with it, in pieces of the usual length."""
-    return ml(_system(reduce_runs(small_truth.model, small_runs[:2], SMALL)))
+    return ml(regrouped(reduce_runs(small_truth.model, small_runs[:2], SMALL)))
 
 
 @given(st.integers(min_value=1, max_value=400))
@@ -59,7 +55,7 @@ def small_estimate(small_truth: Truth, small_runs: tuple[Run, ...]) -> Estimate:
 def test_results_do_not_depend_on_the_chunk(
     small_truth: Truth, small_runs: tuple[Run, ...], small_estimate: Estimate, chunk: int
 ) -> None:
-    other = ml(_system(reduce_runs(small_truth.model, small_runs[:2], SMALL, chunk_rows=chunk)))
+    other = ml(regrouped(reduce_runs(small_truth.model, small_runs[:2], SMALL, chunk_rows=chunk)))
     assert other.gains == pytest.approx(small_estimate.gains, rel=1e-9)
     assert other.gains_std == pytest.approx(small_estimate.gains_std, rel=1e-6)
 
@@ -68,7 +64,7 @@ def test_many_moves_are_joined_and_say_the_same(
     truth: Truth, noisy_runs: tuple[Run, ...], whole: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reduction_module, "MAX_CLUSTERS", 20)
-    joined = _system(reduce_runs(truth.model, noisy_runs, CONDITIONING))
+    joined = regrouped(reduce_runs(truth.model, noisy_runs, CONDITIONING))
     assert len(joined.clusters) < len(whole.clusters)
     assert ml(joined).gains == pytest.approx(ml(whole).gains, rel=1e-9)
     assert ml(joined).gains_std == pytest.approx(ml(whole).gains_std, rel=0.5)
@@ -99,16 +95,15 @@ def test_rows_kept_by_a_fit_are_those_built_of_its_runs(small_truth: Truth, smal
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4, 5), (5, 4, 3, 2, 1, 0)])
-def test_the_layout_leaves_nothing_out(truth: Truth, order: tuple[int, ...]) -> None:
-    """Columns outside a joint's or a motor's layout are zero for any motion."""
+def test_the_support_leaves_nothing_out(truth: Truth, order: tuple[int, ...]) -> None:
+    """Columns that a joint or a motor does not have are zero for any motion."""
     model = Model(truth.model.robot, DriveTrain(truth.model.drive_train.ratio[list(order)]))
     rng = np.random.default_rng(0)
     columns = model.regressor(Motion(*rng.normal(size=(3, 50, 6))))
     assert not columns[~model.support].any()
     mixed = np.einsum("ij,jck->ick", model.drive_train.to_motor, columns)
-    for motor, held in enumerate(layout(model).motor):
-        left_out = np.setdiff1d(np.arange(columns.shape[1]), held)
-        assert np.max(np.abs(mixed[motor][left_out]), initial=0.0) < 1e-9
+    for motor, held in enumerate(motor_support(model.drive_train, model.support)):
+        assert np.max(np.abs(mixed[motor][~held]), initial=0.0) < 1e-9
 
 
 @given(st.integers(0, 40), st.integers(1, 12), st.integers(0, 2**32 - 1))

@@ -12,7 +12,8 @@ from ident.arrays import FloatArray
 from ident.data.dataset import differentiate
 from ident.equations.currents import PreloadedCurrents, whitening_transform
 from ident.equations.linearisation import linearise
-from ident.equations.rows import decimate_rows, observe
+from ident.equations.observation import observe
+from ident.equations.rows import decimate_rows
 from ident.errors import DataUnfit
 from ident.estimators.estimate import Identification
 from ident.estimators.identify import identify

@@ -7,42 +7,42 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.data.run import Run
-from ident.estimators.comparison import CUTOFF_FACTORS, ESTIMATORS, Comparison, compare
+from ident.estimators.comparison import CUTOFF_FACTORS, ESTIMATORS, EstimatorComparison, try_estimators
 from tests.ident.recordings import CONDITIONING, GAINS, Truth
 
 FloatArray = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")
-def noisy(truth: Truth, noisy_runs: tuple[Run, ...]) -> Comparison:
-    return compare(truth.model, lambda: noisy_runs, CONDITIONING)
+def noisy(truth: Truth, noisy_runs: tuple[Run, ...]) -> EstimatorComparison:
+    return try_estimators(truth.model, lambda: noisy_runs, CONDITIONING)
 
 
-def _of(comparison: Comparison, estimator: str) -> FloatArray:
+def _of(comparison: EstimatorComparison, estimator: str) -> FloatArray:
     spread = comparison.spread_percent(estimator)
     assert spread is not None
     return spread
 
 
-def test_every_estimator_is_tried_under_every_filter_the_declared_ones_first(noisy: Comparison) -> None:
+def test_every_estimator_is_tried_under_every_filter_the_declared_ones_first(noisy: EstimatorComparison) -> None:
     assert len(noisy.trials) == len(ESTIMATORS) * len(CUTOFF_FACTORS)
     assert {trial.position_cutoff_hz for trial in noisy.declared} == {CONDITIONING.position_cutoff_hz}
     assert [trial.estimator for trial in noisy.declared] == list(ESTIMATORS)
 
 
-def test_gains_of_ml_depend_less_on_the_filters_than_those_of_tls(noisy: Comparison) -> None:
+def test_gains_of_ml_depend_less_on_the_filters_than_those_of_tls(noisy: EstimatorComparison) -> None:
     assert np.mean(_of(noisy, "ml")) < 0.5 * np.mean(_of(noisy, "tls, rows (paper)"))
     assert np.mean(_of(noisy, "tls, rows (paper)")) < 0.2 * np.mean(_of(noisy, "tls, residuals"))
 
 
-def test_gains_of_tls_depend_on_the_weights_of_the_rows(noisy: Comparison) -> None:
+def test_gains_of_tls_depend_on_the_weights_of_the_rows(noisy: EstimatorComparison) -> None:
     errors = {trial.estimator: trial.gains / GAINS - 1.0 for trial in noisy.declared if trial.gains is not None}
     assert np.max(np.abs(errors["tls, rows (paper)"])) < 0.01
     assert np.max(np.abs(errors["tls, residuals"])) > 0.05
 
 
 def test_without_noise_all_agree(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
-    for trial in compare(truth.model, lambda: clean_runs, CONDITIONING).declared:
+    for trial in try_estimators(truth.model, lambda: clean_runs, CONDITIONING).declared:
         assert trial.gains == pytest.approx(GAINS, rel=2e-4)
 
 
@@ -50,7 +50,7 @@ def test_a_filter_that_the_rate_does_not_allow_fails_alone(truth: Truth, noisy_r
     slow = [
         Run(run.name, run.time_s[::6], run.position_rad[::6], run.current_a[::6], run.payload) for run in noisy_runs
     ]
-    found = compare(truth.model, lambda: slow, CONDITIONING)
+    found = try_estimators(truth.model, lambda: slow, CONDITIONING)
     assert all(trial.gains is not None for trial in found.declared)
     assert "needs more than 200 Hz" in found.trials[-1].reason
     assert found.spread_percent("ml") is None

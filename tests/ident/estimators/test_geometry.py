@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ident.data.run import Run
 from ident.errors import ModelError
-from ident.estimators.geometry import GeometryFinding, Positions, estimate_geometry, thinned
+from ident.estimators.geometry_estimate import GeometryFinding, Positions, estimate_geometry, thinned
 from ident.model.geometry import GeometryChange, geometry_parameters
-from ident.model.geometry_derivatives import corrected_model
+from ident.model.geometry_derivatives import model_with_geometry
 from tests.ident.closed_recordings import axis_positions
 from tests.ident.mechanisms import FIVE_BAR, PLANAR
 
@@ -39,7 +39,7 @@ def _recorded(seed: int, noise_rad: float = NOISE_RAD, bend_rad: FloatArray | fl
 def _described(*wrong: tuple[int, float], seed: int = 1, noise_rad: float = NOISE_RAD) -> GeometryFinding:
     """Finding with a description in which numbers are off; what has to be added is the negative of it."""
     changes = [GeometryChange(PARAMETERS[number], change) for number, change in wrong]
-    found = estimate_geometry(corrected_model(PLANAR.model, changes), _recorded(seed, noise_rad))
+    found = estimate_geometry(model_with_geometry(PLANAR.model, changes), _recorded(seed, noise_rad))
     assert found is not None
     return found
 

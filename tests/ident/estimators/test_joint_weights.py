@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ident.data.run import Run
 from ident.discovery.evidence import Evidence
-from ident.equations.reduction import reduce_runs
+from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.system import System
 from ident.equations.triangles import Triangles, triangle
 from ident.estimators.estimate import Identification
@@ -54,8 +54,7 @@ def _small_system(truth: Truth, seed: int, noise_a: float) -> System:
         for number in range(4)
     ]
     conditioning = replace(CONDITIONING, standstill_rad_s=(0.03,) * 3)
-    reduction = reduce_runs(truth.model, runs, conditioning)
-    return reduction.system(reduction.base(), reduction.payload_columns())
+    return regrouped(reduce_runs(truth.model, runs, conditioning))
 
 
 def _mean_error(gains: FloatArray, truth: Truth) -> float:
@@ -153,8 +152,7 @@ def test_a_wrist_has_no_torque_of_the_known_mass_so_free_gains_take_the_global_e
 
 def test_tls_of_runs_in_another_order_is_the_same(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
     def gains(runs: tuple[Run, ...]) -> FloatArray:
-        reduction = reduce_runs(truth.model, runs, CONDITIONING)
-        return tls(reduction.system(reduction.base(), reduction.payload_columns())).gains
+        return tls(regrouped(reduce_runs(truth.model, runs, CONDITIONING))).gains
 
     assert gains(noisy_runs[::-1]) == pytest.approx(gains(noisy_runs), rel=1e-9)
 

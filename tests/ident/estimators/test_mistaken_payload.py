@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ident.data.run import Run
-from ident.equations.reduction import reduce_runs
+from ident.equations.reduction import reduce_runs, regrouped
 from ident.errors import ModelContradicted, PayloadUnseen, RolesExchanged
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.identify import identify
@@ -53,8 +53,7 @@ def test_exchanged_roles_turn_every_sign_and_friction_shows_it(truth: Truth, noi
     exchanged = tuple(replace(run, payload=None if run.payload else MOUNTED) for run in noisy_runs)
     with pytest.raises(RolesExchanged, match=r"fs1 = -5\..*; expected above 0.*payload's run .* exchanged"):
         identify(truth.model, exchanged, CONDITIONING)
-    reduction = reduce_runs(truth.model, exchanged, CONDITIONING)
-    estimate = ml(reduction.system(reduction.base(), reduction.payload_columns()))
+    estimate = ml(regrouped(reduce_runs(truth.model, exchanged, CONDITIONING)))
     assert estimate.gains == pytest.approx(-GAINS, rel=0.05)
 
 

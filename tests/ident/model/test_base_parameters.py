@@ -7,8 +7,8 @@ import pytest
 
 from ident.data.dataset import differentiate
 from ident.data.run import Run
-from ident.equations.reduction import reduce_runs
-from ident.equations.rows import observe
+from ident.equations.observation import observe
+from ident.equations.reduction import reduce_runs, regrouped
 from ident.model.base import base_parameters
 from ident.model.bodies import LINK_PARAMETERS
 from tests.ident.recordings import CONDITIONING, Truth
@@ -16,8 +16,8 @@ from tests.ident.recordings import CONDITIONING, Truth
 
 def test_the_tx40_has_61(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
     data = differentiate(clean_runs[0], truth.model.drive_train, CONDITIONING)
-    reduction = reduce_runs(truth.model, clean_runs[:1], CONDITIONING)
-    observation = observe(truth.model, [data], CONDITIONING, reduction.system(reduction.base(), ()))
+    system = regrouped(reduce_runs(truth.model, clean_runs[:1], CONDITIONING))
+    observation = observe(truth.model, [data], CONDITIONING, system)
     assert len(observation.columns) == 61
     assert observation.columns[0].name.startswith("Izz1 + 1.0*Ia1 + 1.0*Iyy2")
     torque = np.einsum("jcr,c->jr", observation.regressor, observation.base.grouping @ truth.parameters)

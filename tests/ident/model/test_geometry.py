@@ -24,7 +24,7 @@ from ident.model.geometry import (
     geometry_parameters,
     with_geometry,
 )
-from ident.model.geometry_derivatives import corrected_model, torque_derivative
+from ident.model.geometry_derivatives import model_with_geometry, torque_derivative
 from ident.model.model import DriveTrain, Model
 from ident.model.robot import Motion, poses
 from ident.model.urdf import LinkPair, robot_from_urdf
@@ -194,6 +194,6 @@ def test_the_torque_beside_a_redundant_robot_is_the_derivative_times_the_change(
         slope = torque_derivative(model, motion, standard, parameter)
         left = []
         for change in (2e-3, 1e-3):
-            beside = corrected_model(model, (GeometryChange(parameter, change),))
+            beside = model_with_geometry(model, (GeometryChange(parameter, change),))
             left.append(np.linalg.norm(beside.torques(motion, standard)[2] - described - change * slope))
         assert 3.5 < left[0] / left[1] < 4.5

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.data.dataset import differentiate
-from ident.equations.rows import Observation
+from ident.equations.observation import Observation
 from ident.estimators.identify import identify
 from ident.model.robot import Motion
 from ident.planning.clearance import LARGEST_PLANNED_MISFIT, Capsule, Checker, Scene
@@ -18,9 +18,9 @@ from ident.planning.excitation import (
     Expectation,
     ExpectedPayload,
     recorded,
-    visible,
+    visible_base,
 )
-from ident.planning.verdict import Hidden, Identifiability, verdicts
+from ident.planning.gain_verdict import Hidden, Identifiability, verdicts
 from tests.ident.closed_recordings import Made, axis_positions
 from tests.ident.closed_recordings import recorded as made_of
 from tests.ident.mechanisms import BASE_M, CRANK_M, FIVE_BAR, PLANAR, ROD_M, Mechanism
@@ -38,7 +38,7 @@ def _design(mechanism: Mechanism, made: Made, noise_a: FloatArray) -> Design:
     expectation = Expectation(made.model, mechanism.gains, parameters, (payload,), noise_a)
     data = differentiate(made.runs[0], made.model.drive_train, made.conditioning)
     every = slice(None, None, 7)
-    return Design(expectation, visible(made.model, data.motion(every)))
+    return Design(expectation, visible_base(made.model, data.motion(every)))
 
 
 @pytest.mark.parametrize("mechanism", [FIVE_BAR, PLANAR], ids=lambda one: one.name)

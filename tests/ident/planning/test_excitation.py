@@ -26,9 +26,9 @@ from ident.planning.excitation import (
     ExpectedPayload,
     effective_noise,
     recorded,
-    visible,
+    visible_base,
 )
-from ident.planning.verdict import ExtraMoves, GainSource, Verdict, verdicts
+from ident.planning.gain_verdict import ExtraMoves, GainSource, Visibility, verdicts
 from tests.ident.arms import TX40
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth, record, tx40_truth
 
@@ -48,7 +48,7 @@ def _design(
     # White noise at 250 Hz, of which rows at 50 a second keep the band below 20 Hz: s²/5 for what is slower.
     noise = np.full(6, NOISE_A / np.sqrt(decimator(RATE_HZ, CONDITIONING.decimation_cutoff_hz).factor))
     expectation = Expectation(model, truth.gains, truth.parameters, (ExpectedPayload(known, PAYLOAD),), noise)
-    return Design(expectation, visible(model, _motion(np.random.default_rng(5), 900)))
+    return Design(expectation, visible_base(model, _motion(np.random.default_rng(5), 900)))
 
 
 def _motion(rng: np.random.Generator, rows: int, still: int | None = None) -> Motion:
@@ -172,7 +172,7 @@ def test_a_gain_whose_axis_never_moves_is_not_seen() -> None:
     found = design.std_percent(design.information(excitation, (None, 0)))
     assert np.isinf(found[3])
     judged = verdicts(design, [(excitation, (None, 0))]).gains
-    assert judged[3].verdict is Verdict.UNSEEN
+    assert judged[3].verdict is Visibility.UNSEEN
     assert "not identifiable" in judged[3].words("J4")
 
 
@@ -223,6 +223,6 @@ def test_two_mountings_have_unknowns_of_their_own() -> None:
 
 def test_base_parameters_of_the_geometry_do_not_depend_on_the_motion() -> None:
     model = Model(robot_from_urdf(TX40.urdf), tx40_truth().model.drive_train)
-    found = {visible(model, _motion(np.random.default_rng(seed), 700)).independent for seed in range(4)}
+    found = {visible_base(model, _motion(np.random.default_rng(seed), 700)).independent for seed in range(4)}
     assert len(found) == 1
     assert len(found.pop()) == 61

@@ -1,8 +1,8 @@
 """An identification with the geometry that the encoders of a redundant drive show, and what its σ does to the gains.
 
-The corrections come from positions alone (`ident.estimators.geometry`), before any torque is looked at, so that they
-cannot take up what belongs to gains or effects. The gains depend on them through all columns: for each direction of
-their covariance, the rows are built and estimated once more with the geometry one step beside.
+The corrections come from positions alone (`ident.estimators.geometry_estimate`), before any torque is looked at, so
+that they cannot take up what belongs to gains or effects. The gains depend on them through all columns: for each
+direction of their covariance, the rows are built and estimated once more with the geometry one step beside.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.discovery.evidence import Evidence, with_covariance
-from ident.equations.rows import observe
+from ident.equations.observation import observe
 from ident.errors import IdentificationError
 from ident.estimators.estimate import Estimate, Identification
-from ident.estimators.geometry import GeometryFinding
+from ident.estimators.geometry_estimate import GeometryFinding
 from ident.estimators.identify import estimate_with
 from ident.model.geometry import GeometryChange
-from ident.model.geometry_derivatives import corrected_model
+from ident.model.geometry_derivatives import model_with_geometry
 from ident.model.model import Model
 
 LEAST_STEP = 1e-4
@@ -52,7 +52,7 @@ def geometry_covariance(found: Identification, described: Model, finding: Geomet
         step = max(LEAST_STEP, float(size))
         beside = values + step * way
         changes = [GeometryChange(*pair) for pair in zip(parameters, beside.tolist(), strict=True)]
-        moved = _vector(_estimated(found, corrected_model(described, changes))) - center
+        moved = _vector(_estimated(found, model_with_geometry(described, changes))) - center
         shifts.append(moved * (size / step))
     others = [_alternative(found, described, finding, number) - center for number in range(len(finding.alternatives))]
     if others:
@@ -64,7 +64,7 @@ def geometry_covariance(found: Identification, described: Model, finding: Geomet
 def _alternative(found: Identification, described: Model, finding: GeometryFinding, number: int) -> FloatArray:
     """Gains and parameters with another explanation of the misfit."""
     changes = [GeometryChange(one.parameter, one.change) for one in finding.alternatives[number]]
-    return _vector(_estimated(found, corrected_model(described, changes)))
+    return _vector(_estimated(found, model_with_geometry(described, changes)))
 
 
 def _vector(estimate: Estimate) -> FloatArray:

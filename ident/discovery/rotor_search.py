@@ -14,11 +14,11 @@ from dataclasses import replace
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.discovery.candidates import SearchProblem, Trial, shares_explained
+from ident.discovery.candidates import CandidateTrial, SearchProblem, shares_explained
 from ident.discovery.gates import Gates
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.rotor import next_inertia
-from ident.equations.rows import Observation
+from ident.equations.observation import Observation
 from ident.errors import EffectRefused
 
 Families = tuple[tuple[Effect, ...], ...]
@@ -105,7 +105,7 @@ def declared_forms(placed: PlacedEffect, observation: Observation, axes: Sequenc
     return (replace(placed, effect=fitted), placed)
 
 
-def without_rotor(search_problem: SearchProblem, effect: Effect, plain: Trial, axis: int) -> Effect | None:
+def without_rotor(search_problem: SearchProblem, effect: Effect, plain: CandidateTrial, axis: int) -> Effect | None:
     """Return the form of a loss that leaves the rotor out, with the inertia that fits best; None where none is better.
 
     Its second coefficient costs certainty: where the moves do not show the rotor, they are predicted worse with it.

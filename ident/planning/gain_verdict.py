@@ -39,7 +39,7 @@ class GainSource(Enum):
     COUPLING = "coupling with other axes"
 
 
-class Verdict(Enum):
+class Visibility(Enum):
     """How well a gain is identifiable."""
 
     GOOD = "good"
@@ -82,7 +82,7 @@ class GainVerdict:
     known_preload_percent: float | None
     alone_percent: dict[GainSource, float]  #: standard deviation that each source would give alone [%]
     gravity_acts: bool  #: whether gravity of any payload acts on this axis
-    verdict: Verdict  #: good, weak or unseen
+    verdict: Visibility  #: good, weak or unseen
     advice: Advice | None  #: for a gain that is not good; None where no extra moves were offered or none helps
 
     @property
@@ -96,10 +96,10 @@ class GainVerdict:
     def hidden_by(self) -> Hidden | None:
         """Why the gain is unseen, or weak by preload; None for other gains."""
         known = np.inf if self.known_preload_percent is None else self.known_preload_percent
-        if self.verdict is Verdict.UNSEEN:
+        if self.verdict is Visibility.UNSEEN:
             return Hidden.PRELOAD if known <= UNSEEN_PERCENT else Hidden.MOTION
         weakened = self.std_percent > SHARE_OF_KNOWN * known
-        return Hidden.PRELOAD if self.verdict is Verdict.WEAK and weakened else None
+        return Hidden.PRELOAD if self.verdict is Visibility.WEAK and weakened else None
 
     def words(self, axis_name: str) -> str:
         """Describe it for a report: ``J1 is identifiable only through inertia: σ 3.1 %; add 5 s of … (σ 1.9 %)``."""
@@ -191,9 +191,9 @@ def verdicts(design: Design, runs: Runs, extras: Sequence[ExtraMoves] = ()) -> I
             GainSource.INERTIA: inertia,
             GainSource.COUPLING: float(design.std_percent(blind)[axis]),
         }
-        weak = Verdict.WEAK if std <= UNSEEN_PERCENT else Verdict.UNSEEN
-        verdict = Verdict.GOOD if std <= GOOD_PERCENT else weak
-        advice = None if verdict is Verdict.GOOD else _advice(axis, std, with_extras)
+        weak = Visibility.WEAK if std <= UNSEEN_PERCENT else Visibility.UNSEEN
+        verdict = Visibility.GOOD if std <= GOOD_PERCENT else weak
+        advice = None if verdict is Visibility.GOOD else _advice(axis, std, with_extras)
         judged.append(GainVerdict(axis, std, without[axis], alone, acts, verdict, advice))
     return Identifiability(tuple(judged), design.rank(information), known_rank)
 

@@ -10,8 +10,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from daq.config.bus import bus_loads, bus_loads_percent
 from daq.config.cell import PacingMode
+from daq.config.cell_buses import bus_loads, bus_loads_percent
 from daq.report.text import picked, plain_table, printable, terminal_text
 from daq.workflow.events import event_document
 from drivers.profiles.cia402 import ENABLED, FAULTY, State, decode
@@ -19,7 +19,7 @@ from drivers.profiles.cia402 import ENABLED, FAULTY, State, decode
 if TYPE_CHECKING:
     from daq.config.cell import Cell
     from daq.workflow.monitor import WatchedCell
-    from drivers.canopen.scan import FoundNode
+    from drivers.canopen.node_scan import FoundNode
     from drivers.profiles.profile import Identity
     from drivers.stream.monitor import AxisReading
 

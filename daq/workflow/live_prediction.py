@@ -44,7 +44,7 @@ LIVE = "the live motion"  #: Its name in errors and warnings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rows:
+class PredictedRows:
     """Decimated rows; NaN for a motor that is at standstill."""
 
     cycle: IntArray  #: number of the sample at the centre of the window, shape (r,)
@@ -70,10 +70,10 @@ class Recent:
 
     def __init__(self, rows_hz: float) -> None:
         self._kept, self._least = round(RECENT_S * rows_hz), LEAST_S * rows_hz
-        self._last: Rows | None = None
+        self._last: PredictedRows | None = None
         self._moving: list[FloatArray] = []
 
-    def add(self, rows: Rows) -> None:
+    def add(self, rows: PredictedRows) -> None:
         """Take the newest rows."""
         new = [column[np.isfinite(column)] for column in rows.residual.T]
         old = self._moving or [np.zeros(0)] * len(new)
@@ -131,7 +131,7 @@ class Predictor:
             self._band = 2.0 * np.array(calibration.current_residual)
         self._cycle, self._position, self._current = -1, np.zeros((0, 0)), np.zeros((0, 0))
 
-    def take(self, cycle: IntArray, position_rad: FloatArray, current: FloatArray) -> list[Rows]:
+    def take(self, cycle: IntArray, position_rad: FloatArray, current: FloatArray) -> list[PredictedRows]:
         """Take samples in their order; returns the rows that are complete now.
 
         Args:
@@ -150,7 +150,7 @@ class Predictor:
         ]
         return [part for part in parts if part is not None]
 
-    def _take(self, cycle: int, position_rad: FloatArray, current: FloatArray) -> Rows | None:
+    def _take(self, cycle: int, position_rad: FloatArray, current: FloatArray) -> PredictedRows | None:
         if cycle != self._cycle + len(self._position) or not len(self._position):
             self._cycle, self._position, self._current = cycle, position_rad, current
         else:
@@ -164,7 +164,7 @@ class Predictor:
         self._cycle, self._position, self._current = self._cycle + done, self._position[done:], self._current[done:]
         return found
 
-    def _predict(self) -> Rows:
+    def _predict(self) -> PredictedRows:
         rate_hz, settings = self._rate_hz, self._conditioning
         raw = np.ascontiguousarray(self._position.T)
         smooth = low_pass(raw, rate_hz, settings.position_cutoff_hz, settings.position_order)
@@ -181,7 +181,7 @@ class Predictor:
         still = ~row_masks(self._model, data, settings)[1][:, whole]
         predicted, measured = predicted[:, whole], measured[:, whole]
         predicted = np.where(still, np.nan, predicted)
-        return Rows(self._cycle + 1 + centres[whole], predicted.T, (measured - predicted).T, self._band)
+        return PredictedRows(self._cycle + 1 + centres[whole], predicted.T, (measured - predicted).T, self._band)
 
 
 def predictor_of(calibration: Calibration, cell: Cell, run: RunFacts) -> tuple[Predictor | None, str]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from ident.arrays import BoolArray, FloatArray
 from ident.data.dataset import Dataset
-from ident.effects.effect import Effect, PlacedEffect, Property, Side
+from ident.effects.effect import Effect, GearSide, PlacedEffect, Property
 from ident.effects.signals import Abscissa, Arm, Signals
 from ident.model.model import Column, Model
 from ident.model.robot import JointKind, Motion, Robot, skew
@@ -36,7 +36,7 @@ class GeometryEffect(Effect):
     The applied part does not take part in comparisons: an effect is the same one after each correction.
     """
 
-    side = Side.ALL_JOINTS
+    side = GearSide.ALL_JOINTS
     needs_inertia = False
 
     @property

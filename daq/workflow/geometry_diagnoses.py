@@ -1,8 +1,8 @@
 """The geometry of a cell whose robot has more encoders than degrees of freedom: what is said of it, and what is kept.
 
-`ident.estimators.geometry` finds which numbers of the description the encoders contradict. `fit` names them and keeps
-to the description; `residual` identifies with the corrected numbers, and a calibration says which they are, so that
-`validate` and `weigh` predict with the same geometry.
+`ident.estimators.geometry_estimate` finds which numbers of the description the encoders contradict. `fit` names them
+and keeps to the description; `residual` identifies with the corrected numbers, and a calibration says which they are,
+so that `validate` and `weigh` predict with the same geometry.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from daq.config.cell import Cell, model_of
 from ident.calibration import Calibration, EncoderMisfit, GeometryCorrection
 from ident.errors import Diagnosis, ModelError
 from ident.model.geometry import GeometryChange, GeometryKind, GeometryParameter, described_length
-from ident.model.geometry_derivatives import corrected_model
+from ident.model.geometry_derivatives import model_with_geometry
 from ident.model.model import Model
 from ident.model.robot import JointKind
 
 if TYPE_CHECKING:  # who predicts with a calibration estimates no geometry
-    from ident.estimators.geometry import GeometryEstimate, GeometryFinding
+    from ident.estimators.geometry_estimate import GeometryEstimate, GeometryFinding
 
 NAMES = {GeometryKind.ZERO: "zero-off", GeometryKind.LENGTH: "length-off"}  #: Diagnoses of one wrong number
 SEVERAL = "geometry-off"  #: Diagnosis of several, and of a misfit without an explanation
@@ -201,4 +201,4 @@ def calibrated_model(calibration: Calibration, cell: Cell) -> Model:
         else:
             now = described_length(model.robot, parameter)
         changes.append(GeometryChange(parameter, one.described + one.change - now))
-    return corrected_model(model, changes)
+    return model_with_geometry(model, changes)

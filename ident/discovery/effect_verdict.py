@@ -19,7 +19,7 @@ class Judgement(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class EffectVerdict:
     """Held-out error without an effect, everything else refitted, and with it."""
 
     placed: PlacedEffect  #: the effect
@@ -36,7 +36,7 @@ class Verdict:
         return f"{self.before.total:.2f} % of the held-out torques without it, {self.after.total:.2f} % with it"
 
 
-def judge(change: ErrorChange, motor: int | None = None) -> tuple[Judgement, str]:
+def judge_change(change: ErrorChange, motor: int | None = None) -> tuple[Judgement, str]:
     """Judge a change of errors on held-out runs, and say why.
 
     Args:

@@ -1,0 +1,48 @@
+"""Messages of the libraries on the command line: verbs and options in the place of functions and arguments."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from daq.advice import COMMANDS, for_command_line
+from daq.cli.failure import ErrorParts
+from drivers.canopen.emcy import remedy_of
+from drivers.errors import NodeMisplaced, ParametersMixed
+from ident.errors import PayloadMissing
+from ident.estimators.diagnosis import REMEDIES_OF_DISAGREEMENT
+from ident.estimators.method import Method
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_name_of_the_table_is_in_a_message(name: str) -> None:
+    code = "".join(file.read_text() for folder in ("ident", "drivers") for file in (ROOT / folder).rglob("*.py"))
+    assert name in code
+
+
+def test_a_missing_payload_names_the_options_of_record_and_fit() -> None:
+    assert ErrorParts.of(PayloadMissing(("bare",))).do == (
+        "record one (`record --payload NAME --mass KG`), or hold the gains (`--gains fixed`)"
+    )
+
+
+def test_a_remedy_of_an_error_code_names_the_verb() -> None:
+    said = for_command_line(remedy_of(0x8611))
+    assert said.endswith("then reset the fault with `drivegain scan CELL --reset-faults`")
+
+
+def test_estimators_that_disagree_name_method_and_residual() -> None:
+    said = for_command_line(REMEDIES_OF_DISAGREEMENT[Method.TLS])
+    assert said.startswith("use --method ml: ")
+    assert said.endswith("; `drivegain residual` looks for effects")
+
+
+def test_a_misplaced_node_names_the_scan() -> None:
+    assert "; `drivegain scan` shows the nodes of each bus" in ErrorParts.of(NodeMisplaced(3, "can0", "can1")).error
+
+
+def test_mixed_parameters_name_the_rollback() -> None:
+    assert "`drivegain rollback CELL --drives`" in ErrorParts.of(ParametersMixed(("J1",), ("J2: silent",))).do
