@@ -37,6 +37,8 @@ faults:
   - {fault: lost, axis: J2, at_s: 1.5, cycles: 1}
   - {fault: emergency, axis: J3, at_s: 4.0, emcy_code: 0x7305}
 """
+SHORT_S = "8"  #: Duration of a plan that a recording comes to the end of
+LONG_S = "240"  #: Of one that is stopped: a simulated cell moves faster than a real one, and a browser may be slow
 HEARD_S = 60.0  #: Time for the page to show what is awaited; longer than a busy machine needs
 
 
@@ -56,7 +58,9 @@ def until(page: Page, condition: str) -> None:
 class Rig:
     """A simulated cell with its console, and a browser."""
 
-    def __init__(self, folder: Path, checkout: Path, browser: Browser, stack: ExitStack, faults: str) -> None:
+    def __init__(
+        self, folder: Path, checkout: Path, browser: Browser, stack: ExitStack, faults: str, duration_s: str
+    ) -> None:
         self.folder, self.checkout, self.stack = folder, checkout, stack
         (folder / "faults.yaml").write_text(faults, encoding="utf-8")
         shutil.copytree(checkout / "configs", folder / "configs")
@@ -70,7 +74,7 @@ class Rig:
         self.cell_file.write_text(re.sub(r"bus:\n.*?(?=axes:)", bus, text, flags=re.DOTALL), encoding="utf-8")
         self.cell = load_cell(self.cell_file)
         self.plan, self.log = folder / "plan.yaml", folder / "run.mcap"
-        planned = ["plan", str(self.cell_file), "--out", str(self.plan), "--duration", "8", "--exchanges", "0"]
+        planned = ["plan", str(self.cell_file), "--out", str(self.plan), "--duration", duration_s, "--exchanges", "0"]
         assert main(planned) == ExitCode.OK
         calibration = folder / "calibration.yaml"
         save_calibration(predicting_calibration(), calibration)
@@ -137,10 +141,10 @@ def browser() -> Iterator[Browser]:
 
 
 @contextmanager
-def rig(folder: Path, checkout: Path, browser: Browser, faults: str = "") -> Iterator[Rig]:
+def rig(folder: Path, checkout: Path, browser: Browser, faults: str = "", duration_s: str = SHORT_S) -> Iterator[Rig]:
     """Run cell and console until the block ends."""
     with ExitStack() as stack:
-        yield Rig(folder, checkout, browser, stack, faults)
+        yield Rig(folder, checkout, browser, stack, faults, duration_s)
 
 
 def test_a_recording_with_a_fault_is_shown_as_its_log_holds_it(
@@ -188,7 +192,7 @@ def test_a_recording_with_a_fault_is_shown_as_its_log_holds_it(
 
 
 def test_the_button_stops_the_axes_and_the_page_says_so(tmp_path: Path, checkout: Path, browser: Browser) -> None:
-    with rig(tmp_path, checkout, browser) as made:
+    with rig(tmp_path, checkout, browser, duration_s=LONG_S) as made:
         recorder = made.record()
         until(made.page, "window.drivegain.points.length > 20")
         made.page.click("#stop")
