@@ -108,9 +108,25 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequ
         effects: of the model. Those of the result may hold another applied part.
         runs: signals of the runs of the fit around the estimate before, where they are at hand.
     """
+    return settled_corrections(with_first_order_effects(before, effects, runs))
+
+
+def with_first_order_effects(
+    before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals] = ()
+) -> Evidence:
+    """As `with_effects`, but what a correction of the geometry finds is not applied to the description."""
     corrections = tuple(placed for placed in effects if is_correction(placed))
-    is_same = _is_same_geometry(before.corrections, corrections)
-    found = _refitted(before if is_same else with_corrections(before, corrections), effects, runs if is_same else ())
+    if _is_same_geometry(before.corrections, corrections):
+        return _refitted(before, effects, runs)
+    return _refitted(with_corrections(before, corrections), effects, ())
+
+
+def settled_corrections(found: Evidence) -> Evidence:
+    """Apply what corrections of the geometry have found to the description and refit, until nothing is left to apply.
+
+    Args:
+        found: with effects; without a correction among them it is returned as it is.
+    """
     for _ in range(RELINEARISATIONS):
         moved = _relinearised(found)
         if moved is None:

@@ -9,20 +9,21 @@ part of what a wrong zero does, and friction that it lacks on another axis does 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ident.arrays import FloatArray
 from ident.discovery.candidates import FamilyTrials, SearchProblem, folds_around
-from ident.discovery.evidence import Evidence
+from ident.discovery.evidence import Evidence, coefficients_of, with_effects
 from ident.discovery.gates import Gates
 from ident.discovery.search import Finding, rank_families
 from ident.effects.dictionary import EFFECTS, GEOMETRY
-from ident.effects.effect import Effect, is_placeable
+from ident.effects.effect import Effect, PlacedEffect, is_placeable
 from ident.effects.geometry_corrections import GravityDirection, ZeroOffset, turned_gravity
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.rows import at_rows
+from ident.errors import IdentificationError
 
 AT_ROWS = frozenset(
     {Abscissa.VELOCITY, Abscissa.POSITION, Abscissa.LOAD, Abscissa.TIME, Abscissa.SESSION, Abscissa.CURRENT}
@@ -74,6 +75,8 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
         is_best = (best.effect, best.axis) == (mistake.effect, mistake.axis)
         if not is_best and not _explains_beside(problem, mistake, best):
             mistake = None
+    if mistake is not None:
+        mistake = _settled(evidence, mistake)
     zeros = [found for found in findings if isinstance(found.effect, ZeroOffset)]
     shown = {found.axis for found in zeros if found.deviations[0] < SEEN_ZERO}
     robot = evidence.model.robot
@@ -83,6 +86,18 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
         mistake=mistake,
         hidden_zeros=tuple(axis for axis in can_be_wrong if axis not in shown),
     )
+
+
+def _settled(evidence: Evidence, mistake: Finding) -> Finding:
+    """A correction with the value that it has once it is applied to the description: its column is for small ones."""
+    placed = PlacedEffect(mistake.effect, mistake.axis)
+    try:
+        corrected = with_effects(evidence, (*evidence.effects, placed))
+    except IdentificationError:
+        return mistake
+    applied = corrected.effects[-1]
+    values, deviations = coefficients_of(corrected.estimate, applied)
+    return replace(mistake, coefficients=values, deviations=deviations)
 
 
 def _explains_beside(problem: SearchProblem, correction: Finding, rival: Finding) -> bool:

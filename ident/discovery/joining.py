@@ -14,7 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, prepare_search, score_candidates
-from ident.discovery.evidence import Evidence, by_instruments, with_effects
+from ident.discovery.evidence import (
+    Evidence,
+    by_instruments,
+    settled_corrections,
+    with_effects,
+    with_first_order_effects,
+)
 from ident.discovery.gates import (
     Gates,
     PartsLeftOut,
@@ -146,9 +152,12 @@ def _refit(model: JointFit, accepted: Finding) -> JointFit | SetAside:
     if is_unnamed(last.effect) and (moved := _moved_by(model, accepted)):
         return SetAside(accepted, moved=moved)
     try:
-        refitted = with_effects(evidence, (*evidence.effects, last), problem.runs)
+        first_order = with_first_order_effects(evidence, (*evidence.effects, last), problem.runs)
         # Asked here: after it, the linearised problem would take memory beside the instruments.
-        if why := _refuted_by_instruments(refitted, last):
+        if why := _refuted_by_instruments(first_order, last):
+            return SetAside(accepted, why)
+        refitted = settled_corrections(first_order)
+        if refitted is not first_order and (why := _refuted_by_instruments(refitted, last)):
             return SetAside(accepted, why)
         joined = resettled(linearised_after(refitted, model))
     except UNFITTED as error:

@@ -24,7 +24,7 @@ from ident.model.robot import JointKind, Motion, Robot, skew
 
 POSITION_STEP = 1e-5  #: Of a difference quotient, rad or m: torques change by 1e-5 of themselves, far above rounding
 TIME_STEP_S = 1e-5  #: The same of a delay
-LARGEST_ZERO = 0.35  #: Largest zero offset, rad or m: 20°; a larger one is another robot
+LARGEST_ZERO = 0.8  #: Largest zero offset, rad or m: 46°; a larger one is looked for by `turned_geometry`
 LARGEST_TILT_RAD = 0.35  #: Largest turn of gravity that two columns can find
 LONGEST_DELAY_S = 0.02  #: Longest delay of one encoder
 

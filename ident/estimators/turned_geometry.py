@@ -1,6 +1,6 @@
-"""Gross mistakes of geometry: gravity that points elsewhere than declared, and a position that counts the other way.
+"""Gross mistakes of geometry: gravity that points elsewhere, a position that counts the other way, a zero far off.
 
-Either makes the equations of most motors wrong at once, and its traces look like those of wrong currents: a gain of the
+Each makes the equations of most motors wrong at once, and its traces look like those of wrong currents: a gain of the
 wrong sign, a large error, an iteration that does not converge. So geometry is judged before the currents are.
 
 **Fit.** Each hypothesis about the geometry is fitted to some hundred rows of each run,
@@ -14,6 +14,10 @@ take part in the judgement. Everything is done in products of the columns [W | v
 **Gravity** enters W linearly, W(g) = A + Σ_k g_k G_k, so products of [A | G_x | G_y | G_z | v_i] serve every direction.
 A direction opposite to the right one is stationary; therefore the search begins at 26 directions and goes on from the
 best by Gauss-Newton. σ of the direction comes from leaving out parts of the moves in turn.
+
+**Readings.** A position is read the other way, or from another zero: descriptions differ in whether an arm stands
+upright or lies at zero. The search begins at zeros in steps of 45° and goes on from the best; a small zero offset is
+an effect of the description (`ident.effects.geometry.ZeroOffset`), whose linear column does not lead so far.
 
 **Judgement.** Another gravity makes other parameters identifiable. So each part of the moves is predicted from a fit of
 the others, and a hypothesis must lower the errors of these predictions, in sum over the motors and in most parts.
@@ -40,11 +44,12 @@ from ident.estimators.refusals import FRICTION, LARGEST_TOTAL_PERCENT, SMALL_ERR
 from ident.model.base import SMALLEST_COLUMN
 from ident.model.bodies import LINK_PARAMETERS
 from ident.model.model import Model
-from ident.model.robot import Motion
+from ident.model.robot import JointKind, Motion
 
 GRAVITY_TURNED = "gravity-turned"
 POSITION_REVERSED = "position-reversed"
-GEOMETRY = frozenset((GRAVITY_TURNED, POSITION_REVERSED))  #: Names of these diagnoses
+ZERO_TURNED = "zero-turned"
+GEOMETRY = frozenset((GRAVITY_TURNED, POSITION_REVERSED, ZERO_TURNED))  #: Names of these diagnoses
 
 PARTS = 8  #: Parts of the moves, of which each is predicted from the others
 LEAST_FALL = 0.5
@@ -56,6 +61,13 @@ ALIKE_FALL = 0.85
 """Share of the largest fall above which a hypothesis is as good: a mirror image of an arm has the same torques."""
 LARGEST_FACTOR = 3.0  #: Of a gain beside its nameplate and the other gains
 SCREENED_ROWS = 500  #: Rows of all runs together with which every recording is screened
+ZERO_TURNS_DEG = (45.0, 90.0, 135.0, 180.0, -135.0, -90.0, -45.0)
+"""Zeros of a revolute joint from which the search begins."""
+ZERO_REACH_RAD = 0.5  #: How far it goes from there
+ZERO_TOLERANCE_RAD = 2e-3
+SUSPECT_ERROR = 0.2
+"""Error of the worst current, of its size, from which another zero is looked for: 45° of a joint that bears anything
+leave more."""
 SUSPECT_FALL = 0.25  #: Fall of the errors of the fits themselves, as LEAST_FALL, above which predictions are judged
 RIDGE = 1e-7  #: Added to products of columns of unit length, for combinations that no row shows
 FIT_ROUNDS, NEXT_ROUNDS = 6, 2  #: Rounds of a fit from the nameplate, and of one from a neighbouring solution
@@ -66,6 +78,35 @@ WEIGHTY = tuple(index for index, name in enumerate(LINK_PARAMETERS) if name.star
 
 
 # Hypotheses
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """Another reading of the positions of one axis: the other way, or from another zero."""
+
+    axis: int
+    sign: float = 1.0
+    zero_rad: float = 0.0  #: added to its positions
+
+    def positions(self, position_rad: FloatArray) -> FloatArray:
+        """Positions of all axes in this reading [rad or m], shape (k, m)."""
+        read = position_rad.copy()
+        read[:, self.axis] = self.sign * position_rad[:, self.axis] + self.zero_rad
+        return read
+
+    def motion(self, motion: Motion) -> Motion:
+        """Motion of all axes in this reading."""
+        signs = np.ones(motion.position_rad.shape[1])
+        signs[self.axis] = self.sign
+        return Motion(
+            self.positions(motion.position_rad), motion.velocity_rad_s * signs, motion.acceleration_rad_s2 * signs
+        )
+
+    def text(self, axes: Sequence[str]) -> str:
+        """The mistake in words."""
+        if self.sign < 0.0:
+            return f"{axes[self.axis]} reversed"
+        return f"the zero of {axes[self.axis]} off by about {np.rad2deg(self.zero_rad):+.0f} deg"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,22 +129,20 @@ class TurnedGeometry:
     """Another geometry than the declared one, which predicts left-out moves clearly better."""
 
     gravity: GravityFound | None  #: where gravity is turned
-    reversed_axes: tuple[int, ...]  #: else the axis of a reversed position, and others that explain the same
+    readings: tuple[Reading, ...]  #: else the reading of a position; then others that explain the same
     reversed_currents: tuple[int, ...]  #: axes whose gains have another sign than their nameplates in this geometry
     before_percent: FloatArray  #: error of each motor's current on left-out moves, as declared, shape (m,)
     after_percent: FloatArray  #: the same in this geometry
 
     def model(self, declared: Model) -> Model:
-        """The model with this gravity; for a reversed position see `corrected_positions`."""
+        """The model with this gravity; for another reading of a position see `corrected_positions`."""
         if self.gravity is None:
             return declared
         return with_gravity(declared, self.gravity.found_m_s2)
 
     def corrected_positions(self, position_rad: FloatArray) -> FloatArray:
         """Positions of a run in this geometry [rad or m], shape (k, m)."""
-        signs = np.ones(len(self.before_percent))
-        signs[list(self.reversed_axes[:1])] = -1.0
-        return np.asarray(position_rad * signs)
+        return position_rad if self.gravity is not None else self.readings[0].positions(position_rad)
 
     def diagnosis(self, axes: Sequence[str], runs: tuple[str, ...] = ()) -> Diagnosis:
         """Name the mistake.
@@ -114,6 +153,8 @@ class TurnedGeometry:
         """
         errors = f"errors of {_percents(self.after_percent)} % of the currents of left-out moves"
         declared = f"{_percents(self.before_percent)} % as declared"
+        alike = [one.text(axes) for one in self.readings[0 if self.gravity is not None else 1 :]]
+        others = f"; explained as well by {' or '.join(alike)}" if alike else ""
         if self.gravity is not None:
             found = self.gravity
             unit = found.found_m_s2 / np.linalg.norm(found.found_m_s2)
@@ -122,22 +163,32 @@ class TurnedGeometry:
                 runs,
                 (),
                 f"gravity along {_numbers(unit)}, turned by {found.turned_deg:.1f} ± {found.std_deg:.1f} deg from what "
-                f"the cell says, with {errors}, {declared}",
+                f"the cell says, with {errors}, {declared}{others}",
                 f"gravity along the declared {_numbers(found.declared_m_s2)}",
                 f"how is the base mounted? correct `gravity_m_s2` of the cell: {_numbers(found.found_m_s2)} m/s² by "
                 "these recordings; nothing else is judged until it is right",
             )
-        first = self.reversed_axes[0]
-        alike = [axes[axis] for axis in self.reversed_axes[1:]]
-        others = f"; the mirror image, {' or '.join(alike)} reversed, explains them as well" if alike else ""
-        if first in self.reversed_currents:
+        reading = self.readings[0]
+        name = axes[reading.axis]
+        if reading.sign > 0.0:
+            turn = f"{np.rad2deg(reading.zero_rad):+.0f} deg"
+            return Diagnosis(
+                ZERO_TURNED,
+                runs,
+                (name,),
+                f"{reading.text(axes)}: so read, its position leaves {errors}, {declared}{others}",
+                "positions whose zero is that of the URDF",
+                f"add about {turn} to `zero_offset_deg` of {name} in the cell file, or move the zero in the "
+                "controller, and fit again: nothing else is judged until it is right",
+            )
+        if reading.axis in self.reversed_currents:
             remedy = "reverse the axis of this joint in the URDF, or the signs of both its position and its current"
         else:
             remedy = "reverse the sign of its position, not of its current, in the cell or the import"
         return Diagnosis(
             POSITION_REVERSED,
             runs,
-            (axes[first],),
+            (name,),
             f"a position that counts the other way: so read, it leaves {errors}, {declared}{others}",
             "each position to count about the axis of its joint in the URDF",
             f"{remedy}; nothing else is judged until it is right",
@@ -179,8 +230,8 @@ def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: Floa
     declared = model.robot.gravity_m_s2
     as_declared = weighed.directed(declared)
     start = first_fit(model, as_declared, reference)
-    before = judge_motor(as_declared, start, reference)
-    judged = _reversed_geometries(model, instants, before, start, reference)
+    before = judge_hypothesis(as_declared, start, reference)
+    judged = _other_readings(model, instants, before, start, reference)
     turned = _turned_gravity(weighed, declared, start, reference)
     if turned is not None:
         judged.append(turned)
@@ -189,19 +240,16 @@ def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: Floa
         return None
     best = max(one.fall(before) for one in better)
     alike = [one for one in better if one.fall(before) >= ALIKE_FALL * best]
-    # A mirror image of an arm needs more reversed currents than the mistake itself does.
-    alike.sort(key=lambda one: (one.contradictions(gains), -one.fall(before)))
+    # A mirror image of an arm needs more reversed currents than the mistake itself does. Where a zero half a turn away
+    # explains the same as another gravity, the mounting is named first: it is declared once for the whole arm.
+    alike.sort(key=lambda one: (one.contradictions(gains), one.gravity is None, -one.fall(before)))
     chosen = alike[0]
     fewest = chosen.contradictions(gains)
-    reversed_axes = list[int]()
-    for one in alike:
-        is_alike = chosen.gravity is None and one.contradictions(gains) == fewest
-        if is_alike and one.reversed_axis is not None:
-            reversed_axes.append(one.reversed_axis)
+    readings = [one.reading for one in alike if one.reading is not None and one.contradictions(gains) == fewest]
     against = np.flatnonzero(chosen.fit.per_unit * gains < 0.0)
     return TurnedGeometry(
         gravity=chosen.gravity,
-        reversed_axes=tuple(reversed_axes),
+        readings=tuple(readings),
         reversed_currents=tuple(against.tolist()),
         before_percent=before.percent,
         after_percent=chosen.percent,
@@ -217,8 +265,8 @@ def _thinned(instants: Sequence[Instants]) -> tuple[Instants, ...]:
 def _is_suspect(model: Model, instants: Sequence[Instants], reference: FloatArray) -> bool:
     """Whether another geometry may explain rows better, by the errors of the fits themselves.
 
-    No direction of gravity leaves less than three directions at once, each with moments of its own, and a reversed
-    position has as many parameters as the declared one. Nearly all recordings need no other judgement.
+    No direction of gravity leaves less than three directions at once, each with moments of its own, and another
+    reading of a position has as many parameters as the declared one. Nearly all recordings need no other judgement.
 
     Args:
         model: the declared model.
@@ -230,38 +278,98 @@ def _is_suspect(model: Model, instants: Sequence[Instants], reference: FloatArra
     as_declared = weighed.directed(model.robot.gravity_m_s2)
     start = first_fit(model, as_declared, reference)
     square = as_declared.square[:, 0]
-    limit = _log_error(square, improved(square, rows, start, reference, FIT_ROUNDS)) - SUSPECT_FALL
+    as_read = improved(square, rows, start, reference, FIT_ROUNDS)
+    limit = _log_error(square, as_read) - SUSPECT_FALL
+    current_square = square[:, -1, -1]
+    errors = np.sqrt(left_over(square, as_read) / np.where(current_square > 0.0, current_square, 1.0))
+    is_gross = float(errors.max()) > SUSPECT_ERROR
     any_gravity = weighed.square[:, 0]
     if _log_error(any_gravity, improved(any_gravity, rows, start, reference, FIT_ROUNDS)) < limit:
         return True
-    for axis in range(model.robot.axis_count):
+    for reading in _readings(model):
+        if reading.sign > 0.0 and not is_gross:
+            continue
         with suppress(ModelError):  # the loops of a closed chain cannot be closed so
-            square = reversed_products(model, instants, axis, part_count=1).square[:, 0]
-            opposite = start.with_opposite(axis)
-            if _log_error(square, improved(square, rows, opposite, reference, FIT_ROUNDS)) < limit:
+            square = products_of_reading(model, instants, reading, part_count=1).square[:, 0]
+            near = start.in_reading(reading)
+            if _log_error(square, improved(square, rows, near, reference, FIT_ROUNDS)) < limit:
                 return True
     return False
 
 
-def _reversed_geometries(
+def _readings(model: Model) -> Iterator[Reading]:
+    """Each position the other way, and each angle from the zeros at which a search begins."""
+    for axis in range(model.robot.axis_count):
+        yield Reading(axis, sign=-1.0)
+        yield from _turned_zeros(model, axis)
+
+
+def _turned_zeros(model: Model, axis: int) -> tuple[Reading, ...]:
+    """Readings of an angle from other zeros; none of a prismatic joint."""
+    if model.robot.axes[axis].kind is JointKind.PRISMATIC:
+        return ()
+    return tuple(Reading(axis, zero_rad=float(np.deg2rad(turn_deg))) for turn_deg in ZERO_TURNS_DEG)
+
+
+def _best_zero(
+    model: Model, instants: Sequence[Instants], axis: int, start: MotorFit, reference: FloatArray
+) -> Reading | None:
+    """The reading of an angle whose fit leaves least; None of a prismatic joint, or where no loop can be closed so.
+
+    Args:
+        model: the declared model.
+        instants: few rows of all runs.
+        axis: number of the axis.
+        start: of the declared geometry.
+        reference: 1/|g| of the nameplate [A/Nm or A/N], shape (m,).
+    """
+
+    def left(zero_rad: float) -> float:
+        try:
+            products = products_of_reading(model, instants, Reading(axis, zero_rad=zero_rad), part_count=1)
+        except ModelError:  # the loops of a closed chain cannot be closed so
+            return np.inf
+        square = products.square[:, 0]
+        rows = products.rows.sum(axis=1)
+        return _log_error(square, improved(square, rows, start, reference, FIT_ROUNDS))
+
+    begins = [one.zero_rad for one in _turned_zeros(model, axis)]
+    levels = [left(zero_rad) for zero_rad in begins]
+    if not np.any(np.isfinite(levels)):
+        return None
+    near = begins[int(np.argmin(levels))]
+    bounds = (near - ZERO_REACH_RAD, near + ZERO_REACH_RAD)
+    found = scipy.optimize.minimize_scalar(left, bounds=bounds, method="bounded", options={"xatol": ZERO_TOLERANCE_RAD})
+    best = float(found.x) if found.fun < min(levels) else near
+    return Reading(axis, zero_rad=best if best <= np.pi else best - 2.0 * np.pi)
+
+
+def _other_readings(
     model: Model, instants: Sequence[Instants], before: Judged, start: MotorFit, reference: FloatArray
 ) -> list[Judged]:
-    """Judge each axis with its position reversed."""
-    judged = list[Judged]()
+    """Judge each position the other way, and each angle from its best other zero."""
+    few = _thinned(instants)
+    tried = list[Reading]()
     for axis in range(model.robot.axis_count):
+        tried.append(Reading(axis, sign=-1.0))
+        turned = _best_zero(model, few, axis, start, reference)
+        if turned is not None:
+            tried.append(turned)
+    judged = list[Judged]()
+    for reading in tried:
         try:
-            products = reversed_products(model, instants, axis)
+            products = products_of_reading(model, instants, reading)
         except ModelError:  # the loops of a closed chain cannot be closed so
             continue
-        opposite = start.with_opposite(axis)
+        near = start.in_reading(reading)
         square = products.square.sum(axis=1)
         rows = products.rows.sum(axis=1)
-        fit = improved(square, rows, opposite, reference, FIT_ROUNDS)
+        fit = improved(square, rows, near, reference, FIT_ROUNDS)
         fitted = np.maximum(np.sqrt(left_over(square, fit)), before.smallest)
         falls = np.log(before.floored_error / fitted)
         if np.sum(falls) < LEAST_FALL:  # prediction is never better than the fit: most hypotheses end here
             continue
-        judged.append(replace(judge_motor(products, opposite, reference), reversed_axis=axis))
+        judged.append(replace(judge_hypothesis(products, near, reference), reading=reading))
     return judged
 
 
@@ -411,7 +519,7 @@ class Judged:
     fit: MotorFit  #: of all rows
     left: FloatArray  #: of each motor's current on each part, by the fit of the others, sums of squares, shape (m, P)
     current_square: FloatArray  #: sums of squares of the currents likewise, shape (m, P)
-    reversed_axis: int | None = None
+    reading: Reading | None = None
     gravity: GravityFound | None = None
 
     @property
@@ -455,12 +563,12 @@ class Judged:
         """
         against = self.fit.per_unit * gains < 0.0
         count = float(np.count_nonzero(against))
-        if self.reversed_axis is not None and against[self.reversed_axis]:
+        if self.reading is not None and self.reading.sign < 0.0 and against[self.reading.axis]:
             count -= 0.5
         return count
 
 
-def judge_motor(products: Products, start: MotorFit, reference: FloatArray) -> Judged:
+def judge_hypothesis(products: Products, start: MotorFit, reference: FloatArray) -> Judged:
     """Fit a hypothesis, and predict each part of the moves from the others.
 
     Args:
@@ -490,10 +598,10 @@ class MotorFit:
     parameters: FloatArray  #: χ in the same scale, shape (c,)
     weight: FloatArray  #: 1/σ² of each motor's current [1/A²], shape (m,)
 
-    def with_opposite(self, axis: int) -> MotorFit:
-        """The fit with the other sign of a motor: friction brakes the motion of a reversed position."""
+    def in_reading(self, reading: Reading) -> MotorFit:
+        """The fit from which that of a reading begins: friction brakes the motion of a reversed position."""
         signs = np.ones(len(self.per_unit))
-        signs[axis] = -1.0
+        signs[reading.axis] = reading.sign
         return replace(self, per_unit=self.per_unit * signs)
 
 
@@ -686,23 +794,19 @@ def gravity_products(model: Model, instants: Sequence[Instants], part_count: int
     return GravityProducts(np.sum(squares, axis=0), np.sum(rows, axis=0), weighty)
 
 
-def reversed_products(model: Model, instants: Sequence[Instants], axis: int, part_count: int = PARTS) -> Products:
-    """Products under the hypothesis that the position of an axis counts the other way; arguments as before.
+def products_of_reading(
+    model: Model, instants: Sequence[Instants], reading: Reading, part_count: int = PARTS
+) -> Products:
+    """Products where the position of an axis is read otherwise; arguments as before.
 
     Raises:
         ModelError: the loops of a closed chain cannot be closed.
     """
     mountings = _mountings(instants)
-    signs = np.ones(model.robot.axis_count)
-    signs[axis] = -1.0
     squares = list[FloatArray]()
     rows = list[IntArray]()
     for one, parts in zip(instants, _parts(instants, part_count), strict=True):
-        motion = one.motion
-        opposite = Motion(
-            motion.position_rad * signs, motion.velocity_rad_s * signs, motion.acceleration_rad_s2 * signs
-        )
-        moving = _motor_columns(model, one, opposite, mountings)
+        moving = _motor_columns(model, one, reading.motion(one.motion), mountings)
         columns = np.concatenate((moving, one.current_a[:, None]), axis=1)
         square, counted = _products(columns, one, parts, part_count)
         squares.append(square)

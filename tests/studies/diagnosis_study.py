@@ -182,6 +182,8 @@ MISTAKES: dict[str, Callable[[Truth, int, bool], list[str]]] = {
     "gravity turned by 90 degrees about x": lambda t, s, f: mounted(t, s, f, (0.0, 9.81, 0.0)),
     "gravity turned by 180 degrees": lambda t, s, f: mounted(t, s, f, (0.0, 0.0, 9.81)),
     "zero of J2 off by 2 degrees": lambda t, s, f: offset(t, s, f, 2.0),
+    "zero of J2 off by 20 degrees": lambda t, s, f: offset(t, s, f, 20.0),
+    "zero of J2 off by 90 degrees": lambda t, s, f: offset(t, s, f, 90.0),
     "base tilted by 3 degrees": lambda t, s, f: tilted(t, s, f, 3.0),
     "position of J2 reversed": lambda t, s, f: counted(t, s, f, 1, 1.0),
     "position of J3 reversed": lambda t, s, f: counted(t, s, f, 2, 1.0),

@@ -18,7 +18,7 @@ NOISE, AXIS_NOISE = 1.01, 1.02
 two differ by 0.1 % and 0.3 % (`tests.studies.holdout_study`)."""
 CORRECTED_BY = {"zero-off": "zero-offset", "gravity-tilted": "gravity-direction", "position-late": "late-position"}
 """Diagnosis of the description, and the effect that corrects it in a calibration."""
-NEVER_CORRECTED = frozenset({"gravity-turned", "position-reversed"})
+NEVER_CORRECTED = frozenset({"gravity-turned", "position-reversed", "zero-turned"})
 """Diagnoses of a description that is so far off that nothing in a calibration corrects it."""
 BY_ENCODERS = frozenset({"zero-off", "length-off", "geometry-off"})
 """Diagnoses by encoders that miss the loops of a closed chain."""

@@ -117,6 +117,17 @@ def test_the_check_beside_a_fit_names_it_too(mistake: Mistake) -> None:
     found = _checked(mistake).mistake
     assert found is not None
     assert (found.effect.name, found.axis) == (mistake.name, mistake.axis)
+    assert np.all(np.abs(found.coefficients - mistake.values) < 3.0 * found.deviations)
+
+
+@pytest.mark.parametrize("zero_deg", [-15.0, 30.0])
+def test_the_check_gives_a_large_zero_its_size(zero_deg: float) -> None:
+    """The column of a zero is for small ones: by it alone, 30° are 35 ± 1°."""
+    mistake = Mistake("zero-offset", 1, (-np.radians(zero_deg),), zero_rad=np.radians(zero_deg))
+    found = _checked(mistake).mistake
+    assert found is not None
+    assert (found.effect.name, found.axis) == ("zero-offset", 1)
+    assert np.all(np.abs(found.coefficients - mistake.values) < 3.0 * found.deviations)
 
 
 def test_a_clean_recording_names_nothing_and_shows_the_direction_of_gravity() -> None:

@@ -1,4 +1,4 @@
-"""Gravity that points elsewhere than declared, and positions that count the other way."""
+"""Gravity that points elsewhere than declared, positions that count the other way, and zeros a quarter turn away."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from ident.estimators.turned_geometry import (
     GRAVITY_TURNED,
     POSITION_REVERSED,
     SMALLEST_TURN_DEG,
+    ZERO_TURNED,
     TurnedGeometry,
     find_turned_geometry,
     gravity_products,
@@ -84,6 +85,30 @@ def test_a_reversed_position_is_found(truth: Truth, clean: list[Run], axis: int,
     assert found.reversed_currents == ((axis,) if current_sign < 0.0 else ())
     assert ("in the URDF, or the signs of both" in said.remedy) == (current_sign < 0.0)
     assert found.corrected_positions(np.ones((1, 3))).tolist() == [signs.tolist()]
+
+
+@pytest.mark.parametrize("offset_deg", [40.0, -45.0, 60.0, 90.0, -90.0, 135.0, 160.0, 180.0])
+def test_a_zero_that_is_far_off_is_found_with_its_size(truth: Truth, clean: list[Run], offset_deg: float) -> None:
+    """It was silent below 45°, and called a payload that was not there above."""
+    offset = np.array([0.0, np.deg2rad(offset_deg), 0.0])
+    found = found_in(truth, [replace(run, position_rad=run.position_rad + offset) for run in clean])
+    assert found is not None
+    said = found.diagnosis(AXES)
+    assert (said.name, said.axes) == (ZERO_TURNED, ("J2",))
+    read = np.rad2deg(found.readings[0].zero_rad)
+    assert abs((read + offset_deg + 180.0) % 360.0 - 180.0) < 2.0
+    assert -180.0 < read <= 180.0
+    assert f"add about {read:+.0f} deg to `zero_offset_deg` of J2" in said.remedy
+    corrected = found.corrected_positions(np.zeros((1, 3)))
+    assert corrected == pytest.approx(np.deg2rad([[0.0, read, 0.0]]))
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_a_zero_that_no_torque_shows_is_not_found(truth: Truth, clean: list[Run], axis: int) -> None:
+    """About a vertical axis and behind the last joint another zero makes the same torques."""
+    offset = np.zeros(3)
+    offset[axis] = np.deg2rad(90.0)
+    assert found_in(truth, [replace(run, position_rad=run.position_rad + offset) for run in clean]) is None
 
 
 @pytest.mark.parametrize(
