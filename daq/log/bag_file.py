@@ -1,4 +1,4 @@
-"""Read the messages of a file of a ROS 2 bag: MCAP or SQLite, with messages or the whole file packed by zstd, or not.
+"""Open a file of a ROS 2 bag: MCAP or SQLite, packed as a whole by zstd or not.
 
 The file may be truncated, damaged or malicious: what it unfolds to, or makes SQLite compute, is bounded by its size.
 """
@@ -7,120 +7,25 @@ from __future__ import annotations
 
 import os
 import sqlite3
-import struct
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
 
 import zstandard
-from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Header, McapRecord, Message, Schema
 
 from daq.errors import LogCorrupt, LogMissing, LogTruncated, OutputFailed
 from daq.files import open_regular
-from daq.log.container import LARGEST_CHUNK, LARGEST_RATIO, LARGEST_RECORD, RecordFile
+from daq.log.container import LARGEST_CHUNK, LARGEST_RATIO, LARGEST_RECORD
+from daq.log.mcap_bag import ZSTD_MAGIC, BagMessage, McapBag, Topic
 from daq.log.message import JOINTS_SCHEMA
 
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 SQLITE_MAGIC = b"SQLite format 3\0"
 STEPS = 10_000_000  #: Instructions of SQLite for any file, and STEPS_A_BYTE more for each byte; a message takes 20
 STEPS_A_BYTE = 2
 COUNTED_STEPS = 1000  #: Instructions between two counts
 BYTES_A_TOPIC = 64  #: Least size of a topic in the file
 PIECE_BYTES = 2**20  #: Unpacked at a time
-
-
-@dataclass(frozen=True, slots=True)
-class Topic:
-    """A topic of a bag."""
-
-    name: str  #: as publishers know it
-    has_joint_states: bool  #: in CDR
-
-
-class BagMessage(NamedTuple):
-    """A message as it was recorded."""
-
-    place: int  #: byte of the file, or row of the table
-    topic: Topic  #: where it was published
-    time_ns: int  #: time of its recording
-    data: bytes  #: its fields, maybe packed: see `unpack_message`
-
-
-class McapBag(RecordFile):
-    """A bag in MCAP, which is laxer than a log of ours: checksums are optional, and messages need no chunks."""
-
-    def __init__(self, path: Path, source: Path | None = None) -> None:
-        """Store the path, and where the content is if not there."""
-        super().__init__(path, source)
-        self.library = ""
-        self.topics: dict[int, Topic] = {}
-        self._schemas: dict[int, Schema] = {}
-
-    def messages(self) -> Generator[BagMessage, None, None]:
-        """Yield the messages; `topics` grows meanwhile.
-
-        Raises:
-            LogUnreadable: one of its kinds, with the place in the file.
-        """
-        with closing(iter(self)) as records:
-            yield from self._messages(records)
-
-    def unfinished_messages(self) -> Generator[BagMessage, None, None]:
-        """Yield the messages before the damage of a file without a valid end, then raise as `messages`."""
-        with closing(self.unfinished()) as records:
-            yield from self._messages(records)
-
-    def _messages(self, records: Iterable[tuple[int, McapRecord]]) -> Iterator[BagMessage]:
-        for offset, outer in records:
-            inside = self._inside(offset, outer) if isinstance(outer, Chunk) else (outer,)
-            for record in inside:
-                if isinstance(record, Message):
-                    topic = self.topics.get(record.channel_id)
-                    if topic is None:
-                        raise self.corrupt(offset, f"a message of channel {record.channel_id}", "a channel before it")
-                    yield BagMessage(offset, topic, record.log_time, record.data)
-                elif isinstance(record, Header):
-                    self.library = record.library
-                elif isinstance(record, Schema):
-                    self._schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    schema = self._schemas.get(record.schema_id)
-                    is_joints = schema is not None and schema.name == JOINTS_SCHEMA
-                    self.topics[record.id] = Topic(record.topic, is_joints and record.message_encoding == "cdr")
-
-    def _inside(self, offset: int, chunk: Chunk) -> Iterator[McapRecord]:
-        data = self.unpack(offset, chunk)
-        at = 0
-        while at < len(data):
-            self.spend(offset)
-            opcode, length = struct.unpack_from("<BQ", data, at) if len(data) - at >= 9 else (0, len(data))
-            at += 9 + length
-            if at > len(data):
-                raise self.corrupt(offset, "a record beyond the end of its chunk", "one inside")
-            for _, record in self._record(offset, opcode, data[at - length : at]):
-                yield record
-
-    def _record(self, offset: int, opcode: int, body: bytes) -> Iterator[tuple[int, McapRecord]]:
-        if opcode != Opcode.MESSAGE:
-            yield from super()._record(offset, opcode, body)
-        elif len(body) < 22:
-            raise self.corrupt(offset, "a message without its head", "one of at least 22 bytes")
-        else:
-            channel, sequence, log_time, publish_time = struct.unpack_from("<HIQQ", body)
-            yield offset, Message(channel, log_time, body[22:], publish_time, sequence)
-
-    def _check_crc(self, offset: int, what: str, stored: int, computed: int) -> None:
-        if stored != 0:  # ROS 2 leaves the checksum of the data section out
-            super()._check_crc(offset, what, stored, computed)
-
-    def _truncated(self, size: int, good: int | None) -> LogTruncated:
-        error = super()._truncated(size, good)
-        remedy = "the recorder was killed or the copy is incomplete: copy it again, or repair it with `mcap recover`"
-        return LogTruncated(error.subject, found=error.found, expected="a finished bag", remedy=remedy)
 
 
 class SqliteBag:
@@ -276,23 +181,3 @@ def _packed_wrong(path: Path, found: str) -> LogCorrupt:
         expected="a recording, packed by zstd",
         remedy="copy it again from where it was recorded",
     )
-
-
-def unpack_message(data: bytes) -> bytes:
-    """Return the fields of a message that may be packed by itself (`compression_mode: MESSAGE`).
-
-    CDR begins with two bytes of which the first is 0, a frame of zstd never does.
-
-    Raises:
-        ValueError: it is packed, and broken or large.
-    """
-    if not data.startswith(ZSTD_MAGIC):
-        return data
-    try:
-        largest = LARGEST_RATIO * len(data)
-        claimed = zstandard.frame_content_size(data)
-        if claimed > largest:
-            raise ValueError(f"{len(data)} bytes that unfold to {claimed}")
-        return zstandard.ZstdDecompressor().decompress(data, max_output_size=largest)
-    except zstandard.ZstdError as error:
-        raise ValueError(f"packed bytes ({error})") from error

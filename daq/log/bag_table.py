@@ -6,83 +6,23 @@ stamp that hold different joints make one row, because several publishers may sh
 
 from __future__ import annotations
 
-import struct
 from array import array
-from contextlib import closing, suppress
-from dataclasses import dataclass
-from itertools import islice
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 
 from daq.config.import_description import Column, ImportDescription, TimeColumn, TimeUnit
-from daq.errors import LogForeign, LogUnreadable, TableUnfit
-from daq.log.bag_file import McapBag, open_bag, unpack_message
-from daq.log.message import JOINTS_SCHEMA, SAMPLES_TOPIC
+from daq.errors import TableUnfit
+from daq.log.bag_file import open_bag
+from daq.log.mcap_bag import JointState, joint_state_from_cdr, unpack_message
+from daq.log.message import JOINTS_SCHEMA
 from daq.log.table import LATEST_NS, Table, digest_of, require_finite, stamps_of_ns
 
 STAMP = "header.stamp"  #: Name of the time column
 FIELDS = ("position", "velocity", "effort")
 PACKED = ".zstd"  #: Suffix of a file that is packed as a whole
 PATTERNS = ("*.mcap", "*.db3", "*.mcap.zstd", "*.db3.zstd")  #: Files of a bag in its folder
-
-
-@dataclass(frozen=True, slots=True)
-class JointState:
-    """A message of the type sensor_msgs/msg/JointState; a field without values is empty."""
-
-    stamp_ns: int  #: of its header
-    names: tuple[str, ...]  #: names of n joints
-    position: tuple[float, ...]  #: [rad; m for a prismatic joint], shape (n,)
-    velocity: tuple[float, ...]  #: per second, shape (n,)
-    effort: tuple[float, ...]  #: [Nm; N for a prismatic joint], or what the publisher takes it for, shape (n,)
-
-
-def joint_state_from_cdr(data: bytes) -> JointState:
-    """Decode a message (OMG CDR as DDS transports it: four bytes of encapsulation, then the fields, each aligned).
-
-    Raises:
-        ValueError: it is not one, or ends early.
-    """
-    order = {b"\x00\x00": ">", b"\x00\x01": "<"}.get(data[:2])
-    if order is None:
-        raise ValueError(f"encapsulation {data[:2].hex()}")
-    body, at = data[4:], 8
-
-    def unsigned() -> int:
-        nonlocal at
-        at += -at % 4
-        (number,) = struct.unpack_from(order + "I", body, at)
-        at += 4
-        return int(number)
-
-    def text() -> str:
-        nonlocal at
-        size = unsigned()
-        if size > len(body) - at:
-            raise ValueError(f"{len(body) - at} bytes of a text of {size}")
-        at += size
-        return body[at - size : at].rstrip(b"\0").decode()
-
-    def numbers() -> tuple[float, ...]:
-        nonlocal at
-        count = unsigned()
-        at += -at % 8 if count else 0
-        if 8 * count > len(body) - at:
-            raise ValueError(f"{len(body) - at} bytes of {count} numbers")
-        at += 8 * count
-        return struct.unpack_from(f"{order}{count}d", body, at - 8 * count)
-
-    try:
-        seconds, nanoseconds = struct.unpack_from(order + "iI", body)
-        text()  # the frame
-        count = unsigned()
-        if count > len(body):
-            raise ValueError(f"{count} names in {len(body)} bytes")
-        names = tuple([text() for _ in range(count)])
-        return JointState(seconds * 1_000_000_000 + nanoseconds, names, numbers(), numbers(), numbers())
-    except struct.error as error:
-        raise ValueError(f"a message of {len(data)} bytes ({error})") from error
 
 
 def read_bag(path: Path, wanted: ImportDescription, columns: tuple[Column, ...], time: TimeColumn | None) -> Table:
@@ -272,27 +212,3 @@ class _Rows:
 def _require_possible(time_ns: int) -> None:
     if time_ns >= LATEST_NS:
         raise ValueError(f"a time of {time_ns} ns")
-
-
-EXAMINED = 10_000  #: Messages that are examined to say what a file is
-
-
-def foreign_recording(path: Path) -> LogForeign | None:
-    """Return the error for an MCAP file of another program; None if it may be a log of ours, or no MCAP file."""
-    bag = McapBag(path)
-    joints: tuple[str, ...] = ()
-    with suppress(LogUnreadable, ValueError), closing(bag.unfinished_messages()) as messages:
-        for message in islice(messages, EXAMINED):
-            if message.topic.has_joint_states:
-                joints = joints or joint_state_from_cdr(unpack_message(message.data)).names
-    topics = {topic.name: topic.has_joint_states for topic in bag.topics.values()}
-    if not topics or SAMPLES_TOPIC in topics:
-        return None
-    states = [topic for topic, has in topics.items() if has]
-    found = f"a bag of {bag.library or 'another program'} with " + (
-        f"joint states of {', '.join(joints) or 'no joint'} on {', '.join(states)}" if states else ", ".join(topics)
-    )
-    remedy = f"`drivegain import` reads bags with {JOINTS_SCHEMA}"
-    if states:
-        remedy = "import it: `drivegain import`, with the joints as `columns` (configs/imports/tx40.yaml)"
-    return LogForeign(str(path), found=found, expected="a log of drivegain", remedy=remedy)

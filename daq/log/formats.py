@@ -8,11 +8,12 @@ from pathlib import Path
 
 from daq.config.import_description import ImportDescription, Section, TemperatureColumns
 from daq.errors import ConfigurationInconsistent, TableUnfit
-from daq.log.bag_file import SQLITE_MAGIC, ZSTD_MAGIC, first_bytes
+from daq.log.bag_file import SQLITE_MAGIC, first_bytes
 from daq.log.bag_table import FIELDS, read_bag
 from daq.log.container import MAGIC
 from daq.log.csv_table import read_csv
 from daq.log.mat_table import read_mat
+from daq.log.mcap_bag import ZSTD_MAGIC
 from daq.log.table import Reader
 
 _HEADS: dict[bytes, Reader] = {

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from daq.config.yaml_file import MAX_BYTES
 from daq.errors import ClockImplausible, CyclesLost, DataError, LogIncomplete, LogMissing, LogUnreadable
-from daq.log.bag_table import foreign_recording
 from daq.log.container import UNFINISHED, ChunkContents, RecordFile
+from daq.log.mcap_bag import foreign_recording
 from daq.log.message import ENCAPSULATION_WORD, LARGEST_AXES, SAMPLES_TOPIC
 from daq.log.metadata import (
     READBACK,

@@ -20,9 +20,10 @@ from mcap_ros2.writer import Writer as Ros2Writer
 from daq.cli import main
 from daq.config.import_description import ImportDescription, TimeColumn, TimeUnit
 from daq.errors import ConfigurationInconsistent, DataError, LogForeign, LogTruncated, TableUnfit
-from daq.log.bag_table import STAMP, joint_state_from_cdr, read_bag
+from daq.log.bag_table import STAMP, read_bag
 from daq.log.conversion import load_run
 from daq.log.importing import import_recording
+from daq.log.mcap_bag import joint_state_from_cdr
 from daq.log.message import DEFINITIONS, JOINTS_SCHEMA
 from daq.log.reader import read_log
 from daq.log.table import Table

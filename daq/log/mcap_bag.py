@@ -1,0 +1,211 @@
+"""Read ROS 2 bags in MCAP: their messages, the joint states in them, and the name of a file that is no log of ours."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import zstandard
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Header, McapRecord, Message, Schema
+
+from daq.errors import LogForeign, LogTruncated, LogUnreadable
+from daq.log.container import LARGEST_RATIO, RecordFile
+from daq.log.message import JOINTS_SCHEMA, SAMPLES_TOPIC
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+EXAMINED = 10_000  #: Messages that are examined to say what a file is
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of a bag."""
+
+    name: str  #: as publishers know it
+    has_joint_states: bool  #: in CDR
+
+
+class BagMessage(NamedTuple):
+    """A message as it was recorded."""
+
+    place: int  #: byte of the file, or row of the table
+    topic: Topic  #: where it was published
+    time_ns: int  #: time of its recording
+    data: bytes  #: its fields, maybe packed: see `unpack_message`
+
+
+class McapBag(RecordFile):
+    """A bag in MCAP, which is laxer than a log of ours: checksums are optional, and messages need no chunks."""
+
+    def __init__(self, path: Path, source: Path | None = None) -> None:
+        """Store the path, and where the content is if not there."""
+        super().__init__(path, source)
+        self.library = ""
+        self.topics: dict[int, Topic] = {}
+        self._schemas: dict[int, Schema] = {}
+
+    def messages(self) -> Generator[BagMessage, None, None]:
+        """Yield the messages; `topics` grows meanwhile.
+
+        Raises:
+            LogUnreadable: one of its kinds, with the place in the file.
+        """
+        with closing(iter(self)) as records:
+            yield from self._messages(records)
+
+    def unfinished_messages(self) -> Generator[BagMessage, None, None]:
+        """Yield the messages before the damage of a file without a valid end, then raise as `messages`."""
+        with closing(self.unfinished()) as records:
+            yield from self._messages(records)
+
+    def _messages(self, records: Iterable[tuple[int, McapRecord]]) -> Iterator[BagMessage]:
+        for offset, outer in records:
+            inside = self._inside(offset, outer) if isinstance(outer, Chunk) else (outer,)
+            for record in inside:
+                if isinstance(record, Message):
+                    topic = self.topics.get(record.channel_id)
+                    if topic is None:
+                        raise self.corrupt(offset, f"a message of channel {record.channel_id}", "a channel before it")
+                    yield BagMessage(offset, topic, record.log_time, record.data)
+                elif isinstance(record, Header):
+                    self.library = record.library
+                elif isinstance(record, Schema):
+                    self._schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    schema = self._schemas.get(record.schema_id)
+                    is_joints = schema is not None and schema.name == JOINTS_SCHEMA
+                    self.topics[record.id] = Topic(record.topic, is_joints and record.message_encoding == "cdr")
+
+    def _inside(self, offset: int, chunk: Chunk) -> Iterator[McapRecord]:
+        data = self.unpack(offset, chunk)
+        at = 0
+        while at < len(data):
+            self.spend(offset)
+            opcode, length = struct.unpack_from("<BQ", data, at) if len(data) - at >= 9 else (0, len(data))
+            at += 9 + length
+            if at > len(data):
+                raise self.corrupt(offset, "a record beyond the end of its chunk", "one inside")
+            for _, record in self._record(offset, opcode, data[at - length : at]):
+                yield record
+
+    def _record(self, offset: int, opcode: int, body: bytes) -> Iterator[tuple[int, McapRecord]]:
+        if opcode != Opcode.MESSAGE:
+            yield from super()._record(offset, opcode, body)
+        elif len(body) < 22:
+            raise self.corrupt(offset, "a message without its head", "one of at least 22 bytes")
+        else:
+            channel, sequence, log_time, publish_time = struct.unpack_from("<HIQQ", body)
+            yield offset, Message(channel, log_time, body[22:], publish_time, sequence)
+
+    def _check_crc(self, offset: int, what: str, stored: int, computed: int) -> None:
+        if stored != 0:  # ROS 2 leaves the checksum of the data section out
+            super()._check_crc(offset, what, stored, computed)
+
+    def _truncated(self, size: int, good: int | None) -> LogTruncated:
+        error = super()._truncated(size, good)
+        remedy = "the recorder was killed or the copy is incomplete: copy it again, or repair it with `mcap recover`"
+        return LogTruncated(error.subject, found=error.found, expected="a finished bag", remedy=remedy)
+
+
+def unpack_message(data: bytes) -> bytes:
+    """Return the fields of a message that may be packed by itself (`compression_mode: MESSAGE`).
+
+    CDR begins with two bytes of which the first is 0, a frame of zstd never does.
+
+    Raises:
+        ValueError: it is packed, and broken or large.
+    """
+    if not data.startswith(ZSTD_MAGIC):
+        return data
+    try:
+        largest = LARGEST_RATIO * len(data)
+        claimed = zstandard.frame_content_size(data)
+        if claimed > largest:
+            raise ValueError(f"{len(data)} bytes that unfold to {claimed}")
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=largest)
+    except zstandard.ZstdError as error:
+        raise ValueError(f"packed bytes ({error})") from error
+
+
+@dataclass(frozen=True, slots=True)
+class JointState:
+    """A message of the type sensor_msgs/msg/JointState; a field without values is empty."""
+
+    stamp_ns: int  #: of its header
+    names: tuple[str, ...]  #: names of n joints
+    position: tuple[float, ...]  #: [rad; m for a prismatic joint], shape (n,)
+    velocity: tuple[float, ...]  #: per second, shape (n,)
+    effort: tuple[float, ...]  #: [Nm; N for a prismatic joint], or what the publisher takes it for, shape (n,)
+
+
+def joint_state_from_cdr(data: bytes) -> JointState:
+    """Decode a message (OMG CDR as DDS transports it: four bytes of encapsulation, then the fields, each aligned).
+
+    Raises:
+        ValueError: it is not one, or ends early.
+    """
+    order = {b"\x00\x00": ">", b"\x00\x01": "<"}.get(data[:2])
+    if order is None:
+        raise ValueError(f"encapsulation {data[:2].hex()}")
+    body, at = data[4:], 8
+
+    def unsigned() -> int:
+        nonlocal at
+        at += -at % 4
+        (number,) = struct.unpack_from(order + "I", body, at)
+        at += 4
+        return int(number)
+
+    def text() -> str:
+        nonlocal at
+        size = unsigned()
+        if size > len(body) - at:
+            raise ValueError(f"{len(body) - at} bytes of a text of {size}")
+        at += size
+        return body[at - size : at].rstrip(b"\0").decode()
+
+    def numbers() -> tuple[float, ...]:
+        nonlocal at
+        count = unsigned()
+        at += -at % 8 if count else 0
+        if 8 * count > len(body) - at:
+            raise ValueError(f"{len(body) - at} bytes of {count} numbers")
+        at += 8 * count
+        return struct.unpack_from(f"{order}{count}d", body, at - 8 * count)
+
+    try:
+        seconds, nanoseconds = struct.unpack_from(order + "iI", body)
+        text()  # the frame
+        count = unsigned()
+        if count > len(body):
+            raise ValueError(f"{count} names in {len(body)} bytes")
+        names = tuple([text() for _ in range(count)])
+        return JointState(seconds * 1_000_000_000 + nanoseconds, names, numbers(), numbers(), numbers())
+    except struct.error as error:
+        raise ValueError(f"a message of {len(data)} bytes ({error})") from error
+
+
+def foreign_recording(path: Path) -> LogForeign | None:
+    """Return the error for an MCAP file of another program; None if it may be a log of ours, or no MCAP file."""
+    bag = McapBag(path)
+    joints: tuple[str, ...] = ()
+    with suppress(LogUnreadable, ValueError), closing(bag.unfinished_messages()) as messages:
+        for message in islice(messages, EXAMINED):
+            if message.topic.has_joint_states:
+                joints = joints or joint_state_from_cdr(unpack_message(message.data)).names
+    topics = {topic.name: topic.has_joint_states for topic in bag.topics.values()}
+    if not topics or SAMPLES_TOPIC in topics:
+        return None
+    states = [topic for topic, has in topics.items() if has]
+    found = f"a bag of {bag.library or 'another program'} with " + (
+        f"joint states of {', '.join(joints) or 'no joint'} on {', '.join(states)}" if states else ", ".join(topics)
+    )
+    remedy = f"`drivegain import` reads bags with {JOINTS_SCHEMA}"
+    if states:
+        remedy = "import it: `drivegain import`, with the joints as `columns` (configs/imports/tx40.yaml)"
+    return LogForeign(str(path), found=found, expected="a log of drivegain", remedy=remedy)
