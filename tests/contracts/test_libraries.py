@@ -84,9 +84,10 @@ SAME_NAME = {
 def _defined(code: str) -> Iterator[str]:
     """Classes and public functions of a module."""
     for node in ast.parse(code).body:
-        is_function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-        if isinstance(node, ast.ClassDef) or (is_function and not node.name.startswith("_")):
-            yield node.name
+        if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            is_private = node.name.startswith("_")
+            if isinstance(node, ast.ClassDef) or not is_private:
+                yield node.name
 
 
 def test_no_class_or_public_function_is_defined_twice() -> None:
