@@ -86,6 +86,7 @@ def identify(
     if not standard.runs:
         raise DataUnfit("", "no run was given; expected one without load and one with a weighed payload")
     system = regrouped(standard)
+    del standard  # its clusters hold every column
     require_distinct(system, gains=fixed_gains is None)
     estimate = estimate_with(method, system, fixed_gains)
     jackknifed = estimate

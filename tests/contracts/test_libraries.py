@@ -84,10 +84,10 @@ SAME_NAME = {
 def _defined(code: str) -> Iterator[str]:
     """Classes and public functions of a module."""
     for node in ast.parse(code).body:
-        if not isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            continue
-        if isinstance(node, ast.ClassDef) or not node.name.startswith("_"):
-            yield node.name
+        if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            is_private = node.name.startswith("_")
+            if isinstance(node, ast.ClassDef) or not is_private:
+                yield node.name
 
 
 def test_no_class_or_public_function_is_defined_twice() -> None:
