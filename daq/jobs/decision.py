@@ -15,7 +15,7 @@ from daq.jobs.journal import Level
 from daq.jobs.session import CALIBRATION, Session
 from daq.ledger.audit import AuditAction
 from daq.ledger.audit import read as read_audit
-from daq.ledger.history import History
+from daq.ledger.fold import History
 from daq.ledger.ledger import record_session
 from daq.report.text import json_text, picked
 from daq.writeback.file_access import resolve_links

@@ -31,7 +31,7 @@ from daq.ledger.audit import (
     verify,
 )
 from daq.ledger.entry import Entry, figures_of, iso
-from daq.ledger.history import (
+from daq.ledger.fold import (
     AuditedWrite,
     History,
     at_of,
@@ -42,13 +42,13 @@ from daq.ledger.history import (
 )
 from daq.ledger.migration import (
     EMPTY,
-    Draft,
+    EntryDraft,
     StoredHistory,
-    contradictions,
     drafts_of,
     history_subject,
     read_stored,
     set_aside,
+    stored_contradictions,
 )
 from ident.calibration import Calibration
 
@@ -224,7 +224,9 @@ def enter_calibration(ledger: Ledger, calibration: Calibration, *, digest: str, 
             "document": encode_calibration(calibration).decode(),
             "figures": figures_of(calibration, digest, at),
         }
-        _append(ledger, Draft(AuditAction.CALIBRATION_ENTERED, at, who, history_subject(ledger.cell.name), details))
+        _append(
+            ledger, EntryDraft(AuditAction.CALIBRATION_ENTERED, at, who, history_subject(ledger.cell.name), details)
+        )
     _end_found_writes(ledger)
     return new
 
@@ -244,7 +246,7 @@ def acknowledge(ledger: Ledger, axis: str, *, since: datetime, at: datetime, who
         AuditUnusable, OutputFailed: it could not be recorded.
     """
     details = {"axis": axis, "cell": ledger.cell.name, "since": since.isoformat(), "why": why}
-    _append(ledger, Draft(AuditAction.ACKNOWLEDGED, at, who, f"gain of {axis}", details))
+    _append(ledger, EntryDraft(AuditAction.ACKNOWLEDGED, at, who, f"gain of {axis}", details))
 
 
 def migrate(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) -> Migrated:
@@ -333,7 +335,7 @@ def _read_stored(ledger: Ledger) -> StoredHistory:
 
 
 def _flaws(ledger: Ledger, stored: StoredHistory, entries: Sequence[AuditEntry]) -> tuple[str, ...]:
-    return (*stored.flaws, *contradictions(stored, entries, ledger.cell.name))
+    return (*stored.flaws, *stored_contradictions(stored, entries, ledger.cell.name))
 
 
 def _with_stored(entries: Sequence[AuditEntry], stored: StoredHistory, cell: Cell) -> tuple[AuditEntry, ...]:
@@ -348,7 +350,7 @@ def _with_stored(entries: Sequence[AuditEntry], stored: StoredHistory, cell: Cel
     return tuple(chain)
 
 
-def _append(ledger: Ledger, draft: Draft) -> AuditEntry:
+def _append(ledger: Ledger, draft: EntryDraft) -> AuditEntry:
     with writing(ledger.audit):
         return append(
             ledger.audit, draft.action, at=draft.at, who=draft.who, subject=draft.subject, details=draft.details
@@ -377,7 +379,7 @@ def _end_found_writes(ledger: Ledger) -> None:
             "calibration": {"sha256": write.calibration, "cell": ledger.cell.name},
             "sha256_after": write.sha256_after,
         }
-        _append(ledger, Draft(AuditAction.WRITE_FOUND, at, begun.who, begun.subject, details))
+        _append(ledger, EntryDraft(AuditAction.WRITE_FOUND, at, begun.who, begun.subject, details))
 
 
 def _is_made(one: OpenWrite) -> bool:

@@ -20,15 +20,15 @@ from daq.documents.calibration_file import decode_calibration
 from daq.errors import DaqError, HistoryUnreadable
 from daq.ledger.audit import AuditAction, AuditEntry
 from daq.ledger.entry import Acknowledgement, Event, WriteAction, figures_of, iso, zoned
-from daq.ledger.history import (
+from daq.ledger.fold import (
     AuditedWrite,
     acknowledgement_of,
     at_of,
     begun_by,
-    calibration_of,
+    calibration_field,
     entered_calibrations,
     is_end,
-    text_of,
+    text_field,
 )
 
 BUSY_S = 5.0  #: How long to wait for another process' transaction
@@ -65,7 +65,7 @@ EMPTY = StoredHistory((), (), (), ())
 
 
 @dataclass(frozen=True, slots=True)
-class Draft:
+class EntryDraft:
     """An entry that the audit log is to get."""
 
     action: AuditAction  #: its kind
@@ -156,7 +156,7 @@ def _gaps(connection: sqlite3.Connection, table: str) -> Iterator[str]:
         yield f"{table}: found {len(there)} rows, expected all from 1 to {last}"
 
 
-def contradictions(stored: StoredHistory, entries: Sequence[AuditEntry], cell: str) -> Iterator[str]:
+def stored_contradictions(stored: StoredHistory, entries: Sequence[AuditEntry], cell: str) -> Iterator[str]:
     """Report what the file says otherwise than the audit log, as sentences."""
     by_digest = {one.sha256: one for one in entries}
     begun = {one.number: one for one in entries}
@@ -189,10 +189,10 @@ def _event_flaws(name: str, event: Event, entry: AuditEntry, begun: AuditEntry |
     if is_end(entry):
         # One that names the begin was entered later: its writer was killed, and another process may have done it.
         expected |= {"who": entry.who, "at": at_of(entry), "action": AuditedWrite(first, entry).action}
-    after = text_of(first, "sha256_after")
+    after = text_field(first, "sha256_after")
     if after is not None:
         expected["sha256_after"] = after
-    digest = calibration_of(first, "sha256")
+    digest = calibration_field(first, "sha256")
     if digest is not None and entry.action is not AuditAction.ROLLED_BACK:
         expected["digest"] = digest
     yield from _differences(name, asdict(event), expected, _as_said_by(entry))
@@ -231,7 +231,9 @@ def _shown(value: object) -> str:
     return repr(value.value if isinstance(value, WriteAction) else value)
 
 
-def drafts_of(stored: StoredHistory, entries: Sequence[AuditEntry], cell: str, who: str, at: datetime) -> list[Draft]:
+def drafts_of(
+    stored: StoredHistory, entries: Sequence[AuditEntry], cell: str, who: str, at: datetime
+) -> list[EntryDraft]:
     """Return what the audit log lacks of a stored history: nothing where it was migrated before.
 
     Args:
@@ -250,7 +252,7 @@ def drafts_of(stored: StoredHistory, entries: Sequence[AuditEntry], cell: str, w
 
 def _calibration_drafts(
     stored: Iterable[StoredCalibration], entries: Sequence[AuditEntry], cell: str, who: str, at: datetime
-) -> Iterator[Draft]:
+) -> Iterator[EntryDraft]:
     """Enter calibrations that only the file has, and the figures of those that an earlier version entered."""
     known = {one.digest: one for one in entered_calibrations(entries, cell)}
     lacking = [one for one in stored if one.digest not in known]
@@ -272,7 +274,7 @@ def _calibration_drafts(
         }
         if one.digest not in known:
             details["document"] = one.document
-        yield Draft(AuditAction.CALIBRATION_ENTERED, at, who, history_subject(cell), details)
+        yield EntryDraft(AuditAction.CALIBRATION_ENTERED, at, who, history_subject(cell), details)
 
 
 def history_subject(cell: str) -> str:
@@ -280,7 +282,7 @@ def history_subject(cell: str) -> str:
     return f"history of {cell}"
 
 
-def _event_drafts(stored: Iterable[Event], entries: Sequence[AuditEntry], cell: str) -> Iterator[Draft]:
+def _event_drafts(stored: Iterable[Event], entries: Sequence[AuditEntry], cell: str) -> Iterator[EntryDraft]:
     by_digest = {one.sha256: one for one in entries}
     found = {(one.subject, one.at, one.who) for one in entries if one.action is AuditAction.WRITE_FOUND}
     for event in stored:
@@ -296,16 +298,16 @@ def _event_drafts(stored: Iterable[Event], entries: Sequence[AuditEntry], cell: 
             "sha256_after": event.sha256_after,
             "migrated": True,
         }
-        yield Draft(AuditAction.WRITE_FOUND, event.at, event.who, event.target, details)
+        yield EntryDraft(AuditAction.WRITE_FOUND, event.at, event.who, event.target, details)
 
 
 def _acknowledgement_drafts(
     stored: Iterable[Acknowledgement], entries: Sequence[AuditEntry], cell: str
-) -> Iterator[Draft]:
+) -> Iterator[EntryDraft]:
     known = set()
     for entry in entries:
         found = acknowledgement_of(entry)
-        if found is not None and text_of(entry, "cell") == cell:
+        if found is not None and text_field(entry, "cell") == cell:
             known.add((found.axis, found.since, found.at, found.who, found.why))
     for noted in stored:
         # The first versions did not enter the name of the cell.
@@ -317,7 +319,7 @@ def _acknowledgement_drafts(
                 "why": noted.why,
                 "migrated": True,
             }
-            yield Draft(AuditAction.ACKNOWLEDGED, noted.at, noted.who, f"gain of {noted.axis}", details)
+            yield EntryDraft(AuditAction.ACKNOWLEDGED, noted.at, noted.who, f"gain of {noted.axis}", details)
 
 
 def set_aside(path: Path, at: datetime) -> Path:

@@ -18,7 +18,7 @@ from daq.formats.document import decode_document, read_controller_file
 from daq.formats.scalar import Scalar, rewrite_gain
 from daq.ledger.audit import AuditEntry
 from daq.ledger.entry import Entry, Event, WriteAction, drives_of
-from daq.ledger.history import History
+from daq.ledger.fold import History
 from daq.ledger.ledger import Verification
 from daq.ledger.watch import Series, alarm_text, pattern_of, questions
 from daq.report.gains import with_deviation

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from daq.config.cell import Cell
 from daq.errors import DaqError
 from daq.files import sha256
-from daq.ledger.history import History
+from daq.ledger.fold import History
 from daq.ledger.ledger import Ledger, read_history
 from daq.ledger.watch import dispersions_of
 from daq.writeback.request import GainChange, Request

@@ -14,7 +14,7 @@ from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import encode_calibration
 from daq.environment import shipped_configurations
 from daq.ledger.audit import AuditAction, AuditEntry, append
-from daq.ledger.history import History
+from daq.ledger.fold import History
 from daq.ledger.ledger import Ledger, enter_calibration, read_history
 from ident.calibration import Calibration
 from tests.daq.calibrations import demo_calibration, recorded

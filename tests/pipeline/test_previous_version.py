@@ -20,7 +20,7 @@ from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import load_calibration
 from daq.ledger.audit import read as read_audit
 from daq.ledger.audit import verify
-from daq.ledger.history import writes_to
+from daq.ledger.fold import writes_to
 from daq.ledger.ledger import Ledger, read_history
 from daq.log.reader import read_log
 from tests.daq.histories import history_of

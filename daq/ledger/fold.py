@@ -46,17 +46,17 @@ class AuditedWrite:
     @property
     def action(self) -> WriteAction:
         """Applied or rolled back."""
-        return {**_ENDS, **_BEGINS}.get(self.ended.action) or WriteAction(text_of(self.ended, "action"))
+        return {**_ENDS, **_BEGINS}.get(self.ended.action) or WriteAction(text_field(self.ended, "action"))
 
     @property
     def calibration(self) -> str | None:
         """SHA-256 of the calibration, None where the audit log has none."""
-        return None if self.begun is None else calibration_of(self.begun, "sha256")
+        return None if self.begun is None else calibration_field(self.begun, "sha256")
 
     @property
     def sha256_after(self) -> str | None:
         """SHA-256 of the target's content after the write, None where the audit log has none."""
-        return None if self.begun is None else text_of(self.begun, "sha256_after")
+        return None if self.begun is None else text_field(self.begun, "sha256_after")
 
     def __str__(self) -> str:
         one = self.ended
@@ -157,11 +157,11 @@ def entered_calibrations(entries: Iterable[AuditEntry], cell: str) -> list[Enter
 
 
 def _entered_calibration(entry: AuditEntry, cell: str) -> EnteredCalibration | None:
-    if entry.action is not AuditAction.CALIBRATION_ENTERED or text_of(entry, "cell") != cell:
+    if entry.action is not AuditAction.CALIBRATION_ENTERED or text_field(entry, "cell") != cell:
         return None
-    digest = text_of(entry, "sha256")
-    entered = utc(text_of(entry, "entered") or "", _NEVER)
-    document = text_of(entry, "document")
+    digest = text_field(entry, "sha256")
+    entered = utc(text_field(entry, "entered") or "", _NEVER)
+    document = text_field(entry, "document")
     figures = entry.details.get("figures")
     known = figures if isinstance(figures, dict) else None
     if digest is None or entered == _NEVER or (document is None and known is None):
@@ -172,16 +172,16 @@ def _entered_calibration(entry: AuditEntry, cell: str) -> EnteredCalibration | N
 def _acknowledgements(entries: Iterable[AuditEntry], cell: str) -> Iterator[Acknowledgement]:
     for entry in entries:
         found = acknowledgement_of(entry)
-        if found is not None and text_of(entry, "cell") == cell:
+        if found is not None and text_field(entry, "cell") == cell:
             yield found
 
 
 def acknowledgement_of(entry: AuditEntry) -> Acknowledgement | None:
     """Return the acknowledgement of an entry, None where it lacks a part or would silence an axis beforehand."""
-    axis = text_of(entry, "axis")
-    why = text_of(entry, "why")
+    axis = text_field(entry, "axis")
+    why = text_field(entry, "why")
     at = at_of(entry)
-    since = utc(text_of(entry, "since") or "", _NEVER)
+    since = utc(text_field(entry, "since") or "", _NEVER)
     if entry.action is not AuditAction.ACKNOWLEDGED or axis is None or why is None or at is None:
         return None
     if not _NEVER < since <= at:
@@ -192,7 +192,7 @@ def acknowledgement_of(entry: AuditEntry) -> Acknowledgement | None:
 def is_end(entry: AuditEntry) -> bool:
     """Whether an entry says that a controller has other gains now."""
     return entry.action in _ENDS or (
-        entry.action is AuditAction.WRITE_FOUND and text_of(entry, "action") in {one.value for one in WriteAction}
+        entry.action is AuditAction.WRITE_FOUND and text_field(entry, "action") in {one.value for one in WriteAction}
     )
 
 
@@ -226,7 +226,7 @@ def writes_to(
         itself = one.number in unended or one.action is AuditAction.WRITE_FOUND
         write = AuditedWrite(one if itself else begun.get(begun_by(one)), one)
         if write.action is WriteAction.APPLIED:
-            owner = None if write.begun is None else calibration_of(write.begun, "cell")
+            owner = None if write.begun is None else calibration_field(write.begun, "cell")
             owners[one.subject] = owner or (cell.name if one.subject in targets else "")
         if owners.get(one.subject) == cell.name:
             found.insert(_place(found, one), write)
@@ -248,7 +248,7 @@ def _identity(one: AuditEntry) -> object:
     if number:
         return number
     if one.action is AuditAction.WRITE_FOUND:
-        return one.subject, one.at, one.who, text_of(one, "sha256_after")
+        return one.subject, one.at, one.who, text_field(one, "sha256_after")
     return one.number
 
 
@@ -295,7 +295,7 @@ def at_of(entry: AuditEntry) -> datetime | None:
     return None if found == _NEVER else found
 
 
-def text_of(entry: AuditEntry, key: str) -> str | None:
+def text_field(entry: AuditEntry, key: str) -> str | None:
     """Return a text of an entry's details, None where there is none."""
     found = entry.details.get(key)
     return found if isinstance(found, str) else None
@@ -307,7 +307,7 @@ def begun_by(entry: AuditEntry) -> int:
     return found if isinstance(found, int) else 0
 
 
-def calibration_of(begun: AuditEntry, key: str) -> str | None:
+def calibration_field(begun: AuditEntry, key: str) -> str | None:
     """Return what an entry says of its calibration, None without it."""
     recorded = begun.details.get("calibration")
     found = recorded.get(key) if isinstance(recorded, dict) else None
