@@ -81,7 +81,7 @@ WEIGHTY = tuple(index for index, name in enumerate(LINK_PARAMETERS) if name.star
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class PositionReading:
     """Another reading of the positions of one axis: the other way, or from another zero."""
 
     axis: int
@@ -129,7 +129,7 @@ class TurnedGeometry:
     """Another geometry than the declared one, which predicts left-out moves clearly better."""
 
     gravity: GravityFound | None  #: where gravity is turned
-    readings: tuple[Reading, ...]  #: else the reading of a position; then others that explain the same
+    readings: tuple[PositionReading, ...]  #: else the reading of a position; then others that explain the same
     reversed_currents: tuple[int, ...]  #: axes whose gains have another sign than their nameplates in this geometry
     before_percent: FloatArray  #: error of each motor's current on left-out moves, as declared, shape (m,)
     after_percent: FloatArray  #: the same in this geometry
@@ -297,23 +297,23 @@ def _is_suspect(model: Model, instants: Sequence[Instants], reference: FloatArra
     return False
 
 
-def _readings(model: Model) -> Iterator[Reading]:
+def _readings(model: Model) -> Iterator[PositionReading]:
     """Each position the other way, and each angle from the zeros at which a search begins."""
     for axis in range(model.robot.axis_count):
-        yield Reading(axis, sign=-1.0)
+        yield PositionReading(axis, sign=-1.0)
         yield from _turned_zeros(model, axis)
 
 
-def _turned_zeros(model: Model, axis: int) -> tuple[Reading, ...]:
+def _turned_zeros(model: Model, axis: int) -> tuple[PositionReading, ...]:
     """Readings of an angle from other zeros; none of a prismatic joint."""
     if model.robot.axes[axis].kind is JointKind.PRISMATIC:
         return ()
-    return tuple(Reading(axis, zero_rad=float(np.deg2rad(turn_deg))) for turn_deg in ZERO_TURNS_DEG)
+    return tuple(PositionReading(axis, zero_rad=float(np.deg2rad(turn_deg))) for turn_deg in ZERO_TURNS_DEG)
 
 
 def _best_zero(
     model: Model, instants: Sequence[Instants], axis: int, start: MotorFit, reference: FloatArray
-) -> Reading | None:
+) -> PositionReading | None:
     """The reading of an angle whose fit leaves least; None of a prismatic joint, or where no loop can be closed so.
 
     Args:
@@ -326,7 +326,7 @@ def _best_zero(
 
     def left(zero_rad: float) -> float:
         try:
-            products = products_of_reading(model, instants, Reading(axis, zero_rad=zero_rad), part_count=1)
+            products = products_of_reading(model, instants, PositionReading(axis, zero_rad=zero_rad), part_count=1)
         except ModelError:  # the loops of a closed chain cannot be closed so
             return np.inf
         square = products.square[:, 0]
@@ -341,7 +341,7 @@ def _best_zero(
     bounds = (near - ZERO_REACH_RAD, near + ZERO_REACH_RAD)
     found = scipy.optimize.minimize_scalar(left, bounds=bounds, method="bounded", options={"xatol": ZERO_TOLERANCE_RAD})
     best = float(found.x) if found.fun < min(levels) else near
-    return Reading(axis, zero_rad=best if best <= np.pi else best - 2.0 * np.pi)
+    return PositionReading(axis, zero_rad=best if best <= np.pi else best - 2.0 * np.pi)
 
 
 def _other_readings(
@@ -349,9 +349,9 @@ def _other_readings(
 ) -> list[Judged]:
     """Judge each position the other way, and each angle from its best other zero."""
     few = _thinned(instants)
-    tried = list[Reading]()
+    tried = list[PositionReading]()
     for axis in range(model.robot.axis_count):
-        tried.append(Reading(axis, sign=-1.0))
+        tried.append(PositionReading(axis, sign=-1.0))
         turned = _best_zero(model, few, axis, start, reference)
         if turned is not None:
             tried.append(turned)
@@ -519,7 +519,7 @@ class Judged:
     fit: MotorFit  #: of all rows
     left: FloatArray  #: of each motor's current on each part, by the fit of the others, sums of squares, shape (m, P)
     current_square: FloatArray  #: sums of squares of the currents likewise, shape (m, P)
-    reading: Reading | None = None
+    reading: PositionReading | None = None
     gravity: GravityFound | None = None
 
     @property
@@ -598,7 +598,7 @@ class MotorFit:
     parameters: FloatArray  #: χ in the same scale, shape (c,)
     weight: FloatArray  #: 1/σ² of each motor's current [1/A²], shape (m,)
 
-    def in_reading(self, reading: Reading) -> MotorFit:
+    def in_reading(self, reading: PositionReading) -> MotorFit:
         """The fit from which that of a reading begins: friction brakes the motion of a reversed position."""
         signs = np.ones(len(self.per_unit))
         signs[reading.axis] = reading.sign
@@ -795,7 +795,7 @@ def gravity_products(model: Model, instants: Sequence[Instants], part_count: int
 
 
 def products_of_reading(
-    model: Model, instants: Sequence[Instants], reading: Reading, part_count: int = PARTS
+    model: Model, instants: Sequence[Instants], reading: PositionReading, part_count: int = PARTS
 ) -> Products:
     """Products where the position of an axis is read otherwise; arguments as before.
 
