@@ -146,6 +146,10 @@ class HistoryUnreadable(DataError):
     """Not a history of drivegain, broken, of another version, or not writable."""
 
 
+class HistoryInaccessible(HistoryUnreadable):
+    """A history that may be sound: another program keeps it locked, or its rights do not let it be read."""
+
+
 class LogsDiffer(DataError):
     """Logs of different cells, or of different configurations of one."""
 

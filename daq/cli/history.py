@@ -69,7 +69,7 @@ def history_verb(
     false.
     """
     from daq.config.cell_file import load_cell
-    from daq.ledger.ledger import Ledger, read_history, warn_if_broken
+    from daq.ledger.ledger import MAY_LACK, Ledger, read_history
     from daq.ledger.watch import watch
     from daq.report.history import (
         describe_actions,
@@ -108,7 +108,8 @@ def history_verb(
         checked = _verified(ledger) if verify else None
         history = read_history(ledger) if checked is None else checked.history
         all_series = watch(history.entries, history.acknowledgements)
-    broken = checked is None and warn_if_broken(ledger)
+    if checked is None and history.may_lack:
+        _LOG.warning(MAY_LACK)
     chosen = all_series if axis is None else (_named(all_series, axis, declared),)
     _write_files(chosen, declared, plot, csv)
     current = in_force(declared, history)
@@ -125,7 +126,7 @@ def history_verb(
             say_verification(checked, console)
         elif axis is not None:
             show_axis(chosen[0], all_series, actions, console)
-        elif history.entries or not broken:
+        elif history.entries or not history.may_lack:
             show_history(history.entries, all_series, actions, console)
         say_written(console, plot, csv)
     if checked is not None:
@@ -165,8 +166,8 @@ def _require(ledger: Ledger, checked: Verification) -> None:
             str(checked.audit),
             found=_first([*checked.broken, *unknown]),
             expected="calibrations that this version can read",
-            remedy="use the version of drivegain that entered them, or keep this file and begin audit and history "
-            "anew, both (`history.audit`, `history.store`)",
+            remedy="use the version of drivegain that entered them, or keep this file and begin another one under a "
+            "new name (`history.audit`)",
         )
     if checked.unknown:
         raise HistoryUnreadable(
@@ -175,7 +176,7 @@ def _require(ledger: Ledger, checked: Verification) -> None:
             expected="a calibration in the history, and an end, of every write to this cell's controller",
             remedy="`drivegain history CELL --add CALIBRATION` for each calibration that was written, which also "
             "enters its writes from the audit; of a rollback with any one. Where a calibration is lost, keep the file "
-            "and begin audit and history anew, both (`history.audit`, `history.store`)",
+            "and begin another one under a new name (`history.audit`)",
         )
 
 
@@ -214,8 +215,8 @@ def _migrate(ledger: Ledger, who: str, now: datetime, *, forced: bool) -> None:
         typer.echo(f"There is no history of an earlier version; {ledger.audit} is the history.", err=True)
         return
     typer.echo(f"Migrated to {ledger.audit}: {done.entries} entries. The old history is {done.aside}.", err=True)
-    if not done.trusted:
-        typer.echo("The old history was broken: what only it had was not taken over.", err=True)
+    if done.flaws:
+        typer.echo(f"The old history was broken ({_first(done.flaws)}): what only it had was not taken over.", err=True)
 
 
 def _acknowledge(ledger: Ledger, series: Series, who: str, why: str | None, since: str | None, now: datetime) -> None:

@@ -360,6 +360,7 @@ function showResults(found) {
   }
   if (found.history) {
     parts.push(element("h3", `History: ${found.history.calibrations} calibrations`));
+    if (found.history.problem) parts.push(prose("p", found.history.problem, "alarm"));
     parts.push(table(["axis", "since baseline", "in σ", "drift"], found.history.axes.map((one) => [one.axis,
       signed(one.change_percent, 2, "%"), one.change_sigmas === null ? "–" : number(Math.abs(one.change_sigmas), 1),
       one.alarm || "none"])));

@@ -16,7 +16,7 @@ from daq.documents.session_state import Outcome
 from daq.errors import DaqError, ExitCode
 from daq.jobs.reporting import Conclusion, to_do
 from daq.jobs.session import CALIBRATION, REPORT, Session, sessions
-from daq.ledger.ledger import Ledger, read_history
+from daq.ledger.ledger import MAY_LACK, Ledger, read_history
 from daq.ledger.watch import alarm_text, watch
 from daq.report.residual_page import PAGE
 from ident.calibration import Calibration
@@ -107,11 +107,12 @@ class Results:
         if ledger is None:
             return None
         history = read_history(ledger)
-        if not history.entries:
+        if not history.entries and not history.may_lack:
             return None
         series = watch(history.entries, history.acknowledgements)
         return {
             "calibrations": len(history.entries),
+            "problem": MAY_LACK if history.may_lack else None,
             "axes": [
                 {
                     "axis": one.axis,

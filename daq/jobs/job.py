@@ -22,7 +22,7 @@ from daq.jobs.reporting import Conclusion, audit_entry, report_failure, report_s
 from daq.jobs.session import Session
 from daq.jobs.time_bound import time_bound
 from daq.ledger.audit import AuditAction
-from daq.ledger.ledger import enter_calibration, read_history
+from daq.ledger.ledger import MAY_LACK, enter_calibration, read_history
 from daq.ledger.watch import alarm_text, watch
 from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.network import SignalBlocker
@@ -120,6 +120,8 @@ def _run(context: JobContext, session: Session) -> Session:
     # Before the decision: what is only proposed is in the history, too. This also ends the write of a killed job.
     enter_calibration(context.ledger, calibration, digest=digest, who=context.who, at=context.tools.now())
     history = read_history(context.ledger)
+    if history.may_lack:
+        context.within("watch").journal.say(Level.WARNING, "history may be incomplete", text=MAY_LACK)
     series = watch(history.entries, history.acknowledgements)
     watched = tuple(WatchedGain(axis=one.axis, alarm=alarm_text(one) or "") for one in series)
     session = session.update(watched=watched)

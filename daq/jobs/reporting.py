@@ -22,7 +22,7 @@ from daq.jobs.journal import Level
 from daq.jobs.recording import calibration_of_session
 from daq.jobs.session import CALIBRATION, REPORT, Session
 from daq.ledger.audit import AuditAction, AuditEntry
-from daq.ledger.ledger import read_history, record_session
+from daq.ledger.ledger import MAY_LACK, read_history, record_session
 from daq.report.text import json_text, picked
 from drivers.errors import stop_notes
 from ident.calibration import Calibration
@@ -127,13 +127,17 @@ def _report(
 
 
 def _remove_old(context: JobContext, found: tuple[Session, ...]) -> None:
+    # Where the calibrations in force are unknown, all sessions stay.
     try:
-        newest = {event.target: event.digest for event in read_history(context.ledger).events}
-        in_force = frozenset(digest for digest in newest.values() if digest is not None)
+        history = read_history(context.ledger)
     except (AuditUnusable, HistoryUnreadable) as error:
-        # The calibrations in force are unknown: keep all sessions.
         context.journal.say(Level.WARNING, "no old session removed", text=str(error))
         return
+    if history.may_lack:
+        context.journal.say(Level.WARNING, "no old session removed", text=MAY_LACK)
+        return
+    newest = {event.target: event.digest for event in history.events}
+    in_force = frozenset(digest for digest in newest.values() if digest is not None)
     for folder in sessions.remove_old(found, context.section.keep_sessions, in_force):
         context.journal.say(Level.INFO, "old session removed", folder=str(folder))
 

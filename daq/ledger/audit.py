@@ -203,11 +203,17 @@ def noted_heads(path: Path) -> tuple[str, ...]:
     The last one is that of the last entry. Others are of entries that were missing when the next one was appended.
     """
     try:
-        text = read_regular(_head_file(path), MAX_BYTES).decode(errors="replace")
+        text = read_regular(head_file(path), MAX_BYTES).decode(errors="replace")
     except OSError:
         return ()
     lines = text.split("\n")
     return tuple(line for line in lines if len(line) == _DIGITS and set(line) <= set("0123456789abcdef"))
+
+
+def head_file(path: Path) -> Path:
+    """Return the note beside an audit log, FILE.head; symbolic links to the log are followed."""
+    target = Path(os.path.realpath(path))
+    return target.with_name(f"{target.name}.head")
 
 
 def _note_head(path: Path, content: bytes, head: str) -> None:
@@ -222,7 +228,7 @@ def _note_head(path: Path, content: bytes, head: str) -> None:
 
 def _write_heads(path: Path, heads: Sequence[str]) -> None:
     flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-    descriptor = os.open(_head_file(path), flags, 0o666)
+    descriptor = os.open(head_file(path), flags, 0o666)
     try:
         # In one piece and in place: there are never fewer lines than before, but where a missing entry came back.
         content = "".join(f"{head}\n" for head in heads).encode()
@@ -230,11 +236,6 @@ def _write_heads(path: Path, heads: Sequence[str]) -> None:
         os.ftruncate(descriptor, len(content))
     finally:
         os.close(descriptor)
-
-
-def _head_file(path: Path) -> Path:
-    target = Path(os.path.realpath(path))
-    return target.with_name(f"{target.name}.head")
 
 
 def read(path: Path) -> tuple[AuditEntry, ...]:
@@ -284,6 +285,7 @@ def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]
 
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[int]:
+    _require_target(path)
     # O_NONBLOCK: a FIFO of that name must not keep us waiting for its other end.
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK
     try:
@@ -314,9 +316,29 @@ def _content_of(path: Path) -> bytes:
     try:
         return read_regular(path, MAX_BYTES)
     except FileNotFoundError:
+        _require_target(path)
         return b""
+    except PermissionError as error:
+        raise AuditUnusable(
+            str(path),
+            found="no right to read it",
+            expected="an audit log that this user may read and write",
+            remedy="check its owner and rights; nothing was written",
+        ) from error
     except OSError as error:
         raise _no_file(path, (error.strerror or type(error).__name__).lower()) from error
+
+
+def _require_target(path: Path) -> None:
+    """Refuse a link that leads to no file: an audit log on a disk that is not mounted is not a new one."""
+    if path.is_symlink() and not path.exists():
+        raise AuditUnusable(
+            str(path),
+            found=f"a link to {path.readlink()}, where there is no file",
+            expected="a link to the cell's audit log",
+            remedy="mount the disk that it is on, or correct the link; for a new audit log there make an empty file; "
+            "nothing was written",
+        )
 
 
 def _no_file(path: Path, found: str) -> AuditUnusable:

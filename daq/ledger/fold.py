@@ -27,6 +27,7 @@ class History:
     events: tuple[Event, ...]  #: writes to controllers, oldest first
     acknowledgements: tuple[Acknowledgement, ...]  #: explained changes, oldest first
     unreadable: tuple[str, ...] = ()  #: calibrations of the audit log that cannot be read, as sentences
+    may_lack: bool = False  #: whether the audit log is not what was written, so that something may be missing here
 
     def in_force(self, target: str | None = None) -> str | None:
         """Return the digest of the calibration in a target, or in the last written one; None for other numbers."""

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 from daq.config.cell import Cell
 from daq.documents.calibration_file import encode_calibration
-from daq.errors import DataError, HistoryUnreadable, evidence, writing
+from daq.errors import DataError, HistoryInaccessible, HistoryUnreadable, OutputFailed, evidence, writing
 from daq.files import fsync_folder
 from daq.ledger.audit import (
     FIRST,
@@ -23,9 +23,11 @@ from daq.ledger.audit import (
     AuditEntry,
     AuditVerdict,
     Content,
+    Flaw,
     OpenWrite,
     append,
     entry,
+    head_file,
     noted_heads,
     open_writes,
     verify,
@@ -103,6 +105,7 @@ class Verification:
     history: History  #: as far as it can be read
     broken: tuple[str, ...]  #: what the history cannot show, and what a history of an earlier version says otherwise
     unknown: tuple[AuditedWrite, ...] = ()  #: writes that the history lacks
+    noted: bool = True  #: whether the last entry of the audit log is noted, without which a missing end does not show
 
     @property
     def complete(self) -> bool:
@@ -116,22 +119,30 @@ class Migrated:
 
     entries: int  #: number of entries that the audit log got
     aside: Path | None  #: new name of the file; None where there was none
-    trusted: bool  #: whether anything was taken over from it: not where it is broken
+    flaws: tuple[str, ...] = ()  #: why nothing was taken over from it, as sentences; empty where it is sound
+
+
+MAY_LACK = (
+    "the audit log is not what was written, so the history may lack something: `drivegain history CELL --verify` says "
+    "what"
+)
+"""What a reader of a history with `may_lack` must know."""
 
 
 def read_history(ledger: Ledger) -> History:
-    """Read the history of a cell; nothing is written.
+    """Read the history of a cell, as far as the audit log is what was written (`may_lack`); nothing is written.
 
     Raises:
         AuditUnusable: the audit log is no regular file, or it cannot be read.
         HistoryUnreadable: there is a history of an earlier version that cannot be read, or contradicts the audit log.
     """
-    entries = verify(ledger.audit).intact
     stored = _read_stored(ledger)
-    flaws = _flaws(ledger, stored, entries)
+    verdict = verify(ledger.audit, stored.noted.union(noted_heads(ledger.audit)))
+    flaws = _flaws(ledger, stored, verdict.intact)
     if flaws:
         raise stored_error(ledger, flaws)
-    return fold(_with_stored(entries, stored, ledger.cell), ledger.cell)
+    history = fold(_with_stored(verdict.intact, stored, ledger.cell), ledger.cell)
+    return replace(history, may_lack=not verdict.holds)
 
 
 def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
@@ -145,24 +156,18 @@ def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
         AuditUnusable, HistoryUnreadable: see `read_history`.
     """
     stored = _read_stored(ledger)
-    verdict = verify(ledger.audit, stored.noted.union(heads, noted_heads(ledger.audit)))
+    noted = noted_heads(ledger.audit)
+    verdict = verify(ledger.audit, stored.noted.union(heads, noted))
     broken = _flaws(ledger, stored, verdict.intact)
     entries = _with_stored(verdict.intact, EMPTY if broken else stored, ledger.cell)
     history = fold(entries, ledger.cell)
     broken += history.unreadable
     if not verdict.holds:  # its entries do not prove that anything is missing
-        return Verification(ledger.audit, verdict, history, broken)
+        return Verification(ledger.audit, verdict, replace(history, may_lack=True), broken)
     known = {one.digest for one in history.entries}
     unknown = unknown_writes(ledger.cell, entries, verdict.open_writes, known)
-    return Verification(ledger.audit, verdict, history, broken, unknown)
-
-
-def warn_if_broken(ledger: Ledger) -> bool:
-    """Warn, and return true, if the audit log is not what was written: the history may lack something."""
-    broken = not verify(ledger.audit, noted_heads(ledger.audit)).holds
-    if broken:
-        _LOG.warning("the audit log is not what was written; what is missing: drivegain history CELL --verify")
-    return broken
+    is_noted = bool(noted) or not verdict.entries
+    return Verification(ledger.audit, verdict, history, broken, unknown, noted=is_noted)
 
 
 def record_write(
@@ -207,11 +212,14 @@ def enter_calibration(ledger: Ledger, calibration: Calibration, *, digest: str, 
         AuditUnusable, HistoryUnreadable, OutputFailed: it could not be entered; see `migrate`.
     """
     try:
-        migrate(ledger, who=who, at=at)
+        _take_over(ledger, who=who, at=at)
+        _put_aside(ledger, at)
     except HistoryUnreadable:
         raise
     except DataError as error:  # the next line goes behind the changed ones all the same
         _LOG.warning("the history of an earlier version stays where it is: %s", evidence(error))
+    except _NotPutAside as error:  # the audit log has all of it, and takes the calibration too
+        _LOG.warning("the history of an earlier version keeps its name: %s", evidence(error))
     entries = verify(ledger.audit).intact
     known = {one.digest for one in entered_calibrations(entries, ledger.cell.name)}
     new = digest not in known
@@ -263,16 +271,25 @@ def migrate(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) -> 
             add figures where there is no such file.
 
     Raises:
+        HistoryInaccessible: the file is locked, or its rights do not let it be read; nothing was changed.
         HistoryUnreadable: the file is broken or contradicts the audit log, without `forced`; nothing was changed.
         DataError: the audit log is not what was written; nothing was changed.
         AuditUnusable, OutputFailed: a file cannot be written; the next call goes on.
     """
+    count, flaws = _take_over(ledger, who=who, at=at, forced=forced)
+    return Migrated(count, _put_aside(ledger, at), flaws)
+
+
+def _take_over(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) -> tuple[int, tuple[str, ...]]:
+    """Enter what only a history of an earlier version has; return the number of entries, and what is broken in it."""
     if not ledger.outdated and not forced:
-        return Migrated(0, None, trusted=True)
+        return 0, ()
     stored = EMPTY
     flaws: tuple[str, ...] = ()
     try:
         stored = _read_stored(ledger)
+    except HistoryInaccessible:
+        raise
     except HistoryUnreadable as error:
         if not forced:
             raise
@@ -286,12 +303,30 @@ def migrate(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) -> 
     drafts = drafts_of(EMPTY if flaws else stored, verdict.entries, ledger.cell.name, who, at)
     for draft in drafts:
         _append(ledger, draft)
-    aside = None
-    if ledger.stored is not None and ledger.outdated:
-        with writing(ledger.stored):
-            aside = set_aside(ledger.stored, at)
-            fsync_folder(aside.parent)
-    return Migrated(len(drafts), aside, trusted=not flaws)
+    return len(drafts), flaws
+
+
+class _NotPutAside(OutputFailed):
+    """All of it is in the audit log, and the file could not be renamed."""
+
+
+def _put_aside(ledger: Ledger, at: datetime) -> Path | None:
+    """Rename a history that was taken over; return its new name, None where there was none."""
+    if ledger.stored is None or not ledger.outdated:
+        return None
+    try:
+        aside = set_aside(ledger.stored, at)
+        fsync_folder(aside.parent)
+    except FileNotFoundError:  # another process was faster
+        return None
+    except OSError as error:
+        raise _NotPutAside(
+            str(ledger.stored),
+            found=(error.strerror or type(error).__name__).lower(),
+            expected="a new name for it, now that the audit log has its content",
+            remedy="check the rights of its folder, and repeat the command; nothing is lost",
+        ) from error
+    return aside
 
 
 def audit_error(audit: Path, verdict: AuditVerdict) -> DataError:
@@ -302,16 +337,18 @@ def audit_error(audit: Path, verdict: AuditVerdict) -> DataError:
             str(audit),
             found=f"no file; {first.says}",
             expected="the audit log with these entries",
-            remedy="restore it from a backup; without one begin both anew (`history.audit`, `history.store`)",
+            remedy="restore it from a backup; without one, begin another one under a new name (`history.audit`)",
         )
+    cut_off = any(flaw.flaw is Flaw.CUT_OFF for flaw in verdict.flaws)
+    note = f" (if the entries that are missing are of another log, remove {head_file(audit)})" if cut_off else ""
     more = "".join(f"\n  line {flaw.line}: {flaw.flaw.value}: {flaw.says}" for flaw in verdict.flaws)
     return DataError(
         f"{audit}, line {first.line}",
         found=f"{len(verdict.flaws)} places that are not what was written{more}\n ",
         expected="entries that were never changed, moved or removed",
-        remedy="keep this file as it is, compare it with a backup, ask who can write to it; until that is known trust "
-        "the controller's file by its backups only, and begin audit and history anew, both (`history.audit`, "
-        "`history.store`)",
+        remedy=f"keep this file as it is, compare it with a backup{note}, ask who can write to it; until that is "
+        "known trust the controller's file by its backups only, and begin another log under a new name "
+        "(`history.audit`)",
     )
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from daq.documents.calibration_file import decode_calibration
-from daq.errors import DaqError, HistoryUnreadable
+from daq.errors import DaqError, HistoryInaccessible, HistoryUnreadable
 from daq.ledger.audit import AuditAction, AuditEntry
 from daq.ledger.entry import Acknowledgement, Event, WriteAction, figures_of, iso, zoned
 from daq.ledger.fold import (
@@ -79,7 +79,8 @@ def read_stored(path: Path) -> StoredHistory:
     """Read a history of an earlier version, and check it by itself; nothing is changed.
 
     Raises:
-        HistoryUnreadable: it is none, of a later version, broken, or locked for long.
+        HistoryInaccessible: it is locked for long, or its rights do not let it be read.
+        HistoryUnreadable: it is none, of a later version, or broken.
     """
     # Not "ro", which could not undo the unfinished transaction of a killed writer; "rw" opens a read-only file, too.
     address = f"file:{quote(os.fsencode(path.absolute()))}?mode=rw"
@@ -112,7 +113,19 @@ def _translate_errors(path: Path) -> Iterator[None]:
     except sqlite3.Error as error:
         name = getattr(error, "sqlite_errorname", "") or type(error).__name__
         # Without the bytes of a damaged row.
-        raise _unreadable(path, f"{str(error).partition(' with text ')[0]} ({name})") from error
+        found = f"{str(error).partition(' with text ')[0]} ({name})"
+        if name.startswith(_INACCESSIBLE):
+            raise HistoryInaccessible(
+                str(path),
+                found=found,
+                expected="the history that earlier versions of drivegain kept of a cell, readable and not locked",
+                remedy="check its rights, and who has it open (`fuser`), then try again; nothing was changed",
+            ) from error
+        raise _unreadable(path, found) from error
+
+
+_INACCESSIBLE = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_CANTOPEN", "SQLITE_PERM", "SQLITE_READONLY", "SQLITE_IOERR")
+"""Errors of SQLite, by the begin of their names, that say nothing of what the file has."""
 
 
 def _unreadable(path: Path, found: str) -> HistoryUnreadable:
@@ -120,8 +133,8 @@ def _unreadable(path: Path, found: str) -> HistoryUnreadable:
         str(path),
         found=found,
         expected="the history that earlier versions of drivegain kept of a cell",
-        remedy="check its rights, and who has it open (`fuser`); if it is broken, restore the last good one from a "
-        "backup, or go on without it: `drivegain history CELL --migrate` keeps it under another name",
+        remedy="restore the last good one from a backup, or go on without it: `drivegain history CELL --migrate` "
+        "keeps it under another name",
     )
 
 

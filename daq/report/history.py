@@ -16,7 +16,7 @@ from daq.config.cell import Cell
 from daq.errors import ControllerUnfit
 from daq.formats.document import decode_document, read_controller_file
 from daq.formats.scalar import Scalar, rewrite_gain
-from daq.ledger.audit import AuditEntry
+from daq.ledger.audit import AuditEntry, head_file
 from daq.ledger.entry import Entry, Event, WriteAction, drives_of
 from daq.ledger.fold import History
 from daq.ledger.ledger import Verification
@@ -184,6 +184,11 @@ def say_verification(found: Verification, console: Console) -> None:
     """Print the state of audit log and history; flaws are in the error."""
     verdict = found.verdict
     console.print(f"{found.audit}: {len(verdict.entries)} entries, chain {'unbroken' if verdict.holds else 'BROKEN'}.")
+    if not found.noted:
+        console.print(
+            f"{head_file(found.audit).name} does not note its last entry: whether its end is missing cannot be seen. "
+            "The next entry is noted again."
+        )
     if verdict.torn:
         lines = ", ".join(map(str, verdict.torn))
         console.print(f"Unfinished lines, left by a writer that was killed: {lines}. They are no flaw.")
@@ -194,7 +199,9 @@ def say_verification(found: Verification, console: Console) -> None:
             f"ended; {printable(begun.subject)} was found {one.content.value}."
         )
     state = "sound"
-    if found.broken:
+    if not verdict.holds:
+        state = "not known, because entries may be missing"
+    elif found.broken:
         state = "BROKEN"
     elif found.unknown:
         state = "NOT COMPLETE"

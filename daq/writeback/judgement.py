@@ -11,7 +11,7 @@ from daq.config.cell import Cell
 from daq.errors import DaqError
 from daq.files import sha256
 from daq.ledger.fold import History
-from daq.ledger.ledger import Ledger, read_history
+from daq.ledger.ledger import MAY_LACK, Ledger, read_history
 from daq.ledger.watch import dispersions_of
 from daq.writeback.request import GainChange, Request
 from ident.drift.change import DISPERSION, FALSE_ALARM, decide
@@ -55,10 +55,13 @@ def query_history(cell: Cell, target: str, request: Request, changes: Sequence[G
     if ledger is None:
         return NOTHING
     try:
-        return known_of(read_history(ledger), target, sha256(request.signed), changes)
+        history = read_history(ledger)
     except DaqError as error:
         _LOG.warning("the history cannot be read: the numbers in the controller are taken as exact: %s", error)
         return NOTHING
+    if history.may_lack:
+        _LOG.warning(MAY_LACK)
+    return known_of(history, target, sha256(request.signed), changes)
 
 
 def known_of(history: History, target: str, digest: str, changes: Sequence[GainChange]) -> Spread:

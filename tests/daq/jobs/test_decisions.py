@@ -14,6 +14,7 @@ from daq.cli.app import main
 from daq.documents.session_state import Outcome
 from daq.errors import CalibrationRefused, ExitCode, HistoryUnreadable
 from daq.ledger.audit import AuditAction, append, read
+from daq.ledger.ledger import MAY_LACK
 from daq.workflow.record import RecordingRequest
 from daq.writeback.signature import generate
 from drivers.errors import DriveFault
@@ -186,6 +187,19 @@ def test_nothing_is_removed_while_no_one_knows_what_is_in_force(tmp_path: Path, 
         rig.job()
     assert len(rig.sessions) == 3
     assert "no old session removed" in {event["event"] for event in rig.events}
+
+
+def test_a_job_says_that_its_history_may_lack_something_and_removes_nothing(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160, keep_sessions=1)
+    assert rig.job().outcome is Outcome.APPLIED
+    rig.clock.go_on(days=7)
+    audit = rig.cells / "demo.audit.jsonl"
+    lines = audit.read_bytes().splitlines(keepends=True)
+    audit.write_bytes(b"".join(lines[1:]))
+    assert rig.job().outcome is Outcome.UNCHANGED
+    assert len(rig.sessions) == 2
+    said = {event["event"]: event["text"] for event in rig.events if event["level"] == "warning"}
+    assert said["history may be incomplete"] == said["no old session removed"] == MAY_LACK
 
 
 def test_what_is_written_stays_reported_as_written_whatever_becomes_of_the_history(tmp_path: Path, made: Made) -> None:

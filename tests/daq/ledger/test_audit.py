@@ -322,8 +322,13 @@ def test_what_is_no_regular_file_is_refused_and_no_one_waits(tmp_path: Path) -> 
         with pytest.raises((AuditUnusable, PermissionError)):
             _filled(path, 1)
     (tmp_path / "dangling").symlink_to(tmp_path / "gone" / "a")
-    with pytest.raises(OSError, match="No such file"):
-        _filled(tmp_path / "dangling", 1)
+    for refused in (lambda path: _filled(path, 1), read, verify):
+        with pytest.raises(AuditUnusable, match="where there is no file"):
+            refused(tmp_path / "dangling")
+    (tmp_path / "gone").mkdir()
+    (tmp_path / "gone" / "a").touch()
+    _filled(tmp_path / "dangling", 1)
+    assert len(read(tmp_path / "gone" / "a")) == 1
 
 
 def test_the_entry_is_on_the_disk_and_so_is_the_folder_of_a_new_audit(

@@ -21,11 +21,20 @@ from hypothesis import strategies as st
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import decode_calibration, encode_calibration
-from daq.errors import DataError, OutputFailed, exit_code
-from daq.ledger.audit import AuditAction, append, read, verify
+from daq.errors import DataError, ExitCode, OutputFailed, exit_code
+from daq.ledger.audit import AuditAction, append, head_file, read, verify
 from daq.ledger.entry import Acknowledgement, WriteAction, iso, utc
-from daq.ledger.ledger import Ledger, acknowledge, enter_calibration, read_history, record_session, record_write
-from tests.daq.calibrations import AXES, demo_calibration
+from daq.ledger.ledger import (
+    MAY_LACK,
+    Ledger,
+    acknowledge,
+    enter_calibration,
+    read_history,
+    record_session,
+    record_write,
+    verify_ledger,
+)
+from tests.daq.calibrations import AXES, calibration_for, demo_calibration
 from tests.daq.histories import BEGIN, calibration_of, digest_of, enter, history_of, ledger_in, ledger_of, write
 
 FORK = multiprocessing.get_context("fork")
@@ -361,6 +370,47 @@ def test_a_calibration_that_cannot_be_read_is_a_finding(cell: Path, capsys: pyte
     said = " ".join(capsys.readouterr().err.split())
     assert "calibration 000000000000… of entry 2: its document is" in said
     assert "calibration 111111111111… of entry 3: its figures are not those" in said
+
+
+@pytest.mark.parametrize("damage", ["edited", "first removed", "end cut off", "deleted"])
+def test_whoever_reads_the_history_of_a_damaged_log_is_told_that_it_may_lack_something(
+    cell: Path, damage: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A calibration that is missing changes the judgement of a gain and of its drift."""
+    for factor in (1.0, 1.02, 1.01):
+        assert main(["apply", str(cell), str(calibration_for(cell, factor)), "--yes"]) == ExitCode.OK
+    ledger = ledger_of(cell)
+    assert not read_history(ledger).may_lack
+    lines = ledger.audit.read_bytes().splitlines(keepends=True)
+    damaged = {
+        "edited": [lines[0].replace(b"demo", b"dema", 1), *lines[1:]],
+        "first removed": lines[1:],
+        "end cut off": lines[:-1],
+        "deleted": [],
+    }
+    ledger.audit.write_bytes(b"".join(damaged[damage]))
+    if damage == "deleted":
+        ledger.audit.unlink()
+    assert read_history(ledger).may_lack
+    assert verify_ledger(ledger).history.may_lack
+    calibration = str(calibration_for(cell, 1.005))
+    for command in (["apply", str(cell), calibration], ["history", str(cell)]):
+        caplog.clear()
+        assert main(command) == ExitCode.OK
+        assert MAY_LACK in caplog.text
+
+
+def test_a_log_without_its_note_is_said_to_be_one(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["history", str(cell), "--add", str(calibration_for(cell))]) == ExitCode.OK
+    note = head_file(ledger_of(cell).audit)
+    for spoil in (note.unlink, lambda: note.write_text("no digest\n")):
+        spoil()
+        assert main(["history", str(cell), "--verify"]) == ExitCode.OK
+        assert "whether its end is missing cannot be seen" in " ".join(capsys.readouterr().out.split())
+    assert main(["history", str(cell), "--add", str(calibration_for(cell, 1.01))]) == ExitCode.OK
+    capsys.readouterr()
+    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
+    assert "cannot be seen" not in capsys.readouterr().out
 
 
 def test_a_path_that_is_not_utf_8_is_in_the_history(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:

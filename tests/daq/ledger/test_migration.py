@@ -15,6 +15,7 @@ import sqlite3
 import tempfile
 from collections.abc import Callable
 from contextlib import closing
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from hypothesis import strategies as st
 from daq.cli.app import main
 from daq.errors import ExitCode, HistoryUnreadable
 from daq.ledger import ledger as ledger_module
+from daq.ledger import migration as migration_module
 from daq.ledger.audit import AuditAction, read
 from daq.ledger.entry import WriteAction
 from daq.ledger.ledger import Ledger, migrate, read_history
@@ -261,6 +263,41 @@ def test_a_file_that_is_no_history_is_refused_and_kept(
     (aside,) = asides_of(cell)
     assert aside.read_bytes() == content
     assert writers_of(cell) == WRITERS
+
+
+def test_a_sound_file_that_cannot_be_read_now_is_never_put_aside(
+    cell: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(migration_module, "BUSY_S", 0.05)
+    before = read(audit_of(cell))
+    with closing(sqlite3.connect(stored_of(cell), isolation_level=None)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        assert main(["history", str(cell), "--migrate"]) == ExitCode.DATA_UNFIT
+    said = " ".join(capsys.readouterr().err.split())
+    assert "SQLITE_BUSY" in said
+    assert "try again" in said
+    assert asides_of(cell) == []
+    assert read(audit_of(cell)) == before
+    assert main(["history", str(cell), "--migrate", "--verify"]) == ExitCode.OK
+    assert writers_of(cell) == WRITERS
+
+
+@pytest.mark.parametrize("error", [PermissionError(13, "Permission denied"), FileNotFoundError(2, "No such file")])
+def test_a_file_that_keeps_its_name_keeps_no_calibration_out(
+    cell: Path, error: OSError, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its folder may be read only, or another process may rename it first."""
+
+    def refuse(path: Path, at: datetime) -> Path:
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ledger_module, "set_aside", refuse)
+        assert main(["history", str(cell), "--add", str(calibration_for(cell, 1.005))]) == ExitCode.OK
+    assert ("keeps its name" in caplog.text) == isinstance(error, PermissionError)
+    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
+    assert len(history_of(cell).entries) == 4
+    assert len(asides_of(cell)) == 1
 
 
 def _pragma(path: Path, setting: str) -> None:
