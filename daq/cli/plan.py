@@ -43,7 +43,7 @@ def plan_verb(
     from daq.cli.terminal import check_folder, check_output, check_replaceable, progress_bar, write_output
     from daq.config.cell_file import load_cell
     from daq.files import replace_file
-    from daq.report.plan import plan_document, plan_text
+    from daq.report.plan import plan_report, plan_text
     from daq.report.plan_preview import MARK, preview_page
     from daq.workflow.experiment import RUNS, experiment_of, extra_moves, paths_of
     from daq.workflow.nameplates import check_controller
@@ -88,7 +88,7 @@ def plan_verb(
     excitation, _ = experiment.excitation(paths_of(declared, made.moves))
     judged = verdicts(experiment.design, [(excitation, RUNS)], extra_moves(experiment))
     if json:
-        print_json(plan_document(out, declared, experiment, made, judged))
+        print_json(plan_report(out, declared, experiment, made, judged))
     else:
         typer.echo(plan_text(out, preview, declared, experiment, made, judged))
         say_next("drivegain", "record", cell, out, "--out", free_name(), "--enable-motion")

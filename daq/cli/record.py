@@ -48,11 +48,10 @@ def record_verb(
     A run with losses is kept, marked invalid, and ends with exit code 4; `fit` refuses it.
     """
     from daq.cli.terminal import interruptible, progress_bar, say_last
-    from daq.config.cell_buses import bus_loads
     from daq.config.cell_file import load_cell
     from daq.environment import login
     from daq.log.feed import Feed
-    from daq.report.text import picked
+    from daq.report.log import record_report
     from daq.workflow.bus_lock import bus_lock
     from daq.workflow.plan import slowed
     from daq.workflow.plan_file import load_plan
@@ -106,10 +105,7 @@ def record_verb(
     for warning in done.warnings:
         typer.echo(warning, err=True)
     if json:
-        print_json({"log": str(out), **picked(done.log, "samples", "lost_cycles", "missing", "valid", "reason"),
-                    "warnings": done.warnings,
-                    "bus_load": [{"bus": bus.name, "mean_percent": 100 * load.mean, "worst_percent": 100 * load.worst}
-                                 for bus, load in bus_loads(declared)]})  # fmt: skip
+        print_json(record_report(out, done, declared))
     else:
         verdict = "complete" if done.log.valid else f"INVALID: {done.log.reason}; a fit will refuse it"
         typer.echo(f"{out}: {done.log.samples} samples, {done.log.lost_cycles} cycles lost, {verdict}")

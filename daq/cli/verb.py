@@ -24,7 +24,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from daq.errors import UsageError
 from daq.files import judge_target
-from daq.report.text import json_text
+from daq.report.document import Report, json_text
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 CellArgument = Annotated[Path, typer.Argument(help="Cell file.")]
@@ -298,6 +298,6 @@ def say_correct_first() -> None:
     typer.echo("Next: correct the description as CHECK says, then fit the logs again.", err=True)
 
 
-def print_json(document: Any) -> None:
+def print_json(document: Report) -> None:
     """Print one JSON document on stdout."""
     sys.stdout.write(json_text(document))

@@ -1,13 +1,13 @@
-"""JSON Schema of what `monitor` and `explain-emcy` print under `--json`."""
+"""What `scan`, `monitor` and `explain-emcy` print under `--json`."""
 
 from __future__ import annotations
 
 from pydantic import Field
 
-from daq.config.yaml_file import StrictModel
+from daq.report.document import Report
 
 
-class ErrorCodeEntry(StrictModel):
+class ErrorCodeEntry(Report):
     """An error code of EMCY or 603Fh in words."""
 
     code: int
@@ -22,7 +22,7 @@ class ErrorCodeReport(ErrorCodeEntry):
     standard: bool = Field(description="whether CiA 301 or CiA 402 names it; else its class is described")
 
 
-class PredictedCurrent(StrictModel):
+class PredictedCurrent(Report):
     """Current of one axis by a calibration, half a second ago, filtered as in the fit [unit of the gain's current]."""
 
     measured: float | None = Field(description="null at standstill, or where the scale of the current is unknown")
@@ -33,14 +33,14 @@ class PredictedCurrent(StrictModel):
     conspicuous: bool = Field(description="it is outside for more than half of at least 2 s of motion")
 
 
-class RefusedObject(StrictModel):
+class RefusedObject(Report):
     """Object that an axis does not give."""
 
     object: str = Field(description="index and sub-index, as 6041h:00")
     abort_code: int | None = Field(description="of the SDO abort; null for an answer that is no value of this size")
 
 
-class MonitoredAxis(StrictModel):
+class MonitoredAxis(Report):
     """One axis."""
 
     axis: str
@@ -65,21 +65,21 @@ class MonitoredAxis(StrictModel):
     prediction: PredictedCurrent | None
 
 
-class MonitoredBus(StrictModel):
+class MonitoredBus(Report):
     """Load of one bus."""
 
     bus: str
     load_percent: float = Field(description="with every frame as long as bit stuffing can make it")
 
 
-class PredictionState(StrictModel):
+class PredictionState(Report):
     """Premise of the predicted currents."""
 
     payload: str | None
     remark: str = Field(description="why there are none; empty if there are")
 
 
-class Notice(StrictModel):
+class Notice(Report):
     """A recent event."""
 
     axis: str | None
@@ -90,7 +90,7 @@ class Notice(StrictModel):
     alarm: bool
 
 
-class MonitorReport(StrictModel):
+class MonitorReport(Report):
     """`monitor`."""
 
     cell: str
@@ -105,3 +105,35 @@ class MonitorReport(StrictModel):
     prediction: PredictionState | None = Field(description="null without --calibration")
     events: list[str] = Field(description="texts of recent events")
     notices: list[Notice] = Field(description="the same events with what to do")
+
+
+class ScannedNode(Report):
+    """A node that is in the cell file or on the bus."""
+
+    bus: str
+    node_id: int
+    axis: str | None
+    vendor_id: int | None
+    product_code: int | None
+    serial: int | None
+    device_name: str | None
+    nmt: str | None = Field(description="NMT state of CiA 301")
+    state: str | None = Field(description="state of CiA 402")
+    enabled: bool | None = Field(description="whether the motor has torque")
+    in_fault: bool
+    verdict: str
+    remarks: list[str] = Field(description="what is wrong with it")
+
+
+class ScanReport(Report):
+    """`scan`."""
+
+    bus: str = Field(description="address of all buses")
+    nodes: list[ScannedNode]
+    reset: list[str] = Field(description="axes whose fault was reset")
+    faults: dict[str, str] = Field(description="the fault of each of them")
+    current: dict[str, str] = Field(description="recorded current of each axis")
+    mistyped: list[str] = Field(description="nameplate gains that plan or record would refuse")
+    warnings: list[str] = Field(
+        description="what record would warn of, such as a gain that is near √2 times the drive's"
+    )

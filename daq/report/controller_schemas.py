@@ -1,4 +1,4 @@
-"""JSON Schema of what `apply`, `rollback`, `report` and `history` print under `--json`."""
+"""What `apply`, `rollback`, `report` and `history` print under `--json`."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from daq.config.yaml_file import StrictModel
-from daq.report.fit_schemas import Errors, Figure
+from daq.report.document import Figure, Report
+from daq.report.fit_schemas import Errors
 from ident.calibration import EncoderMisfit, PayloadMass
 
 
-class Refused(StrictModel):
+class Refused(Report):
     """A check that failed."""
 
     gate: str
@@ -21,7 +21,7 @@ class Refused(StrictModel):
     remedy: str
 
 
-class FileGain(StrictModel):
+class FileGain(Report):
     """A gain in the controller's file and its planned value."""
 
     axis: str
@@ -38,7 +38,7 @@ class FileGain(StrictModel):
     unit: str
 
 
-class FileChange(StrictModel):
+class FileChange(Report):
     """`apply` to the controller's file."""
 
     file: str
@@ -51,7 +51,7 @@ class FileChange(StrictModel):
     diff: str
 
 
-class DriveGain(StrictModel):
+class DriveGain(Report):
     """An object in a drive and its planned value."""
 
     axis: str
@@ -63,7 +63,7 @@ class DriveGain(StrictModel):
     unit: str
 
 
-class DriveChange(StrictModel):
+class DriveChange(Report):
     """`apply --drives`; the last three are there once the drives are written."""
 
     cell: str | None
@@ -77,7 +77,7 @@ class DriveChange(StrictModel):
     saved: bool = False
 
 
-class FileRollback(StrictModel):
+class FileRollback(Report):
     """`rollback` of the controller's file."""
 
     file: str
@@ -87,7 +87,7 @@ class FileRollback(StrictModel):
     audit: str | None
 
 
-class RestoredObject(StrictModel):
+class RestoredObject(Report):
     """An object in a drive before and after."""
 
     axis: str
@@ -96,7 +96,7 @@ class RestoredObject(StrictModel):
     new: float
 
 
-class DriveRollback(StrictModel):
+class DriveRollback(Report):
     """`rollback --drives`; the last two are there once the drives are written."""
 
     drives: str
@@ -107,7 +107,7 @@ class DriveRollback(StrictModel):
     saved: bool = False
 
 
-class CertifiedGain(StrictModel):
+class CertifiedGain(Report):
     """A gain beside the one in the controller, or beside the nameplate."""
 
     axis: str
@@ -127,7 +127,7 @@ class CertifiedGain(StrictModel):
     verdict: str
 
 
-class CertifiedEffect(StrictModel):
+class CertifiedEffect(Report):
     """An effect in words."""
 
     axis: str
@@ -138,7 +138,7 @@ class CertifiedEffect(StrictModel):
     ambiguity: list[str]
 
 
-class EarlierCalibration(StrictModel):
+class EarlierCalibration(Report):
     """An earlier calibration, and the gains beside it."""
 
     created: str
@@ -146,7 +146,7 @@ class EarlierCalibration(StrictModel):
     holdout_error_percent: Errors | None
 
 
-class CertificateReport(StrictModel):
+class CertificateReport(Report):
     """`report`: the numbers of the certificate."""
 
     format: Literal["drivegain-certificate"]
@@ -168,7 +168,7 @@ class CertificateReport(StrictModel):
     beside: EarlierCalibration | None
 
 
-class Acknowledged(StrictModel):
+class Acknowledged(Report):
     """A change that was explained."""
 
     since: str
@@ -177,7 +177,7 @@ class Acknowledged(StrictModel):
     why: str
 
 
-class HistoryPoint(StrictModel):
+class HistoryPoint(Report):
     """One calibration of a gain; the columns of `--csv`."""
 
     axis: str
@@ -209,7 +209,7 @@ class HistoryPoint(StrictModel):
     digest: str
 
 
-class HistoryAxis(StrictModel):
+class HistoryAxis(Report):
     """One gain over time."""
 
     axis: str
@@ -226,7 +226,7 @@ class HistoryAxis(StrictModel):
     points: list[HistoryPoint]
 
 
-class HistoryReport(StrictModel):
+class HistoryReport(Report):
     """`history`."""
 
     cell: str

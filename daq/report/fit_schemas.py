@@ -1,4 +1,4 @@
-"""JSON Schema of what `fit`, `residual`, `validate`, `weigh` and `contact` print under `--json`.
+"""What `fit`, `residual`, `validate`, `weigh` and `contact` print under `--json`.
 
 docs/reference/residual-json.md describes the keys of `residual`.
 """
@@ -9,22 +9,20 @@ from typing import Literal
 
 from pydantic import Field
 
-from daq.config.yaml_file import StrictModel
 from daq.documents.calibration_file import CalibrationBody
+from daq.report.document import Figure, Report
 from ident.calibration import PayloadMass
 from ident.errors import Diagnosis
 
-Figure = float | None  #: null where it is not known
 
-
-class Errors(StrictModel):
+class Errors(Report):
     """Relative errors [%]; null for an axis that did not move, and in total where none did."""
 
     axes: list[Figure]
     total: Figure
 
 
-class ComparedGain(StrictModel):
+class ComparedGain(Report):
     """A gain by another estimator."""
 
     axis: str
@@ -32,7 +30,7 @@ class ComparedGain(StrictModel):
     std_percent: Figure
 
 
-class ComparedFit(StrictModel):
+class ComparedFit(Report):
     """The paper's total least squares on the same rows."""
 
     gains: list[ComparedGain]
@@ -41,7 +39,7 @@ class ComparedFit(StrictModel):
     misjudged: list[str]
 
 
-class OwnTorque(StrictModel):
+class OwnTorque(Report):
     """Slope of the drive's own torque over the current."""
 
     axis: str
@@ -52,14 +50,14 @@ class OwnTorque(StrictModel):
     readings: int = 0
 
 
-class RemovedParameter(StrictModel):
+class RemovedParameter(Report):
     """Parameter that is not essential."""
 
     name: str
     std_percent: Figure
 
 
-class JudgedGain(StrictModel):
+class JudgedGain(Report):
     """Verdict on how well data show a gain."""
 
     axis: str
@@ -74,7 +72,7 @@ class GainWords(JudgedGain):
     std_percent: Figure
 
 
-class Trial(StrictModel):
+class Trial(Report):
     """One estimator under one filter."""
 
     estimator: str
@@ -85,7 +83,7 @@ class Trial(StrictModel):
     reason: str = ""
 
 
-class FoundGravity(StrictModel):
+class FoundGravity(Report):
     """Direction of gravity by the torques, beside the declared one."""
 
     declared_m_s2: list[Figure]
@@ -94,14 +92,14 @@ class FoundGravity(StrictModel):
     turn_std_deg: Figure
 
 
-class CheckedGeometry(StrictModel):
+class CheckedGeometry(Report):
     """What the torques say of the description of the robot."""
 
     gravity: FoundGravity | None
     hidden_zeros: list[str]
 
 
-class FitReport(CalibrationBody):
+class FitReport(Report, CalibrationBody):
     """`fit`."""
 
     compared: dict[Literal["tls"], ComparedFit]
@@ -112,7 +110,7 @@ class FitReport(CalibrationBody):
     comparison: tuple[Trial, ...] = ()
 
 
-class CaseReport(CalibrationBody):
+class CaseReport(Report, CalibrationBody):
     """One case of the paper."""
 
     title: str
@@ -120,13 +118,13 @@ class CaseReport(CalibrationBody):
     removed: list[RemovedParameter]
 
 
-class CasesReport(StrictModel):
+class CasesReport(Report):
     """`fit --cases`."""
 
     cases: dict[str, CaseReport]
 
 
-class MotorNoise(StrictModel):
+class MotorNoise(Report):
     """Noise of one motor at rest or between repeated moves."""
 
     axis: str
@@ -141,7 +139,7 @@ class MotorNoise(StrictModel):
     refuted: bool
 
 
-class NoiseFloor(StrictModel):
+class NoiseFloor(Report):
     """Error that noise alone would leave: estimates, and their lower limits."""
 
     motors: list[MotorNoise | None]
@@ -152,7 +150,7 @@ class NoiseFloor(StrictModel):
     confidence: float
 
 
-class Skew(StrictModel):
+class Skew(Report):
     """Delay of currents against positions that instruments confirm [s]."""
 
     seconds: float
@@ -168,7 +166,7 @@ class SkewByInstruments(Skew):
     is_in_model: bool
 
 
-class GearLossEntry(StrictModel):
+class GearLossEntry(Report):
     """Side that drives a gear, and its loss."""
 
     axis: str
@@ -182,7 +180,7 @@ class GearLossEntry(StrictModel):
     gain_carries_it: bool
 
 
-class LeftOutRun(StrictModel):
+class LeftOutRun(Report):
     """Error of one run by a fit of the others, or why there is none."""
 
     run: str
@@ -190,14 +188,14 @@ class LeftOutRun(StrictModel):
     reason: str | None
 
 
-class LeftOutRuns(StrictModel):
+class LeftOutRuns(Report):
     """Errors of runs left out in turn."""
 
     error_percent: Errors | None
     runs: list[LeftOutRun]
 
 
-class ModelErrors(StrictModel):
+class ModelErrors(Report):
     """Errors of one model."""
 
     relative_error_percent: Errors
@@ -206,7 +204,7 @@ class ModelErrors(StrictModel):
     holdout_error_percent: Errors | None
 
 
-class ChangedGain(StrictModel):
+class ChangedGain(Report):
     """A gain before and after effects."""
 
     axis: str
@@ -221,7 +219,7 @@ class ChangedGain(StrictModel):
     significant: bool
 
 
-class Coefficient(StrictModel):
+class Coefficient(Report):
     """Linear parameter of an effect."""
 
     name: str
@@ -230,7 +228,7 @@ class Coefficient(StrictModel):
     unit: str
 
 
-class PlacedEffectEntry(StrictModel):
+class PlacedEffectEntry(Report):
     """An effect on an axis."""
 
     effect: str
@@ -262,7 +260,7 @@ class AsideEntry(FindingEntry):
     reason: str
 
 
-class DetectionLimit(StrictModel):
+class DetectionLimit(Report):
     """Torque that an effect needs to be detected, root mean square in motion."""
 
     axis: str
@@ -270,7 +268,7 @@ class DetectionLimit(StrictModel):
     unit: str
 
 
-class SplitNameEntry(StrictModel):
+class SplitNameEntry(Report):
     """Name that splits of the data choose for what a turn added."""
 
     effect: str
@@ -279,7 +277,7 @@ class SplitNameEntry(StrictModel):
     splits: int
 
 
-class TurnEntry(StrictModel):
+class TurnEntry(Report):
     """One turn of the loop."""
 
     accepted: FindingEntry | None
@@ -295,7 +293,7 @@ class TurnEntry(StrictModel):
     detection_limits: list[DetectionLimit]
 
 
-class VerdictEntry(StrictModel):
+class VerdictEntry(Report):
     """What held-out runs say of one effect."""
 
     effect: str
@@ -309,7 +307,7 @@ class VerdictEntry(StrictModel):
     error_after_percent: Errors | None
 
 
-class ResidualReport(CalibrationBody):
+class ResidualReport(Report, CalibrationBody):
     """`residual`, and the body of `residual.json`."""
 
     summary: list[str]
@@ -327,7 +325,7 @@ class ResidualReport(CalibrationBody):
     turns: list[TurnEntry]
 
 
-class ValidatedLog(StrictModel):
+class ValidatedLog(Report):
     """Errors of one log."""
 
     log: str
@@ -341,13 +339,13 @@ class ValidatedLog(StrictModel):
     picture: str | None
 
 
-class Together(StrictModel):
+class Together(Report):
     """Errors of all logs together."""
 
     relative_error_percent: Errors
 
 
-class CheckedLog(StrictModel):
+class CheckedLog(Report):
     """One log under every calibration."""
 
     log: str
@@ -357,7 +355,7 @@ class CheckedLog(StrictModel):
     seen_by: list[str]
 
 
-class FoundMass(StrictModel):
+class FoundMass(Report):
     """Mass of a payload by one calibration, or why it was not found."""
 
     reason: str = ""
@@ -367,7 +365,7 @@ class FoundMass(StrictModel):
     error_percent: Figure = None
 
 
-class CheckedPayload(StrictModel):
+class CheckedPayload(Report):
     """A weighed payload."""
 
     log: str
@@ -378,7 +376,7 @@ class CheckedPayload(StrictModel):
     masses: dict[str, FoundMass]
 
 
-class ValidateReport(StrictModel):
+class ValidateReport(Report):
     """`validate`."""
 
     cell: str
@@ -394,21 +392,21 @@ class ValidateReport(StrictModel):
     payloads: list[CheckedPayload]
 
 
-class WeighedValue(StrictModel):
+class WeighedValue(Report):
     """A number and its σ."""
 
     value: Figure
     std: Figure
 
 
-class WeighedValues(StrictModel):
+class WeighedValues(Report):
     """Numbers and their σ."""
 
     value: list[Figure]
     std: list[Figure]
 
 
-class AddedMoves(StrictModel):
+class AddedMoves(Report):
     """Moves that would show a parameter."""
 
     words: str
@@ -416,7 +414,7 @@ class AddedMoves(StrictModel):
     std: Figure
 
 
-class WeighedParameter(StrictModel):
+class WeighedParameter(Report):
     """One of the ten parameters of a body."""
 
     name: str
@@ -428,7 +426,7 @@ class WeighedParameter(StrictModel):
     add: AddedMoves | None
 
 
-class WeighReport(StrictModel):
+class WeighReport(Report):
     """`weigh`."""
 
     cell: str
@@ -446,7 +444,7 @@ class WeighReport(StrictModel):
     complete: bool
 
 
-class ContactAxis(StrictModel):
+class ContactAxis(Report):
     """Band and threshold of one axis; medians over the motion in `unit`."""
 
     axis: str
@@ -461,7 +459,7 @@ class ContactAxis(StrictModel):
     largest: Figure
 
 
-class ContactEntry(StrictModel):
+class ContactEntry(Report):
     """A stretch beyond the threshold."""
 
     axis: str
@@ -471,14 +469,14 @@ class ContactEntry(StrictModel):
     peak_over_threshold: float
 
 
-class NotJudged(StrictModel):
+class NotJudged(Report):
     """An axis that cannot show a contact."""
 
     axis: str
     reason: str
 
 
-class ContactReport(StrictModel):
+class ContactReport(Report):
     """`contact`."""
 
     cell: str

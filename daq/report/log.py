@@ -11,16 +11,38 @@ from typing import Any
 
 from rich.text import Text
 
+from daq.config.cell import Cell
+from daq.config.cell_buses import bus_loads
 from daq.config.cell_file import cell_from_bundle
 from daq.log.metadata import Timing
 from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import LogReader
 from daq.report.bus_views import current_signals
+from daq.report.log_schemas import BusLoadEntry, RecordReport
 from daq.report.text import entry_lines, picked, printable
+from daq.workflow.record import Recorded
 from drivers.messages import EventKind
 
 _ROUTINE = {EventKind.MOVE_START, EventKind.MOVE_END, EventKind.NMT, EventKind.STATE}
 """Events of every run; all others are shown."""
+
+
+def record_report(path: Path, recorded: Recorded, cell: Cell) -> RecordReport:
+    """Return a finished recording: the log with its losses, warnings about the currents, and the load of the buses."""
+    statistics = recorded.log
+    return RecordReport(
+        log=str(path),
+        samples=statistics.samples,
+        lost_cycles=statistics.lost_cycles,
+        missing=list(statistics.missing),
+        valid=statistics.valid,
+        reason=statistics.reason,
+        warnings=list(recorded.warnings),
+        bus_load=[
+            BusLoadEntry(bus=bus.name, mean_percent=100 * load.mean, worst_percent=100 * load.worst)
+            for bus, load in bus_loads(cell)
+        ],
+    )
 
 
 def describe_log(path: Path) -> dict[str, Any]:

@@ -4,46 +4,78 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from daq.config.cell import Cell, joint_unit
+from daq.report.document import Figure, Report
 from daq.workflow.experiment import Experiment
 from daq.workflow.plan import Plan
 from daq.workflow.plan_file import LONGEST_S
-from ident.planning.gain_verdict import GOOD_PERCENT, Identifiability, Visibility
+from ident.planning.gain_verdict import GOOD_PERCENT, GainVerdict, Identifiability, Visibility
 
 
-def plan_document(
-    out: Path, cell: Cell, experiment: Experiment, made: Plan, judged: Identifiability
-) -> dict[str, object]:
-    """Build the JSON document of a plan, with the verdict on the gain of each axis."""
-    return {
-        "plan": str(out),
-        "cell": made.cell,
-        "seed": made.seed,
-        "payload": experiment.payload.name,
-        "moves": len(made.moves),
-        "duration_s": round(made.duration_s, 3),
-        "condition": round(made.condition, 1),
-        "assumed": list(experiment.remarks),
-        "rank": judged.rank,
-        "known_preload_rank": judged.known_preload_rank,
-        "hidden": list(judged.sentences(cell.axis_names)),
-        "gains": [
-            {
-                "axis": axis.name,
-                "predicted_std_percent": round(gain.std_percent, 3),
-                "known_preload_std_percent": _finite(gain.known_preload_percent),
-                "verdict": gain.verdict.value,
-                "hidden_by": gain.hidden_by and gain.hidden_by.value,
-                "seen_by": [source.value for source in gain.sources],
-                "alone_percent": {source.value: _finite(alone) for source, alone in gain.alone_percent.items()},
-                "words": gain.words(axis.name),
-            }
-            for axis, gain in zip(cell.axes, judged.gains, strict=True)
-        ],
-    }
+class PlannedGain(Report):
+    """Prediction for one gain."""
+
+    axis: str
+    predicted_std_percent: Figure
+    known_preload_std_percent: Figure = Field(description="σ if internal preload of redundant motors were known [%]")
+    verdict: str
+    hidden_by: Literal["preload", "motion"] | None = Field(description="why the gain is unseen, or weak by preload")
+    seen_by: list[str]
+    alone_percent: dict[str, Figure] = Field(description="σ that each source of information gives alone [%]")
+    words: str
+
+
+class PlanReport(Report):
+    """`plan`."""
+
+    plan: str
+    cell: str
+    seed: int
+    payload: str
+    moves: int
+    duration_s: float
+    condition: float
+    assumed: list[str]
+    rank: int = Field(description="independent directions of the gains that the moves determine to 10 %")
+    known_preload_rank: int | None = Field(description="the same if internal preload were known")
+    hidden: list[str] = Field(description="sentences on gains that the moves do not show, with what to do")
+    gains: list[PlannedGain]
+
+
+def plan_report(out: Path, cell: Cell, experiment: Experiment, made: Plan, judged: Identifiability) -> PlanReport:
+    """Return a plan, with the verdict on the gain of each axis."""
+    return PlanReport(
+        plan=str(out),
+        cell=made.cell,
+        seed=made.seed,
+        payload=experiment.payload.name,
+        moves=len(made.moves),
+        duration_s=round(made.duration_s, 3),
+        condition=round(made.condition, 1),
+        assumed=list(experiment.remarks),
+        rank=judged.rank,
+        known_preload_rank=judged.known_preload_rank,
+        hidden=list(judged.sentences(cell.axis_names)),
+        gains=[_planned_gain(axis.name, gain) for axis, gain in zip(cell.axes, judged.gains, strict=True)],
+    )
+
+
+def _planned_gain(axis: str, gain: GainVerdict) -> PlannedGain:
+    return PlannedGain(
+        axis=axis,
+        predicted_std_percent=round(gain.std_percent, 3),
+        known_preload_std_percent=_finite(gain.known_preload_percent),
+        verdict=gain.verdict.value,
+        hidden_by=None if gain.hidden_by is None else gain.hidden_by.value,
+        seen_by=[source.value for source in gain.sources],
+        alone_percent={source.value: _finite(alone) for source, alone in gain.alone_percent.items()},
+        words=gain.words(axis),
+    )
 
 
 def _finite(std_percent: float | None) -> float | None:

@@ -190,11 +190,13 @@ def spelled_bytes(text: str) -> str:
 
 
 def json_safe(value: Any) -> Any:
-    """Copy a document, with null for numbers that JSON lacks."""
+    """Copy mappings and lists, with null for numbers that JSON lacks, and without bytes of names that are not UTF-8."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
+    if isinstance(value, str):
+        return spelled_bytes(value)
     if isinstance(value, dict):
-        return {str(key): json_safe(item) for key, item in value.items()}
+        return {spelled_bytes(str(key)): json_safe(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [json_safe(item) for item in value]
     return value

@@ -18,6 +18,53 @@ from ident.physical.physical import MARGIN
 _SHOWN_SHIFTS = 5
 
 
+class ShiftedParameter(Report):
+    """Identified parameter, and the nearest one of a physical robot."""
+
+    name: str
+    identified: float
+    physical: float
+    standard_deviations: Figure
+
+
+class UrdfJoint(Report):
+    """Body and friction of one moving joint."""
+
+    name: str
+    link: str
+    mass_kg: float
+    centre_m: list[float]
+    inertia_kg_m2: list[list[float]] | list[float]
+    damping: float
+    friction: float
+    smallest_eigenvalue: float
+    prior_assumed: bool
+
+
+class NotInUrdf(Report):
+    """Parameter that a URDF cannot hold."""
+
+    name: str
+    value: float
+    unit: str
+
+
+class UrdfReport(Report):
+    """`export urdf`."""
+
+    urdf: str
+    calibration: str
+    same_configuration: bool | None
+    exact: bool
+    torque_change_percent: Errors
+    shifts: list[ShiftedParameter]
+    margin: float
+    joints: list[UrdfJoint]
+    merged_links: list[str]
+    not_in_urdf: list[NotInUrdf]
+    effects_left_out: list[str]
+
+
 def urdf_view(
     calibration: Calibration,
     robot: PhysicalRobot,
