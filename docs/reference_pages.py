@@ -25,7 +25,8 @@ from daq.config.drive import DriveModel
 from daq.config.import_description import ImportDescription
 from daq.documents.calibration_file import CalibrationDocument
 from daq.errors import DaqError, exit_code
-from daq.report.schemas import REPORTS, ErrorReport
+from daq.report.error_schema import ErrorReport
+from daq.report.schemas import REPORTS
 from daq.simulation.simulation_file import SimulationModel
 from daq.writeback.gates.table import GATES
 from drivers.errors import DriverError

@@ -7,22 +7,14 @@ import os
 # Before NumPy is imported: what is equal bit by bit with one thread need not be with two.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import functools
 import gc
-import re
 import resource
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import settings
-from pydantic import TypeAdapter
 from xdist.scheduler import LoadFileScheduling
-
-from daq.cli import app, failure
-from daq.report.schemas import REPORTS, ErrorReport
-from daq.report.text import json_text
 
 # A busy machine is no reason to fail: no test asserts on a clock. And what passed once passes again.
 settings.register_profile("drivegain", deadline=None, derandomize=True)
@@ -73,40 +65,6 @@ class _FolderTogether(LoadFileScheduling):  # type: ignore[misc]  # xdist has no
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling | None:
     """Replace the scheduler of `--dist loadfile`."""
     return _FolderTogether(config, log) if config.getvalue("dist") == "loadfile" else None
-
-
-@pytest.fixture(scope="session", autouse=True)
-def reports_match_their_schemas() -> Iterator[None]:
-    """Hold every document that a verb prints under `--json`, in any test, against its published schema."""
-    running = ""
-    adapter = functools.cache(TypeAdapter[Any])
-    run, spell, describe = app._run, json_text, failure.ErrorParts.document
-
-    def noted(words: list[str], json_wanted: bool) -> int:
-        nonlocal running
-        running = words[0] if words else ""
-        try:
-            return run(words, json_wanted)
-        finally:
-            running = ""
-
-    def spelled(document: Any) -> str:
-        text = spell(document)
-        if running in REPORTS:
-            # Names that are no text are spelled \\udcff, which not every reader of JSON takes.
-            adapter(REPORTS[running]).validate_json(re.sub(r"(?<!\\)\\ud", "ud", text))
-        return text
-
-    def described(error: failure.ErrorParts) -> dict[str, Any]:
-        document = describe(error)
-        ErrorReport.model_validate(document)
-        return document
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(app, "_run", noted)
-        patch.setattr("daq.cli.verb.json_text", spelled)
-        patch.setattr(failure.ErrorParts, "document", described)
-        yield
 
 
 @pytest.fixture(scope="session")

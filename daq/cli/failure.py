@@ -12,7 +12,7 @@ import json
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.text import Text
@@ -22,6 +22,9 @@ from daq.errors import DaqError, ExitCode, exit_code
 from daq.report.text import printable, spelled_bytes
 from drivers import errors as driver
 from ident import errors as identification
+
+if TYPE_CHECKING:
+    from daq.report.error_schema import ErrorReport
 
 WITH_EVIDENCE = (
     identification.ModelContradicted | identification.PayloadMissing | identification.CurrentUnsigned
@@ -181,13 +184,27 @@ class ErrorParts:
             may_have_power(error),
         )
 
-    def document(self) -> dict[str, Any]:
-        """Return the object of `--json`."""
-        stop: dict[str, Any] = {"axes": NOT_STOPPED.format(self.powered)} if self.powered else {}
+    def document(self) -> ErrorReport:
+        """Return the object of `--json`.
+
+        It is made unchecked: an error is reported whatever is in it, and bytes of file names that are not UTF-8 stay.
+        """
+        from daq.report.error_schema import ErrorReport
+
+        sometimes: dict[str, Any] = dict(self.notes)
+        if self.powered:
+            sometimes["axes"] = NOT_STOPPED.format(self.powered)
         if self.unconfirmed:
-            stop["unconfirmed"] = list(self.unconfirmed)
-        parts = {"error": self.error, "found": self.found, "expected": self.expected, "do": self.do}
-        return {**parts, "exit_code": self.exit_code, "kind": self.kind, **self.notes, **stop}
+            sometimes["unconfirmed"] = list(self.unconfirmed)
+        return ErrorReport.model_construct(
+            error=self.error,
+            found=self.found,
+            expected=self.expected,
+            do=self.do,
+            exit_code=self.exit_code,
+            kind=self.kind,
+            **sometimes,
+        )
 
     def lines(self) -> Iterator[tuple[str, str, str]]:
         """Label, text and style of each line for a terminal."""
@@ -237,7 +254,10 @@ def show_failure(failure: ErrorParts, *, json_wanted: bool) -> None:
     console = Console(stderr=True, soft_wrap=True)
     with suppress(OSError, ValueError):  # a full disk, a reader that has gone, a closed stream
         if json_wanted:
-            line = json.dumps(failure.document(), ensure_ascii=False)
+            # An error as text needs no types of documents.
+            from daq.report.document import json_tree
+
+            line = json.dumps(json_tree(failure.document()), ensure_ascii=False)
             console.file.write(spelled_bytes(line) + "\n")
             return
         for label, text, style in failure.lines():

@@ -17,14 +17,16 @@ from dataclasses import dataclass
 from enum import Enum
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from daq.errors import UsageError
 from daq.files import judge_target
-from daq.report.document import Report, json_text
+
+if TYPE_CHECKING:
+    from daq.report.document import Report
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 CellArgument = Annotated[Path, typer.Argument(help="Cell file.")]
@@ -300,4 +302,6 @@ def say_correct_first() -> None:
 
 def print_json(document: Report) -> None:
     """Print one JSON document on stdout."""
+    from daq.report.document import json_text
+
     sys.stdout.write(json_text(document))

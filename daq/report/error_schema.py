@@ -16,7 +16,7 @@ class ErrorReport(Report):
     do: str
     exit_code: int
     kind: str = Field(description="class of the error")
-    kept: str = Field("", description="files that were written before")
+    kept: str = Field(default="", description="files that were written before")
     hint: str = ""
-    axes: str = Field("", description="axes that had power and are not confirmed without it")
-    unconfirmed: list[str] = Field([], description="what could not be confirmed")
+    axes: str = Field(default="", description="axes that had power and are not confirmed without it")
+    unconfirmed: list[str] = Field(default=[], description="what could not be confirmed")

@@ -19,6 +19,8 @@ import pytest
 from daq.cli.app import main
 from daq.cli.failure import ADVICE, ErrorParts, show_failure
 from daq.errors import DataError, ExitCode, OutputFailed
+from daq.report.document import json_tree
+from daq.report.error_schema import ErrorReport
 from drivers.canopen.bus import bus_errors
 from drivers.errors import BusError, DriveFault, DriverError
 from ident.errors import IdentificationError
@@ -99,9 +101,9 @@ def test_a_program_gets_one_object_a_line(capsys: pytest.CaptureFixture[str]) ->
     }
     stop = DriveFault(3, "fault")
     stop.add_note("while stopping: J3 (node 3) does not answer")
-    assert "axes" not in ErrorParts.of(stop).document()
+    assert "axes" not in json_tree(ErrorParts.of(stop).document())
     stop.add_note("not confirmed without power: J3 (node 3)")
-    assert ErrorParts.of(stop).document()["axes"] == "J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop"
+    assert ErrorParts.of(stop).document().axes == "J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop"
 
 
 def test_what_a_stop_could_not_confirm_is_shown_though_a_later_error_hides_its_cause() -> None:
@@ -111,8 +113,9 @@ def test_what_a_stop_could_not_confirm_is_shown_though_a_later_error_hides_its_c
     stop.add_note("while stopping: J3 (node 3) does not answer")
     stop.add_note("not confirmed without power: J3 (node 3)")
     document = ErrorParts.of(later).document()
-    assert document["axes"] == "J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop"
-    assert document["unconfirmed"] == ["while stopping: J3 (node 3) does not answer"]
+    assert document.axes == "J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop"
+    assert document.unconfirmed == ["while stopping: J3 (node 3) does not answer"]
+    ErrorReport.model_validate(json_tree(document))  # an error is shown unchecked
 
 
 def test_an_error_that_is_its_own_cause_is_explained() -> None:

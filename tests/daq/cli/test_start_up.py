@@ -58,6 +58,10 @@ def test_no_help_waits_for_numerics_or_the_bus(checkout: Path) -> None:
     assert _loaded(HELP, (*NUMERICS, "scipy", "numpy", "can", "canopen", "mcap"), checkout) == []
 
 
+def test_an_error_as_text_waits_for_no_types_of_documents(checkout: Path) -> None:
+    assert _loaded("from daq.cli.app import main; main(['recrod'])", ("daq.report.document", "yaml"), checkout) == []
+
+
 @pytest.mark.parametrize("verb", UNUSED)
 def test_a_quick_verb_loads_only_libraries_that_it_uses(verb: str, checkout: Path, tmp_path: Path) -> None:
     code = "from daq.cli.app import main\n"
