@@ -127,7 +127,7 @@ def apply_to(
 
     The write, with its entries in audit log and history, is done within `whole`.
     """
-    from daq.report.proposal import proposal_document, show_proposal
+    from daq.report.proposal import proposal_report, show_proposal
     from daq.writeback.judgement import query_history
     from daq.writeback.target import apply, propose
 
@@ -144,10 +144,10 @@ def apply_to(
                     written = apply(proposal, request.now, audit=audit, who=str(actor))
         except CalibrationRefused:
             if json:
-                print_json(proposal_document(proposal, None, known))
+                print_json(proposal_report(proposal, None, known))
             raise
     if json:
-        print_json(proposal_document(proposal, written, known))
+        print_json(proposal_report(proposal, written, known))
     else:
         _show_outcome(proposal, written, audit, undo, yes=yes)
     if proposal.refusals:
@@ -244,7 +244,7 @@ def rollback(
     values are in no file that could be reviewed.
     """
     from daq.config.cell_file import load_cell
-    from daq.report.proposal import describe_file_rollback, show_file_rollback
+    from daq.report.proposal import file_rollback_report, show_file_rollback
     from daq.writeback import target
     from daq.writeback.file_target import FileTarget
 
@@ -277,7 +277,7 @@ def rollback(
             file = FileTarget(path, format=format_, cell=declared)
             written = target.rollback(file, now, audit=audit, who=str(actor))
         if json:
-            print_json({**describe_file_rollback(written), "audit": None if audit is None else str(audit)})
+            print_json(file_rollback_report(written, audit))
             return
         console = output_console()
         show_file_rollback(written, console)
@@ -289,7 +289,7 @@ def rollback_drives(
     declared: Cell, *, now: datetime, actor: Applier, saving: Saving, audit: Path | None, yes: bool, json: bool
 ) -> None:
     """Show the values in the drives before the last write, and restore them with `yes`; a second time undoes it."""
-    from daq.report.proposal import describe_drive_rollback, show_drive_rollback
+    from daq.report.proposal import drive_rollback_report, show_drive_rollback
     from daq.writeback import target
     from daq.writeback.drive_target import record_folder
 
@@ -303,7 +303,7 @@ def rollback_drives(
             with write_output(record_folder(declared)):
                 written = target.rollback(drives, now, audit=audit, who=str(actor), planned=planned)
     if json:
-        print_json(describe_drive_rollback(planned, written))
+        print_json(drive_rollback_report(planned, written))
     elif written is None:
         console.print("Dry run, nothing was written. To restore them, repeat the command with --yes.")
     else:

@@ -49,7 +49,7 @@ def fleet_verb(
     from daq.files import replace_file
     from daq.jobs.cell_fit import Loop, open_cache
     from daq.jobs.fleet import fit_fleet, worker_pool
-    from daq.jobs.fleet_report import FIRST_COLUMNS, fleet_csv, fleet_document, fleet_view
+    from daq.jobs.fleet_report import FIRST_COLUMNS, fleet_csv, fleet_report, fleet_view
     from daq.jobs.fleet_survey import list_logs
 
     loop = Loop.CLOSED if residual else Loop.OPEN
@@ -67,7 +67,7 @@ def fleet_verb(
         with write_output(csv):
             replace_file(csv, fleet_csv(rows).encode())
     if json:
-        print_json(fleet_document(rows))
+        print_json(fleet_report(rows))
     else:
         print_view(fleet_view(rows), out, csv)
     if not all(row.fitted for row in rows):

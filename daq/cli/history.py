@@ -73,8 +73,7 @@ def history_verb(
     from daq.ledger.watch import watch
     from daq.report.history import (
         describe_actions,
-        describe_verification,
-        history_document,
+        history_report,
         in_force,
         say_verification,
         show_axis,
@@ -119,8 +118,7 @@ def history_verb(
         resolve_links(declared.controller_path)
     console = output_console()
     if json:
-        document = history_document(declared.name, history.entries, chosen, all_series, current)
-        print_json(document if checked is None else {**document, "audit": describe_verification(checked)})
+        print_json(history_report(declared.name, history.entries, chosen, all_series, current, checked))
     else:
         if checked is not None:
             say_verification(checked, console)

@@ -70,10 +70,11 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
     from daq.environment import login
     from daq.jobs.context import Tools
     from daq.jobs.job import preview, recalibrate
-    from daq.jobs.reporting import document, text
+    from daq.jobs.reporting import conclusion_report, text
     from daq.jobs.session import CALIBRATION
     from daq.log.feed import Feed
     from daq.report.certificate import compare
+    from daq.report.job_schemas import DryRunReport
     from daq.report.residual_page import save_report
     from daq.report.text import printable
     from daq.workflow.record import record
@@ -94,13 +95,13 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
         if dry_run:
             seen = preview(cell, declared, tools, journal, who=who)
             if json:
-                print_json({"dry_run": True, "remark": seen.remark, "steps": seen.steps})
+                print_json(DryRunReport(dry_run=True, remark=seen.remark, steps=list(seen.steps)))
             else:
                 typer.echo("\n".join((f"Dry run: {seen.remark}", *(f"  {step}" for step in seen.steps))))
             return
         ended = recalibrate(cell, declared, tools, journal, who=who, block_signals=block_signals)
     if json:
-        print_json(document(ended, cell))
+        print_json(conclusion_report(ended, cell))
     else:
         typer.echo(printable(text(ended, cell)), nl=False)
     if ended.exit_code:

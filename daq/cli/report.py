@@ -36,7 +36,7 @@ def report_verb(
     from daq.config.cell_file import load_cell
     from daq.documents.calibration_file import decode_calibration, load_calibration, read_calibration_bytes
     from daq.files import replace_file
-    from daq.report.certificate import certificate_document, certify, compare, without_controller
+    from daq.report.certificate import certificate_report, certify, compare, without_controller
     from daq.report.certificate_page import certificate_page
     from daq.report.html import MARK
     from daq.writeback.request import Request
@@ -58,7 +58,7 @@ def report_verb(
     with write_output(page):
         replace_file(page, certificate_page(certificate).encode())
     if json:
-        print_json(certificate_document(certificate))
+        print_json(certificate_report(certificate))
     else:
         print_view((certificate.sentence,), page)
 

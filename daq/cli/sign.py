@@ -29,6 +29,7 @@ def sign_key_verb(
 ) -> None:
     """Make a key pair: NAME.key is secret and stays with the person, the public key goes into the cell file."""
     from daq.cli.terminal import print_view
+    from daq.report.job_schemas import KeyReport
     from daq.writeback.signature import generate
 
     password = "" if no_password else _password()
@@ -44,7 +45,7 @@ def sign_key_verb(
         )
     secret, public = generate(folder, name, password)
     if json:
-        print_json({"name": name, "secret_key": str(secret), "public_key": public.line})
+        print_json(KeyReport(name=name, secret_key=str(secret), public_key=public.line))
         return
     entry = f"For the cell file, under `policy: {{apply: {{signers: …}}}}`:\n  {name}: {public.line}"
     print_view([entry], secret, secret.with_suffix(".pub"))
@@ -63,6 +64,7 @@ def sign_calibration_verb(
     from daq.cli.terminal import print_view
     from daq.documents.calibration_file import load_calibration
     from daq.report.gains import gain_table
+    from daq.report.job_schemas import SignatureReport
     from daq.writeback.signature import needs_password, sign
 
     known = load_calibration(calibration)
@@ -71,7 +73,7 @@ def sign_calibration_verb(
         print_view([gain_table(known.gains, title=f"{known.cell}, {known.created}")])
     path = sign(calibration, key, name, password=password, at=datetime.now(UTC))
     if json:
-        print_json({"calibration": str(calibration), "signature": str(path), "name": name})
+        print_json(SignatureReport(calibration=str(calibration), signature=str(path), name=name))
     else:
         print_view([], path)
 
@@ -84,12 +86,13 @@ def sign_check_verb(
     """Show which of the cell's signers have signed a calibration; an invalid signature is exit code 3."""
     from daq.cli.terminal import print_view
     from daq.config.cell_file import load_cell
+    from daq.report.job_schemas import SignersReport
     from daq.writeback.signature import signers_of
 
     policy = load_cell(cell).apply
     found = signers_of(calibration, policy.signers)
     if json:
-        print_json({"signers": list(found), "signatures_needed": policy.signatures})
+        print_json(SignersReport(signers=list(found), signatures_needed=policy.signatures))
         return
     signed = ", ".join(found) or "none of the cell's signers"
     print_view(

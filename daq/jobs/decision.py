@@ -17,12 +17,13 @@ from daq.ledger.audit import AuditAction
 from daq.ledger.audit import read as read_audit
 from daq.ledger.fold import History
 from daq.ledger.ledger import record_session
-from daq.report.text import json_text, picked
+from daq.report.document import json_text
+from daq.report.job_schemas import FailedCheck, ProposalReport, ProposedGain
 from daq.writeback.file_access import resolve_links
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.gates.gate import Gate
 from daq.writeback.judgement import Spread, judge, known_of
-from daq.writeback.request import Request
+from daq.writeback.request import GainChange, Request
 from daq.writeback.target import Proposal, Written
 from ident.calibration import Calibration
 
@@ -111,7 +112,10 @@ def decision_of(proposal: Proposal[FileEdit], known: Spread) -> Decision:
     judged, words = judge(proposal.edit.changes, known)
     gains = tuple(
         JudgedGain(
-            **picked(change, "axis", "unit", "old", "new"),
+            axis=change.axis,
+            unit=change.unit,
+            old=change.old,
+            new=change.new,
             old_std=known.stds[change.axis],
             new_std=change.std,
             change_percent=_finite(judged[change.axis].percent),
@@ -144,19 +148,28 @@ def _written_since(context: JobContext, session: Session) -> bool:
 
 def _write_proposal(session: Session, proposal: Proposal[FileEdit], after_sha256: str) -> None:
     """Write the change beside the calibration, as JSON and as a diff."""
-    document = {
-        "file": str(proposal.edit.file),
-        "base_sha256": proposal.edit.base_sha256,
-        "after_sha256": after_sha256,
-        "changes": [
-            picked(change, "axis", "key", "old", "new", "std", "unit", "change_percent")
-            for change in proposal.edit.changes
-        ],
-        "refusals": [{"gate": refusal.gate.value, "text": str(refusal)} for refusal in proposal.refusals],
-    }
+    report = ProposalReport(
+        file=str(proposal.edit.file),
+        base_sha256=proposal.edit.base_sha256,
+        after_sha256=after_sha256,
+        changes=[_proposed_gain(change) for change in proposal.edit.changes],
+        refusals=[FailedCheck(gate=refusal.gate.value, text=str(refusal)) for refusal in proposal.refusals],
+    )
     with writing(session.folder / PROPOSAL):
-        replace_file(session.folder / PROPOSAL, json_text(document).encode())
+        replace_file(session.folder / PROPOSAL, json_text(report).encode())
         replace_file(session.folder / DIFF, proposal.edit.diff.encode())
+
+
+def _proposed_gain(change: GainChange) -> ProposedGain:
+    return ProposedGain(
+        axis=change.axis,
+        key=change.key,
+        old=change.old,
+        new=change.new,
+        std=change.std,
+        unit=change.unit,
+        change_percent=change.change_percent,
+    )
 
 
 def _finite(number: float) -> float | None:

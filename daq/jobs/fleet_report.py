@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import RenderableType
 from rich.text import Text
@@ -13,7 +13,8 @@ from rich.text import Text
 from daq.jobs.cell_fit import Failure, Summary
 from daq.jobs.fleet import FleetRow
 from daq.report.gains import with_deviation
-from daq.report.text import WholeTable, inert, inert_row, picked, printable, spelled_bytes
+from daq.report.job_schemas import FleetCell, FleetEffect, FleetFailure, FleetGain, FleetReport
+from daq.report.text import WholeTable, inert, inert_row, printable
 from ident.calibration import Gain
 
 FIRST_COLUMNS = ("cell", "configuration_sha256", "fit", "holdout")
@@ -93,10 +94,10 @@ def fleet_csv(rows: Sequence[FleetRow]) -> str:
     return text.getvalue()
 
 
-def fleet_document(rows: Sequence[FleetRow]) -> dict[str, Any]:
-    """Build the object of `fleet --json`."""
+def fleet_report(rows: Sequence[FleetRow]) -> FleetReport:
+    """Return the cells of a fleet."""
     fitted = sum(row.fitted for row in rows)
-    return {"cells": [_document(row) for row in rows], "fitted": fitted, "failed": len(rows) - fitted}
+    return FleetReport(cells=[_fleet_cell(row) for row in rows], fitted=fitted, failed=len(rows) - fitted)
 
 
 def _line(row: FleetRow) -> dict[str, Any]:
@@ -124,33 +125,33 @@ def _line(row: FleetRow) -> dict[str, Any]:
     }
 
 
-def _document(row: FleetRow) -> dict[str, Any]:
+def _fleet_cell(row: FleetRow) -> FleetCell:
     result = row.result
     failure = result if isinstance(result, Failure) else None
     summary = result if isinstance(result, Summary) else None
-    return {
-        "cell": spelled_bytes(row.cell),
-        "configuration_sha256": row.configuration_sha256 or None,
-        "configurations": row.configurations,
-        "fit": [spelled_bytes(name) for name in row.fit],
-        "holdout": [spelled_bytes(name) for name in row.holdout],
-        "gains": [] if summary is None else [_gain(gain) for gain in summary.gains],
-        "worst": None if summary is None else _gain(summary.worst),
-        "error_percent": None if summary is None else summary.error_percent,
-        "error_on": None if summary is None else _measured_on(summary),
-        "effects": [] if summary is None else [{"name": name, "axis": axis} for name, axis in summary.effects],
-        "partial": None if summary is None else summary.partial,
-        "seconds": row.seconds,
-        "kept": row.kept,
-        "calibration": None if row.file is None else spelled_bytes(str(row.file)),
-        "exit_code": 0 if failure is None else failure.exit_code,
-        "error": None if failure is None else {"kind": failure.kind, "text": spelled_bytes(failure.text)},
-    }
+    return FleetCell(
+        cell=row.cell,
+        configuration_sha256=row.configuration_sha256 or None,
+        configurations=row.configurations,
+        fit=list(row.fit),
+        holdout=list(row.holdout),
+        gains=[] if summary is None else [_fleet_gain(gain) for gain in summary.gains],
+        worst=None if summary is None else _fleet_gain(summary.worst),
+        error_percent=None if summary is None else summary.error_percent,
+        error_on=None if summary is None else _measured_on(summary),
+        effects=[] if summary is None else [FleetEffect(name=name, axis=axis) for name, axis in summary.effects],
+        partial=None if summary is None else summary.partial,
+        seconds=row.seconds,
+        kept=row.kept,
+        calibration=None if row.file is None else str(row.file),
+        exit_code=0 if failure is None else failure.exit_code,
+        error=None if failure is None else FleetFailure(kind=failure.kind, text=failure.text),
+    )
 
 
-def _measured_on(summary: Summary) -> str:
+def _measured_on(summary: Summary) -> Literal["holdout", "fit"]:
     return "holdout" if summary.held_out else "fit"
 
 
-def _gain(gain: Gain) -> dict[str, Any]:
-    return picked(gain, "axis", "value", "std", "std_percent", "unit")
+def _fleet_gain(gain: Gain) -> FleetGain:
+    return FleetGain(axis=gain.axis, value=gain.value, std=gain.std, std_percent=gain.std_percent, unit=gain.unit)

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from prometheus_client import CollectorRegistry, Gauge, write_to_textfile
 
@@ -23,7 +22,8 @@ from daq.jobs.recording import calibration_of_session
 from daq.jobs.session import CALIBRATION, REPORT, Session
 from daq.ledger.audit import AuditAction, AuditEntry
 from daq.ledger.ledger import MAY_LACK, read_history, record_session
-from daq.report.text import json_text, picked
+from daq.report.document import json_text
+from daq.report.job_schemas import JobReport, RefusedJob
 from drivers.errors import stop_notes
 from ident.calibration import Calibration
 
@@ -109,7 +109,7 @@ def _report(
     context.journal.say(level, "session ended", outcome=outcome.value, exit_code=int(code), remark=remark)
     with writing(session.folder):
         replace_file(session.folder / SUMMARY_TEXT, text(conclusion, context.file).encode())
-        replace_file(session.folder / SUMMARY_JSON, json_text(document(conclusion, context.file)).encode())
+        replace_file(session.folder / SUMMARY_JSON, json_text(conclusion_report(conclusion, context.file)).encode())
     found = sessions.sessions(context.section.folder, context.cell.name)
     if context.section.metrics is not None:
         duration_s = context.tools.monotonic_s() - context.began_s
@@ -142,16 +142,20 @@ def _remove_old(context: JobContext, found: tuple[Session, ...]) -> None:
         context.journal.say(Level.INFO, "old session removed", folder=str(folder))
 
 
-def document(conclusion: Conclusion, cell_file: Path) -> dict[str, Any]:
-    """Convert a conclusion to the JSON of `recalibrate --json` and summary.json."""
-    found: dict[str, Any] = {
-        "outcome": conclusion.outcome.value,
-        **picked(conclusion, "exit_code", "remark"),
-        "to_do": to_do(conclusion, cell_file),
-    }
-    if conclusion.session is not None:
-        found |= {"folder": str(conclusion.session.folder), **conclusion.session.state.model_dump(mode="json")}
-    return found
+def conclusion_report(conclusion: Conclusion, cell_file: Path) -> JobReport | RefusedJob:
+    """Return how a job ended, for `recalibrate --json` and summary.json."""
+    refused = RefusedJob(
+        outcome=conclusion.outcome,
+        exit_code=conclusion.exit_code,
+        remark=conclusion.remark,
+        to_do=to_do(conclusion, cell_file),
+    )
+    session = conclusion.session
+    if session is None:
+        return refused
+    # Not strictly: what is a tuple in a state is a list in its mapping.
+    values = {**session.state.model_dump(), **dict(refused), "folder": str(session.folder)}
+    return JobReport.model_validate(values, strict=False)
 
 
 def text(conclusion: Conclusion, cell_file: Path) -> str:

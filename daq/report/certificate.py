@@ -7,29 +7,36 @@ controller was not read, the nameplate takes its place, and the limit of a chang
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from enum import Enum
-from typing import Any
+from typing import overload
 
 from daq.config.cell import Cell
 from daq.config.policy import ApplyPolicy
 from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationRefused, DaqError
+from daq.report.controller_schemas import (
+    CertificateReport,
+    CertifiedEffect,
+    CertifiedGain,
+    EarlierCalibration,
+)
 from daq.report.effect_names import accepted_text, size_text
 from daq.report.fit import error_document
+from daq.report.fit_schemas import Errors
 from daq.report.gains import encoder_text, mass_texts
-from daq.report.proposal import refusal_document
-from daq.report.text import picked
+from daq.report.proposal import refused_of
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.gates.gate import Gate, GateContext, Refusal
 from daq.writeback.gates.table import check_gates
 from daq.writeback.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, judge, noise_note, query_history
 from daq.writeback.request import Edit, GainChange, Request
 from daq.writeback.target import Proposal, propose
-from ident.calibration import Calibration
+from ident.calibration import AcceptedEffect, Calibration
+from ident.estimators.estimate import RelativeError
 
-FORMAT, VERSION = "drivegain-certificate", 1
 EARLIER = "earlier calibration"  #: What `since` compares with
 _OPERATORS = frozenset({Gate.SIGNATURE, Gate.BASE})
 """Gates that an operator opens by reviewing or signing; the calibration itself is not at fault."""
@@ -349,56 +356,79 @@ def _minute(iso: str) -> str:
         return iso or "time not known"
 
 
-def certificate_document(certificate: Certificate) -> dict[str, Any]:
-    """Return the numbers of the page, for `report --json`."""
+def certificate_report(certificate: Certificate) -> CertificateReport:
+    """Return the numbers of the page."""
     calibration, comparison = certificate.calibration, certificate.comparison
-    edit = comparison.edit
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "cell": calibration.cell,
-        "identity": dict(identity(calibration)),
-        "verdict": certificate.verdict.value,
-        "sentence": certificate.sentence,
-        "controller": None if edit is None else str(edit.file),
-        "controller_unread": comparison.unread or None,
-        "axes": [_axis_document(row, certificate.place) for row in certificate.rows],
-        "refusals": [refusal_document(refusal) for refusal in comparison.refusals],
-        "holdout_error_percent": error_document(calibration.holdout_error_percent),
-        "nameplate_holdout_error_percent": error_document(calibration.nameplate_holdout_error_percent),
-        "relative_error_percent": error_document(calibration.relative_error_percent),
-        "payload_mass": [asdict(one) for one in calibration.payload_mass],
-        "encoder_misfit": None if calibration.encoder_misfit is None else asdict(calibration.encoder_misfit),
-        "effects": [
-            {
-                "axis": effect.axis,
-                "effect": accepted_text(effect, calibration),
-                "size": size_text(effect, calibration),
-                **picked(effect, "error_before_percent", "error_after_percent"),
-                "ambiguity": list(effect.ambiguity),
-            }
-            for effect in calibration.effects
-        ],
-        "beside": None
-        if certificate.earlier is None
-        else {
-            "created": certificate.earlier.created,
-            "axes": [_axis_document(row, EARLIER) for row in certificate.since],
-            "holdout_error_percent": error_document(certificate.earlier.holdout_error_percent),
-        },
-    }
+    edit, earlier = comparison.edit, certificate.earlier
+    return CertificateReport(
+        format="drivegain-certificate",
+        version=1,
+        cell=calibration.cell,
+        identity=dict(identity(calibration)),
+        verdict=certificate.verdict.value,
+        sentence=certificate.sentence,
+        controller=None if edit is None else str(edit.file),
+        controller_unread=comparison.unread or None,
+        axes=[_certified_gain(row, certificate.place) for row in certificate.rows],
+        refusals=[refused_of(refusal) for refusal in comparison.refusals],
+        holdout_error_percent=_errors(calibration.holdout_error_percent),
+        nameplate_holdout_error_percent=_errors(calibration.nameplate_holdout_error_percent),
+        relative_error_percent=_errors(calibration.relative_error_percent),
+        payload_mass=list(calibration.payload_mass),
+        encoder_misfit=calibration.encoder_misfit,
+        effects=[_certified_effect(effect, calibration) for effect in calibration.effects],
+        beside=None if earlier is None else _beside(earlier, certificate.since),
+    )
 
 
-def _axis_document(row: AxisRow, place: str) -> dict[str, Any]:
-    return {
-        "axis": row.change.axis,
-        "key": row.change.key or None,
-        "line": row.change.line or None,
-        **picked(row.change, "old", "new", "std", "std_percent", "unit", "nameplate"),
-        **picked(row.change, "change_percent"),
-        "written": row.change.spelling or None,
-        "allowed_percent": list(row.allowed_percent),
-        "change_sigmas": row.judged.sigmas,
-        "significant": row.significant,
-        "verdict": row.words(place),
-    }
+def _certified_gain(row: AxisRow, place: str) -> CertifiedGain:
+    change = row.change
+    return CertifiedGain(
+        axis=change.axis,
+        key=change.key or None,
+        line=change.line or None,
+        old=change.old,
+        new=change.new,
+        std=change.std,
+        std_percent=change.std_percent,
+        unit=change.unit,
+        nameplate=change.nameplate,
+        change_percent=change.change_percent,
+        written=change.spelling or None,
+        allowed_percent=list(row.allowed_percent),
+        change_sigmas=row.judged.sigmas,
+        significant=row.significant,
+        verdict=row.words(place),
+    )
+
+
+def _certified_effect(effect: AcceptedEffect, calibration: Calibration) -> CertifiedEffect:
+    return CertifiedEffect(
+        axis=effect.axis,
+        effect=accepted_text(effect, calibration),
+        size=size_text(effect, calibration),
+        error_before_percent=effect.error_before_percent,
+        error_after_percent=effect.error_after_percent,
+        ambiguity=list(effect.ambiguity),
+    )
+
+
+def _beside(earlier: Calibration, since: Sequence[AxisRow]) -> EarlierCalibration:
+    return EarlierCalibration(
+        created=earlier.created,
+        axes=[_certified_gain(row, EARLIER) for row in since],
+        holdout_error_percent=_errors(earlier.holdout_error_percent),
+    )
+
+
+@overload
+def _errors(error: RelativeError) -> Errors: ...
+
+
+@overload
+def _errors(error: RelativeError | None) -> Errors | None: ...
+
+
+def _errors(error: RelativeError | None) -> Errors | None:
+    document = error_document(error)
+    return None if document is None else Errors(**document)

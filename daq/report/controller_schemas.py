@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -27,8 +27,8 @@ class FileGain(Report):
     axis: str
     key: str
     line: int
-    old: float
-    new: float
+    old: Figure
+    new: Figure = Field(description="as it is read back; null where there is none to write")
     change_percent: Figure
     change_sigmas: Figure = Field(description="signed as change_percent")
     significant: bool
@@ -56,25 +56,25 @@ class DriveGain(Report):
 
     axis: str
     object: str
-    old: float
-    new: float
+    old: Figure = Field(description="null where the drive has no number")
+    new: Figure
     std: float
     nameplate: float
     unit: str
 
 
 class DriveChange(Report):
-    """`apply --drives`; the last three are there once the drives are written."""
+    """`apply --drives`; `record`, `source` and `saved` are there once the drives are written."""
 
     cell: str | None
     base_sha256: str
     base: str
     applied: bool
-    changes: list[DriveGain]
-    refusals: list[Refused]
     record: str = ""
     source: str | None = None
     saved: bool = False
+    changes: list[DriveGain]
+    refusals: list[Refused]
 
 
 class FileRollback(Report):
@@ -92,8 +92,8 @@ class RestoredObject(Report):
 
     axis: str
     object: str
-    old: float
-    new: float
+    old: Figure = Field(description="null where the drive has no number")
+    new: Figure
 
 
 class DriveRollback(Report):
@@ -114,7 +114,7 @@ class CertifiedGain(Report):
     key: str | None = Field(description="in the controller's file; null where it was not read")
     line: int | None
     old: Figure
-    new: float
+    new: Figure
     std: float
     std_percent: Figure
     unit: str
@@ -162,8 +162,8 @@ class CertificateReport(Report):
     holdout_error_percent: Errors | None
     nameplate_holdout_error_percent: Errors | None
     relative_error_percent: Errors
-    payload_mass: tuple[PayloadMass, ...] = ()
-    encoder_misfit: EncoderMisfit | None = None
+    payload_mass: list[PayloadMass]
+    encoder_misfit: EncoderMisfit | None
     effects: list[CertifiedEffect]
     beside: EarlierCalibration | None
 
@@ -190,8 +190,8 @@ class HistoryPoint(Report):
     change_sigmas: Figure
     change_probability: Figure
     deviation_sigmas: Figure
-    cusum_up: float
-    cusum_down: float
+    cusum_up: Figure
+    cusum_down: Figure
     trend_sigmas: Figure
     alarm: str | None
     baseline: Figure
@@ -226,14 +226,58 @@ class HistoryAxis(Report):
     points: list[HistoryPoint]
 
 
+class FlawedLine(Report):
+    """A line of the audit log that is not what was written."""
+
+    line: int = Field(description="in the file, from 1")
+    flaw: str
+    says: str = Field(description="the same as a sentence")
+
+
+class NamedEntry(Report):
+    """An entry of the audit log."""
+
+    number: int = Field(description="from 1")
+    at: str
+    who: str
+    file: str = Field(description="the controller's file, or the drives")
+
+
+class UnendedWrite(NamedEntry):
+    """A write that was begun and never ended."""
+
+    content: str = Field(description="of the file afterwards")
+
+
+class UnknownWrite(NamedEntry):
+    """A write that the history lacks."""
+
+    action: str
+    calibration_sha256: str | None
+
+
+class AuditReport(Report):
+    """State of the audit log and of the history in it."""
+
+    file: str
+    entries: int
+    holds: bool = Field(description="no line was changed or removed, as far as the chain shows it")
+    broken_line: int | None = Field(description="the first that is not what was written")
+    flaws: list[FlawedLine]
+    torn_lines: list[int] = Field(description="left by a writer that was killed; they are no flaw")
+    open_writes: list[UnendedWrite]
+    history_broken: list[str] = Field(description="what the history cannot show")
+    unknown_writes: list[UnknownWrite]
+
+
 class HistoryReport(Report):
     """`history`."""
 
     cell: str
     calibrations: int
     in_force: str | None
-    chart: dict[str, float] = Field(description="limits of the control chart")
+    chart: dict[str, int | float] = Field(description="limits of the control chart")
     pattern: str
     questions: list[str]
     axes: list[HistoryAxis]
-    audit: dict[str, Any] | None = Field(None, description="with --verify")
+    audit: AuditReport | None = Field(default=None, description="with --verify")

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -16,14 +17,24 @@ from daq.config.cell import Cell
 from daq.errors import ControllerUnfit
 from daq.formats.document import decode_document, read_controller_file
 from daq.formats.scalar import Scalar, rewrite_gain
-from daq.ledger.audit import AuditEntry, head_file
-from daq.ledger.entry import Entry, Event, WriteAction, drives_of
-from daq.ledger.fold import History
+from daq.ledger.audit import OpenWrite, head_file
+from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, drives_of
+from daq.ledger.fold import AuditedWrite, History
 from daq.ledger.ledger import Verification
 from daq.ledger.watch import Series, alarm_text, pattern_of, questions
+from daq.report.controller_schemas import (
+    Acknowledged,
+    AuditReport,
+    FlawedLine,
+    HistoryAxis,
+    HistoryPoint,
+    HistoryReport,
+    UnendedWrite,
+    UnknownWrite,
+)
 from daq.report.gains import with_deviation
 from daq.report.picture import BLUE, GREY, ORANGE, PURPLE, SKY, legend_below, panels, render, unformatted
-from daq.report.text import SHOWN_SIGMAS, inert_row, picked, plain_table, printable
+from daq.report.text import SHOWN_SIGMAS, inert_row, plain_table, printable
 from daq.writeback.file_access import resolve_links
 from ident.drift.change import CHART
 
@@ -149,35 +160,57 @@ def axis_table(series: Series, actions: Mapping[str, str]) -> Table:
     return table
 
 
-_DRIFT = ("change_percent", "change_sigmas", "baseline", "baseline_std")
+def history_report(
+    cell: str,
+    entries: Sequence[Entry],
+    chosen: Sequence[Series],
+    all_series: Sequence[Series],
+    in_force: str | None,
+    checked: Verification | None = None,
+) -> HistoryReport:
+    """Return the history of a cell.
+
+    Args:
+        cell: its name.
+        entries: its calibrations.
+        chosen: axes that were asked for.
+        all_series: all axes.
+        in_force: digest of the calibration whose gains the controller has.
+        checked: state of audit log and history; None where it was not asked for.
+    """
+    audit = {} if checked is None else {"audit": audit_report(checked)}
+    return HistoryReport(
+        cell=cell,
+        calibrations=len(entries),
+        in_force=in_force,
+        chart=asdict(CHART),
+        pattern=pattern_of(all_series).value,
+        questions=list(questions(all_series)),
+        axes=[_history_axis(series) for series in chosen],
+        **audit,
+    )
 
 
-def history_document(
-    cell: str, entries: Sequence[Entry], chosen: Sequence[Series], all_series: Sequence[Series], in_force: str | None
-) -> dict[str, Any]:
-    """All of it for --json; `chosen` are the axes that were asked for."""
-    return {
-        "cell": cell,
-        "calibrations": len(entries),
-        "in_force": in_force,
-        "chart": picked(CHART, "reference", "threshold", "single", "trend", "baseline"),
-        "pattern": pattern_of(all_series).value,
-        "questions": list(questions(all_series)),
-        "axes": [
-            {
-                **picked(series, "axis", "unit", "dispersion", "alarmed"),
-                "alarm": alarm_text(series),
-                "since": None if series.onset is None else series.onset.isoformat(),
-                **(dict.fromkeys(_DRIFT) if series.drift is None else picked(series.drift, *_DRIFT)),
-                "acknowledged": [
-                    {"since": a.since.isoformat(), "at": a.at.isoformat(), "who": a.who, "why": a.why}
-                    for a in series.acknowledged
-                ],
-                "points": rows(series),
-            }
-            for series in chosen
-        ],
-    }
+def _history_axis(series: Series) -> HistoryAxis:
+    drift = series.drift
+    return HistoryAxis(
+        axis=series.axis,
+        unit=series.unit,
+        dispersion=series.dispersion,
+        alarmed=series.alarmed,
+        alarm=alarm_text(series),
+        since=None if series.onset is None else series.onset.isoformat(),
+        change_percent=None if drift is None else drift.change_percent,
+        change_sigmas=None if drift is None else drift.change_sigmas,
+        baseline=None if drift is None else drift.baseline,
+        baseline_std=None if drift is None else drift.baseline_std,
+        acknowledged=[_acknowledged(one) for one in series.acknowledged],
+        points=history_points(series),
+    )
+
+
+def _acknowledged(one: Acknowledgement) -> Acknowledged:
+    return Acknowledged(since=one.since.isoformat(), at=one.at.isoformat(), who=one.who, why=one.why)
 
 
 def say_verification(found: Verification, console: Console) -> None:
@@ -208,27 +241,43 @@ def say_verification(found: Verification, console: Console) -> None:
     console.print(f"History: {state}.")
 
 
-def describe_verification(found: Verification) -> dict[str, Any]:
-    """Return the same for --json."""
+def audit_report(found: Verification) -> AuditReport:
+    """Return the state of audit log and history."""
     verdict = found.verdict
-    return {
-        "file": str(found.audit),
-        "entries": len(verdict.entries),
-        "holds": verdict.holds,
-        "broken_line": verdict.broken,
-        "flaws": [{"line": f.line, "flaw": f.flaw.value, "says": f.says} for f in verdict.flaws],
-        "torn_lines": list(verdict.torn),
-        "open_writes": [{**_described(one.begun), "content": one.content.value} for one in verdict.open_writes],
-        "history_broken": [printable(one) for one in found.broken],
-        "unknown_writes": [
-            {**_described(one.ended), "action": one.ended.action.value, "calibration_sha256": one.calibration}
-            for one in found.unknown
-        ],
-    }
+    return AuditReport(
+        file=str(found.audit),
+        entries=len(verdict.entries),
+        holds=verdict.holds,
+        broken_line=verdict.broken,
+        flaws=[FlawedLine(line=one.line, flaw=one.flaw.value, says=one.says) for one in verdict.flaws],
+        torn_lines=list(verdict.torn),
+        open_writes=[_unended_write(one) for one in verdict.open_writes],
+        history_broken=[printable(one) for one in found.broken],
+        unknown_writes=[_unknown_write(one) for one in found.unknown],
+    )
 
 
-def _described(entry: AuditEntry) -> dict[str, Any]:
-    return {"number": entry.number, "at": entry.at, "who": entry.who, "file": entry.subject}
+def _unended_write(write: OpenWrite) -> UnendedWrite:
+    entry = write.begun
+    return UnendedWrite(
+        number=entry.number,
+        at=entry.at,
+        who=entry.who,
+        file=entry.subject,
+        content=write.content.value,
+    )
+
+
+def _unknown_write(write: AuditedWrite) -> UnknownWrite:
+    entry = write.ended
+    return UnknownWrite(
+        number=entry.number,
+        at=entry.at,
+        who=entry.who,
+        file=entry.subject,
+        action=entry.action.value,
+        calibration_sha256=write.calibration,
+    )
 
 
 _WORDS = {WriteAction.APPLIED: "applied by", WriteAction.ROLLED_BACK: "gains restored by the rollback of"}
@@ -292,57 +341,60 @@ def _has(entry: Entry, numbers: dict[str, tuple[Scalar, float]]) -> bool:
     return all(one.new == one.old for one in put)
 
 
-_FIT = ("error_percent", "holdout_percent", "rows", "method", "software", "configuration_sha256")
-COLUMNS = (
-    *("axis", "recorded", "gain", "std", "unit", "nameplate", "change_percent", "change_sigmas", "change_probability"),
-    *("deviation_sigmas", "cusum_up", "cusum_down", "trend_sigmas", "alarm", "baseline"),
-    *("applied_at", "applied_by", "applied_to", *_FIT, "created", "entered", "digest"),
-)
-
-
-def rows(series: Series) -> list[dict[str, Any]]:
-    """Return one row a point, by COLUMNS; None for a missing value."""
-    return [_row(series, index) for index in range(len(series.points))]
+COLUMNS = tuple(HistoryPoint.model_fields)
+"""Headings of the table for a spreadsheet."""
 
 
 def csv_text(all_series: Sequence[Series]) -> str:
-    """All rows with a header (RFC 4180); no text in it is a formula to a spreadsheet."""
+    """All calibrations of all gains with a header (RFC 4180); no text in it is a formula to a spreadsheet."""
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\r\n")
     writer.writeheader()
     for series in all_series:
-        writer.writerows(map(inert_row, rows(series)))
+        writer.writerows(inert_row(dict(point)) for point in history_points(series))
     return text.getvalue()
 
 
-def _row(series: Series, index: int) -> dict[str, Any]:
+def history_points(series: Series) -> list[HistoryPoint]:
+    """Return the calibrations of a gain, oldest first; None for a missing value."""
+    return [_history_point(series, index) for index in range(len(series.points))]
+
+
+def _history_point(series: Series, index: int) -> HistoryPoint:
     point, stretch = series.points[index], series.stretch_at(index)
     entry, gain, change = point.entry, point.gain, point.change
     drift, place = stretch.drift, index - stretch.began
     alarm = series.alarm_at(index)
     last = entry.events[-1] if entry.events else None
-    return {
-        "axis": series.axis,
-        "recorded": entry.recorded.isoformat(),
-        "gain": gain.value,
-        **picked(gain, "std", "unit", "nameplate"),
-        "change_percent": None if change is None else change.percent,
-        "change_sigmas": None if change is None else change.sigmas,
-        "change_probability": None if change is None else change.probability,
-        "deviation_sigmas": float(drift.deviations[place]),
-        "cusum_up": float(drift.upper[place]),
-        "cusum_down": float(drift.lower[place]),
-        "trend_sigmas": float(drift.trend[place]),
-        "alarm": None if alarm is None else alarm.kind.value,
-        "baseline": drift.baseline,
-        "applied_at": None if last is None else last.at.isoformat(),
-        "applied_by": None if last is None else last.who,
-        "applied_to": None if last is None else last.target,
-        **picked(entry, *_FIT),
-        "created": entry.created.isoformat(),
-        "entered": entry.entered.isoformat(),
-        "digest": entry.digest,
-    }
+    return HistoryPoint(
+        axis=series.axis,
+        recorded=entry.recorded.isoformat(),
+        gain=gain.value,
+        std=gain.std,
+        unit=gain.unit,
+        nameplate=gain.nameplate,
+        change_percent=None if change is None else change.percent,
+        change_sigmas=None if change is None else change.sigmas,
+        change_probability=None if change is None else change.probability,
+        deviation_sigmas=float(drift.deviations[place]),
+        cusum_up=float(drift.upper[place]),
+        cusum_down=float(drift.lower[place]),
+        trend_sigmas=float(drift.trend[place]),
+        alarm=None if alarm is None else alarm.kind.value,
+        baseline=drift.baseline,
+        applied_at=None if last is None else last.at.isoformat(),
+        applied_by=None if last is None else last.who,
+        applied_to=None if last is None else last.target,
+        error_percent=entry.error_percent,
+        holdout_percent=entry.holdout_percent,
+        rows=entry.rows,
+        method=entry.method,
+        software=entry.software,
+        configuration_sha256=entry.configuration_sha256,
+        created=entry.created.isoformat(),
+        entered=entry.entered.isoformat(),
+        digest=entry.digest,
+    )
 
 
 _COLUMNS = 2

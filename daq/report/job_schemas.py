@@ -1,20 +1,20 @@
-"""What `recalibrate`, `fleet` and `sign` print under `--json`."""
+"""What `recalibrate`, `fleet` and `sign` print under `--json`, and what a recalibration leaves in its folder."""
 
 from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
-
-from daq.documents.session_state import SessionState
+from daq.documents.session_state import Outcome, SessionState
 from daq.report.document import Figure, Report
-from daq.report.fit_schemas import ComparedGain
 
 
-class FleetGain(ComparedGain):
+class FleetGain(Report):
     """A gain of a cell of the fleet."""
 
+    axis: str
+    value: float
     std: Figure
+    std_percent: Figure
     unit: str
 
 
@@ -95,15 +95,50 @@ class DryRunReport(Report):
 class RefusedJob(Report):
     """`recalibrate` where no session was begun."""
 
-    outcome: str
+    outcome: Outcome
     exit_code: int
     remark: str
     to_do: list[str]
 
 
-class JobReport(SessionState):
-    """`recalibrate`: the state of its session, and what is left to do."""
+class ConcludedJob(RefusedJob):
+    """How a job with a session ended."""
 
-    remark: str
-    to_do: list[str]
     folder: str
+
+
+class JobReport(SessionState, ConcludedJob):
+    """`recalibrate`: what is left to do, and the state of its session."""
+
+    # Keys of the base that is named last come first.
+    outcome: Outcome
+    exit_code: int
+
+
+class ProposedGain(Report):
+    """A gain in the controller's file and the one that a job proposes."""
+
+    axis: str
+    key: str
+    old: Figure
+    new: Figure
+    std: float
+    unit: str
+    change_percent: Figure
+
+
+class FailedCheck(Report):
+    """A check that failed, as a sentence."""
+
+    gate: str
+    text: str
+
+
+class ProposalReport(Report):
+    """`proposal.json`: the change of the controller's file that a job found."""
+
+    file: str
+    base_sha256: str
+    after_sha256: str
+    changes: list[ProposedGain]
+    refusals: list[FailedCheck]

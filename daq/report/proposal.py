@@ -1,9 +1,8 @@
-"""A proposed change of a controller's file or of the drives: tables for the operator, documents for `--json`."""
+"""A proposed change of a controller's file or of the drives: tables for the operator, and what `--json` prints."""
 
 from __future__ import annotations
 
 import difflib
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +10,25 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from daq.report.controller_schemas import (
+    DriveChange,
+    DriveGain,
+    DriveRollback,
+    FileChange,
+    FileGain,
+    FileRollback,
+    Refused,
+    RestoredObject,
+)
 from daq.report.gains import with_deviation
-from daq.report.text import picked, plain_table, terminal_lines, terminal_text
+from daq.report.text import plain_table, terminal_lines, terminal_text
 from daq.writeback.drive_target import DriveEdit
 from daq.writeback.file_target import FileEdit
 from daq.writeback.gates.gate import Refusal
 from daq.writeback.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, judge, noise_note
 from daq.writeback.request import Edit, GainChange
 from daq.writeback.target import E, Proposal, Written
+from drivers.canopen.parameters import ParameterValue, ParameterWrite
 
 
 def show_proposal(proposal: Proposal[E], console: Console, known: Spread = NOTHING) -> None:
@@ -56,51 +66,84 @@ def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING, place
     return table
 
 
-def proposal_document(proposal: Proposal[E], written: Written | None, known: Spread = NOTHING) -> dict[str, Any]:
-    """Make the document of a proposal and its outcome for `--json`."""
+def proposal_report(
+    proposal: Proposal[E], written: Written | None, known: Spread = NOTHING
+) -> FileChange | DriveChange:
+    """Return a proposal and its outcome; `written` is None where nothing was written."""
     edit = proposal.edit
-    refusals = [refusal_document(refusal) for refusal in proposal.refusals]
-    base = {"base_sha256": edit.base_sha256, "base": edit.base, "applied": written is not None}
     if isinstance(edit, DriveEdit):
-        names = ("old", "new", "std", "nameplate", "unit")
-        changes = [{"axis": one.axis, "object": one.key, **picked(one, *names)} for one in edit.changes]
-        cell = None if proposal.target.cell is None else proposal.target.cell.name
-        return {"cell": cell, **base, **_outcome(written), "changes": changes, "refusals": refusals}
+        return _drive_change(proposal, written)
     judged, _ = judge(edit.changes, known)
-    return {
-        "file": str(edit.place),
-        **base,
-        "backup": None if written is None else str(written.backup),
-        "changes": [_file_change(change, judged.get(change.axis, NOT_JUDGED)) for change in edit.changes],
-        "refusals": refusals,
-        "diff": edit.diff if isinstance(edit, FileEdit) else "",
-    }
+    return FileChange(
+        file=str(edit.place),
+        base_sha256=edit.base_sha256,
+        base=edit.base,
+        applied=written is not None,
+        backup=None if written is None else str(written.backup),
+        changes=[_file_gain(change, judged.get(change.axis, NOT_JUDGED)) for change in edit.changes],
+        refusals=[refused_of(refusal) for refusal in proposal.refusals],
+        diff=edit.diff if isinstance(edit, FileEdit) else "",
+    )
 
 
-def refusal_document(refusal: Refusal) -> dict[str, Any]:
-    """Make the document of a failed check for `--json`."""
-    return asdict(refusal) | {"gate": refusal.gate.value}
+def refused_of(refusal: Refusal) -> Refused:
+    """Return a failed check."""
+    return Refused(
+        gate=refusal.gate.value,
+        subject=refusal.subject,
+        found=refusal.found,
+        expected=refusal.expected,
+        remedy=refusal.remedy,
+    )
 
 
-def _file_change(change: GainChange, judged: JudgedChange) -> dict[str, Any]:
-    return {
-        **picked(change, "axis", "key", "line", "old", "new", "change_percent"),
-        "change_sigmas": judged.sigmas,
-        "significant": judged.significant,
-        **picked(change, "std_percent", "nameplate", "nameplate_percent", "unit"),
-    }
+def _file_gain(change: GainChange, judged: JudgedChange) -> FileGain:
+    return FileGain(
+        axis=change.axis,
+        key=change.key,
+        line=change.line,
+        old=change.old,
+        new=change.new,
+        change_percent=change.change_percent,
+        change_sigmas=judged.sigmas,
+        significant=judged.significant,
+        std_percent=change.std_percent,
+        nameplate=change.nameplate,
+        nameplate_percent=change.nameplate_percent,
+        unit=change.unit,
+    )
 
 
-def _outcome(written: Written | None) -> dict[str, Any]:
-    """Describe a write to drives."""
-    if written is None:
-        return {}
-    source = written.edit.source
-    return {
-        "record": str(written.backup),
-        "source": None if source is None else str(source),
-        "saved": all(change.saved for change in written.parameters),
-    }
+def _drive_change(proposal: Proposal[E], written: Written | None) -> DriveChange:
+    edit, cell = proposal.edit, proposal.target.cell
+    # A calibration restores no record.
+    outcome = {} if written is None else {**_outcome(written), "source": None}
+    return DriveChange(
+        cell=None if cell is None else cell.name,
+        base_sha256=edit.base_sha256,
+        base=edit.base,
+        applied=written is not None,
+        changes=[_drive_gain(change) for change in edit.changes],
+        refusals=[refused_of(refusal) for refusal in proposal.refusals],
+        **outcome,
+    )
+
+
+def _drive_gain(change: GainChange) -> DriveGain:
+    return DriveGain(
+        axis=change.axis,
+        object=change.key,
+        old=change.old,
+        new=change.new,
+        std=change.std,
+        nameplate=change.nameplate,
+        unit=change.unit,
+    )
+
+
+def _outcome(written: Written) -> dict[str, Any]:
+    """Keys that are there once the drives are written."""
+    return {"record": str(written.backup), "saved": all(change.saved for change in written.parameters)}
 
 
 def show_drive_rollback(edit: DriveEdit, console: Console) -> None:
@@ -114,23 +157,24 @@ def show_drive_rollback(edit: DriveEdit, console: Console) -> None:
         )
 
 
-def describe_drive_rollback(edit: DriveEdit, written: Written | None) -> dict[str, Any]:
-    """Make the document of a rollback of the drives for `--json`."""
-    return {
-        "drives": edit.subject,
-        "source": str(edit.source),
-        "restored": written is not None,
-        "changes": [
-            {
-                "axis": value.axis.name,
-                "object": str(value.parameter),
-                "old": value.value,
-                "new": value.parameter.value(write.word),
-            }
-            for value, write in zip(edit.values, edit.writes, strict=True)
-        ],
-        **_outcome(written),
-    }
+def drive_rollback_report(edit: DriveEdit, written: Written | None) -> DriveRollback:
+    """Return a rollback of the drives; `written` is None where nothing was written."""
+    return DriveRollback(
+        drives=edit.subject,
+        source=str(edit.source),
+        restored=written is not None,
+        changes=[_restored(value, write) for value, write in zip(edit.values, edit.writes, strict=True)],
+        **({} if written is None else _outcome(written)),
+    )
+
+
+def _restored(value: ParameterValue, write: ParameterWrite) -> RestoredObject:
+    return RestoredObject(
+        axis=value.axis.name,
+        object=str(value.parameter),
+        old=value.value,
+        new=value.parameter.value(write.word),
+    )
 
 
 def show_file_rollback(written: Written, console: Console) -> None:
@@ -142,14 +186,15 @@ def show_file_rollback(written: Written, console: Console) -> None:
     console.print(terminal_text(f"Restored {source} to {edit.subject}; {replaced}."))
 
 
-def describe_file_rollback(written: Written) -> dict[str, Any]:
-    """Make the document of a rollback of the controller's file for `--json`."""
-    return {
-        "file": written.edit.subject,
-        "restored": str(written.edit.source),
-        "backup": None if written.backup is None else str(written.backup),
-        "diff": _rollback_diff(written.edit),
-    }
+def file_rollback_report(written: Written, audit: Path | None) -> FileRollback:
+    """Return a rollback of the controller's file; `audit` is the log that has it."""
+    return FileRollback(
+        file=written.edit.subject,
+        restored=str(written.edit.source),
+        backup=None if written.backup is None else str(written.backup),
+        diff=_rollback_diff(written.edit),
+        audit=None if audit is None else str(audit),
+    )
 
 
 def _rollback_diff(edit: Edit) -> str:

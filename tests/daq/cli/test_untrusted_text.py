@@ -16,9 +16,10 @@ from rich.console import Console
 
 from daq.jobs.cell_fit import Failure, Summary
 from daq.jobs.fleet import FleetRow
-from daq.jobs.fleet_report import FIRST_COLUMNS, fleet_csv, fleet_document
+from daq.jobs.fleet_report import FIRST_COLUMNS, fleet_csv, fleet_report
 from daq.ledger.ledger import read_history
 from daq.ledger.watch import Series, watch
+from daq.report.document import json_text
 from daq.report.history import csv_text, plot_history
 from daq.report.proposal import show_proposal
 from daq.report.text import inert, printable, terminal_lines, terminal_text
@@ -69,8 +70,7 @@ def test_the_table_of_a_fleet_has_no_formula_and_can_be_written(text: str) -> No
         assert not cell.startswith(tuple("=+@\t\r\n"))
     assert len(lines) == 2
     assert lines[0][header.index(inert(f"{text} gain"))] == "-3.5"  # numbers stay numbers
-    document = fleet_document(rows)
-    assert str(document).encode()
+    assert json_text(fleet_report(rows)).encode()
 
 
 def _watched(path: Path, times: tuple[datetime, ...], unit: str = "Nm/A") -> tuple[Series, ...]:

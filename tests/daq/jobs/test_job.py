@@ -14,7 +14,6 @@ from daq.errors import ExitCode
 from daq.jobs import session as sessions
 from daq.jobs.recording import basis_of
 from daq.ledger.audit import AuditAction, noted_heads
-from daq.report.schemas import JobReport
 from tests.daq.histories import history_of
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import WHO, Rig
@@ -56,7 +55,7 @@ def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_records_it
     assert {gain.old_std for gain in session.state.decision.gains} == {0.0}
     assert [gain.alarm for gain in session.state.watched] == [""] * 6
     summary = json.loads((session.folder / "summary.json").read_text())
-    JobReport.model_validate_json(json.dumps(summary))
+    assert list(summary)[:6] == ["outcome", "exit_code", "remark", "to_do", "folder", "format"]
     assert summary["outcome"] == "applied"
     assert "drivegain rollback" in " ".join(summary["to_do"])
     metrics = (rig.cells / "drivegain_demo.prom").read_text()

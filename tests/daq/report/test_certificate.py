@@ -14,12 +14,11 @@ import pytest
 from daq.cli.app import main
 from daq.documents.calibration_file import save_calibration
 from daq.errors import CalibrationRefused, ExitCode
-from daq.report.certificate import Verdict, certificate_document, certify, without_controller
+from daq.report.certificate import Verdict, certificate_report, certify, without_controller
 from daq.report.certificate_page import certificate_page
-from daq.report.controller_schemas import CertificateReport
+from daq.report.document import json_tree
 from daq.report.effect_names import curve_of, named_size, size_text
 from daq.report.gains import with_deviation
-from daq.report.text import json_text
 from daq.writeback.gates.gate import Gate
 from ident.calibration import AcceptedEffect, Calibration, Parameter, PayloadMass
 from ident.effects.effect import PlacedEffect
@@ -73,20 +72,22 @@ def _page(calibration: Calibration, earlier: Calibration | None = None) -> str:
 def test_every_number_of_the_document_is_on_the_page() -> None:
     calibration = demo_calibration()
     certificate = certify(calibration, without_controller(calibration, "not read", NOW))
-    text, document = certificate_page(certificate), certificate_document(certificate)
+    text, report = certificate_page(certificate), certificate_report(certificate)
     page = Reader(text)
     assert not set(page.tags) & {"script", "link", "iframe", "object", "a", "img"}
     assert "http" not in text.replace("http-equiv", "")
-    assert f"• {document['sentence']}" in page.texts
-    for gain, axis in zip(calibration.gains, document["axes"], strict=True):
+    assert f"• {report.sentence}" in page.texts
+    for gain, axis in zip(calibration.gains, report.axes, strict=True):
         identified = f"{with_deviation(gain.value, gain.std)} {gain.unit}"
-        assert {f"{axis['old']:.5g}", identified, axis["verdict"]} <= set(page.texts)
-        assert axis["change_percent"] == pytest.approx(gain.change_percent)
-    before, after = document["nameplate_holdout_error_percent"], document["holdout_error_percent"]
-    assert f"{before['total']:.2f} → {after['total']:.2f}" in page.texts
-    for first, second in zip(before["axes"], after["axes"], strict=True):
+        assert {f"{axis.old:.5g}", identified, axis.verdict} <= set(page.texts)
+        assert axis.change_percent == pytest.approx(gain.change_percent)
+    before, after = report.nameplate_holdout_error_percent, report.holdout_error_percent
+    assert before is not None
+    assert after is not None
+    assert f"{before.total:.2f} → {after.total:.2f}" in page.texts
+    for first, second in zip(before.axes, after.axes, strict=True):
         assert f"{first:.2f} → {second:.2f}" in page.texts
-    for value in document["identity"].values():
+    for value in report.identity.values():
         assert value in page.texts
 
 
@@ -120,9 +121,8 @@ def test_the_dependence_of_the_gains_on_the_mass_is_on_the_sheet_and_in_the_deta
     sheet = next(text for text in Reader(_page(drawn)).texts if text.startswith("disc: 4.59 kg in the cell file"))
     assert f"the gains are wrong by: {gains[0].axis} 0.10 %, " in sheet
     assert "which is at most ± 0.6 % of every gain, not in σ" in sheet
-    document = certificate_document(certify(drawn, without_controller(drawn, "", NOW)))
-    CertificateReport.model_validate_json(json_text(document))
-    (found,) = document["payload_mass"]
+    report = json_tree(certificate_report(certify(drawn, without_controller(drawn, "", NOW))))
+    (found,) = report["payload_mass"]
     assert (found["payload"], found["mass_kg"], found["tolerance_kg"]) == ("disc", 4.59, 0.0459)
     for one, gain, share in zip(found["gains"], gains, shares, strict=True):
         assert one["axis"] == gain.axis

@@ -16,9 +16,8 @@ from daq.config.cell import Cell, model_of
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.log.reader import LossyLogs
-from daq.report.certificate import certificate_document, certify, without_controller
-from daq.report.controller_schemas import CertificateReport
-from daq.report.text import json_text
+from daq.report.certificate import certificate_report, certify, without_controller
+from daq.report.document import json_tree
 from daq.workflow import fit as fitting
 from daq.workflow.fit import Fit, calibration_of, fit, with_corrected_geometry
 from daq.workflow.geometry_diagnoses import calibrated_model, encoder_misfit_of, geometry_diagnoses
@@ -199,8 +198,7 @@ def test_a_wrong_number_is_named_and_corrected(
         with pytest.raises(ModelError, match="'motor-2' was corrected, and no axis"):
             calibrated_model(replace(read, encoder_misfit=misfit), cell)
     certificate = certify(read, without_controller(read, "not read", RECORDED))
-    document = certificate_document(certificate)
-    CertificateReport.model_validate_json(json_text(document))
+    document = json_tree(certificate_report(certificate))
     assert document["encoder_misfit"]["corrections"][0]["kind"] == parameter.kind.value
     assert "the gains are those of the corrected geometry" in document["identity"]["Encoders"]
 
