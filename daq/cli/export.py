@@ -35,6 +35,7 @@ def export_log_verb(
     """
     from daq.cli.terminal import one_of, print_view, status
     from daq.log.export import TableFormat, export_log
+    from daq.report.log import table_report
 
     one_of("choose the kind of table to write", csv=csv, parquet=parquet)
     kind = TableFormat.CSV if csv else TableFormat.PARQUET
@@ -42,8 +43,7 @@ def export_log_verb(
         done = export_log(log, out, kind)
     _warn(log, done.partial, done.valid, done.reason)
     if json:
-        print_json({"log": str(log), "table": str(out), "format": kind.value, "rows": done.rows,
-                    "columns": list(done.columns), "partial": done.partial, "valid": done.valid})  # fmt: skip
+        print_json(table_report(log, out, kind, done))
     else:
         print_view([f"{done.rows} rows of {len(done.columns)} columns"], out)
 
@@ -73,14 +73,14 @@ def export_bag_verb(
     from daq.cli.terminal import print_view, status
     from daq.documents.calibration_file import load_calibration
     from daq.log.bag_writer import export_bag
+    from daq.report.log import bag_report
 
     known = None if calibration is None else load_calibration(calibration)
     with status("writing the bag"):
         done = export_bag(log, out, known)
     _warn(log, done.partial, done.valid, done.reason)
     if json:
-        print_json({"log": str(log), "bag": str(out), "duration_s": done.duration_s, "messages": done.messages,
-                    "effort": known is not None, "partial": done.partial, "valid": done.valid})  # fmt: skip
+        print_json(bag_report(log, out, done, effort=known is not None))
     else:
         print_view([f"{topic}: {count} messages" for topic, count in done.messages.items()], out)
 
@@ -106,7 +106,7 @@ def export_urdf_verb(
     from daq.config.yaml_file import read_yaml_bytes
     from daq.documents.calibration_file import load_calibration
     from daq.environment import software
-    from daq.report.urdf_views import urdf_document, urdf_view
+    from daq.report.urdf_views import urdf_report, urdf_view
     from daq.workflow.fit import DOUBTFUL_PERCENT
     from daq.workflow.remaining_corrections import on_cell
     from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, require_solver, update_urdf
@@ -159,7 +159,7 @@ def export_urdf_verb(
     updated = update_urdf(content, str(given), updates, provenance)
     _write(updated, robot, out)
     if json:
-        print_json(urdf_document(known, robot, updates, updated, out, same))
+        print_json(urdf_report(known, robot, updates, updated, out, same))
     else:
         print_view(urdf_view(known, robot, updates, updated, same), out)
 

@@ -20,19 +20,20 @@ def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: Json
     """Show what is in a log: role and payload, duration, losses, moves, validity."""
     from daq.cli.terminal import output_console, print_view
     from daq.documents.calibration_file import load_calibration
-    from daq.report.log import describe_log, log_lines
+    from daq.report.document import json_tree
+    from daq.report.log import info_report, log_lines
 
     try:
-        description = describe_log(log)
+        report = info_report(log)
     except LogForeign as error:
         with suppress(DaqError):
             load_calibration(log)
             error.found, error.remedy = "a calibration", f"`drivegain report {log}` reads it"
         raise
     if json:
-        print_json(description)
+        print_json(report)
     else:
-        print_view(log_lines(description, output_console().width))
+        print_view(log_lines(json_tree(report), output_console().width))
 
 
 INFO = Verb("info", info, "drivegain info loaded.mcap")
@@ -46,20 +47,17 @@ def import_files(
     json: JsonOption = False,
 ) -> None:
     """Convert CSV files, MATLAB files or ROS 2 bags of another controller to a log."""
-    from dataclasses import asdict
-
     from daq.cli.terminal import WRITTEN
     from daq.environment import software
     from daq.log.importing import import_recording
-    from daq.report.log import timing_text
+    from daq.report.log import import_report, timing_text
     from daq.report.text import printable
 
     imported = import_recording(description, data, out, software=software(), cell_path=cell)
     WRITTEN.append(out)
     statistics, timing = imported.statistics, imported.timing
     if json:
-        stamps = None if timing is None else asdict(timing)
-        print_json({"log": str(out), **asdict(statistics), "timing": stamps, "remarks": imported.remarks})
+        print_json(import_report(out, imported))
         return
     typer.echo(f"{out}: {statistics.samples} samples of {len(statistics.missing)} axes")
     for line in (*(() if timing is None else (timing_text(timing),)), *imported.remarks):
@@ -82,6 +80,7 @@ def salvage_verb(
     """
     from daq.cli.terminal import WRITTEN, progress_bar
     from daq.log.salvage import salvage
+    from daq.report.log import salvage_report
     from daq.report.text import printable
 
     with progress_bar("salvaging") as report_progress:
@@ -89,10 +88,7 @@ def salvage_verb(
     WRITTEN.append(out)
     statistics = saved.statistics
     if json:
-        print_json({"log": str(out), "partial": statistics.partial, "samples": statistics.samples,
-                    "duration_s": saved.duration_s, "lost_cycles": statistics.lost_cycles,
-                    "missing": statistics.missing, "valid": statistics.valid, "reason": statistics.reason,
-                    "left_out_bytes": saved.left_out_bytes, "damage": saved.damage})  # fmt: skip
+        print_json(salvage_report(out, saved))
         return
     use = ": `fit` accepts it and says so; `apply` refuses the result" if statistics.valid else ""
     typer.echo(f"{printable(str(out))}: {statistics.samples} samples, {saved.duration_s:g} s, PARTIAL{use}")

@@ -36,7 +36,7 @@ def monitor_verb(
     from daq.config.cell_file import load_cell
     from daq.documents.calibration_file import load_calibration
     from daq.log.feed import Feed
-    from daq.report.bus_views import monitor_document, monitor_view
+    from daq.report.bus_views import monitor_report, monitor_view
     from daq.workflow.monitor import CellWatch
     from daq.workflow.validate import check_cell
     from drivers.canopen.network import CanopenNetwork
@@ -59,15 +59,15 @@ def monitor_verb(
         watch = CellWatch(cell, declared, network, feed, known, None if carried is None else carried.name)
         watch.listen(QUIET_S)
         if once or json or not console.is_terminal:
-            document = monitor_document(declared, watch.read(interval))
-            if any(axis["silent"] for axis in document["axes"]):  # it may be a slow one
-                document = monitor_document(declared, watch.read(ABANDONED_S))
+            report = monitor_report(declared, watch.read(interval))
+            if any(axis.silent for axis in report.axes):  # it may be a slow one
+                report = monitor_report(declared, watch.read(ABANDONED_S))
             if json:
-                print_json(document)
+                print_json(report)
             else:
-                console.print(monitor_view(document))
-            silent = [axis for axis, shown in zip(network.axes, document["axes"], strict=True) if shown["silent"]]
-            heard = tuple(axis["node_id"] for axis in document["axes"] if not axis["silent"])
+                console.print(monitor_view(report))
+            silent = [axis for axis, shown in zip(network.axes, report.axes, strict=True) if shown.silent]
+            heard = tuple(axis.node_id for axis in report.axes if not axis.silent)
             if silent:
                 raise no_answer(declared, silent, heard, QUIET_S + interval + ABANDONED_S)
             return
@@ -75,7 +75,7 @@ def monitor_verb(
             console.print(feed.remark)
         with Live(console=console, auto_refresh=False, screen=False) as live:
             while True:
-                live.update(monitor_view(monitor_document(declared, watch.read(interval))), refresh=True)
+                live.update(monitor_view(monitor_report(declared, watch.read(interval))), refresh=True)
 
 
 MONITOR = Verb("monitor", monitor_verb, "drivegain monitor CELL --calibration calibration.yaml")

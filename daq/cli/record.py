@@ -150,13 +150,13 @@ def _say_next(cell: Path, declared: Cell, plan: Path, out: Path, carried: Payloa
 def _is_unloaded(log: Path, declared: Cell) -> bool:
     """Whether a log is a valid run of this cell without load."""
     from daq.errors import DaqError
-    from daq.report.log import describe_log
+    from daq.report.log import info_report
 
     try:
-        found = describe_log(log)
+        found = info_report(log)
     except DaqError:
         return False
-    return (found["cell"], found["payload"], found["valid"]) == (declared.name, None, True)
+    return (found.cell, found.payload, found.valid) == (declared.name, None, True)
 
 
 def _before_motion(cell: Cell, plan: Path, not_weighed: bool) -> Iterator[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -38,16 +38,15 @@ def scan_verb(
     another master uses the bus, nothing is sent: exit code 12 or 5.
     """
     from daq.cli.terminal import print_view
-    from daq.config.cell_buses import bus_parts, cell_address, drive_axes
+    from daq.config.cell_buses import bus_parts, drive_axes
     from daq.config.cell_file import load_cell
     from daq.errors import ConfigurationInconsistent
-    from daq.report.bus_views import current_signals, scan_rows, scan_view
+    from daq.report.bus_views import scan_report, scan_view, scanned_nodes
     from daq.workflow.bus_lock import bus_lock
     from daq.workflow.nameplates import check_nameplates, nameplate_warnings
 
     declared = load_cell(cell)
     found: dict[str, tuple[FoundNode, ...]] = {}
-    reset: list[str] = []
     misfits: dict[str, str] = {}
     scales: dict[str, ScaleReading | None] = {}
     causes: dict[str, str] = {}
@@ -59,26 +58,23 @@ def scan_verb(
             scales |= scanned.scales
             misfits |= scanned.misfits
             causes |= scanned.causes
-            reset += scanned.causes
     readings = [scales.get(name) for name in declared.axis_names]
-    mistyped, warnings = list[str](), nameplate_warnings(declared, readings)
+    mistyped = list[str]()
     try:
         check_nameplates(cell, declared, readings)
     except ConfigurationInconsistent as error:
         mistyped.append(str(error))
-    rows = [row for name, nodes in found.items() for row in scan_rows(declared, nodes, name, misfits)]
+    listed = [node for name, nodes in found.items() for node in scanned_nodes(declared, nodes, name, misfits)]
+    report = scan_report(declared, listed, causes, mistyped, nameplate_warnings(declared, readings))
     if json:
-        address = str(cell_address(declared))
-        signals = current_signals(declared)
-        cause, doubts = {"reset": reset, "faults": causes}, {"mistyped": mistyped, "warnings": warnings}
-        print_json({"bus": address, "nodes": rows, **cause, "current": signals, **doubts})
+        print_json(report)
     else:
-        print_view(scan_view(rows, causes, mistyped, warnings))
-    absent = {row["node_id"] for row in rows if row["verdict"] == "missing"}
+        print_view(scan_view(report))
+    absent = {node.node_id for node in listed if node.verdict == "missing"}
     missing = [axis for axis in drive_axes(declared) if axis.node_id in absent]
     if missing:
         raise no_answer(declared, missing, tuple(node.node_id for nodes in found.values() for node in nodes), wait)
-    if not json and not mistyped and all(row["verdict"] == "ok" for row in rows):
+    if not json and not mistyped and all(node.verdict == "ok" for node in listed):
         say_next("drivegain", "plan", cell, "--out", "plan.yaml")
 
 
@@ -189,12 +185,12 @@ def explain_emcy_verb(
 
     For a manufacturer's own code only its class is known; the drive's manual has the rest.
     """
+    from daq.report.bus_views import error_code_report
     from daq.workflow.events import explain_error_code
-    from drivers.canopen.emcy import CODES
 
     found = explain_error_code(read_code(code))
     if json:
-        print_json({**asdict(found), "standard": found.code in CODES})
+        print_json(error_code_report(found))
     else:
         typer.echo(f"{found.hex}: {found.text}\nWhat to do: {found.remedy}.")
 

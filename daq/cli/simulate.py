@@ -214,9 +214,9 @@ def demo(
 
     from daq.cli.terminal import output_console, print_view, show_steps, write_output
     from daq.files import replace_file
+    from daq.report.document import json_text
     from daq.report.proposal import show_proposal
-    from daq.report.text import json_text
-    from daq.simulation.demo import ProgressReporter, Settings, demo_summary, demonstrate
+    from daq.simulation.demo import ProgressReporter, Settings, demo_report, demonstrate
     from daq.simulation.simulation_file import shipped_simulation
 
     began = time.monotonic()
@@ -224,10 +224,10 @@ def demo(
     with write_output(out):
         with show_steps() as stepper:
             outcome = demonstrate(settings, lambda: datetime.now(UTC), ProgressReporter(stepper.step, stepper.progress))
-        document = {**demo_summary(outcome), "seconds": round(time.monotonic() - began, 1)}
-        replace_file(out / "summary.json", json_text(document).encode())
+        report = demo_report(outcome, seconds=round(time.monotonic() - began, 1))
+        replace_file(out / "summary.json", json_text(report).encode())
     if json:
-        print_json(document)
+        print_json(report)
         return
     print_view(demo_view(outcome))
     show_proposal(outcome.proposal, output_console())
@@ -238,13 +238,13 @@ def demo(
 
 def demo_view(outcome: DemoOutcome) -> Iterator[RenderableType]:
     """Nodes on the bus, turns of the loop, errors before and after, the summary, and the gains beside the truth."""
-    from daq.report.bus_views import scan_rows, scan_table
+    from daq.report.bus_views import scan_table, scanned_nodes
     from daq.report.gains import gain_table
     from daq.report.residual import before_after_table, summary, turns_view
     from daq.report.text import Sentence
 
     fitted, truth = outcome.fitted, outcome.truth
-    yield scan_table(scan_rows(outcome.cell, outcome.nodes, outcome.cell.buses[0].name))
+    yield scan_table(scanned_nodes(outcome.cell, outcome.nodes, outcome.cell.buses[0].name))
     yield ""
     yield from turns_view(fitted)
     yield before_after_table(outcome.changed, fitted.cell.axis_names)

@@ -30,7 +30,7 @@ from daq.log.feed import (
     read_packet,
     socket_names,
 )
-from daq.workflow.events import event_document
+from daq.workflow.events import notice_of
 from daq.workflow.live_prediction import Predictor, predictor_of
 from drivers.messages import CellEvent, EventKind
 from drivers.profiles.cia402 import ENABLED, FAULTY, decode
@@ -195,7 +195,7 @@ class Live:
             self._words[event.axis] = event.code
         axis = None if event.axis is None else self.cell.axis_names[event.axis]
         time_s = 1e-9 * (event.time_ns - self.origin_ns)
-        return {"time_s": round(time_s, 6), **event_document(event.kind, event.code, axis, event.text)}
+        return {"time_s": round(time_s, 6), **asdict(notice_of(event.kind, event.code, axis, event.text))}
 
     def _take_samples(self, samples: Any) -> None:
         if self.origin_ns is None:

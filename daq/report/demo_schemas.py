@@ -1,11 +1,10 @@
-"""What `demo` prints under `--json`."""
+"""What `demo` prints under `--json`, and writes into `summary.json`."""
 
 from __future__ import annotations
 
 from daq.documents.calibration_file import EffectEntry
 from daq.report.document import Figure, Report
 from daq.report.job_schemas import FleetEffect
-from daq.report.log_schemas import LogSize
 
 
 class DemoGain(Report):
@@ -28,6 +27,15 @@ class DemoPlan(Report):
     predicted_std_percent: list[Figure]
 
 
+class DemoLog(Report):
+    """A log of the demonstration."""
+
+    log: str
+    samples: int
+    lost_cycles: int
+    valid: bool
+
+
 class DemoReport(Report):
     """`demo`."""
 
@@ -39,7 +47,7 @@ class DemoReport(Report):
     error_before_percent_axes: list[Figure] | None
     error_after_percent_axes: list[Figure] | None
     plans: list[DemoPlan]
-    logs: list[LogSize]
+    logs: list[DemoLog]
     controller_diff: str
     applied: bool
     seconds: float

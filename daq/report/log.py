@@ -1,27 +1,45 @@
-"""The contents of a log, as `drivegain info` shows them."""
+"""Logs: what verbs say of those that they write, and the contents as `drivegain info` shows them."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
-from daq.config.cell import Cell
 from daq.config.cell_buses import bus_loads
 from daq.config.cell_file import cell_from_bundle
-from daq.log.metadata import Timing
 from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import LogReader
 from daq.report.bus_views import current_signals
-from daq.report.log_schemas import BusLoadEntry, RecordReport
-from daq.report.text import entry_lines, picked, printable
-from daq.workflow.record import Recorded
+from daq.report.log_schemas import (
+    BagReport,
+    BusLoadEntry,
+    ImportReport,
+    InfoReport,
+    LogEvent,
+    MountedPayload,
+    RecordReport,
+    SalvageReport,
+    Stamps,
+    TableReport,
+)
+from daq.report.text import entry_lines, printable
 from drivers.messages import EventKind
+
+if TYPE_CHECKING:
+    from daq.config.cell import Cell
+    from daq.log.bag_writer import BagWritten
+    from daq.log.export import Exported, TableFormat
+    from daq.log.importing import Imported
+    from daq.log.metadata import RunInfo, RunStatistics, Timing
+    from daq.log.salvage import Salvaged
+    from daq.workflow.record import Recorded
+    from drivers.messages import CellEvent
+    from ident.model.bodies import Payload
 
 _ROUTINE = {EventKind.MOVE_START, EventKind.MOVE_END, EventKind.NMT, EventKind.STATE}
 """Events of every run; all others are shown."""
@@ -45,7 +63,67 @@ def record_report(path: Path, recorded: Recorded, cell: Cell) -> RecordReport:
     )
 
 
-def describe_log(path: Path) -> dict[str, Any]:
+def import_report(path: Path, imported: Imported) -> ImportReport:
+    """Return the log of an import with its losses, and what was found out of its time stamps."""
+    statistics = imported.statistics
+    return ImportReport(
+        log=str(path),
+        samples=statistics.samples,
+        lost_cycles=statistics.lost_cycles,
+        missing=list(statistics.missing),
+        valid=statistics.valid,
+        reason=statistics.reason,
+        partial=statistics.partial,
+        wall_minus_monotonic_ns=statistics.wall_minus_monotonic_ns,
+        timing=_stamps(imported.timing),
+        remarks=list(imported.remarks),
+    )
+
+
+def salvage_report(path: Path, saved: Salvaged) -> SalvageReport:
+    """Return the log of a salvage with its losses, and what was left out."""
+    statistics = saved.statistics
+    return SalvageReport(
+        log=str(path),
+        partial=statistics.partial,
+        samples=statistics.samples,
+        duration_s=saved.duration_s,
+        lost_cycles=statistics.lost_cycles,
+        missing=list(statistics.missing),
+        valid=statistics.valid,
+        reason=statistics.reason,
+        left_out_bytes=saved.left_out_bytes,
+        damage=saved.damage,
+    )
+
+
+def table_report(log: Path, table: Path, kind: TableFormat, written: Exported) -> TableReport:
+    """Return the table that was made of a log."""
+    return TableReport(
+        log=str(log),
+        table=str(table),
+        format=kind.value,
+        rows=written.rows,
+        columns=list(written.columns),
+        partial=written.partial,
+        valid=written.valid,
+    )
+
+
+def bag_report(log: Path, bag: Path, written: BagWritten, *, effort: bool) -> BagReport:
+    """Return the bag that was made of a log; `effort` says whether a calibration gave its joint states efforts."""
+    return BagReport(
+        log=str(log),
+        bag=str(bag),
+        duration_s=written.duration_s,
+        messages=dict(written.messages),
+        effort=effort,
+        partial=written.partial,
+        valid=written.valid,
+    )
+
+
+def info_report(path: Path) -> InfoReport:
     """Read everything known of a log, in one pass and bounded memory.
 
     Raises:
@@ -68,42 +146,79 @@ def describe_log(path: Path) -> dict[str, Any]:
     head, statistics = reader.head, reader.statistics
     run, samples = head.run, reader.checks.samples
     valid, reason = log_verdict(cell, head, reader.checks, statistics, watch, lambda: LogReader(path))
-    return {
-        "log": str(path),
-        "sha256": reader.digest,
-        "run_id": run.run_id,
-        "cell": cell.name,
-        "cell_sha256": cell.digest,
-        "axes": list(cell.axis_names),
-        "current": current_signals(cell),
-        "role": run.role.value,
-        "payload": None if run.payload is None else picked(run.payload, "name", "mounting", "known"),
-        **picked(run, "rate_hz", "speed"),
-        "samples": samples,
-        "duration_s": samples / run.rate_hz,
-        "stamped_duration_s": (last_ns - first_ns) * 1e-9,
-        "moves": sum(event.kind is EventKind.MOVE_START for event in reader.events),
-        "slow_readings": dict(Counter(reading.quantity.value for reading in reader.readings)),
-        "lost_cycles": statistics.lost_cycles,
-        "missing": dict(zip(cell.axis_names, statistics.missing, strict=True)),
-        "partial": reader.partial,
-        "valid": valid,
-        "reason": reason,
-        "events": [
-            {"time_ns": e.time_ns, "axis": e.axis, "kind": e.kind.value, "code": e.code, "text": e.text}
-            for e in reader.events
-            if e.kind not in _ROUTINE
-        ],
-        **picked(run, "operator", "software"),
-        "started": datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC).isoformat() if run.started_wall_ns else None,
-        "wall_minus_monotonic_s": run.wall_minus_monotonic_ns * 1e-9,
-        "wall_clock_step_s": None
-        if statistics.wall_minus_monotonic_ns is None
-        else (statistics.wall_minus_monotonic_ns - run.wall_minus_monotonic_ns) * 1e-9,
-        "origin": run.origin,
-        "timing": None if run.timing is None else asdict(run.timing),
-        "attachments": {name: len(data) for name, data in sorted(head.files.items())},
-    }
+    return InfoReport(
+        log=str(path),
+        sha256=reader.digest,
+        run_id=run.run_id,
+        cell=cell.name,
+        cell_sha256=cell.digest,
+        axes=list(cell.axis_names),
+        current=current_signals(cell),
+        role=run.role.value,
+        payload=_mounted(run.payload),
+        rate_hz=run.rate_hz,
+        speed=run.speed,
+        samples=samples,
+        duration_s=samples / run.rate_hz,
+        stamped_duration_s=(last_ns - first_ns) * 1e-9,
+        moves=sum(event.kind is EventKind.MOVE_START for event in reader.events),
+        slow_readings=dict(Counter(reading.quantity.value for reading in reader.readings)),
+        lost_cycles=statistics.lost_cycles,
+        missing=dict(zip(cell.axis_names, statistics.missing, strict=True)),
+        partial=reader.partial,
+        valid=valid,
+        reason=reason,
+        events=[_event(event) for event in reader.events if event.kind not in _ROUTINE],
+        operator=run.operator,
+        software=run.software,
+        started=datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC).isoformat() if run.started_wall_ns else None,
+        wall_minus_monotonic_s=run.wall_minus_monotonic_ns * 1e-9,
+        wall_clock_step_s=_wall_clock_step_s(run, statistics),
+        origin=run.origin,
+        timing=_stamps(run.timing),
+        attachments={name: len(data) for name, data in sorted(head.files.items())},
+    )
+
+
+def _mounted(payload: Payload | None) -> MountedPayload | None:
+    if payload is None:
+        return None
+    return MountedPayload(name=payload.name, mounting=payload.mounting, known=dict(payload.known))
+
+
+def _event(event: CellEvent) -> LogEvent:
+    return LogEvent(
+        time_ns=event.time_ns,
+        axis=event.axis,
+        kind=event.kind.value,
+        code=event.code,
+        text=event.text,
+    )
+
+
+def _wall_clock_step_s(run: RunInfo, statistics: RunStatistics) -> float | None:
+    """How far the wall clock was set during the run; None where it was not read at the end."""
+    if statistics.wall_minus_monotonic_ns is None:
+        return None
+    return (statistics.wall_minus_monotonic_ns - run.wall_minus_monotonic_ns) * 1e-9
+
+
+def _stamps(timing: Timing | None) -> Stamps | None:
+    if timing is None:
+        return None
+    return Stamps(
+        rows=timing.rows,
+        rate_hz=timing.rate_hz,
+        usual_step_s=timing.usual_step_s,
+        longest_step_s=timing.longest_step_s,
+        jitter_s=timing.jitter_s,
+        drift_s=timing.drift_s,
+        missing=timing.missing,
+        resampled=timing.resampled,
+        duplicates=timing.duplicates,
+        close=timing.close,
+        started_s=timing.started_s,
+    )
 
 
 def timing_text(timing: Timing) -> str:

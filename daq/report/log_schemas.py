@@ -15,15 +15,6 @@ class BusLoadEntry(Report):
     worst_percent: float
 
 
-class LogSize(Report):
-    """A log and its samples."""
-
-    log: str
-    samples: int
-    lost_cycles: int
-    valid: bool
-
-
 class RecordReport(Report):
     """`record`."""
 
@@ -106,20 +97,32 @@ class InfoReport(Report):
     attachments: dict[str, int] = Field(description="size of each [bytes]")
 
 
-class ImportReport(WrittenLog):
+class ImportReport(Report):
     """`import`."""
 
+    log: str
+    samples: int
+    lost_cycles: int
+    missing: list[int] = Field(description="samples without an answer, an axis each")
+    valid: bool
+    reason: str = Field(description="why it is not valid")
     partial: bool
     wall_minus_monotonic_ns: int | None
     timing: Stamps | None
     remarks: list[str]
 
 
-class SalvageReport(WrittenLog):
+class SalvageReport(Report):
     """`salvage`."""
 
+    log: str
     partial: bool
+    samples: int
     duration_s: float
+    lost_cycles: int
+    missing: list[int] = Field(description="samples without an answer, an axis each")
+    valid: bool
+    reason: str = Field(description="why it is not valid")
     left_out_bytes: int
     damage: str
 

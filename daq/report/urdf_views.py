@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from rich.console import RenderableType
 from rich.text import Text
 
+from daq.report.document import Figure, Report
+from daq.report.fit_schemas import Errors
 from daq.report.text import plain_table, printable, terminal_text
 from daq.workflow.remaining_corrections import CORRECTIONS
-from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
+from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Shift, Updated
 from ident.calibration import Calibration
 from ident.physical.physical import MARGIN
 
@@ -34,7 +35,7 @@ class UrdfJoint(Report):
     link: str
     mass_kg: float
     centre_m: list[float]
-    inertia_kg_m2: list[list[float]] | list[float]
+    inertia_kg_m2: list[list[float]]
     damping: float
     friction: float
     smallest_eigenvalue: float
@@ -119,55 +120,60 @@ def urdf_view(
         yield Text("The cell's configuration has changed since the fit; check the difference.", style="bold")
 
 
-def urdf_document(
+def urdf_report(
     calibration: Calibration,
     robot: PhysicalRobot,
     updates: dict[str, JointUpdate],
     updated: Updated,
     out: Path,
     same_configuration: bool | None,
-) -> dict[str, Any]:
-    """Build the object of `export urdf --json`."""
+) -> UrdfReport:
+    """Return the bodies of a URDF that was written, and what it does not hold of the calibration.
+
+    Args:
+        calibration, robot, updates, updated, same_configuration: as in `urdf_view`.
+        out: the URDF.
+    """
     parameters = robot.parameters
     change = parameters.torque_change_percent
-    joints = parameters.model.robot.joints
-    return {
-        "urdf": str(out),
-        "calibration": calibration.cell,
-        "same_configuration": same_configuration,
-        "exact": parameters.exact,
-        "torque_change_percent": {"axes": list(change.axes), "total": change.total},
-        "shifts": [
-            {
-                "name": shift.name,
-                "identified": shift.identified,
-                "physical": shift.realised,
-                "standard_deviations": shift.deviations,
-            }
-            for shift in robot.shifts
-        ],
-        "margin": MARGIN,
-        "joints": [
-            {
-                "name": joint.name,
-                "link": updated.links[joint.name],
-                "mass_kg": update.body.mass_kg,
-                "centre_m": update.body.centre_m.tolist(),
-                "inertia_kg_m2": update.body.inertia_kg_m2.tolist(),
-                "damping": update.damping,
-                "friction": update.friction,
-                "smallest_eigenvalue": float(eigenvalue),
-                "prior_assumed": number in robot.prior.assumed,
-            }
-            for number, (joint, update, eigenvalue) in enumerate(
-                zip(joints, updates.values(), parameters.eigenvalues, strict=True)
-            )
-        ],
-        "merged_links": list(updated.merged),
-        "not_in_urdf": [
-            {"name": column.name, "value": float(value), "unit": column.unit}
+    return UrdfReport(
+        urdf=str(out),
+        calibration=calibration.cell,
+        same_configuration=same_configuration,
+        exact=parameters.exact,
+        torque_change_percent=Errors(axes=list(change.axes), total=change.total),
+        shifts=[_shifted(shift) for shift in robot.shifts],
+        margin=MARGIN,
+        joints=[_joint(robot, number, update, updated) for number, update in enumerate(updates.values())],
+        merged_links=list(updated.merged),
+        not_in_urdf=[
+            NotInUrdf(name=column.name, value=float(value), unit=column.unit)
             for column, value in zip(parameters.model.columns, parameters.standard, strict=True)
             if column.name.startswith(("Ia", "off", "fvm", "fsm"))
         ],
-        "effects_left_out": [f"{effect.name} on {effect.axis}" for effect in calibration.effects],
-    }
+        effects_left_out=[f"{effect.name} on {effect.axis}" for effect in calibration.effects],
+    )
+
+
+def _shifted(shift: Shift) -> ShiftedParameter:
+    return ShiftedParameter(
+        name=shift.name,
+        identified=shift.identified,
+        physical=shift.realised,
+        standard_deviations=shift.deviations,
+    )
+
+
+def _joint(robot: PhysicalRobot, number: int, update: JointUpdate, updated: Updated) -> UrdfJoint:
+    name = robot.parameters.model.robot.joints[number].name
+    return UrdfJoint(
+        name=name,
+        link=updated.links[name],
+        mass_kg=update.body.mass_kg,
+        centre_m=update.body.centre_m.tolist(),
+        inertia_kg_m2=update.body.inertia_kg_m2.tolist(),
+        damping=update.damping,
+        friction=update.friction,
+        smallest_eigenvalue=float(robot.parameters.eigenvalues[number]),
+        prior_assumed=number in robot.prior.assumed,
+    )

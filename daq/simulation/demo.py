@@ -11,20 +11,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from daq.config.cell import Cell
 from daq.config.cell_buses import bus_address
 from daq.config.cell_file import load_cell
-from daq.documents.calibration_file import as_document, save_calibration
+from daq.documents.calibration_file import EffectEntry, as_document, save_calibration
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
 from daq.files import replace_file
 from daq.report.certificate import Comparison
+from daq.report.demo_schemas import DemoGain, DemoLog, DemoPlan, DemoReport
 from daq.report.fit import start_of
+from daq.report.job_schemas import FleetEffect
 from daq.report.plots import draw_fit
 from daq.report.residual_page import save_report
-from daq.report.text import picked
 from daq.simulation.simulation_file import load_simulation, require_simulator
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.plan import Plan, plan
@@ -36,7 +36,7 @@ from daq.writeback.target import Proposal, Written, apply, propose
 from drivers.canopen.bus import open_bus
 from drivers.canopen.node_scan import FoundNode
 from drivers.simulation.spec import CellSpec
-from ident.calibration import Calibration
+from ident.calibration import Calibration, Gain
 from ident.discovery.before_after import Account, account
 
 MARK = ".drivegain-demo"
@@ -134,42 +134,62 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     return DemoOutcome(cell, nodes, plans, recorded, fitted, changed, calibration, truth, proposal, written)
 
 
-def demo_summary(outcome: DemoOutcome) -> dict[str, Any]:
-    """The outcome as `summary.json` holds it."""
-    before, after = outcome.fitted.identification, outcome.fitted.final
-    errors = before.holdout_error, after.holdout_error
-    totals = [None if error is None else error.total for error in errors]
-    axes = [None if error is None else list(error.axes) for error in errors]
+def demo_report(outcome: DemoOutcome, seconds: float) -> DemoReport:
+    """Return the outcome as `summary.json` holds it; `seconds` is how long the demonstration took."""
+    before, after = outcome.fitted.identification.holdout_error, outcome.fitted.final.holdout_error
     first = next(iter(outcome.calibration.effects), None)
+    return DemoReport(
+        gains=demo_gains(outcome),
+        effect=None if first is None else FleetEffect(name=first.name, axis=first.axis),
+        effects=[EffectEntry.model_validate(one, strict=False) for one in as_document(outcome.calibration)["effects"]],
+        error_before_percent=None if before is None else before.total,
+        error_after_percent=None if after is None else after.total,
+        error_before_percent_axes=None if before is None else list(before.axes),
+        error_after_percent_axes=None if after is None else list(after.axes),
+        plans=[_made(made) for made in outcome.plans],
+        logs=[_recorded(run) for run in outcome.recorded],
+        controller_diff=outcome.proposal.edit.diff,
+        applied=outcome.written is not None,
+        seconds=seconds,
+    )
+
+
+def demo_gains(outcome: DemoOutcome) -> list[DemoGain]:
+    """Return each gain beside the truth."""
     paper = outcome.fitted.paper
-    return {
-        "gains": [
-            {
-                "axis": gain.axis,
-                "nameplate": gain.nameplate,
-                "identified": gain.value,
-                "std_percent": gain.std_percent,
-                "truth": outcome.truth[gain.axis],
-                "error_percent": 100.0 * (gain.value / outcome.truth[gain.axis] - 1.0),
-                "paper_tls": None if paper is None else float(paper.gains[index]),
-            }
-            for index, gain in enumerate(outcome.calibration.gains)
-        ],
-        "effect": None if first is None else {"name": first.name, "axis": first.axis},
-        "effects": as_document(outcome.calibration)["effects"],
-        "error_before_percent": totals[0],
-        "error_after_percent": totals[1],
-        "error_before_percent_axes": axes[0],
-        "error_after_percent_axes": axes[1],
-        "plans": [
-            {"moves": len(plan.moves), **picked(plan, "condition", "predicted_std_percent")} for plan in outcome.plans
-        ],
-        "logs": [
-            {"log": run.path.name, **picked(run.log, "samples", "lost_cycles", "valid")} for run in outcome.recorded
-        ],
-        "controller_diff": outcome.proposal.edit.diff,
-        "applied": outcome.written is not None,
-    }
+    values = [None] * len(outcome.truth) if paper is None else paper.gains.tolist()
+    return [
+        _gain(gain, outcome.truth[gain.axis], tls) for gain, tls in zip(outcome.calibration.gains, values, strict=True)
+    ]
+
+
+def _gain(gain: Gain, truth: float, paper_tls: float | None) -> DemoGain:
+    return DemoGain(
+        axis=gain.axis,
+        nameplate=gain.nameplate,
+        identified=gain.value,
+        std_percent=gain.std_percent,
+        truth=truth,
+        error_percent=100.0 * (gain.value / truth - 1.0),
+        paper_tls=paper_tls,
+    )
+
+
+def _made(made: Plan) -> DemoPlan:
+    return DemoPlan(
+        moves=len(made.moves),
+        condition=made.condition,
+        predicted_std_percent=list(made.predicted_std_percent),
+    )
+
+
+def _recorded(run: Recorded) -> DemoLog:
+    return DemoLog(
+        log=run.path.name,
+        samples=run.log.samples,
+        lost_cycles=run.log.lost_cycles,
+        valid=run.log.valid,
+    )
 
 
 def make_room(out: Path, logs: tuple[Path, ...]) -> None:

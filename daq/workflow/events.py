@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 from daq.advice import for_command_line
 from drivers.canopen.emcy import ErrorCode, explain
@@ -27,8 +26,20 @@ REMEDIES = {
 ALARMING = frozenset(REMEDIES) | {EventKind.EMCY}
 
 
-def event_document(kind: EventKind, code: int, axis: str | None, text: str) -> dict[str, Any]:
-    """JSON document of an event: the axis by name, and the remedy.
+@dataclass(frozen=True, slots=True)
+class EventNotice:
+    """An event as people are shown it."""
+
+    axis: str | None  #: its name; None for the whole cell
+    kind: str  #: name of the event's kind
+    code: int  #: as in `CellEvent`
+    text: str  #: what happened, without the axis, which is shown beside it
+    remedy: str  #: what to do; empty where nothing is to be done
+    alarm: bool  #: whether a person has to look
+
+
+def notice_of(kind: EventKind, code: int, axis: str | None, text: str) -> EventNotice:
+    """Return an event with the axis by name, and the remedy.
 
     Args:
         kind, code, text: as in `CellEvent`.
@@ -37,12 +48,14 @@ def event_document(kind: EventKind, code: int, axis: str | None, text: str) -> d
     remedy = REMEDIES.get(kind, "")
     if kind is EventKind.EMCY:
         remedy = explain_error_code(code).remedy
-    # The axis is shown beside the text.
-    shown = text if axis is None else re.sub(rf"^{re.escape(axis)}( \(node \d+\))?: ", "", text)
-    return {
-        **{"axis": axis, "kind": kind.value, "code": code},
-        **{"text": shown, "remedy": remedy, "alarm": kind in ALARMING},
-    }
+    return EventNotice(
+        axis=axis,
+        kind=kind.value,
+        code=code,
+        text=text if axis is None else re.sub(rf"^{re.escape(axis)}( \(node \d+\))?: ", "", text),
+        remedy=remedy,
+        alarm=kind in ALARMING,
+    )
 
 
 def explain_error_code(code: int) -> ErrorCode:

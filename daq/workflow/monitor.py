@@ -10,10 +10,9 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from math import isfinite, nan
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,7 +24,7 @@ from daq.log.feed import Feed, RunFacts, facts_of_recorder
 from daq.log.metadata import AxisReadback, Readback, RunStatistics
 from daq.workflow.bus_lock import bus_taken
 from daq.workflow.events import ALARMING, explain_error_code
-from daq.workflow.live_prediction import Predictor, Recent, predictor_of
+from daq.workflow.live_prediction import Predictor, Recent, RecentCurrent, predictor_of
 from drivers.canopen.emcy import ErrorCode, explain, read_error_code
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.scale import read_scale
@@ -53,6 +52,15 @@ class _SampleSource:
 
 
 @dataclass(frozen=True, slots=True)
+class CellPrediction:
+    """Currents that a calibration predicts, and their premise."""
+
+    payload: str | None  #: name of the mounted one; None without one
+    remark: str  #: why there are no currents; empty if there are
+    axes: Sequence[RecentCurrent]  #: of each axis; empty where there are none
+
+
+@dataclass(frozen=True, slots=True)
 class WatchedCell:
     """One reading of the bus with all that is shown beside it."""
 
@@ -62,8 +70,7 @@ class WatchedCell:
     events: Sequence[CellEvent]  #: recent ones, oldest first
     faults: Mapping[str, ErrorCode] = field(default_factory=dict)  #: error code of axes in fault, by name
     recorder: bool = False  #: whether a recording or job of drivegain on this computer has the bus
-    #: `remark`, `payload` and the currents of the `axes`, if any, by a calibration; None without one.
-    prediction: dict[str, Any] | None = None
+    prediction: CellPrediction | None = None  #: None without a calibration
 
 
 class CellWatch:
@@ -271,15 +278,14 @@ class CellWatch:
         except IdentificationError as error:
             self._predictor, self._remark = None, f"no prediction: {error}"
 
-    def _prediction(self) -> dict[str, Any] | None:
+    def _prediction(self) -> CellPrediction | None:
         if self._calibration is None:
             return None
-        axes = [] if self._recent is None or self._facts is None else [asdict(one) for one in self._recent.axes()]
-        return {
-            "payload": self._payload if self._facts is None else self._facts.payload,
-            "remark": self._remark,
-            "axes": axes,
-        }
+        return CellPrediction(
+            payload=self._payload if self._facts is None else self._facts.payload,
+            remark=self._remark,
+            axes=() if self._recent is None or self._facts is None else self._recent.axes(),
+        )
 
 
 def joint_positions(cell: Cell, reading: CellReading) -> list[float | None]:

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from daq.simulation.demo import ProgressReporter, Settings, demo_summary, demonstrate
+from daq.simulation.demo import ProgressReporter, Settings, demo_gains, demonstrate
 from daq.simulation.simulation_file import shipped_simulation
 
 OUT = Path("out/gain-study")
@@ -25,16 +25,17 @@ def one(seed: int) -> dict[str, Any]:
     quiet = ProgressReporter(lambda _: None, lambda _done, _total, _remark: None)
     settings = Settings(OUT / str(seed), shipped_simulation("clean"), seed, DURATION_S)
     outcome = demonstrate(settings, lambda: datetime.now(UTC), quiet)
-    reported = demo_summary(outcome)
-    ml = [gain["error_percent"] for gain in reported["gains"]]
-    tls = [100.0 * (gain["paper_tls"] / gain["truth"] - 1.0) for gain in reported["gains"]]
+    gains, paper = demo_gains(outcome), outcome.fitted.paper
+    assert paper is not None  # no gain is held fixed
+    ml = [gain.error_percent for gain in gains]
+    tls = [100.0 * (value / gain.truth - 1.0) for gain, value in zip(gains, paper.gains.tolist(), strict=True)]
     return {
         "seed": seed,
         "floor_percent": outcome.calibration.relative_error_percent.total,
         "ml_error_percent": ml,
         "tls_error_percent": tls,
-        "scores": [gain["error_percent"] / gain["std_percent"] for gain in reported["gains"]],
-        "effects": [effect["name"] for effect in reported["effects"]],
+        "scores": [gain.error_percent / gain.std_percent for gain in gains if gain.std_percent is not None],
+        "effects": [effect.name for effect in outcome.calibration.effects],
     }
 
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import can
 import numpy as np
@@ -26,11 +26,11 @@ from daq.config.cell_buses import answer_us, bus_loads_percent, drive_axes
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
 from daq.log.feed import Feed, RunFacts
-from daq.report.bus_schemas import MonitorReport
-from daq.report.bus_views import monitor_document, monitor_view, prediction_view
+from daq.report.bus_schemas import MonitorReport, PredictionState
+from daq.report.bus_views import monitor_report, monitor_view, prediction_view
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.bus_lock import bus_lock, bus_taken
-from daq.workflow.events import event_document, explain_error_code
+from daq.workflow.events import explain_error_code, notice_of
 from daq.workflow.monitor import CellWatch, WatchedCell, joint_positions
 from drivers.canopen.bus import BusAddress, open_bus
 from drivers.canopen.emcy import remedy_of
@@ -276,8 +276,8 @@ def test_what_is_not_known_is_shown_as_that() -> None:
     reading = CellReading(reading.source, 0.5, (*reading.axes[:5], dead), 0.0, ((0,) * 9,), ())
     event = CellEvent(0, None, EventKind.CONTROLLER, 0, "a\x1b[2Jb")
     ampere = (0.002, None, None, None, None, None)
-    document = monitor_document(CELL, WatchedCell(reading, joint_positions(CELL, reading), ampere, (event,)))
-    Console(file=out, width=100).print(monitor_view(document))
+    report = monitor_report(CELL, WatchedCell(reading, joint_positions(CELL, reading), ampere, (event,)))
+    Console(file=out, width=100).print(monitor_view(report))
     text = out.getvalue()
     assert "+0.010 A" in text
     assert "+5 raw" in text
@@ -286,10 +286,10 @@ def test_what_is_not_known_is_shown_as_that() -> None:
     assert "no power" not in text
     off = tuple(replace(axis, statusword=0x250) for axis in reading.axes[:5])
     without = replace(reading, axes=(*off, dead))
-    document = monitor_document(CELL, WatchedCell(without, joint_positions(CELL, without), ampere, ()))
-    assert document["axes"][0]["current_a"] == pytest.approx(0.01)  # the document has what the drive says
+    report = monitor_report(CELL, WatchedCell(without, joint_positions(CELL, without), ampere, ()))
+    assert report.axes[0].current_a == pytest.approx(0.01)  # the document has what the drive says
     out = io.StringIO()
-    Console(file=out, width=100).print(monitor_view(document))
+    Console(file=out, width=100).print(monitor_view(report))
     assert out.getvalue().count("no power") == 5
     assert " A " not in out.getvalue()
     assert "\x1b[2J" not in text
@@ -357,14 +357,13 @@ def test_a_node_that_aborts_is_not_called_silent(
         monkeypatch.setattr(node._sdo, "_read", read)
         assert main(["monitor", str(cell), "--json", "--interval", "0.5"]) == ExitCode.OK
     document = json.loads(capsys.readouterr().out)
-    MonitorReport.model_validate(document)
     refusing = document["axes"][2]
     assert (refusing["silent"], refusing["rate_hz"], refusing["state"]) == (False, 0.0, None)
     assert refusing["position"] == pytest.approx(90.0, abs=1e-2)
     assert refusing["current_a"] is not None
     assert refusing["refused"] == [{"object": "6041h:00", "abort_code": 0x06020000}]
     assert refusing["remark"].startswith("answers with abort 0x06020000 for 6041h:00")
-    assert "J3 answers with abort 0x06020000 for 6041h:00" in _view(document)
+    assert "J3 answers with abort 0x06020000 for 6041h:00" in _view(MonitorReport.model_validate(document))
     assert document["axes"][1]["refused"] == []
 
 
@@ -382,13 +381,13 @@ def test_a_refused_object_is_no_value_and_forgotten_when_it_is_given(
     _answering(bus, monkeypatch, lambda data: answers[0] if data[1:3] == b"\x41\x60" else None)
     watch = _watch(bus, tmp_path / "cell.yaml")
     watch.listen(QUIET_S)
-    document = monitor_document(CELL, watch.read(0.5))
-    assert [axis["remark"] for axis in document["axes"]] == [remark] * 6
-    assert {(axis["statusword"], axis["rate_hz"], axis["lost"]) for axis in document["axes"]} == {(None, 0.0, 0)}
+    report = monitor_report(CELL, watch.read(0.5))
+    assert [axis.remark for axis in report.axes] == [remark] * 6
+    assert {(axis.statusword, axis.rate_hz, axis.lost) for axis in report.axes} == {(None, 0.0, 0)}
     answers[0] = bytes.fromhex("4b41600050020000")
-    document = monitor_document(CELL, watch.read(0.5))
-    assert {(axis["remark"], axis["statusword"]) for axis in document["axes"]} == {("", 0x250)}
-    assert document["axes"][0]["rate_hz"] > 5.0
+    report = monitor_report(CELL, watch.read(0.5))
+    assert {(axis.remark, axis.statusword) for axis in report.axes} == {("", 0x250)}
+    assert report.axes[0].rate_hz > 5.0
 
 
 def test_a_node_that_answers_after_400_ms_is_called_slow(
@@ -397,14 +396,14 @@ def test_a_node_that_answers_after_400_ms_is_called_slow(
     _answering(bus, monkeypatch, lambda _: None, slow={1: 400_000_000})
     watch = _watch(bus, tmp_path / "cell.yaml")
     watch.listen(QUIET_S)
-    documents = [monitor_document(CELL, watch.read(0.5)) for _ in range(10)]
-    slow = [document["axes"][0] for document in documents]
-    assert {axis["remark"] for axis in slow} == {"answers after 400 ms"}
-    assert 0.5 * sum(axis["rate_hz"] for axis in slow) >= 3  # in 5 s; a reading has three objects
-    assert {(axis["silent"], axis["lost"]) for axis in slow} == {(False, 0)}
-    assert slow[-1]["position_counts"] == 0
-    assert {document["axes"][1]["remark"] for document in documents} == {""}
-    assert "J1 answers after 400 ms" in _view(documents[-1])
+    reports = [monitor_report(CELL, watch.read(0.5)) for _ in range(10)]
+    slow = [report.axes[0] for report in reports]
+    assert {axis.remark for axis in slow} == {"answers after 400 ms"}
+    assert 0.5 * sum(axis.rate_hz for axis in slow) >= 3  # in 5 s; a reading has three objects
+    assert {(axis.silent, axis.lost) for axis in slow} == {(False, 0)}
+    assert slow[-1].position_counts == 0
+    assert {report.axes[1].remark for report in reports} == {""}
+    assert "J1 answers after 400 ms" in _view(reports[-1])
 
 
 def test_a_cell_that_is_slower_than_one_reading_gets_more_time(
@@ -451,9 +450,9 @@ def _answering(
     monkeypatch.setattr(bus, "send", answer)
 
 
-def _view(document: dict[str, Any]) -> str:
+def _view(report: MonitorReport) -> str:
     out = io.StringIO()
-    Console(file=out, width=200).print(monitor_view(document))
+    Console(file=out, width=200).print(monitor_view(report))
     return out.getvalue()
 
 
@@ -468,8 +467,8 @@ def test_our_own_recorder_is_no_other_master(tmp_path: Path) -> None:
     said = []
     for recorder in (False, True):
         out = io.StringIO()
-        document = monitor_document(CELL, WatchedCell(reading, (None,) * 6, (None,) * 6, (), recorder=recorder))
-        Console(file=out, width=200).print(monitor_view(document))
+        report = monitor_report(CELL, WatchedCell(reading, (None,) * 6, (None,) * 6, (), recorder=recorder))
+        Console(file=out, width=200).print(monitor_view(report))
         said.append(out.getvalue())
     assert "another master" in said[0]
     assert "drivegain's recorder" in said[1]
@@ -535,29 +534,30 @@ def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong
     monkeypatch.setattr("daq.workflow.monitor.facts_of_recorder", lambda *_: run)
     watch = _watch(bus, tmp_path / "cell.yaml", calibration)
     watch.listen(2.0)
-    document = [monitor_document(CELL, watch.read(0.5)) for _ in range(7)][-1]
-    assert document["recorder"]
-    assert document["prediction"] == {"payload": None, "remark": ""}
-    MonitorReport.model_validate(document)
-    predictions = [axis["prediction"] for axis in document["axes"]]
-    assert [found["conspicuous"] for found in predictions] == [False, False, False, factor > 1.0, False, False]
+    report = [monitor_report(CELL, watch.read(0.5)) for _ in range(7)][-1]
+    assert report.recorder
+    assert report.prediction == PredictionState(payload=None, remark="")
+    predictions = [axis.prediction for axis in report.axes if axis.prediction is not None]
+    assert [found.conspicuous for found in predictions] == [False, False, False, factor > 1.0, False, False]
     for number, found in enumerate(predictions):
         wrong = factor > 1.0 and number == 3
-        assert found["outside_share"] > 0.8 if wrong else found["residual_rms"] < 0.1 * found["band"]
-        if found["predicted"] is not None:
-            assert found["measured"] == pytest.approx(found["predicted"] * (factor if wrong else 1.0), abs=0.01)
+        assert found.residual_rms is not None and found.band is not None
+        assert found.outside_share > 0.8 if wrong else found.residual_rms < 0.1 * found.band
+        if found.predicted is not None:
+            assert found.measured == pytest.approx(found.predicted * (factor if wrong else 1.0), abs=0.01)
     out = io.StringIO()
-    Console(file=out, width=80, force_terminal=True, color_system="standard").print(monitor_view(document))
+    Console(file=out, width=80, force_terminal=True, color_system="standard").print(monitor_view(report))
     coloured = [line for line in out.getvalue().splitlines() if "33m" in line]
     assert [line.split("J")[1][0] for line in coloured] == (["4"] if factor > 1.0 else [])
-    document["axes"][0]["enabled"] = False
-    _, without = prediction_view(document)
+    off = report.axes[0].model_copy(update={"enabled": False})
+    _, without = prediction_view(report.model_copy(update={"axes": [off, *report.axes[1:]]}))
     assert isinstance(without, Table)
     assert next(str(cell) for cell in without.columns[1].cells) == "no power"
     bus.coming.clear()
-    document = monitor_document(CELL, watch.read(0.5))
-    assert document["prediction"]["remark"] == "no prediction: there is no SYNC"
-    assert not any(axis["silent"] for axis in document["axes"])  # they were not asked
+    report = monitor_report(CELL, watch.read(0.5))
+    assert report.prediction is not None
+    assert report.prediction.remark == "no prediction: there is no SYNC"
+    assert not any(axis.silent for axis in report.axes)  # they were not asked
 
 
 def test_the_rate_of_another_master_is_measured_once_its_sync_is_steady(bus: QuietBus, tmp_path: Path) -> None:
@@ -570,11 +570,12 @@ def test_the_rate_of_another_master_is_measured_once_its_sync_is_steady(bus: Qui
     watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), cell=timed)
     watch.listen(0.5)
     assert watch._facts is None
-    documents = [monitor_document(CELL, watch.read(0.5)) for _ in range(6)]
+    reports = [monitor_report(CELL, watch.read(0.5)) for _ in range(6)]
     assert watch._facts is not None
     assert watch._facts.rate_hz == pytest.approx(PREDICTED_HZ, rel=0.01)
-    predictions = [axis["prediction"] for axis in documents[-1]["axes"]]
-    assert all(found["measured"] is None and found["residual_rms"] is None for found in predictions)
+    predictions = [axis.prediction for axis in reports[-1].axes if axis.prediction is not None]
+    assert len(predictions) == 6
+    assert all(found.measured is None and found.residual_rms is None for found in predictions)
 
 
 def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_remedy(
@@ -592,24 +593,25 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
     feed = Feed(tmp_path / "cell.yaml", stop=None)
     watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), feed)
     watch.listen(QUIET_S)
-    document = monitor_document(CELL, watch.read(0.5))
-    MonitorReport.model_validate(document)
-    assert document["source"] == "asked"
-    assert "10 positions a second are too few" in document["prediction"]["remark"]
-    assert [axis["prediction"] for axis in document["axes"]] == [None] * 6
-    assert [axis["fault"] is not None for axis in document["axes"]] == [False, False, True, False, False, False]
-    assert document["axes"][2]["fault"] == asdict(explain_error_code(0x7305))
+    report = monitor_report(CELL, watch.read(0.5))
+    assert report.source == "asked"
+    assert report.prediction is not None
+    assert "10 positions a second are too few" in report.prediction.remark
+    assert [axis.prediction for axis in report.axes] == [None] * 6
+    assert [axis.fault is not None for axis in report.axes] == [False, False, True, False, False, False]
+    fault = report.axes[2].fault
+    assert fault is not None and fault.model_dump() == asdict(explain_error_code(0x7305))
     out = io.StringIO()
-    Console(file=out, width=200).print(monitor_view(document))
+    Console(file=out, width=200).print(monitor_view(report))
     assert "J3 is in fault: 7305h incremental sensor 1 fault; check the plugs and cables of encoder" in out.getvalue()
     # A console gets it too, however late it comes.
     assert [(event["axis"], event["code"]) for event in feed._events] == [(2, 0x7305)]
     bus.coming.append((bus.clock.now_ns, _frame(0x82, struct.pack("<HB5x", 0x3210, 1))))
     for node in range(1, 7):  # other events do not displace it
         bus.coming.append((bus.clock.now_ns, _frame(0x700 + node, b"\x05")))
-    (notice,) = (one for one in monitor_document(CELL, watch.read(0.5))["notices"] if one["alarm"])
-    assert notice == event_document(EventKind.EMCY, 0x3210, "J2", notice["text"])
-    assert notice["text"].startswith("EMCY 3210h") and notice["remedy"] == for_command_line(remedy_of(0x3210))
+    (notice,) = (one for one in monitor_report(CELL, watch.read(0.5)).notices if one.alarm)
+    assert notice.model_dump() == asdict(notice_of(EventKind.EMCY, 0x3210, "J2", notice.text))
+    assert notice.text.startswith("EMCY 3210h") and notice.remedy == for_command_line(remedy_of(0x3210))
 
 
 def test_each_reading_publishes_the_load_of_the_buses(

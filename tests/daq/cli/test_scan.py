@@ -24,7 +24,7 @@ from daq.config.cell_buses import bus_address, drive_axes
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.errors import ExitCode
 from daq.log.reader import read_log
-from daq.report.bus_views import scan_rows, scan_table, scan_view
+from daq.report.bus_views import scan_report, scan_table, scan_view, scanned_nodes
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.bus import open_bus
@@ -54,7 +54,7 @@ def _node(node_id: int, statusword: int | None, serial: int | None = None) -> Fo
 
 def _shown(cell: Cell, nodes: tuple[FoundNode, ...], width: int) -> str:
     out = io.StringIO()
-    Console(file=out, width=width, soft_wrap=True).print(scan_table(scan_rows(cell, nodes, "demo")))
+    Console(file=out, width=width, soft_wrap=True).print(scan_table(scanned_nodes(cell, nodes, "demo")))
     return out.getvalue()
 
 
@@ -73,11 +73,11 @@ def _shown(cell: Cell, nodes: tuple[FoundNode, ...], width: int) -> str:
 )
 def test_an_enabled_axis_is_shouted(cell: Cell, statusword: int | None, enabled: bool | None) -> None:
     nodes = (_node(1, 0x250), _node(2, statusword))
-    rows = scan_rows(cell, nodes, "demo")
-    assert [row["enabled"] for row in rows] == [False, enabled, None, None, None, None]
+    rows = scanned_nodes(cell, nodes, "demo")
+    assert [row.enabled for row in rows] == [False, enabled, None, None, None, None]
     in_fault = statusword in {0x0208, 0x020F}
-    assert [row["in_fault"] for row in rows] == [False, in_fault, *[False] * 4]
-    assert [row["verdict"] for row in rows] == ["ok", "in fault" if in_fault else "ok", *["missing"] * 4]
+    assert [row.in_fault for row in rows] == [False, in_fault, *[False] * 4]
+    assert [row.verdict for row in rows] == ["ok", "in fault" if in_fault else "ok", *["missing"] * 4]
     for width in (40, 80, 200):
         text = _shown(cell, nodes, width)
         assert ("ENABLED" in text) is bool(enabled)
@@ -109,29 +109,29 @@ def test_a_real_bus_without_a_node_names_the_wiring(cell: Cell) -> None:
 
 
 def test_a_message_names_the_axis_first(cell: Cell) -> None:
-    rows = scan_rows(cell, (_node(3, 0x237), _node(9, 0x237)), "demo")
-    said = [str(part) for part in scan_view(rows, {})]
+    rows = scanned_nodes(cell, (_node(3, 0x237), _node(9, 0x237)), "demo")
+    said = [str(part) for part in scan_view(scan_report(cell, rows, {}, (), ()))]
     assert said[1].startswith("J3 (node 3) IS ENABLED")
     assert said[2].startswith("node 9 IS ENABLED")
 
 
 def test_identity_and_power_are_distinguished(cell: Cell) -> None:
-    (row, *_) = scan_rows(cell, (_node(1, 0x237, serial=9),), "demo")
-    assert (row["verdict"], row["enabled"]) == ("other serial number", True)
-    assert row["remarks"] == ["serial number 1018h:04 is 0x9, the cell configuration expects 0x3e9"]
+    (row, *_) = scanned_nodes(cell, (_node(1, 0x237, serial=9),), "demo")
+    assert (row.verdict, row.enabled) == ("other serial number", True)
+    assert row.remarks == ["serial number 1018h:04 is 0x9, the cell configuration expects 0x3e9"]
 
 
 def test_a_cell_without_serial_does_not_compare_it(cell: Cell) -> None:
     axes = tuple(replace(axis, identity=axis.identity and replace(axis.identity, serial=None)) for axis in cell.axes)
-    (row, *_) = scan_rows(replace(cell, axes=axes), (_node(1, 0x250, serial=9),), "demo")
-    assert (row["verdict"], row["remarks"]) == ("ok", [])
+    (row, *_) = scanned_nodes(replace(cell, axes=axes), (_node(1, 0x250, serial=9),), "demo")
+    assert (row.verdict, row.remarks) == ("ok", [])
 
 
 def test_two_devices_and_a_profile_that_does_not_fit_are_said(cell: Cell) -> None:
     shared = replace(_node(1, 0x250), shared="two answers to one request")
-    rows = scan_rows(cell, (shared, _node(2, 0x250)), "demo", {"J2": "found no object 6074h:00"})
-    assert [row["verdict"] for row in rows[:2]] == ["two devices", "profile does not fit"]
-    said = [str(part) for part in scan_view(rows, {})]
+    rows = scanned_nodes(cell, (shared, _node(2, 0x250)), "demo", {"J2": "found no object 6074h:00"})
+    assert [row.verdict for row in rows[:2]] == ["two devices", "profile does not fit"]
+    said = [str(part) for part in scan_view(scan_report(cell, rows, {}, (), ()))]
     assert said[1].startswith("J1 (node 1): found two answers to one request; two devices have this node id")
     assert said[2] == "J2 (node 2): found no object 6074h:00"
 
@@ -160,8 +160,8 @@ def test_a_drive_without_an_object_of_its_profile_is_found_on_the_bus(
 
 
 def test_a_fault_is_named_beside_what_else_is_wrong(cell: Cell) -> None:
-    (row, *_) = scan_rows(cell, (_node(1, 0x208, serial=9),), "demo")
-    assert row["verdict"] == "other serial number, in fault"
+    (row, *_) = scanned_nodes(cell, (_node(1, 0x208, serial=9),), "demo")
+    assert row.verdict == "other serial number, in fault"
 
 
 def test_a_fault_is_reset_when_a_person_says_so_and_nothing_gets_power(
@@ -330,16 +330,16 @@ def two(checkout: Path) -> Cell:
 
 
 def test_a_node_is_reported_where_it_is_and_where_it_belongs(two: Cell) -> None:
-    left = scan_rows(two, tuple(_node(number, 0x250) for number in (1, 2, 4, 9)), "left")
-    assert [(row["bus"], row["node_id"], row["axis"], row["verdict"]) for row in left] == [
+    left = scanned_nodes(two, tuple(_node(number, 0x250) for number in (1, 2, 4, 9)), "left")
+    assert [(row.bus, row.node_id, row.axis, row.verdict) for row in left] == [
         ("left", 1, "J1", "ok"),
         ("left", 2, "J2", "ok"),
         ("left", 3, "J3", "missing"),
         ("left", 4, "J4", "belongs on right"),
         ("left", 9, None, "not configured"),
     ]
-    right = scan_rows(two, tuple(_node(number, 0x250) for number in (4, 5, 6)), "right")
-    assert [row["verdict"] for row in right] == ["ok"] * 3
+    right = scanned_nodes(two, tuple(_node(number, 0x250) for number in (4, 5, 6)), "right")
+    assert [row.verdict for row in right] == ["ok"] * 3
     out = io.StringIO()
     Console(file=out, width=200, soft_wrap=True).print(scan_table(left + right))
     heading, _, *lines = out.getvalue().splitlines()

@@ -26,7 +26,8 @@ from daq.errors import ConfigurationInconsistent, ExitCode, OutputFailed, TableU
 from daq.log.conversion import load_run
 from daq.log.importing import import_recording, quantise
 from daq.log.reader import read_log
-from daq.report.log import describe_log
+from daq.report.document import json_tree
+from daq.report.log import info_report
 from ident.data.torque_channel import torque_slope
 
 FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
@@ -504,7 +505,7 @@ def test_jittered_stamps_are_the_sample_times(bench: Bench, capsys: pytest.Captu
     document = json.loads(capsys.readouterr().out)
     assert document["timing"]["resampled"] is True
     assert document["timing"]["longest_step_s"] == pytest.approx(0.005)
-    assert describe_log(bench.out)["timing"] == document["timing"]
+    assert json_tree(info_report(bench.out))["timing"] == document["timing"]
     run = load_run(bench.out)[0]
     at_ms = 1e3 * run.time_s[:, None]
     assert np.abs(np.degrees(run.position_rad) - 20.0 * np.sin(at_ms / 160.0 + np.arange(6))).max() < 1e-3
@@ -769,7 +770,7 @@ def test_torque_columns_give_a_slope_and_temperature_columns_a_temperature(bench
     assert bench.run() == 0
     run, _ = load_run(bench.out)
     # 300 rows at 50 Hz: a torque in every second row, a temperature a second.
-    assert describe_log(bench.out)["slow_readings"] == {"torque": 6 * 150, "temperature": 6 * 6}
+    assert info_report(bench.out).slow_readings == {"torque": 6 * 150, "temperature": 6 * 6}
     slopes = [torque_slope([channel]) for channel in run.torque_channels]
     assert [slope.value for slope in slopes if slope is not None] == pytest.approx(gain, rel=1e-6)
     assert run.temperature_c is not None

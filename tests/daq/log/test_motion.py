@@ -23,7 +23,7 @@ from daq.log.metadata import AxisReadback, Readback
 from daq.log.motion import RecordedMotion
 from daq.log.reader import LossyLogs
 from daq.log.salvage import salvage
-from daq.report.log import describe_log
+from daq.report.log import info_report
 from drivers.messages import Sample
 from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
@@ -88,7 +88,7 @@ def test_a_glitch_of_the_encoder_is_refused_and_called_invalid_by_all(
     joint_rad = _joints(resting=resting)
     sound = _log(tmp_path / "sound.mcap", _samples(joint_rad))
     load_run(sound)
-    assert describe_log(sound)["valid"]
+    assert info_report(sound).valid
     change(joint_rad)
     rows = _samples(joint_rad)
     log = _log(tmp_path / "a.mcap", rows)
@@ -99,8 +99,8 @@ def test_a_glitch_of_the_encoder_is_refused_and_called_invalid_by_all(
     assert when in refused.value.found
     assert refused.value.expected == "at most 600 deg/s, 3 times 200 deg/s, the limit in the cell configuration"
     reason = f"axis J2: {refused.value.found}"
-    described = describe_log(log)
-    assert (described["valid"], described["reason"]) == (False, reason)
+    described = info_report(log)
+    assert (described.valid, described.reason) == (False, reason)
     table = export_log(log, tmp_path / "a.csv", TableFormat.CSV)
     bag = export_bag(log, tmp_path / "bag")
     assert (table.valid, table.reason, bag.valid, bag.reason) == (False, reason, False, reason)
@@ -139,9 +139,9 @@ def test_a_current_that_no_amplifier_sets_is_refused_and_called_invalid(tmp_path
     log = _log(tmp_path / "a.mcap", rows)
     with pytest.raises(CurrentImplausible, match=r"axis J1: found a current of .*at 1 s; expected a current"):
         load_run(log)
-    described = describe_log(log)
-    assert not described["valid"]
-    assert described["reason"].startswith("axis J1: a current of")
+    described = info_report(log)
+    assert not described.valid
+    assert described.reason.startswith("axis J1: a current of")
 
 
 def test_a_short_motion_after_a_long_rest_is_no_outlier() -> None:

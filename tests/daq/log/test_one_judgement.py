@@ -33,7 +33,7 @@ from daq.log.metadata import (
 )
 from daq.log.reader import BLOCK_SAMPLES, LARGEST_ENTRIES, LogReader, read_log
 from daq.log.salvage import salvage
-from daq.report.log import describe_log
+from daq.report.log import info_report
 from drivers.messages import CellEvent, EventKind
 from tests.daq.log.records import (
     HEADER,
@@ -106,7 +106,7 @@ def made(checkout: Path) -> MadeUp:
 
 READERS: dict[str, Callable[[Path, Path], object]] = {
     "read": lambda log, _: read_log(log),
-    "info": lambda log, _: describe_log(log),
+    "info": lambda log, _: info_report(log),
     "fit and validate": lambda log, _: load_run(log),
     "export log": lambda log, out: export_log(log, out / "table.csv", TableFormat.CSV),
     "export bag": lambda log, out: export_bag(log, out / "bag"),
@@ -116,7 +116,7 @@ READERS: dict[str, Callable[[Path, Path], object]] = {
 @pytest.mark.parametrize("reader", READERS)
 def test_the_log_that_the_others_are_made_of_is_sound(reader: str, made: MadeUp, tmp_path: Path) -> None:
     READERS[reader](made.write(tmp_path / "a.mcap"), tmp_path)
-    assert describe_log(tmp_path / "a.mcap")["valid"]
+    assert info_report(tmp_path / "a.mcap").valid
 
 
 @pytest.mark.parametrize("start_ns", [0, START_NS])
@@ -124,9 +124,9 @@ def test_a_log_of_several_blocks_lasts_from_its_first_stamp_on(start_ns: int, ch
     count = 2 * BLOCK_SAMPLES
     log = MadeUp(checkout, list(range(count)), [start_ns + k * 1_000_000 for k in range(count)])
     log.counted()
-    described = describe_log(log.write(tmp_path / "a.mcap"))
-    assert described["samples"] == count
-    assert described["stamped_duration_s"] == pytest.approx((count - 1) * 1e-3)
+    described = info_report(log.write(tmp_path / "a.mcap"))
+    assert described.samples == count
+    assert described.stamped_duration_s == pytest.approx((count - 1) * 1e-3)
 
 
 def _renumbered(made: MadeUp) -> None:
@@ -208,8 +208,8 @@ def test_a_log_that_no_fit_takes_is_called_invalid_by_all(
     with pytest.raises(DataError) as refused:
         load_run(log)
     assert refused.value.found == reason
-    described = describe_log(log)
-    assert (described["valid"], described["reason"]) == (False, reason)
+    described = info_report(log)
+    assert (described.valid, described.reason) == (False, reason)
     table, bag = export_log(log, tmp_path / "a.csv", TableFormat.CSV), export_bag(log, tmp_path / "bag")
     assert (table.valid, table.reason, bag.valid, bag.reason) == (False, reason, False, reason)
     part = log.rename(tmp_path / "a.mcap.part")

@@ -6,7 +6,7 @@ import ast
 import io
 import re
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -37,12 +37,15 @@ from daq.report import (
     validation,
     weighing_views,
 )
+from daq.report.bus_schemas import ScannedNode
 from daq.report.log import log_lines
 from daq.report.text import WholeTable
 from daq.workflow.live_prediction import RecentCurrent
+from daq.workflow.monitor import CellPrediction, WatchedCell
 from daq.workflow.validation import DataUse
 from daq.writeback.judgement import NOTHING
 from daq.writeback.request import GainChange
+from drivers.stream.monitor import AxisReading, CellReading, ReadingSource
 from ident.calibration import Gain
 from ident.data.conditioning import Conditioning
 from ident.data.torque_channel import TorqueSlope
@@ -76,38 +79,47 @@ def series(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, tuple[Series,
 
 
 def _scan(cell: Cell, _: Any) -> Iterator[RenderableType]:
-    row = {
-        "vendor_id": 0xFFFFFFFF,
-        "product_code": 0xFFFFFFFE,
-        "serial": 4294967295,
-        "device_name": "servo amplifier 48 V 12 A, revision 7",
-        "nmt": "PRE-OPERATIONAL",
-        "state": "SWITCH ON DISABLED",
-        "enabled": True,
-        "verdict": "belongs on right, in fault",
-    }
-    yield bus_views.scan_table([{"bus": f"bus-{n % 2}", "node_id": 101 + n, "axis": AXES[n], **row} for n in range(14)])
+    yield bus_views.scan_table([_node(number) for number in range(14)])
+
+
+def _node(number: int) -> ScannedNode:
+    return ScannedNode(
+        bus=f"bus-{number % 2}",
+        node_id=101 + number,
+        axis=AXES[number],
+        vendor_id=0xFFFFFFFF,
+        product_code=0xFFFFFFFE,
+        serial=4294967295,
+        device_name="servo amplifier 48 V 12 A, revision 7",
+        nmt="PRE-OPERATIONAL",
+        state="SWITCH ON DISABLED",
+        enabled=True,
+        in_fault=True,
+        verdict="belongs on right, in fault",
+        remarks=[],
+    )
 
 
 def _monitor(cell: Cell, _: Any) -> Iterator[RenderableType]:
-    axis = {
-        "unit": "deg",
-        "current_raw": -32768,
-        "current_a": -12.345,
-        "state": "FAULT REACTION ACTIVE",
-        "enabled": True,
-        "in_fault": True,
-        "fault": None,
-        "silent": False,
-        "remark": "answers after 1.2 s",
-        "rate_hz": 1000.1,
-        "lost": 12345678,
-        "prediction": asdict(RecentCurrent(-12.345, -11.234, 0.123, 1.234, 0.99, True)),
-    }
-    axes = [{"axis": name, "position": -179.123 - n, **axis} for n, name in enumerate(AXES)]
-    document = {"cell": "demo", "source": "asked", "recorder": False, "axes": axes, "notices": [], "buses": []}
-    known = {"prediction": {"payload": "disc", "remark": ""}, "frames_per_s": 12345.0, "sync_hz": 1000.0}
-    yield bus_views.monitor_view({**document, **known})
+    axis = AxisReading(
+        position_counts=-123456,
+        current_raw=-32768,
+        statusword=0x021F,
+        nmt=5,
+        rate_hz=1000.1,
+        lost=12345678,
+        delay_s=1.2,
+    )
+    reading = CellReading(ReadingSource.ASKED, 0.5, (axis,) * 6, 1000.0, ((0,) * 9,), ())
+    current = RecentCurrent(-12.345, -11.234, 0.123, 1.234, 0.99, True)
+    watched = WatchedCell(
+        reading,
+        position=[-3.126 - number for number in range(6)],
+        ampere=[12.345 / 32768] * 6,
+        events=(),
+        prediction=CellPrediction(payload="disc", remark="", axes=[current] * 6),
+    )
+    yield bus_views.monitor_view(bus_views.monitor_report(cell, watched))
 
 
 def _comparison(cell: Cell, _: Any) -> Iterable[RenderableType]:

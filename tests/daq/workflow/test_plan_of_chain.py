@@ -12,7 +12,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
-from daq.report.plan import plan_document, plan_text
+from daq.report.plan import plan_report, plan_text
 from daq.report.plan_preview import preview_page
 from daq.workflow.experiment import RUNS, Experiment, experiment_of, paths_of
 from daq.workflow.plan import Plan, plan
@@ -140,11 +140,11 @@ def test_the_same_moves_around_one_pose_hide_gains(cell: Cell, experiment: Exper
     text = plan_text(Path("plan.yaml"), None, cell, experiment, replace(made, moves=moves), judged)
     (line,) = (line for line in text.splitlines() if line.startswith("Internal preload obscures"))
     assert [name for name in cell.axis_names if name in line] == named
-    document = plan_document(Path("plan.yaml"), cell, experiment, made, judged)
-    gains = document["gains"]
-    assert isinstance(gains, list)
-    assert [gain["axis"] for gain in gains if gain["hidden_by"] == "preload"] == named
-    assert all(gain["known_preload_std_percent"] < gain["predicted_std_percent"] for gain in gains)
+    gains = plan_report(Path("plan.yaml"), cell, experiment, made, judged).gains
+    assert [gain.axis for gain in gains if gain.hidden_by == "preload"] == named
+    for gain in gains:
+        assert gain.known_preload_std_percent is not None and gain.predicted_std_percent is not None
+        assert gain.known_preload_std_percent < gain.predicted_std_percent
 
 
 def test_a_workspace_too_small_for_the_gains_is_refused_with_the_reason(cell: Cell, experiment: Experiment) -> None:
