@@ -1,14 +1,16 @@
-"""What a verb prints under `--json`: one frozen type a document, from which its JSON and its published schema are made."""
+"""What a verb prints under `--json`: one frozen type a document; its JSON and its published schema are made of it."""
 
 from __future__ import annotations
 
 import json
+import math
+import re
 from typing import Any
 
 from pydantic import model_validator
 
 from daq.config.yaml_file import StrictModel
-from daq.report.text import json_safe
+from daq.report.text import spelled_bytes
 
 Figure = float | None
 """A number that may not be known, which is null."""
@@ -22,8 +24,22 @@ class Report(StrictModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _make_json_safe(cls, values: Any) -> Any:
-        return json_safe(values)
+    def _as_json_has_it(cls, values: Any) -> Any:
+        return _as_json_has_it(values)
+
+
+def _as_json_has_it(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, str):
+        return spelled_bytes(value)
+    if isinstance(value, dict):
+        return {_as_json_has_it(key): _as_json_has_it(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_as_json_has_it(item) for item in value]
+    if isinstance(value, tuple):
+        return tuple(_as_json_has_it(item) for item in value)
+    return value
 
 
 def json_tree(report: Report) -> dict[str, Any]:
@@ -32,6 +48,14 @@ def json_tree(report: Report) -> dict[str, Any]:
     return tree
 
 
+_SPELLED = re.compile(r"\\\\(ud[c-f][0-9a-f]{2})")
+"""A byte that is not UTF-8, as `spelled_bytes` spells it, in the text of a JSON string."""
+
+
 def json_text(report: Report) -> str:
-    """Return a document as JSON with a line end."""
-    return json.dumps(json_tree(report), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    """Return a document as JSON with a line end.
+
+    A byte of a file name that is not UTF-8 is the escape of its surrogate: Python reads the same name from it.
+    """
+    text = json.dumps(json_tree(report), indent=2, ensure_ascii=False, allow_nan=False)
+    return _SPELLED.sub(r"\\\1", text) + "\n"

@@ -190,13 +190,11 @@ def spelled_bytes(text: str) -> str:
 
 
 def json_safe(value: Any) -> Any:
-    """Copy mappings and lists, with null for numbers that JSON lacks, and without bytes of names that are not UTF-8."""
+    """Copy a document, with null for numbers that JSON lacks."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
-    if isinstance(value, str):
-        return spelled_bytes(value)
     if isinstance(value, dict):
-        return {spelled_bytes(str(key)): json_safe(item) for key, item in value.items()}
+        return {str(key): json_safe(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [json_safe(item) for item in value]
     return value
