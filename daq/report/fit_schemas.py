@@ -57,19 +57,14 @@ class RemovedParameter(Report):
     std_percent: Figure
 
 
-class JudgedGain(Report):
-    """Verdict on how well data show a gain."""
+class GainWords(Report):
+    """Verdict on how well the data of a fit show a gain."""
 
     axis: str
+    std_percent: Figure
     verdict: str
     seen_by: list[str]
     words: str
-
-
-class GainWords(JudgedGain):
-    """Verdict on how well the data of a fit show a gain."""
-
-    std_percent: Figure
 
 
 class Trial(Report):
@@ -99,22 +94,28 @@ class CheckedGeometry(Report):
     hidden_zeros: list[str]
 
 
-class FitReport(Report, CalibrationBody):
+class FitReport(CalibrationBody, Report):
     """`fit`."""
 
     compared: dict[Literal["tls"], ComparedFit]
-    geometry: CheckedGeometry | None = None
-    torque_channel: tuple[OwnTorque, ...] = ()
+    geometry: CheckedGeometry | None
+    torque_channel: list[OwnTorque] = Field(default=[])
     removed: list[RemovedParameter]
     verdicts: list[GainWords]
-    comparison: tuple[Trial, ...] = ()
+    comparison: list[Trial] = Field(default=[])
 
 
-class CaseReport(Report, CalibrationBody):
-    """One case of the paper."""
+class CaseTitle(Report):
+    """Name of a case, and what it takes as known of the payload."""
 
     title: str
     known: str
+
+
+# The keys of the last base come first.
+class CaseReport(CalibrationBody, CaseTitle):
+    """One case of the paper."""
+
     removed: list[RemovedParameter]
 
 
