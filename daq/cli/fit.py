@@ -309,7 +309,7 @@ def residual_verb(request: ResidualRequest) -> None:
     from daq.cli.terminal import print_view, status, write_output
     from daq.errors import OutputFailed
     from daq.report.fit import start_of
-    from daq.report.residual import residual_document, residual_view
+    from daq.report.residual import residual_report, residual_view
     from daq.report.residual_page import save_report
     from daq.workflow.fit import calibration_of, check_holdout
     from ident.discovery.before_after import account
@@ -323,7 +323,7 @@ def residual_verb(request: ResidualRequest) -> None:
 
     def show(*written: Path | None) -> None:
         if request.json:
-            print_json(residual_document(closed, changed, calibration))
+            print_json(residual_report(closed, changed, calibration))
         else:
             print_view(residual_view(closed, changed, calibration, verbose=request.verbose), *written)
 

@@ -229,19 +229,25 @@ class Coefficient(Report):
     unit: str
 
 
-class PlacedEffectEntry(Report):
-    """An effect on an axis."""
+class NamedEffect(Report):
+    """An effect, and the axis that it is on."""
 
     effect: str
     axis: str
     settings: dict[str, float]
+
+
+class PlacedEffectEntry(NamedEffect):
+    """An effect on an axis, with its size."""
+
     coefficients: list[Coefficient]
 
 
-class FindingEntry(PlacedEffectEntry):
+class FindingEntry(NamedEffect):
     """Result of testing one effect on one axis."""
 
     variable: str
+    coefficients: list[Coefficient]
     probability: Figure = Field(description="by noise alone; null where it rests on too few moves for a test")
     folds_better: float
     explained: Figure
@@ -269,12 +275,9 @@ class DetectionLimit(Report):
     unit: str
 
 
-class SplitNameEntry(Report):
+class SplitNameEntry(NamedEffect):
     """Name that splits of the data choose for what a turn added."""
 
-    effect: str
-    axis: str
-    settings: dict[str, float]
     splits: int
 
 
@@ -294,12 +297,9 @@ class TurnEntry(Report):
     detection_limits: list[DetectionLimit]
 
 
-class VerdictEntry(Report):
+class VerdictEntry(NamedEffect):
     """What held-out runs say of one effect."""
 
-    effect: str
-    axis: str
-    settings: dict[str, float]
     judgement: str
     reason: str
     written: bool
@@ -308,7 +308,7 @@ class VerdictEntry(Report):
     error_after_percent: Errors | None
 
 
-class ResidualReport(Report, CalibrationBody):
+class ResidualReport(CalibrationBody, Report):
     """`residual`, and the body of `residual.json`."""
 
     summary: list[str]
@@ -316,7 +316,7 @@ class ResidualReport(Report, CalibrationBody):
     metric: str
     noise_floor: NoiseFloor
     time_skew: Skew | None
-    time_skew_by_instruments: SkewByInstruments | None = None
+    time_skew_by_instruments: SkewByInstruments | None
     gear_loss: list[GearLossEntry]
     before: ModelErrors
     after: ModelErrors
@@ -324,6 +324,18 @@ class ResidualReport(Report, CalibrationBody):
     worse_holdout: bool | None
     verdicts: list[VerdictEntry]
     turns: list[TurnEntry]
+
+
+class ResidualFormat(Report):
+    """How `residual.json` begins."""
+
+    format: Literal["drivegain-residual"]
+    version: int
+
+
+# The keys of the last base come first.
+class ResidualFile(ResidualReport, ResidualFormat):
+    """`residual.json`."""
 
 
 class ValidatedLog(Report):
