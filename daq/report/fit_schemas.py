@@ -12,7 +12,6 @@ from pydantic import Field
 from daq.documents.calibration_file import CalibrationBody
 from daq.report.document import Figure, Report
 from ident.calibration import PayloadMass
-from ident.errors import Diagnosis
 
 
 class Errors(Report):
@@ -389,6 +388,18 @@ class CheckedPayload(Report):
     masses: dict[str, FoundMass]
 
 
+# Not the `Diagnosis` of `ident`: the name of a run is that of its file, which only a `Report` makes fit for JSON.
+class DiagnosisEntry(Report):
+    """Something wrong with a recording or a fit, and where to look."""
+
+    name: str
+    runs: list[str]
+    axes: list[str]
+    found: str
+    expected: str
+    remedy: str
+
+
 class ValidateReport(Report):
     """`validate`."""
 
@@ -396,11 +407,11 @@ class ValidateReport(Report):
     axes: list[str]
     filter: dict[str, int | float | list[float]]
     fit_relative_error_percent: Errors
-    payload_mass: tuple[PayloadMass, ...] = ()
+    payload_mass: list[PayloadMass]
     logs: list[ValidatedLog]
     together: Together | None
     calibrations: list[str]
-    diagnoses: list[Diagnosis]
+    diagnoses: list[DiagnosisEntry]
     runs: list[CheckedLog]
     payloads: list[CheckedPayload]
 
