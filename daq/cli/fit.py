@@ -105,7 +105,7 @@ def fit_verb(request: FitRequest) -> None:
     from datetime import UTC, datetime
 
     from daq.cli.terminal import print_view, status
-    from daq.report.fit import fit_document, fit_view
+    from daq.report.fit import fit_report, fit_view
     from daq.workflow.cases import calibration_of_case
     from daq.workflow.fit import compare_estimators
 
@@ -124,7 +124,7 @@ def fit_verb(request: FitRequest) -> None:
         with status("comparing estimators") as report_step:
             comparison = compare_estimators(found.fitted, report_step)
     if request.json:
-        print_json(fit_document(found, calibration, comparison))
+        print_json(fit_report(found, calibration, comparison))
         return
     print_view(fit_view(found, calibration, comparison), request.out, request.report, request.pictures)
     same = _holdout_words(request)
@@ -215,7 +215,7 @@ def _fit_cases(request: FitRequest, folder: Path) -> None:
     from daq.cli.terminal import at_most_one, check_output, print_view, status, write_output
     from daq.documents.calibration_file import save_calibration
     from daq.files import replace_file
-    from daq.report.fit import cases_document, cases_view
+    from daq.report.fit import cases_report, cases_view
     from daq.report.paper_tables import case_tables, paper_page
     from daq.workflow.cases import CASES, calibration_of_case, fit_case, reduce_logs
 
@@ -253,7 +253,7 @@ def _fit_cases(request: FitRequest, folder: Path) -> None:
             save_calibration(calibrations[name], file)
         replace_file(page_file, paper_page(f"Identification of {reduced.cell.name}", tables, marker=TABLES).encode())
     if request.json:
-        print_json(cases_document(fits, calibrations))
+        print_json(cases_report(fits, calibrations))
     else:
         print_view(cases_view(fits, tables), *files.values(), page_file)
 
@@ -309,7 +309,7 @@ def residual_verb(request: ResidualRequest) -> None:
     from daq.cli.terminal import print_view, status, write_output
     from daq.errors import OutputFailed
     from daq.report.fit import start_of
-    from daq.report.residual import residual_document, residual_view
+    from daq.report.residual import residual_report, residual_view
     from daq.report.residual_page import save_report
     from daq.workflow.fit import calibration_of, check_holdout
     from ident.discovery.before_after import account
@@ -323,7 +323,7 @@ def residual_verb(request: ResidualRequest) -> None:
 
     def show(*written: Path | None) -> None:
         if request.json:
-            print_json(residual_document(closed, changed, calibration))
+            print_json(residual_report(closed, changed, calibration))
         else:
             print_view(residual_view(closed, changed, calibration, verbose=request.verbose), *written)
 

@@ -55,13 +55,7 @@ def validate_verb(
     from daq.config.cell_file import load_cell
     from daq.files import replace_file
     from daq.report.paper_tables import paper_page
-    from daq.report.validation import (
-        cross_document,
-        draw_validations,
-        validation_document,
-        validation_tables,
-        validation_view,
-    )
+    from daq.report.validation import draw_validations, validate_report, validation_tables, validation_view
     from daq.workflow.validate import cross_validate
     from daq.writeback.gates.fit import uncorrected_description
 
@@ -81,7 +75,7 @@ def validate_verb(
             page_file.parent.mkdir(parents=True, exist_ok=True)
             replace_file(page_file, paper_page(f"Validation of {known.cell}", tables, marker=TABLES).encode())
     if json:
-        print_json({**validation_document(known, found.validations, drawn), **cross_document(found)})
+        print_json(validate_report(known, found, drawn))
     else:
         print_view(validation_view(known, found), *drawn.values(), page_file)
         if uncorrected_description(known):

@@ -28,14 +28,14 @@ def weigh_verb(
     from daq.cli.terminal import print_view, status
     from daq.config.cell_file import load_cell
     from daq.documents.calibration_file import load_calibration
-    from daq.report.weighing_views import weighed_document, weighed_view
+    from daq.report.weighing_views import weigh_report, weighed_view
     from daq.workflow.weigh import weigh_logs
 
     with status("weighing"):
         described = None if cell is None else load_cell(cell)
         found = weigh_logs(load_calibration(calibration), logs, bare=bare or (), cell=described)
     if json:
-        print_json(weighed_document(found))
+        print_json(weigh_report(found))
     else:
         print_view(weighed_view(found))
 
@@ -63,7 +63,7 @@ def contact_verb(
     from daq.cli.terminal import print_view, status, write_output
     from daq.config.cell_file import load_cell
     from daq.documents.calibration_file import load_calibration
-    from daq.report.weighing_views import contact_document, contact_view, draw_contact
+    from daq.report.weighing_views import contact_report, contact_view, draw_contact
     from daq.workflow.weigh import contact_in
 
     picture = None
@@ -75,7 +75,7 @@ def contact_verb(
                 pictures.mkdir(parents=True, exist_ok=True)
                 picture = draw_contact(found, described, log, pictures)
     if json:
-        print_json(contact_document(found, described, log, picture))
+        print_json(contact_report(found, described, log, picture))
     else:
         print_view(contact_view(found, described), picture)
 

@@ -143,18 +143,18 @@ class EncoderMisfitEntry(StrictModel):
 
 
 class CalibrationBody(StrictModel):
-    """Schema of a calibration, without the envelope of a file."""
+    """Schema of a calibration, without the envelope of a file; its keys are in the order of `Calibration`."""
 
     cell: str
     method: str
     gains: tuple[GainEntry, ...]
     parameters: tuple[ParameterEntry, ...]
+    effects: tuple[EffectEntry, ...]
     relative_error_percent: RelativeErrorEntry
     holdout_error_percent: RelativeErrorEntry | None
     condition: _Positive
     rows: Annotated[int, Field(ge=0, le=10**15)]
     filter: Annotated[dict[str, int | float | list[float]], AfterValidator(_check_filter)]
-    effects: tuple[EffectEntry, ...]
     sources: tuple[Source, ...]
     configuration_sha256: str
     created: str

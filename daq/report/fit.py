@@ -3,26 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from rich.console import RenderableType
 from rich.table import Table
 
-from daq.documents.calibration_file import as_document
+from daq.documents.calibration_file import CalibrationBody, as_document
 from daq.report import paper_tables
 from daq.report.effect_names import size_text
+from daq.report.fit_schemas import (
+    CaseReport,
+    CasesReport,
+    CheckedGeometry,
+    ComparedFit,
+    ComparedGain,
+    Errors,
+    FitReport,
+    FoundGravity,
+    GainWords,
+    RemovedParameter,
+    Trial,
+)
 from daq.report.gains import (
     diagnosis_texts,
     gain_table,
     mass_texts,
+    own_torques,
     partial_note,
-    torque_document,
     torque_sentences,
     torque_table,
 )
-from daq.report.text import Sentence, percent_text, picked, plain_table
-from daq.workflow.cases import CASES, CaseFit
+from daq.report.text import Sentence, percent_text, plain_table
+from daq.workflow.cases import CASES, Case, CaseFit
 from daq.workflow.description import hidden_zeros_text
 from daq.workflow.fit import DOUBTFUL_PERCENT, Fit
 from daq.workflow.nameplates import actual_current_note
@@ -30,7 +43,7 @@ from daq.workflow.verdicts import needed_verdicts
 from ident.arrays import FloatArray
 from ident.calibration import Calibration, Parameter, PayloadMass
 from ident.discovery.evidence import Evidence, without_effects
-from ident.discovery.geometry_check import GeometryCheck
+from ident.discovery.geometry_check import GeometryCheck, Gravity
 from ident.effects.effect import PlacedEffect
 from ident.estimators.comparison import EstimatorComparison, EstimatorTrial
 from ident.estimators.estimate import Estimate, RelativeError
@@ -41,6 +54,9 @@ from ident.planning.gain_verdict import GOOD_PERCENT, GainVerdict
 TLS_APART_SIGMAS = 3.0
 TLS_APART_PERCENT = 2.0
 """Difference of a gain by the paper's total least squares from that by ml, in σ of ml and relative, that is printed."""
+
+
+BodyT = TypeVar("BodyT", bound=CalibrationBody)
 
 
 def fit_view(
@@ -113,66 +129,84 @@ def paper_note(axes: Sequence[str], estimate: Estimate, paper: Estimate, misjudg
     )
 
 
-def fit_document(found: CaseFit, calibration: Calibration, comparison: EstimatorComparison | None) -> dict[str, Any]:
-    """Build the object of `fit --json`."""
+def fit_report(found: CaseFit, calibration: Calibration, comparison: EstimatorComparison | None) -> FitReport:
+    """Return a fit: the calibration, what other estimators find, and what the data cannot show."""
     fitted = found.fitted
-    axes, paper = fitted.cell.axis_names, fitted.paper
-    compared = {}
-    if paper is not None:
-        misjudged = misjudged_joints(fitted.final.system)
-        compared = {
-            "tls": {
-                "gains": _gains(axes, paper.gains, paper.gains_std),
-                "condition": paper.condition,
-                "misjudged": [axes[joint] for joint in misjudged],
-            }
-        }
-    return {
-        **as_document(calibration),
-        "compared": compared,
-        "geometry": geometry_document(fitted.description, axes),
-        **(
-            {"torque_channel": torque_document(fitted.torque_slopes, calibration.gains)} if fitted.torque_slopes else {}
-        ),
-        "removed": _removed(found),
-        "verdicts": [
-            {
-                "axis": axes[gain.axis],
-                "std_percent": gain.std_percent,
-                "verdict": gain.verdict.value,
-                "seen_by": [source.value for source in gain.sources],
-                "words": gain.words(axes[gain.axis]),
-            }
-            for gain in needed_verdicts(fitted)
-        ],
-        **({} if comparison is None else {"comparison": [_trial(trial, axes) for trial in comparison.trials]}),
-    }
+    axes = fitted.cell.axis_names
+    sometimes: dict[str, object] = {}
+    if fitted.torque_slopes:
+        sometimes["torque_channel"] = own_torques(fitted.torque_slopes, calibration.gains)
+    if comparison is not None:
+        sometimes["comparison"] = [_trial(trial, axes) for trial in comparison.trials]
+    return with_calibration(
+        FitReport,
+        calibration,
+        compared={} if fitted.paper is None else {"tls": _compared(fitted, fitted.paper)},
+        geometry=checked_geometry(fitted.description, axes),
+        removed=_removed(found),
+        verdicts=[_gain_words(axes[gain.axis], gain) for gain in needed_verdicts(fitted)],
+        **sometimes,
+    )
 
 
-def _gains(axes: tuple[str, ...], gains: FloatArray, stds: FloatArray) -> list[dict[str, Any]]:
+def with_calibration(kind: type[BodyT], calibration: Calibration, **others: object) -> BodyT:
+    """Return a document that has all keys of a calibration.
+
+    Args:
+        kind: its type.
+        calibration: the calibration.
+        others: all other keys.
+    """
+    # Not strictly: `as_document` makes lists of the tuples that the type has.
+    return kind.model_validate({**as_document(calibration), **others}, strict=False)
+
+
+def _compared(fitted: Fit, paper: Estimate) -> ComparedFit:
+    axes = fitted.cell.axis_names
+    return ComparedFit(
+        gains=_gains(axes, paper.gains, paper.gains_std),
+        condition=paper.condition,
+        misjudged=[axes[joint] for joint in misjudged_joints(fitted.final.system)],
+    )
+
+
+def _gain_words(axis: str, gain: GainVerdict) -> GainWords:
+    return GainWords(
+        axis=axis,
+        std_percent=gain.std_percent,
+        verdict=gain.verdict.value,
+        seen_by=[source.value for source in gain.sources],
+        words=gain.words(axis),
+    )
+
+
+def _gains(axes: tuple[str, ...], gains: FloatArray, stds: FloatArray) -> list[ComparedGain]:
     return [
-        {"axis": axis, "value": float(value), "std_percent": 100.0 * float(std / abs(value))}
+        ComparedGain(axis=axis, value=float(value), std_percent=100.0 * float(std / abs(value)))
         for axis, value, std in zip(axes, gains, stds, strict=True)
     ]
 
 
-def cases_document(fits: Mapping[str, CaseFit], calibrations: Mapping[str, Calibration]) -> dict[str, Any]:
-    """Build the object of `fit --cases --json`; both by the name of the case."""
-    return {
-        "cases": {
-            case.name: {
-                "title": case.title,
-                "known": case.known.value,
-                **as_document(calibrations[case.name]),
-                "removed": _removed(fits[case.name]),
-            }
-            for case in CASES
-        }
-    }
+def cases_report(fits: Mapping[str, CaseFit], calibrations: Mapping[str, Calibration]) -> CasesReport:
+    """Return the paper's cases and ours; both arguments are by the name of the case."""
+    cases = {case.name: _case_report(case, fits[case.name], calibrations[case.name]) for case in CASES}
+    return CasesReport(cases=cases)
 
 
-def _removed(found: CaseFit) -> list[dict[str, Any]]:
-    return [] if found.essential is None else [picked(step, "name", "std_percent") for step in found.essential.removed]
+def _case_report(case: Case, found: CaseFit, calibration: Calibration) -> CaseReport:
+    return with_calibration(
+        CaseReport,
+        calibration,
+        title=case.title,
+        known=case.known.value,
+        removed=_removed(found),
+    )
+
+
+def _removed(found: CaseFit) -> list[RemovedParameter]:
+    if found.essential is None:
+        return []
+    return [RemovedParameter(name=step.name, std_percent=step.std_percent) for step in found.essential.removed]
 
 
 def cases_view(fits: Mapping[str, CaseFit], tables: tuple[paper_tables.PaperTable, ...]) -> Iterator[RenderableType]:
@@ -193,6 +227,16 @@ def error_table(title: str, axes: tuple[str, ...], errors: Mapping[str, Relative
         if error is not None:
             table.add_row(name, *map(percent_text, (*error.axes, error.total)))
     return table
+
+
+def errors_of(error: RelativeError) -> Errors:
+    """Return relative errors for a document."""
+    return Errors(axes=list(error.axes), total=error.total)
+
+
+def errors_or_none(error: RelativeError | None) -> Errors | None:
+    """Return relative errors for a document; None where there are none."""
+    return None if error is None else errors_of(error)
 
 
 def error_document(error: RelativeError | None) -> dict[str, Any] | None:
@@ -269,19 +313,23 @@ def geometry_notes(check: GeometryCheck | None, axes: Sequence[str]) -> tuple[st
     return tuple(texts)
 
 
-def geometry_document(check: GeometryCheck | None, axes: Sequence[str]) -> dict[str, Any] | None:
-    """Build the part `geometry` of `fit --json`; None where nothing was tested."""
+def checked_geometry(check: GeometryCheck | None, axes: Sequence[str]) -> CheckedGeometry | None:
+    """Return what the torques say of the description of the robot; None where nothing was tested."""
     if check is None:
         return None
-    gravity = None
-    if check.gravity is not None:
-        gravity = {
-            "declared_m_s2": check.gravity.declared_m_s2.tolist(),
-            "found_m_s2": check.gravity.found_m_s2.tolist(),
-            "turn_deg": float(np.degrees(check.gravity.turn_rad)),
-            "turn_std_deg": float(np.degrees(check.gravity.turn_std_rad)),
-        }
-    return {"gravity": gravity, "hidden_zeros": [axes[axis] for axis in check.hidden_zeros]}
+    return CheckedGeometry(
+        gravity=None if check.gravity is None else _found_gravity(check.gravity),
+        hidden_zeros=[axes[axis] for axis in check.hidden_zeros],
+    )
+
+
+def _found_gravity(gravity: Gravity) -> FoundGravity:
+    return FoundGravity(
+        declared_m_s2=gravity.declared_m_s2.tolist(),
+        found_m_s2=gravity.found_m_s2.tolist(),
+        turn_deg=float(np.degrees(gravity.turn_rad)),
+        turn_std_deg=float(np.degrees(gravity.turn_std_rad)),
+    )
 
 
 def _mass_mistake(drawn: Sequence[str]) -> str:
@@ -323,9 +371,19 @@ def comparison_tables(comparison: EstimatorComparison, axes: tuple[str, ...]) ->
     return gains, spreads
 
 
-def _trial(trial: EstimatorTrial, axes: tuple[str, ...]) -> dict[str, Any]:
-    document = picked(trial, "estimator", "position_cutoff_hz", "decimation_cutoff_hz")
+def _trial(trial: EstimatorTrial, axes: tuple[str, ...]) -> Trial:
     if trial.gains is None or trial.std is None:
-        return {**document, "gains": None, "reason": trial.reason}
-    gains = _gains(axes, trial.gains, trial.std)
-    return {**document, "gains": gains, "relative_error_percent": trial.relative_error_percent}
+        return Trial(
+            estimator=trial.estimator,
+            position_cutoff_hz=trial.position_cutoff_hz,
+            decimation_cutoff_hz=trial.decimation_cutoff_hz,
+            gains=None,
+            reason=trial.reason,
+        )
+    return Trial(
+        estimator=trial.estimator,
+        position_cutoff_hz=trial.position_cutoff_hz,
+        decimation_cutoff_hz=trial.decimation_cutoff_hz,
+        gains=_gains(axes, trial.gains, trial.std),
+        relative_error_percent=trial.relative_error_percent,
+    )

@@ -12,7 +12,6 @@ from pydantic import Field
 from daq.documents.calibration_file import CalibrationBody
 from daq.report.document import Figure, Report
 from ident.calibration import PayloadMass
-from ident.errors import Diagnosis
 
 
 class Errors(Report):
@@ -57,19 +56,14 @@ class RemovedParameter(Report):
     std_percent: Figure
 
 
-class JudgedGain(Report):
-    """Verdict on how well data show a gain."""
+class GainWords(Report):
+    """Verdict on how well the data of a fit show a gain."""
 
     axis: str
+    std_percent: Figure
     verdict: str
     seen_by: list[str]
     words: str
-
-
-class GainWords(JudgedGain):
-    """Verdict on how well the data of a fit show a gain."""
-
-    std_percent: Figure
 
 
 class Trial(Report):
@@ -99,22 +93,28 @@ class CheckedGeometry(Report):
     hidden_zeros: list[str]
 
 
-class FitReport(Report, CalibrationBody):
+class FitReport(CalibrationBody, Report):
     """`fit`."""
 
     compared: dict[Literal["tls"], ComparedFit]
-    geometry: CheckedGeometry | None = None
-    torque_channel: tuple[OwnTorque, ...] = ()
+    geometry: CheckedGeometry | None
+    torque_channel: list[OwnTorque] = Field(default=[])
     removed: list[RemovedParameter]
     verdicts: list[GainWords]
-    comparison: tuple[Trial, ...] = ()
+    comparison: list[Trial] = Field(default=[])
 
 
-class CaseReport(Report, CalibrationBody):
-    """One case of the paper."""
+class CaseTitle(Report):
+    """Name of a case, and what it takes as known of the payload."""
 
     title: str
     known: str
+
+
+# The keys of the last base come first.
+class CaseReport(CalibrationBody, CaseTitle):
+    """One case of the paper."""
+
     removed: list[RemovedParameter]
 
 
@@ -228,19 +228,25 @@ class Coefficient(Report):
     unit: str
 
 
-class PlacedEffectEntry(Report):
-    """An effect on an axis."""
+class NamedEffect(Report):
+    """An effect, and the axis that it is on."""
 
     effect: str
     axis: str
     settings: dict[str, float]
+
+
+class PlacedEffectEntry(NamedEffect):
+    """An effect on an axis, with its size."""
+
     coefficients: list[Coefficient]
 
 
-class FindingEntry(PlacedEffectEntry):
+class FindingEntry(NamedEffect):
     """Result of testing one effect on one axis."""
 
     variable: str
+    coefficients: list[Coefficient]
     probability: Figure = Field(description="by noise alone; null where it rests on too few moves for a test")
     folds_better: float
     explained: Figure
@@ -268,12 +274,9 @@ class DetectionLimit(Report):
     unit: str
 
 
-class SplitNameEntry(Report):
+class SplitNameEntry(NamedEffect):
     """Name that splits of the data choose for what a turn added."""
 
-    effect: str
-    axis: str
-    settings: dict[str, float]
     splits: int
 
 
@@ -293,12 +296,9 @@ class TurnEntry(Report):
     detection_limits: list[DetectionLimit]
 
 
-class VerdictEntry(Report):
+class VerdictEntry(NamedEffect):
     """What held-out runs say of one effect."""
 
-    effect: str
-    axis: str
-    settings: dict[str, float]
     judgement: str
     reason: str
     written: bool
@@ -307,7 +307,7 @@ class VerdictEntry(Report):
     error_after_percent: Errors | None
 
 
-class ResidualReport(Report, CalibrationBody):
+class ResidualReport(CalibrationBody, Report):
     """`residual`, and the body of `residual.json`."""
 
     summary: list[str]
@@ -315,7 +315,7 @@ class ResidualReport(Report, CalibrationBody):
     metric: str
     noise_floor: NoiseFloor
     time_skew: Skew | None
-    time_skew_by_instruments: SkewByInstruments | None = None
+    time_skew_by_instruments: SkewByInstruments | None
     gear_loss: list[GearLossEntry]
     before: ModelErrors
     after: ModelErrors
@@ -323,6 +323,18 @@ class ResidualReport(Report, CalibrationBody):
     worse_holdout: bool | None
     verdicts: list[VerdictEntry]
     turns: list[TurnEntry]
+
+
+class ResidualFormat(Report):
+    """How `residual.json` begins."""
+
+    format: Literal["drivegain-residual"]
+    version: int
+
+
+# The keys of the last base come first.
+class ResidualFile(ResidualReport, ResidualFormat):
+    """`residual.json`."""
 
 
 class ValidatedLog(Report):
@@ -376,6 +388,18 @@ class CheckedPayload(Report):
     masses: dict[str, FoundMass]
 
 
+# Not the `Diagnosis` of `ident`: the name of a run is that of its file, which only a `Report` makes fit for JSON.
+class DiagnosisEntry(Report):
+    """Something wrong with a recording or a fit, and where to look."""
+
+    name: str
+    runs: list[str]
+    axes: list[str]
+    found: str
+    expected: str
+    remedy: str
+
+
 class ValidateReport(Report):
     """`validate`."""
 
@@ -383,11 +407,11 @@ class ValidateReport(Report):
     axes: list[str]
     filter: dict[str, int | float | list[float]]
     fit_relative_error_percent: Errors
-    payload_mass: tuple[PayloadMass, ...] = ()
+    payload_mass: list[PayloadMass]
     logs: list[ValidatedLog]
     together: Together | None
     calibrations: list[str]
-    diagnoses: list[Diagnosis]
+    diagnoses: list[DiagnosisEntry]
     runs: list[CheckedLog]
     payloads: list[CheckedPayload]
 

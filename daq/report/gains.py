@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from rich.table import Table
 
+from daq.report.fit_schemas import OwnTorque
 from daq.report.picture import BLUE, GREEN, GREY, legend_below, render, single
 from daq.report.text import SHOWN_SIGMAS, plain_table, terminal_text
 from daq.workflow.geometry_diagnoses import misfit_text
@@ -102,21 +102,22 @@ def torque_sentences(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]
         )
 
 
-def torque_document(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]) -> list[dict[str, Any]]:
-    """Return the same for --json; null for an axis whose torque shows no slope."""
-    return [
-        {"axis": gain.axis, "slope": None}
-        if slope is None
-        else {
-            "axis": gain.axis,
-            "slope": slope.value,
-            "std": slope.std,
-            "ratio": slope.value / gain.value,
-            "ratio_std": _ratio_std(slope, gain),
-            "readings": slope.readings,
-        }
-        for slope, gain in zip(slopes, gains, strict=True)
-    ]
+def own_torques(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]) -> list[OwnTorque]:
+    """Return the same for `fit --json`; null for an axis whose torque shows no slope."""
+    return [_own_torque(slope, gain) for slope, gain in zip(slopes, gains, strict=True)]
+
+
+def _own_torque(slope: TorqueSlope | None, gain: Gain) -> OwnTorque:
+    if slope is None:
+        return OwnTorque(axis=gain.axis, slope=None)
+    return OwnTorque(
+        axis=gain.axis,
+        slope=slope.value,
+        std=slope.std,
+        ratio=slope.value / gain.value,
+        ratio_std=_ratio_std(slope, gain),
+        readings=slope.readings,
+    )
 
 
 def _ratio_std(slope: TorqueSlope, gain: Gain) -> float:

@@ -7,29 +7,48 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 from rich.console import RenderableType
 from rich.table import Table
 
-from daq.documents.calibration_file import as_document
 from daq.report.effect_names import effect_text, size_text, variable_text
-from daq.report.fit import coefficients, error_document, error_table, identifiability_notes
+from daq.report.fit import coefficients, error_table, errors_of, errors_or_none, identifiability_notes, with_calibration
+from daq.report.fit_schemas import (
+    AsideEntry,
+    ChangedGain,
+    Coefficient,
+    DetectionLimit,
+    FindingEntry,
+    GearLossEntry,
+    LeftOutRun,
+    LeftOutRuns,
+    ModelErrors,
+    MotorNoise,
+    NoiseFloor,
+    PlacedEffectEntry,
+    ResidualReport,
+    Skew,
+    SkewByInstruments,
+    SplitNameEntry,
+    TurnEntry,
+    VerdictEntry,
+)
 from daq.report.gains import diagnosis_texts, gain_table, partial_note
-from daq.report.split_names import names_by_split
-from daq.report.text import Sentence, picked, plain_table
+from daq.report.split_names import SplitName, names_by_split
+from daq.report.text import Sentence, plain_table
 from daq.workflow.fit import Fit
 from ident.calibration import AcceptedEffect, Calibration
-from ident.discovery.before_after import Account, BeforeAfter, RelativeErrors
+from ident.discovery.before_after import Account, BeforeAfter, GainShift, RelativeErrors, RunError, RunErrors
 from ident.discovery.effect_verdict import EffectVerdict, Judgement
 from ident.discovery.gates import runs_to_leave_out
 from ident.discovery.gear_loss import CERTAIN, GearLoss, gear_losses, is_gear_loss
+from ident.discovery.joining import SetAside
 from ident.discovery.loop import MAX_EFFECTS, Step
-from ident.discovery.noise_floor import CONFIDENCE, FloorSource
+from ident.discovery.noise_floor import CONFIDENCE, FloorSource, MotorNoiseFloor
 from ident.discovery.search import Finding
 from ident.discovery.time_skew import CurrentDelay
 from ident.drift.change import FALSE_ALARM
-from ident.effects.effect import PlacedEffect
+from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.geometry_corrections import is_correction
 from ident.effects.signals import session_began_s
 from ident.effects.unnamed import is_unnamed
@@ -39,17 +58,6 @@ _SHOWN = 6  #: Findings listed for each turn; the JSON has them all
 _SHOWN_RIVALS = 3
 MUCH = 0.2  #: Share of the squared residual; a candidate that would explain it, and failed a check, is named
 SLIGHT = 0.1  #: Share of an error; an effect that lowers it by less is said to be small
-
-_OF_A_GEAR = (
-    "motoring_rows",
-    "motoring_torque",
-    "loss",
-    "loss_std",
-    "efficiency",
-    "gain_factor",
-    "hidden_shift",
-    "gain_carries_it",
-)
 
 ErrorRow = tuple[str, RelativeError]  #: Name of the error and of the data it is measured on, and the error [%]
 WHEN = ("before", "after")
@@ -411,15 +419,6 @@ def _unconfirmed_skew(skew: CurrentDelay | None) -> Iterator[str]:
         )
 
 
-def skew_document(skew: CurrentDelay | None) -> dict[str, Any]:
-    """Return the keys `time_skew`, null unless instruments confirm it, and `time_skew_by_instruments`."""
-    if skew is None:
-        return {"time_skew": None, "time_skew_by_instruments": None}
-    stated = {"seconds": skew.seconds, "std": skew.std} if skew.confirmed else None
-    figures = ("seconds", "std", "fit_seconds", "fit_std", "confirmed", "is_in_model")
-    return {"time_skew": stated, "time_skew_by_instruments": picked(skew, *figures)}
-
-
 def gear_sentences(fitted: Fit) -> list[str]:
     """Say which gains carry the efficiency of their gear, and what a loss in the model means for its gain."""
     if fitted.estimate.gains_fixed:
@@ -572,146 +571,213 @@ _METRIC = (
 )
 
 
-def residual_document(fitted: Fit, account: Account, calibration: Calibration) -> dict[str, Any]:
-    """Build the object of `residual --json`, which is also the body of `residual.json`."""
-    axes = fitted.cell.axis_names
-    return {
-        **as_document(calibration),
-        "summary": list(summary(fitted, account, calibration.effects)),
-        "axes": list(axes),
-        "metric": _METRIC,
-        "noise_floor": {
-            "motors": [
-                None
-                if floor is None
-                else {
-                    "axis": axis,
-                    "noise": floor.noise_a,
-                    "least": floor.least_a if floor.is_bound else None,
-                    "source": floor.source.value,
-                    "std_percent": floor.std_percent,
-                    "dwells": floor.parts if floor.source is FloorSource.STANDSTILL else None,
-                    "pairs": floor.parts if floor.source is FloorSource.REPEATED_MOVES else None,
-                    "degrees_of_freedom": floor.freedom,
-                    "left": left_a,
-                    "refuted": floor.is_refuted(left_a),
-                }
-                for axis, floor, left_a in zip(axes, account.floors, account.left_a.tolist(), strict=True)
-            ],
-            "relative_error_percent": error_document(account.floor),
-            "holdout_error_percent": error_document(account.holdout_floor),
-            "least_error_percent": error_document(account.least_floor),
-            "least_holdout_error_percent": error_document(account.least_holdout_floor),
-            "confidence": CONFIDENCE,
-        },
-        **skew_document(account.skew),
-        "gear_loss": [
-            {"axis": axis, **picked(gear, *_OF_A_GEAR)}
-            for axis, gear in zip(axes, gear_losses(fitted.steps[-1]), strict=True)
-        ],
-        **_before_after(fitted, account.total),
-        "worse_holdout": None if account.holdout_change is None else account.holdout_change.is_rise,
-        "verdicts": [_verdict(verdict, fitted.cell.place_names) for verdict in fitted.steps[-1].verdicts],
-        "turns": [_turn(fitted, step, turn) for step, turn in zip(fitted.steps, account.turns, strict=True)],
-    }
-
-
-def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> dict[str, Any]:
-    axes = fitted.cell.place_names
-    added, removed = ((), ()) if turn is None else (turn.added, turn.removed)
-    return {
-        "accepted": None if step.accepted is None else _finding(step.accepted, axes),
-        "added": [
-            {
-                **_placed(placed, axes),
-                "coefficients": [
-                    picked(one, "name", "value", "std", "unit") for one in coefficients(step.after, placed)
-                ],
-            }
-            for placed in added
-        ],
-        "removed": [placed.name_among(axes) for placed in removed],
-        "names_by_split": [{**_placed(name.placed, axes), "splits": name.splits} for name in names_by_split(step)],
-        **(dict.fromkeys(("before", "after", "gain_changes")) if turn is None else _before_after(fitted, turn)),
-        "findings": [_finding(finding, axes) for finding in step.findings],
-        "structures": [_finding(finding, axes) for finding in step.structures],
-        "set_aside": [{**_finding(aside.finding, axes), "reason": aside.reason(axes)} for aside in step.set_aside],
-        "detection_limits": [
-            {"axis": axis.name, "rms": float(limit), "unit": axis.unit.force}
-            for axis, limit in zip(fitted.cell.axes, step.limits_nm, strict=True)
-        ],
-    }
-
-
-def _before_after(fitted: Fit, compared: BeforeAfter) -> dict[str, Any]:
-    figures = (
-        "before",
-        "before_std",
-        "after",
-        "after_std",
-        "choice_std",
-        "change_percent",
-        "change_std_percent",
-        "significant",
+def residual_report(fitted: Fit, account: Account, calibration: Calibration) -> ResidualReport:
+    """Return the closed loop: the calibration, the errors before and after, and every turn of the search."""
+    axes, last = fitted.cell.axis_names, fitted.steps[-1]
+    return with_calibration(
+        ResidualReport,
+        calibration,
+        summary=list(summary(fitted, account, calibration.effects)),
+        axes=list(axes),
+        metric=_METRIC,
+        noise_floor=_noise_floor(account, axes),
+        time_skew=_stated_skew(account.skew),
+        time_skew_by_instruments=_skew_by_instruments(account.skew),
+        gear_loss=[_gear_loss(axis, gear) for axis, gear in zip(axes, gear_losses(last), strict=True)],
+        before=_model_errors(account.total.before),
+        after=_model_errors(account.total.after),
+        gain_changes=_changed_gains(fitted, account.total),
+        worse_holdout=None if account.holdout_change is None else account.holdout_change.is_rise,
+        verdicts=[_verdict(verdict, fitted.cell.place_names) for verdict in last.verdicts],
+        turns=[_turn(fitted, step, turn) for step, turn in zip(fitted.steps, account.turns, strict=True)],
     )
-    return {
-        "before": _errors(compared.before),
-        "after": _errors(compared.after),
-        "gain_changes": [
-            {"axis": axis.name, "unit": axis.gain_unit, **picked(change, *figures)}
-            for axis, change in zip(fitted.cell.axes, compared.gains, strict=True)
+
+
+def _noise_floor(account: Account, axes: tuple[str, ...]) -> NoiseFloor:
+    floors = zip(axes, account.floors, account.left_a.tolist(), strict=True)
+    return NoiseFloor(
+        motors=[None if floor is None else _motor_noise(axis, floor, left_a) for axis, floor, left_a in floors],
+        relative_error_percent=errors_of(account.floor),
+        holdout_error_percent=errors_or_none(account.holdout_floor),
+        least_error_percent=errors_of(account.least_floor),
+        least_holdout_error_percent=errors_or_none(account.least_holdout_floor),
+        confidence=CONFIDENCE,
+    )
+
+
+def _motor_noise(axis: str, floor: MotorNoiseFloor, left_a: float) -> MotorNoise:
+    return MotorNoise(
+        axis=axis,
+        noise=floor.noise_a,
+        least=floor.least_a if floor.is_bound else None,
+        source=floor.source.value,
+        std_percent=floor.std_percent,
+        dwells=floor.parts if floor.source is FloorSource.STANDSTILL else None,
+        pairs=floor.parts if floor.source is FloorSource.REPEATED_MOVES else None,
+        degrees_of_freedom=floor.freedom,
+        left=left_a,
+        refuted=floor.is_refuted(left_a),
+    )
+
+
+def _stated_skew(skew: CurrentDelay | None) -> Skew | None:
+    """Return a time skew that instruments confirm; None for any other."""
+    if skew is None or not skew.confirmed:
+        return None
+    return Skew(seconds=skew.seconds, std=skew.std)
+
+
+def _skew_by_instruments(skew: CurrentDelay | None) -> SkewByInstruments | None:
+    if skew is None:
+        return None
+    return SkewByInstruments(
+        seconds=skew.seconds,
+        std=skew.std,
+        fit_seconds=skew.fit_seconds,
+        fit_std=skew.fit_std,
+        confirmed=skew.confirmed,
+        is_in_model=skew.is_in_model,
+    )
+
+
+def _gear_loss(axis: str, gear: GearLoss) -> GearLossEntry:
+    return GearLossEntry(
+        axis=axis,
+        motoring_rows=gear.motoring_rows,
+        motoring_torque=gear.motoring_torque,
+        loss=gear.loss,
+        loss_std=gear.loss_std,
+        efficiency=gear.efficiency,
+        gain_factor=gear.gain_factor,
+        hidden_shift=gear.hidden_shift,
+        gain_carries_it=gear.gain_carries_it,
+    )
+
+
+def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> TurnEntry:
+    axes = fitted.cell.place_names
+    limits = zip(fitted.cell.axes, step.limits_nm, strict=True)
+    return TurnEntry(
+        accepted=None if step.accepted is None else _finding(step.accepted, axes),
+        added=[] if turn is None else [_added(step, placed, axes) for placed in turn.added],
+        removed=[] if turn is None else [placed.name_among(axes) for placed in turn.removed],
+        names_by_split=[_split_name(name, axes) for name in names_by_split(step)],
+        before=None if turn is None else _model_errors(turn.before),
+        after=None if turn is None else _model_errors(turn.after),
+        gain_changes=None if turn is None else _changed_gains(fitted, turn),
+        findings=[_finding(finding, axes) for finding in step.findings],
+        structures=[_finding(finding, axes) for finding in step.structures],
+        set_aside=[_aside(aside, axes) for aside in step.set_aside],
+        detection_limits=[
+            DetectionLimit(axis=axis.name, rms=float(limit), unit=axis.unit.force) for axis, limit in limits
         ],
-    }
+    )
 
 
-def _errors(errors: RelativeErrors) -> dict[str, Any]:
-    left_out = errors.left_out_runs
-    return {
-        "relative_error_percent": error_document(errors.in_sample),
-        "cross_validated_error_percent": error_document(errors.cross_validated),
-        "left_out_runs": None
-        if left_out is None
-        else {
-            "error_percent": error_document(left_out.together),
-            "runs": [
-                {"run": run.run, "error_percent": error_document(run.error), "reason": run.reason or None}
-                for run in left_out.runs
-            ],
-        },
-        "holdout_error_percent": error_document(errors.holdout),
-    }
+def _changed_gains(fitted: Fit, compared: BeforeAfter) -> list[ChangedGain]:
+    changes = zip(fitted.cell.axes, compared.gains, strict=True)
+    return [_changed_gain(axis.name, axis.gain_unit, change) for axis, change in changes]
 
 
-def _verdict(verdict: EffectVerdict, axes: tuple[str, ...]) -> dict[str, Any]:
-    return {
-        **_placed(verdict.placed, axes),
-        "judgement": verdict.judgement.value,
-        "reason": verdict.reason,
-        "written": verdict.written,
-        "blocks": verdict.change.total.moves,
-        "error_before_percent": error_document(verdict.before),
-        "error_after_percent": error_document(verdict.after),
-    }
+def _changed_gain(axis: str, unit: str, change: GainShift) -> ChangedGain:
+    return ChangedGain(
+        axis=axis,
+        unit=unit,
+        before=change.before,
+        before_std=change.before_std,
+        after=change.after,
+        after_std=change.after_std,
+        choice_std=change.choice_std,
+        change_percent=change.change_percent,
+        change_std_percent=change.change_std_percent,
+        significant=change.significant,
+    )
 
 
-def _placed(placed: PlacedEffect | Finding, axes: tuple[str, ...]) -> dict[str, Any]:
-    settings = {name: float(value) for name, value in placed.effect.settings.items()}
-    place = PlacedEffect(placed.effect, placed.axis)
-    return {"effect": placed.effect.name, "axis": place.axis_name(axes), "settings": settings}
+def _model_errors(errors: RelativeErrors) -> ModelErrors:
+    return ModelErrors(
+        relative_error_percent=errors_of(errors.in_sample),
+        cross_validated_error_percent=errors_of(errors.cross_validated),
+        left_out_runs=None if errors.left_out_runs is None else _left_out_runs(errors.left_out_runs),
+        holdout_error_percent=errors_or_none(errors.holdout),
+    )
 
 
-def _finding(finding: Finding, axes: tuple[str, ...]) -> dict[str, Any]:
-    names = ("probability", "folds_better", "explained", "error_before_percent", "error_after_percent", "error_fall")
-    values = zip(finding.effect.coefficients, finding.coefficients, finding.deviations, strict=True)
-    return {
-        **_placed(finding, axes),
-        "variable": finding.effect.abscissa.value,
-        "coefficients": [
-            {"name": column.name, "value": float(value), "std": float(std), "unit": column.unit}
-            for column, value, std in values
+def _left_out_runs(left_out: RunErrors) -> LeftOutRuns:
+    return LeftOutRuns(
+        error_percent=errors_or_none(left_out.together),
+        runs=[_left_out_run(run) for run in left_out.runs],
+    )
+
+
+def _left_out_run(run: RunError) -> LeftOutRun:
+    return LeftOutRun(run=run.run, error_percent=errors_or_none(run.error), reason=run.reason or None)
+
+
+def _verdict(verdict: EffectVerdict, axes: tuple[str, ...]) -> VerdictEntry:
+    return VerdictEntry(
+        effect=verdict.placed.effect.name,
+        axis=verdict.placed.axis_name(axes),
+        settings=_settings(verdict.placed.effect),
+        judgement=verdict.judgement.value,
+        reason=verdict.reason,
+        written=verdict.written,
+        blocks=verdict.change.total.moves,
+        error_before_percent=errors_of(verdict.before),
+        error_after_percent=errors_of(verdict.after),
+    )
+
+
+def _settings(effect: Effect) -> dict[str, float]:
+    return {name: float(value) for name, value in effect.settings.items()}
+
+
+def _added(step: Step, placed: PlacedEffect, axes: tuple[str, ...]) -> PlacedEffectEntry:
+    return PlacedEffectEntry(
+        effect=placed.effect.name,
+        axis=placed.axis_name(axes),
+        settings=_settings(placed.effect),
+        coefficients=[
+            Coefficient(name=one.name, value=one.value, std=one.std, unit=one.unit)
+            for one in coefficients(step.after, placed)
         ],
-        **picked(finding, *names, "held_out_fall", "passed", "share_of_excess"),
-        "refusals": list(finding.refusals),
+    )
+
+
+def _split_name(name: SplitName, axes: tuple[str, ...]) -> SplitNameEntry:
+    return SplitNameEntry(
+        effect=name.placed.effect.name,
+        axis=name.placed.axis_name(axes),
+        settings=_settings(name.placed.effect),
+        splits=name.splits,
+    )
+
+
+def _finding(finding: Finding, axes: tuple[str, ...]) -> FindingEntry:
+    sizes = zip(finding.effect.coefficients, finding.coefficients, finding.deviations, strict=True)
+    return FindingEntry(
+        effect=finding.effect.name,
+        axis=PlacedEffect(finding.effect, finding.axis).axis_name(axes),
+        settings=_settings(finding.effect),
+        variable=finding.effect.abscissa.value,
+        coefficients=[
+            Coefficient(name=column.name, value=float(value), std=float(std), unit=column.unit)
+            for column, value, std in sizes
+        ],
+        probability=finding.probability,
+        folds_better=finding.folds_better,
+        explained=finding.explained,
+        error_before_percent=finding.error_before_percent,
+        error_after_percent=finding.error_after_percent,
+        error_fall=finding.error_fall,
+        held_out_fall=finding.held_out_fall,
+        passed=finding.passed,
+        share_of_excess=finding.share_of_excess,
+        refusals=list(finding.refusals),
         # For findings that failed a gate it would be most of the file and of no use.
-        "ambiguity": [rival.name_among(axes) for rival in finding.ambiguity] if finding.passed else None,
-    }
+        ambiguity=[rival.name_among(axes) for rival in finding.ambiguity] if finding.passed else None,
+    )
+
+
+def _aside(aside: SetAside, axes: tuple[str, ...]) -> AsideEntry:
+    return AsideEntry(**dict(_finding(aside.finding, axes)), reason=aside.reason(axes))

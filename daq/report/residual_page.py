@@ -10,8 +10,10 @@ from daq.errors import writing
 from daq.files import replace_file
 from daq.report.certificate import Comparison, certify, without_controller
 from daq.report.certificate_page import certificate_page
+from daq.report.document import json_text
 from daq.report.effect_names import effect_text, variable_text
 from daq.report.fit import coefficients, identifiability_notes, start_of
+from daq.report.fit_schemas import ResidualFile
 from daq.report.gains import with_deviation
 from daq.report.html import MARK, figure, folded, html_list, pair, paragraph, table
 from daq.report.plots import draw_effect, draw_torques, drawn_axis, plot_ranking
@@ -25,13 +27,13 @@ from daq.report.residual import (
     effect_sizes,
     error_rows,
     gains_sentence,
-    residual_document,
+    residual_report,
     searched_steps,
     summary,
     turn_sentences,
 )
 from daq.report.svg import Interval, intervals
-from daq.report.text import json_text, percent_text
+from daq.report.text import percent_text
 from daq.workflow.fit import Fit
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account, BeforeAfter
@@ -56,11 +58,17 @@ def save_report(
     Raises:
         OutputFailed: the file system refuses.
     """
-    document = {"format": FORMAT, "version": VERSION, **residual_document(fitted, account, calibration)}
+    document = _residual_file(fitted, account, calibration)
     content = {PAGE: residual_page(fitted, account, calibration, comparison), DOCUMENT: json_text(document)}
     with writing(folder):
         for name, text in content.items():
             replace_file(folder / name, text.encode())
+
+
+def _residual_file(fitted: Fit, account: Account, calibration: Calibration) -> ResidualFile:
+    body = residual_report(fitted, account, calibration)
+    # Not strictly: a document that is made takes every sequence for a list, and a calibration has tuples.
+    return ResidualFile.model_validate({"format": FORMAT, "version": VERSION, **dict(body)}, strict=False)
 
 
 def beside_nameplate(fitted: Fit, calibration: Calibration) -> Comparison:

@@ -4,24 +4,32 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import RenderableType
 
 from daq.files import replace_file
 from daq.report import paper_tables
-from daq.report.fit import error_document
+from daq.report.fit import errors_of
+from daq.report.fit_schemas import (
+    CheckedLog,
+    CheckedPayload,
+    DiagnosisEntry,
+    FoundMass,
+    Together,
+    ValidatedLog,
+    ValidateReport,
+)
 from daq.report.gains import diagnosis_texts
 from daq.report.plots import plot_torques
 from daq.report.svg import sheet
-from daq.report.text import Sentence, percent_text, picked, plain_table, terminal_text
+from daq.report.text import Sentence, percent_text, plain_table, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
-from daq.workflow.validate import CrossValidation, WeighedRun, conditioning_of, together
+from daq.workflow.validate import CheckedRun, CrossValidation, Mass, WeighedRun, conditioning_of, together
 from daq.workflow.validation import DataUse, Validation
 from ident.calibration import Calibration
+from ident.errors import Diagnosis
 
 
 def validation_view(calibration: Calibration, found: CrossValidation) -> Iterator[RenderableType]:
@@ -98,63 +106,82 @@ def draw_validations(calibration: Calibration, validations: tuple[Validation, ..
     return pictures
 
 
-def validation_document(
-    calibration: Calibration, validations: tuple[Validation, ...], drawn: dict[Path, Path]
-) -> dict[str, Any]:
-    """Build the relative errors of `validate --json`; pictures by log."""
-    return {
-        "cell": calibration.cell,
-        "axes": [gain.axis for gain in calibration.gains],
-        "filter": calibration.filter,
-        "fit_relative_error_percent": error_document(calibration.relative_error_percent),
-        "payload_mass": [asdict(one) for one in calibration.payload_mass],
-        "logs": [
-            {
-                "log": str(validation.log),
-                "sha256": validation.digest,
-                "seen_by_fit": validation.data_use is DataUse.FIT,
-                "partial": validation.partial,
-                "held_out": validation.data_use is DataUse.HOLDOUT,
-                **picked(validation, "same_configuration", "rows"),
-                "relative_error_percent": error_document(validation.error),
-                "picture": str(drawn[validation.log]) if validation.log in drawn else None,
-            }
-            for validation in validations
-        ],
-        "together": {"relative_error_percent": error_document(together(validations))} if validations else None,
-    }
+def validate_report(calibration: Calibration, found: CrossValidation, drawn: dict[Path, Path]) -> ValidateReport:
+    """Return the relative errors of a calibration, and what Tables 5 to 8 show of all calibrations.
+
+    Args:
+        calibration: the one to validate.
+        found: by it, and by those beside it.
+        drawn: pictures by log.
+    """
+    validations = found.validations
+    return ValidateReport(
+        cell=calibration.cell,
+        axes=[gain.axis for gain in calibration.gains],
+        filter=calibration.filter,
+        fit_relative_error_percent=errors_of(calibration.relative_error_percent),
+        payload_mass=list(calibration.payload_mass),
+        logs=[_validated_log(validation, drawn.get(validation.log)) for validation in validations],
+        together=Together(relative_error_percent=errors_of(together(validations))) if validations else None,
+        calibrations=list(found.calibrations),
+        diagnoses=[_diagnosis(one) for one in found.diagnoses],
+        runs=[_checked_log(run) for run in found.runs],
+        payloads=[_checked_payload(run, with_bare_runs=found.with_bare_runs) for run in found.weighed],
+    )
 
 
-def cross_document(found: CrossValidation) -> dict[str, Any]:
-    """Build the part of `validate --json` that Tables 5 to 8 show."""
-    return {
-        "calibrations": list(found.calibrations),
-        "diagnoses": [asdict(one) for one in found.diagnoses],
-        "runs": [
-            {
-                "log": str(run.log),
-                "condition": run.condition,
-                "relative_error_percent": {label: error_document(error) for label, error in run.errors.items()},
-                "left_out": run.left_out or None,
-                "seen_by": list(run.seen_by),
-            }
-            for run in found.runs
-        ],
-        "payloads": [_weighed(run, found) for run in found.weighed],
-    }
+def _validated_log(validation: Validation, picture: Path | None) -> ValidatedLog:
+    return ValidatedLog(
+        log=str(validation.log),
+        sha256=validation.digest,
+        seen_by_fit=validation.data_use is DataUse.FIT,
+        partial=validation.partial,
+        held_out=validation.data_use is DataUse.HOLDOUT,
+        same_configuration=validation.same_configuration,
+        rows=validation.rows,
+        relative_error_percent=errors_of(validation.error),
+        picture=None if picture is None else str(picture),
+    )
 
 
-def _weighed(run: WeighedRun, found: CrossValidation) -> dict[str, Any]:
-    return {
-        "log": str(run.log),
-        "payload": run.payload.name,
-        "mounting": run.payload.mounting,
-        "weighed_kg": run.weighed_kg,
-        "with_bare_runs": found.with_bare_runs,
-        "masses": {
-            label: {"reason": mass}
-            if isinstance(mass, str)
-            else picked(mass, "mass_kg", "std_percent", "std_with_gains_percent", "error_percent")
-            for label, mass in run.masses.items()
-        },
-    }
+def _diagnosis(one: Diagnosis) -> DiagnosisEntry:
+    return DiagnosisEntry(
+        name=one.name,
+        runs=list(one.runs),
+        axes=list(one.axes),
+        found=one.found,
+        expected=one.expected,
+        remedy=one.remedy,
+    )
+
+
+def _checked_log(run: CheckedRun) -> CheckedLog:
+    return CheckedLog(
+        log=str(run.log),
+        condition=run.condition,
+        relative_error_percent={label: errors_of(error) for label, error in run.errors.items()},
+        left_out=run.left_out or None,
+        seen_by=list(run.seen_by),
+    )
+
+
+def _checked_payload(run: WeighedRun, *, with_bare_runs: bool) -> CheckedPayload:
+    return CheckedPayload(
+        log=str(run.log),
+        payload=run.payload.name,
+        mounting=run.payload.mounting,
+        weighed_kg=run.weighed_kg,
+        with_bare_runs=with_bare_runs,
+        masses={label: _found_mass(mass) for label, mass in run.masses.items()},
+    )
+
+
+def _found_mass(mass: Mass | str) -> FoundMass:
+    if isinstance(mass, str):
+        return FoundMass(reason=mass)
+    return FoundMass(
+        mass_kg=mass.mass_kg,
+        std_percent=mass.std_percent,
+        std_with_gains_percent=mass.std_with_gains_percent,
+        error_percent=mass.error_percent,
+    )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import RenderableType
@@ -13,17 +12,29 @@ from rich.text import Text
 
 from daq.config.cell import Cell, robot_of
 from daq.files import replace_file
-from daq.report.fit import error_document
+from daq.report.fit import errors_of
+from daq.report.fit_schemas import (
+    AddedMoves,
+    ContactAxis,
+    ContactEntry,
+    ContactReport,
+    NotJudged,
+    WeighedParameter,
+    WeighedValue,
+    WeighedValues,
+    WeighReport,
+)
 from daq.report.gains import with_deviation
 from daq.report.picture import BLACK, ORANGE, SKY, legend_below, panels, render, unformatted
-from daq.report.text import picked, plain_table, terminal_text
+from daq.report.text import plain_table, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
 from daq.workflow.weigh import Weighed
-from ident.contact import ExternalTorque
+from ident.arrays import FloatArray
+from ident.contact import Contact, ExternalTorque
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, pseudo_inertia
 from ident.model.robot import Place
 from ident.model.urdf import read_urdf
-from ident.weighing import KNOWN, WeighedBody
+from ident.weighing import KNOWN, Help, WeighedBody
 
 LISTED = 20  #: Contacts shown in a terminal; `--json` has all
 NOISE_ROWS = 4.0
@@ -125,39 +136,50 @@ def _platform(cell: Cell) -> tuple[str, Place] | None:
     return None if same else (cell.chain.platform, frame)
 
 
-def weighed_document(found: Weighed) -> dict[str, Any]:
-    """Build `weigh --json`."""
-    body, advice = found.body, {one.name: one for one in found.help}
-    moves_std, platform = np.sqrt(np.diag(body.moves_covariance)), _platform(found.cell)
-    return {
-        "cell": found.cell.name,
-        "logs": [str(log) for log in found.logs],
-        "bare": [str(log) for log in found.bare],
-        "part_of_the_fit": list(found.fitted),
-        "declared_kg": found.declared_kg,
-        "mass_kg": {"value": body.mass_kg, "std": body.mass_std_kg},
-        "centre_m": _pair(*body.centre_m),
-        "centre_in_platform_m": None if platform is None else _pair(*body.centre_in(platform[1])),
-        "inertia_about_centre_kg_m2": _pair(*body.inertia_kg_m2),
-        "parameters": [
-            {
-                "name": name,
-                "unit": unit,
-                "value": float(body.values[index]),
-                "std": float(body.std[index]),
-                "std_of_moves": float(moves_std[index]),
-                "identifiable": bool(body.identifiable[index]),
-                "add": picked(advice[name], "words", "seconds", "std") if name in advice else None,
-            }
-            for index, (name, unit) in enumerate(zip(LINK_PARAMETERS, LINK_UNITS, strict=True))
-        ],
-        "relative_error_percent": error_document(body.error),
-        **picked(body, "moves", "complete"),
-    }
+def weigh_report(found: Weighed) -> WeighReport:
+    """Return a body: mass, centre, inertia, and its ten parameters with the moves that would show them."""
+    body, platform = found.body, _platform(found.cell)
+    return WeighReport(
+        cell=found.cell.name,
+        logs=[str(log) for log in found.logs],
+        bare=[str(log) for log in found.bare],
+        part_of_the_fit=list(found.fitted),
+        declared_kg=found.declared_kg,
+        mass_kg=WeighedValue(value=body.mass_kg, std=body.mass_std_kg),
+        centre_m=_weighed_values(*body.centre_m),
+        centre_in_platform_m=None if platform is None else _weighed_values(*body.centre_in(platform[1])),
+        inertia_about_centre_kg_m2=_weighed_values(*body.inertia_kg_m2),
+        parameters=_weighed_parameters(found),
+        relative_error_percent=errors_of(body.error),
+        moves=body.moves,
+        complete=body.complete,
+    )
 
 
-def _pair(value: Any, std: Any) -> dict[str, Any]:
-    return {"value": value.tolist(), "std": std.tolist()}
+def _weighed_values(value: FloatArray, std: FloatArray) -> WeighedValues:
+    return WeighedValues(value=value.tolist(), std=std.tolist())
+
+
+def _weighed_parameters(found: Weighed) -> list[WeighedParameter]:
+    body = found.body
+    moves_std = np.sqrt(np.diag(body.moves_covariance))
+    moves = {one.name: _added_moves(one) for one in found.help}
+    return [
+        WeighedParameter(
+            name=name,
+            unit=unit,
+            value=float(body.values[index]),
+            std=float(body.std[index]),
+            std_of_moves=float(moves_std[index]),
+            identifiable=bool(body.identifiable[index]),
+            add=moves.get(name),
+        )
+        for index, (name, unit) in enumerate(zip(LINK_PARAMETERS, LINK_UNITS, strict=True))
+    ]
+
+
+def _added_moves(moves: Help) -> AddedMoves:
+    return AddedMoves(words=moves.words, seconds=moves.seconds, std=moves.std)
 
 
 def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
@@ -214,42 +236,48 @@ def not_judged(found: ExternalTorque, cell: Cell) -> dict[str, str]:
     return reasons
 
 
-def contact_document(found: ExternalTorque, cell: Cell, log: Path, picture: Path | None) -> dict[str, Any]:
-    """Build `contact --json`."""
-    band = found.band
-    return {
-        "cell": cell.name,
-        "log": str(log),
-        "band_from_this_log": found.from_itself,
-        "stretches_left_out": found.left_out,
-        "alarms_per_hour": band.alarms_per_hour,
-        "axes": [
-            {
-                "axis": axis.name,
-                "unit": axis.unit.force,
-                "scale": band.scale[index].tolist(),
-                "band_over_scale": float(band.factor[index]),
-                "threshold_over_scale": float(band.threshold[index]),
-                "correlation_s": float(band.correlation_s[index]),
-                "quiet_s": float(band.quiet_s[index]),
-                "band": figures[0],
-                "threshold": figures[1],
-                "largest": figures[2],
-            }
-            for index, (axis, figures) in enumerate(zip(cell.axes, _figures(found), strict=True))
-        ],
-        "contacts": [
-            {
-                "axis": cell.axes[one.axis].name,
-                **picked(one, "start_s", "end_s"),
-                "peak": one.peak_nm,
-                "peak_over_threshold": one.peak_over_threshold,
-            }
-            for one in found.contacts
-        ],
-        "not_judged": [{"axis": axis, "reason": reason} for axis, reason in not_judged(found, cell).items()],
-        "picture": None if picture is None else str(picture),
-    }
+def contact_report(found: ExternalTorque, cell: Cell, log: Path, picture: Path | None) -> ContactReport:
+    """Return band and threshold of each axis, and the contacts."""
+    return ContactReport(
+        cell=cell.name,
+        log=str(log),
+        band_from_this_log=found.from_itself,
+        stretches_left_out=found.left_out,
+        alarms_per_hour=found.band.alarms_per_hour,
+        axes=_contact_axes(found, cell),
+        contacts=[_contact_entry(cell.axes[one.axis].name, one) for one in found.contacts],
+        not_judged=[NotJudged(axis=axis, reason=reason) for axis, reason in not_judged(found, cell).items()],
+        picture=None if picture is None else str(picture),
+    )
+
+
+def _contact_axes(found: ExternalTorque, cell: Cell) -> list[ContactAxis]:
+    learned = found.band
+    return [
+        ContactAxis(
+            axis=axis.name,
+            unit=axis.unit.force,
+            scale=learned.scale[index].tolist(),
+            band_over_scale=float(learned.factor[index]),
+            threshold_over_scale=float(learned.threshold[index]),
+            correlation_s=float(learned.correlation_s[index]),
+            quiet_s=float(learned.quiet_s[index]),
+            band=band,
+            threshold=threshold,
+            largest=largest,
+        )
+        for index, (axis, (band, threshold, largest)) in enumerate(zip(cell.axes, _figures(found), strict=True))
+    ]
+
+
+def _contact_entry(axis: str, contact: Contact) -> ContactEntry:
+    return ContactEntry(
+        axis=axis,
+        start_s=contact.start_s,
+        end_s=contact.end_s,
+        peak=contact.peak_nm,
+        peak_over_threshold=contact.peak_over_threshold,
+    )
 
 
 def _figures(found: ExternalTorque) -> Iterator[tuple[float, float, float]]:

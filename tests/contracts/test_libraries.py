@@ -70,7 +70,6 @@ SAME_NAME = {
     "decode": "still to do: `drivers` publishes that of a statusword; that of `daq.ledger.audit` is an entry's",
     "EffectModel": "still to do: names of published schemas; that of a cell and of a simulated cell",
     "Fitted": "still to do: `daq.documents.session_state` and `daq.jobs.cell_fit`",
-    "JudgedGain": "still to do: `daq.documents.session_state` and `daq.report.fit_schemas`",
     "Refusal": "still to do: `daq.writeback.gates.gate` and `drivers.stream.monitor`",
     "Stamps": "still to do: `daq.log.table` and `daq.report.schemas`",
     "Target": "still to do: `daq.documents.session_state` and `daq.writeback.target`",

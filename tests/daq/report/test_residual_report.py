@@ -24,10 +24,11 @@ from rich.table import Table
 from daq.cli.app import main
 from daq.cli.fit import check_report
 from daq.config.cell_file import load_cell
-from daq.documents.calibration_file import load_calibration, save_calibration
+from daq.documents.calibration_file import as_document, load_calibration, save_calibration
 from daq.environment import shipped_configurations
 from daq.errors import EffectsRefuted, ExitCode, OutputFailed, UsageError
 from daq.report import residual_page as residual_page_module
+from daq.report.document import json_text
 from daq.report.effect_names import WORDS, effect_text, named_size, other_axis
 from daq.report.fit_schemas import ResidualReport
 from daq.report.html import html_page, paragraph, table
@@ -37,14 +38,14 @@ from daq.report.residual import (
     candidate_rows,
     error_change_text,
     headline,
-    residual_document,
+    residual_report,
     residual_view,
     statistical_sentences,
     summary,
     turns_view,
 )
 from daq.report.residual_page import DOCUMENT, PAGE, residual_page, save_report
-from daq.report.text import Sentence, json_text
+from daq.report.text import Sentence
 from daq.workflow import fit as fit_module
 from daq.workflow.fit import Fit, calibration_of, fit
 from ident.calibration import AcceptedEffect, Calibration, Parameter
@@ -107,9 +108,11 @@ class Closed:
         return residual_page(self.fitted, self.account, calibration_of(self.fitted, CREATED))
 
     def document(self) -> dict[str, Any]:
-        made = residual_document(self.fitted, self.account, calibration_of(self.fitted, CREATED))
-        document: dict[str, Any] = json.loads(json_text(made))
+        document: dict[str, Any] = json.loads(json_text(self.report()))
         return document
+
+    def report(self) -> ResidualReport:
+        return residual_report(self.fitted, self.account, calibration_of(self.fitted, CREATED))
 
 
 @pytest.fixture(scope="module")
@@ -354,7 +357,14 @@ def test_the_document_is_complete_and_described(closed: Closed, checkout: Path) 
         assert f"`{key}`" in described, key
     assert document["filter"]["position_cutoff_hz"] == closed.fitted.cell.conditioning.position_cutoff_hz
     assert set(document["before"]) == set(document["after"]) == set(turn["before"])
-    ResidualReport.model_validate_json(json_text(document))
+    assert ResidualReport.model_validate_json(json_text(closed.report()), strict=False) == closed.report()
+
+
+def test_the_document_has_the_calibration_as_its_file_has_it(closed: Closed) -> None:
+    calibration = as_document(calibration_of(closed.fitted, CREATED))
+    document = closed.document()
+    assert list(document)[: len(calibration)] == list(calibration)
+    assert json.dumps({key: document[key] for key in calibration}) == json.dumps(calibration)
 
 
 def test_what_to_check_comes_first(closed: Closed) -> None:
@@ -406,7 +416,6 @@ def test_a_time_skew_is_stated_only_where_instruments_confirm_it(closed: Closed)
         assert (tested is None) == (skew is None)
         if skew is not None:
             assert tested == asdict(skew)
-        ResidualReport.model_validate_json(json_text(document))
     unknown, unconfirmed = (
         statistical_sentences(closed.fitted, replace(closed.account, skew=skew)) for skew in (None, biased)
     )
@@ -516,12 +525,12 @@ def test_the_dependence_on_the_mass_is_in_the_documents_and_in_a_sentence(closed
     payloads = tuple(replace(one, mass_tolerance_kg=0.0459) for one in closed.fitted.cell.payloads)
     weighed = replace(closed.fitted, cell=replace(closed.fitted.cell, payloads=payloads))
     calibration = calibration_of(weighed, CREATED)
-    (document,) = residual_document(weighed, closed.account, calibration)["payload_mass"]
-    assert document["tolerance_kg"] == 0.0459
-    for one, gain in zip(document["gains"], calibration.gains, strict=True):
-        assert one["percent_per_percent"] == pytest.approx(1.0, abs=0.01)
-        assert one["per_kg"] == pytest.approx(gain.value / document["mass_kg"], rel=0.01)
-        assert one["tolerance_std"] == pytest.approx(abs(one["per_kg"]) * 0.0459)
+    (payload,) = residual_report(weighed, closed.account, calibration).payload_mass
+    assert payload.tolerance_kg == 0.0459
+    for one, gain in zip(payload.gains, calibration.gains, strict=True):
+        assert one.percent_per_percent == pytest.approx(1.0, abs=0.01)
+        assert one.per_kg == pytest.approx(gain.value / payload.mass_kg, rel=0.01)
+        assert one.tolerance_std == pytest.approx(abs(one.per_kg) * 0.0459)
     verbose = residual_view(weighed, closed.account, calibration, verbose=True)
     sentences = [part.text for part in verbose if isinstance(part, Sentence)]
     assert any("which is ± 1 % of every gain, not in σ" in one for one in sentences)
@@ -611,8 +620,8 @@ def test_a_candidate_that_was_not_tested_has_no_probability(closed: Closed) -> N
     assert next(candidate_rows(asked, step, 1))[2] == "–"
     (sentence,) = (one for one in summary(asked, closed.account, ()) if why in one)
     assert "p =" not in sentence
-    document = residual_document(asked, closed.account, calibration_of(closed.fitted, CREATED))
-    assert document["turns"][-1]["findings"][0]["probability"] is None
+    report = residual_report(asked, closed.account, calibration_of(closed.fitted, CREATED))
+    assert report.turns[-1].findings[0].probability is None
 
 
 def test_a_name_that_structure_refutes_is_reported_with_what_it_depends_on(closed: Closed) -> None:
@@ -850,6 +859,7 @@ def test_the_verb_writes_the_report_and_says_the_same(
     assert "adding spring on J3" in progress
     document = json.loads((folder / DOCUMENT).read_text(encoding="utf-8"))
     assert (document["format"], document["version"]) == ("drivegain-residual", 1)
+    assert list(document)[:3] == ["format", "version", "cell"]
     assert "axis 3" not in text
     assert "J3 has a spring" in text
     for sentence in document["summary"]:

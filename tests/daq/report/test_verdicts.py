@@ -8,7 +8,6 @@ from typing import cast
 import numpy as np
 import pytest
 
-from daq.report.fit_schemas import VerdictEntry
 from daq.report.residual import _verdict, verdict_sentences
 from daq.workflow.fit import Fit, Undecided
 from ident.calibration import AcceptedEffect
@@ -53,8 +52,7 @@ def test_nothing_is_said_of_a_confirmed_effect_that_is_written() -> None:
 
 
 def test_the_document_has_the_verdict() -> None:
-    document = _verdict(_judged(Judgement.UNDECIDED, written=False), AXES)
-    entry = VerdictEntry.model_validate(document)
+    entry = _verdict(_judged(Judgement.UNDECIDED, written=False), AXES)
     assert (entry.effect, entry.axis, entry.judgement, entry.written, entry.blocks) == (
         "spring",
         "J2",

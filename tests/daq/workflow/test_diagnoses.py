@@ -12,7 +12,7 @@ import pytest
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import decode_calibration, encode_calibration
 from daq.environment import shipped_configurations
-from daq.report.validation import cross_document, validation_view
+from daq.report.validation import validate_report, validation_view
 from daq.workflow import fit as fit_module
 from daq.workflow import validate as validate_module
 from daq.workflow.fit import calibration_of, fit
@@ -84,7 +84,7 @@ def test_validate_names_the_log(
     found = cross_validate({"one": calibration}, [Path(log)])
     assert {one.name for one in found.diagnoses} == {name}
     assert (found.diagnoses[0].runs, found.diagnoses[0].axes) == ((log,), axes)
-    assert cross_document(found)["diagnoses"][0]["name"] == name
+    assert validate_report(calibration, found, {}).diagnoses[0].name == name
 
 
 def test_a_diagnosis_that_is_made_again_is_shown_once(shelf: Shelf, calibration: Calibration) -> None:

@@ -16,7 +16,8 @@ from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import LogRepeated, LogsDiffer
 from daq.log.reader import LossyLogs
-from daq.report.fit import fit_document, fit_view
+from daq.report.document import json_tree
+from daq.report.fit import fit_report, fit_view
 from daq.workflow import fit as fit_module
 from daq.workflow import verdicts as verdicts_module
 from daq.workflow.cases import CaseFit
@@ -154,15 +155,15 @@ def test_the_drives_own_torque_is_shown_beside_the_gains_and_changes_none(
     assert found.torque_slopes[5] is None
     calibration = calibration_of(found, datetime(2025, 1, 2, tzinfo=UTC))
     case = CaseFit(found, (), None)
-    document = fit_document(case, calibration, None)["torque_channel"]
-    assert [row["axis"] for row in document] == list(found.cell.axis_names)
-    assert document[5] == {"axis": "J6", "slope": None}
-    for slope, row, gain in zip(found.torque_slopes[:5], document, GAINS, strict=False):
+    rows = json_tree(fit_report(case, calibration, None))["torque_channel"]
+    assert [row["axis"] for row in rows] == list(found.cell.axis_names)
+    assert rows[5] == {"axis": "J6", "slope": None}
+    for slope, row, gain in zip(found.torque_slopes[:5], rows, GAINS, strict=False):
         assert slope is not None
         assert abs(slope.value - 1.04 * gain) < 4.0 * slope.std
         assert abs(row["ratio"] - 1.04) < 4.0 * row["ratio_std"] < 0.1
         assert slope.readings == len(range(50, 22000 - 50, 50)) * 2
-    assert "torque_channel" not in fit_document(CaseFit(without, (), None), calibration, None)
+    assert "torque_channel" not in json_tree(fit_report(CaseFit(without, (), None), calibration, None))
     out = io.StringIO()
     Console(file=out, width=80).print(*fit_view(case, calibration, None), sep="\n")
     assert "own torque against the current, not used in the fit" in out.getvalue()

@@ -11,16 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydantic import TypeAdapter
 from rich.console import Console, RenderableType
 
 from daq.cli import main
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.errors import ExitCode
-from daq.report.fit_schemas import WeighReport
-from daq.report.text import json_text
-from daq.report.weighing_views import contact_document, contact_view, weighed_document, weighed_view
+from daq.report.weighing_views import contact_report, contact_view, weigh_report, weighed_view
 from daq.workflow.validate import warn_of_fitted
 from daq.workflow.weigh import Weighed
 from ident.calibration import AcceptedEffect, Parameter
@@ -152,11 +149,12 @@ def test_a_weighed_body_is_shown_with_what_would_help(checkout: Path) -> None:
     narrow = _text(weighed_view(found), width=80)
     assert re.search(r"Ixx +0\.070 ± 0\.010 +kg m² +yes", narrow)
     assert "…" not in narrow
-    document = weighed_document(found)
-    assert document["mass_kg"] == {"value": 4.6, "std": pytest.approx(0.01)}
-    assert [one["name"] for one in document["parameters"]] == list(LINK_PARAMETERS)
-    assert [one["name"] for one in document["parameters"] if one["add"]] == ["mz"]
-    assert [one["name"] for one in document["parameters"] if not one["identifiable"]] == ["mz"]
+    report = weigh_report(found)
+    assert report.mass_kg.value == 4.6
+    assert report.mass_kg.std == pytest.approx(0.01)
+    assert [one.name for one in report.parameters] == list(LINK_PARAMETERS)
+    assert [one.name for one in report.parameters if one.add is not None] == ["mz"]
+    assert [one.name for one in report.parameters if not one.identifiable] == ["mz"]
     nothing = replace(found, body=replace(body, values=np.full(10, 0.001)), declared_kg=None)
     assert "No body shows" in _text(weighed_view(nothing))
 
@@ -174,11 +172,11 @@ def test_the_centre_is_shown_in_the_platforms_frame_too(checkout: Path) -> None:
     assert re.search(r"centre x +432\.0 ± 4\.4 +mm", text)
     assert re.search(r"centre x in plate +-18\.0 ± 4\.4 +mm", text)
     assert "no beside a σ: it is more than 10 % of the value" in text
-    document = weighed_document(found)
-    TypeAdapter(WeighReport).validate_json(json_text(document))
-    assert document["centre_in_platform_m"]["value"] == pytest.approx([-0.018, 0.03, np.nan], nan_ok=True)
+    in_platform = weigh_report(found).centre_in_platform_m
+    assert in_platform is not None
+    assert in_platform.value == [pytest.approx(-0.018), pytest.approx(0.03), None]
     serial = replace(found, cell=load_cell(checkout / "configs/cells/demo.yaml"))
-    assert weighed_document(serial)["centre_in_platform_m"] is None
+    assert weigh_report(serial).centre_in_platform_m is None
     assert " in " not in _text(weighed_view(serial)).partition("In the frame")[0]
 
 
@@ -205,11 +203,11 @@ def test_contacts_are_listed(checkout: Path) -> None:
     assert "1.80" in text
     assert "this log less 1 stretch that is far out" in text
     assert "J6 not judged: 40 s of quiet motion have too few separate peaks; record longer." in text
-    document = contact_document(found, cell, Path("a.mcap"), None)
-    (contact,) = document["contacts"]
-    assert (contact["axis"], contact["peak"], contact["peak_over_threshold"]) == ("J3", -9.0, 1.8)
-    assert (contact["start_s"], contact["end_s"]) == pytest.approx((2.0, 2.78))
-    assert [one["axis"] for one in document["not_judged"]] == ["J6"]
+    report = contact_report(found, cell, Path("a.mcap"), None)
+    (contact,) = report.contacts
+    assert (contact.axis, contact.peak, contact.peak_over_threshold) == ("J3", -9.0, 1.8)
+    assert (contact.start_s, contact.end_s) == pytest.approx((2.0, 2.78))
+    assert [one.axis for one in report.not_judged] == ["J6"]
 
 
 def test_no_contact_is_said_of_judged_axes_alone(checkout: Path) -> None:
@@ -226,8 +224,8 @@ def test_no_contact_is_said_of_judged_axes_alone(checkout: Path) -> None:
     assert "J2 not judged: its residual stays on one side for 1.5 s at a time" in text
     assert "J3 not judged: 8 s of quiet motion have too few separate peaks; record longer." in text
     assert "J4 not judged: it does not move in this log." in text
-    listed = contact_document(found, cell, Path("a.mcap"), None)["not_judged"]
-    assert [entry["axis"] for entry in listed] == ["J2", "J3", "J4"]
+    listed = contact_report(found, cell, Path("a.mcap"), None).not_judged
+    assert [entry.axis for entry in listed] == ["J2", "J3", "J4"]
     blind = replace(found, use=np.zeros_like(use))
     assert "No contact" not in _text(contact_view(blind, cell))
     judged = replace(found, use=even > 0.0, band=replace(band, threshold=5.0 * one))
