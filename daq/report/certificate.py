@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from enum import Enum
-from typing import overload
 
 from daq.config.cell import Cell
 from daq.config.policy import ApplyPolicy
@@ -24,8 +23,7 @@ from daq.report.controller_schemas import (
     EarlierCalibration,
 )
 from daq.report.effect_names import accepted_text, size_text
-from daq.report.fit import error_document
-from daq.report.fit_schemas import Errors
+from daq.report.fit import errors_of, errors_or_none
 from daq.report.gains import encoder_text, mass_texts
 from daq.report.proposal import refused_of
 from daq.writeback.file_target import FileEdit, FileTarget
@@ -35,7 +33,6 @@ from daq.writeback.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, j
 from daq.writeback.request import Edit, GainChange, Request
 from daq.writeback.target import Proposal, propose
 from ident.calibration import AcceptedEffect, Calibration
-from ident.estimators.estimate import RelativeError
 
 EARLIER = "earlier calibration"  #: What `since` compares with
 _OPERATORS = frozenset({Gate.SIGNATURE, Gate.BASE})
@@ -371,9 +368,9 @@ def certificate_report(certificate: Certificate) -> CertificateReport:
         controller_unread=comparison.unread or None,
         axes=[_certified_gain(row, certificate.place) for row in certificate.rows],
         refusals=[refused_of(refusal) for refusal in comparison.refusals],
-        holdout_error_percent=_errors(calibration.holdout_error_percent),
-        nameplate_holdout_error_percent=_errors(calibration.nameplate_holdout_error_percent),
-        relative_error_percent=_errors(calibration.relative_error_percent),
+        holdout_error_percent=errors_or_none(calibration.holdout_error_percent),
+        nameplate_holdout_error_percent=errors_or_none(calibration.nameplate_holdout_error_percent),
+        relative_error_percent=errors_of(calibration.relative_error_percent),
         payload_mass=list(calibration.payload_mass),
         encoder_misfit=calibration.encoder_misfit,
         effects=[_certified_effect(effect, calibration) for effect in calibration.effects],
@@ -417,18 +414,5 @@ def _beside(earlier: Calibration, since: Sequence[AxisRow]) -> EarlierCalibratio
     return EarlierCalibration(
         created=earlier.created,
         axes=[_certified_gain(row, EARLIER) for row in since],
-        holdout_error_percent=_errors(earlier.holdout_error_percent),
+        holdout_error_percent=errors_or_none(earlier.holdout_error_percent),
     )
-
-
-@overload
-def _errors(error: RelativeError) -> Errors: ...
-
-
-@overload
-def _errors(error: RelativeError | None) -> Errors | None: ...
-
-
-def _errors(error: RelativeError | None) -> Errors | None:
-    document = error_document(error)
-    return None if document is None else Errors(**document)

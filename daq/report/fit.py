@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from rich.console import RenderableType
@@ -237,11 +237,6 @@ def errors_of(error: RelativeError) -> Errors:
 def errors_or_none(error: RelativeError | None) -> Errors | None:
     """Return relative errors for a document; None where there are none."""
     return None if error is None else errors_of(error)
-
-
-def error_document(error: RelativeError | None) -> dict[str, Any] | None:
-    """Return relative errors, for --json."""
-    return None if error is None else {"axes": list(error.axes), "total": error.total}
 
 
 def start_of(fitted: Fit) -> Evidence:

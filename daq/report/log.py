@@ -24,7 +24,7 @@ from daq.report.log_schemas import (
     MountedPayload,
     RecordReport,
     SalvageReport,
-    Stamps,
+    StampSummary,
     TableReport,
 )
 from daq.report.text import entry_lines, printable
@@ -203,10 +203,10 @@ def _wall_clock_step_s(run: RunInfo, statistics: RunStatistics) -> float | None:
     return (statistics.wall_minus_monotonic_ns - run.wall_minus_monotonic_ns) * 1e-9
 
 
-def _stamps(timing: Timing | None) -> Stamps | None:
+def _stamps(timing: Timing | None) -> StampSummary | None:
     if timing is None:
         return None
-    return Stamps(
+    return StampSummary(
         rows=timing.rows,
         rate_hz=timing.rate_hz,
         usual_step_s=timing.usual_step_s,

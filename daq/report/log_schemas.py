@@ -28,7 +28,7 @@ class RecordReport(Report):
     bus_load: list[BusLoadEntry]
 
 
-class Stamps(Report):
+class StampSummary(Report):
     """Time stamps of an imported recording, and the uniform clock that its log has."""
 
     rows: int
@@ -93,7 +93,7 @@ class InfoReport(Report):
     wall_minus_monotonic_s: float
     wall_clock_step_s: Figure
     origin: str
-    timing: Stamps | None
+    timing: StampSummary | None
     attachments: dict[str, int] = Field(description="size of each [bytes]")
 
 
@@ -108,7 +108,7 @@ class ImportReport(Report):
     reason: str = Field(description="why it is not valid")
     partial: bool
     wall_minus_monotonic_ns: int | None
-    timing: Stamps | None
+    timing: StampSummary | None
     remarks: list[str]
 
 

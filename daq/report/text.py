@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -172,16 +171,6 @@ def plain_table(
 def percent_text(percent: float) -> str:
     """Two decimals; a dash for an unknown value."""
     return f"{percent:.2f}" if math.isfinite(percent) else "-"
-
-
-def json_text(document: Any) -> str:
-    """JSON document; numbers that JSON lacks become null, bytes of file names that are not UTF-8 are spelled out."""
-    return spelled_bytes(json.dumps(json_safe(document), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
-
-
-def picked(thing: object, *names: str) -> dict[str, Any]:
-    """Copy attributes into a document under their own names."""
-    return {name: getattr(thing, name) for name in names}
 
 
 def spelled_bytes(text: str) -> str:

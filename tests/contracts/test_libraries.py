@@ -71,7 +71,6 @@ SAME_NAME = {
     "EffectModel": "still to do: names of published schemas; that of a cell and of a simulated cell",
     "Fitted": "still to do: `daq.documents.session_state` and `daq.jobs.cell_fit`",
     "Refusal": "still to do: `daq.writeback.gates.gate` and `drivers.stream.monitor`",
-    "Stamps": "still to do: `daq.log.table` and `daq.report.schemas`",
     "Target": "still to do: `daq.documents.session_state` and `daq.writeback.target`",
     "judge": "still to do: `daq.ledger.audit` and `daq.writeback.judgement`",
     "rollback": "still to do: the verb of `daq.cli.apply`; `daq` publishes that of `daq.writeback.target`",

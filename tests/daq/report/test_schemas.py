@@ -17,6 +17,7 @@ import daq.report
 from daq.cli.app import VERBS
 from daq.report.document import Report
 from daq.report.error_schema import ErrorReport
+from daq.report.fit_schemas import ResidualFile
 from daq.report.job_schemas import ProposalReport
 from daq.report.schemas import REPORTS
 from ident.calibration import Source
@@ -51,7 +52,7 @@ def test_every_verb_with_json_has_a_schema() -> None:
     assert with_json == REPORTS.keys()
 
 
-FILES = (ProposalReport,)
+FILES = (ProposalReport, ResidualFile)
 """Documents that are written into files and printed by no verb."""
 
 
