@@ -226,7 +226,7 @@ def entered_masses(entries: Sequence[str], calibration: Calibration) -> dict[str
 APPLY = Verb("apply", apply_verb, "drivegain apply CELL calibration.yaml")
 
 
-def rollback(
+def rollback_verb(
     cell: Annotated[Path | None, typer.Argument(help="Cell file; it names the controller file and the audit.")] = None,
     to: Annotated[Path | None, typer.Option("--to", help="Another controller file than the cell's.")] = None,
     by: ByOption = None,
@@ -312,7 +312,7 @@ def rollback_drives(
         console.print(_saving_text(saving))
 
 
-ROLLBACK = Verb("rollback", rollback, "drivegain rollback press-4/cells/press-4.yaml")
+ROLLBACK = Verb("rollback", rollback_verb, "drivegain rollback press-4/cells/press-4.yaml")
 
 
 @dataclass(frozen=True, slots=True)

@@ -74,7 +74,7 @@ class Decision(StrictModel):
     remark: str
 
 
-class Target(StrictModel):
+class PlannedWrite(StrictModel):
     """The planned write, saved before it is made: after a kill, the file's digest shows whether it was made."""
 
     file: str
@@ -107,7 +107,7 @@ class SessionState(StrictModel):
     fitted: Fitted | None = None
     watched: tuple[WatchedGain, ...] = ()
     decision: Decision | None = None
-    target: Target | None = None
+    target: PlannedWrite | None = None
     outcome: Outcome | None = None
     exit_code: _Count | None = None
     problem: str = ""

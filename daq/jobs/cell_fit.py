@@ -72,7 +72,7 @@ class Summary:
 
 
 @dataclass(frozen=True, slots=True)
-class Fitted:
+class FleetFit:
     """Result of a worker; small, whatever the size of the logs."""
 
     summary: Summary  #: of the calibration
@@ -80,7 +80,7 @@ class Fitted:
     seconds: float  #: that it took, reading included
 
 
-def fit_cell(cell: CellLogs, loop: Loop, created: datetime) -> Fitted | Failure:
+def fit_cell(cell: CellLogs, loop: Loop, created: datetime) -> FleetFit | Failure:
     """Fit one cell in this process, as `drivegain fit` (or `residual`) would with the same logs."""
     begun_s = time.perf_counter()
     every_log = (*cell.fit, *cell.holdout)
@@ -131,7 +131,7 @@ def fit_cell(cell: CellLogs, loop: Loop, created: datetime) -> Fitted | Failure:
         held_out=unseen is not None,
         partial=any(source.partial for source in calibration.sources),
     )
-    return Fitted(summary, content, time.perf_counter() - begun_s)
+    return FleetFit(summary, content, time.perf_counter() - begun_s)
 
 
 def failure_of(error: BaseException, paths: Mapping[Path, StoredLog] | None = None) -> Failure:
@@ -187,7 +187,7 @@ class CalibrationCache:
         numbers = [number for gain in summary.gains for number in (gain.value, gain.std, gain.nameplate)]
         return found if all(map(math.isfinite, (*numbers, summary.error_percent, seconds))) else None
 
-    def store(self, cell: CellLogs, fitted: Fitted) -> Path:
+    def store(self, cell: CellLogs, fitted: FleetFit) -> Path:
         """Store a calibration; after a kill at any point, the cache is whole or the entry is made anew.
 
         Raises:

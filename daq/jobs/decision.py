@@ -7,7 +7,7 @@ from datetime import datetime
 
 from daq.config.policy import AppliedBy
 from daq.documents.calibration_file import read_calibration_bytes
-from daq.documents.session_state import Decision, JudgedGain, Outcome, Target
+from daq.documents.session_state import Decision, JudgedGain, Outcome, PlannedWrite
 from daq.errors import writing
 from daq.files import replace_file, sha256, sha256_of
 from daq.jobs.context import JobContext
@@ -55,7 +55,7 @@ def decide_outcome(context: JobContext, session: Session, calibration: Calibrati
         decision = decision.model_copy(update={"remark": f"{decision.remark} {CHANGED_SINCE_START}"})
     context.journal.say(Level.NOTICE, "compared with the gains in the controller", words=decision.remark)
     after = sha256(edit.after)
-    target = Target(
+    target = PlannedWrite(
         file=str(edit.file),
         base_sha256=edit.base_sha256,
         after_sha256=after,

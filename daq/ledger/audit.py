@@ -101,7 +101,7 @@ _TYPES = {
 }
 
 
-def decode(line: bytes) -> AuditEntry | None:
+def decode_entry(line: bytes) -> AuditEntry | None:
     """Return the entry of a line, its digest unchecked; None for a line that `encode` could not write."""
     return _decode(line)[0]
 
@@ -244,7 +244,7 @@ def read(path: Path) -> tuple[AuditEntry, ...]:
     Raises:
         AuditUnusable: no regular file, or it cannot be read.
     """
-    return tuple(one for one in map(decode, _lines_of(_content_of(path))) if one is not None)
+    return tuple(one for one in map(decode_entry, _lines_of(_content_of(path))) if one is not None)
 
 
 def verify(path: Path, heads: Collection[str] = ()) -> AuditVerdict:
@@ -256,7 +256,7 @@ def verify(path: Path, heads: Collection[str] = ()) -> AuditVerdict:
     Raises:
         AuditUnusable: no regular file, or it cannot be read.
     """
-    return judge(_content_of(path), digest_now, heads)
+    return judge_chain(_content_of(path), digest_now, heads)
 
 
 def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]:
@@ -420,7 +420,7 @@ class AuditVerdict:
         return self.flaws[0].line if self.flaws else None
 
 
-def judge(content: bytes, digest_now: Callable[[str], str | None], heads: Collection[str] = ()) -> AuditVerdict:
+def judge_chain(content: bytes, digest_now: Callable[[str], str | None], heads: Collection[str] = ()) -> AuditVerdict:
     """Check a chain.
 
     Args:
@@ -527,7 +527,7 @@ class _Chain:
 
 
 def open_writes(entries: Sequence[AuditEntry], digest_now: Callable[[str], str | None]) -> Iterator[OpenWrite]:
-    """Find writes that were begun and never ended. Args as of `judge`."""
+    """Find writes that were begun and never ended. Args as of `judge_chain`."""
     # A forged chain can hold: a value that is no number names no entry.
     ended = {begun for one in entries if one.action in _ENDS and isinstance(begun := one.details.get("begun"), int)}
     begins = [one for one in entries if one.action in _BEGUN]

@@ -107,7 +107,7 @@ def axis_index(axis: str | int) -> int:
     return number - 1
 
 
-class EffectModel(StrictModel):
+class PlantedEffectModel(StrictModel):
     """An undeclared effect, on an axis or on a passive joint of a closed chain."""
 
     name: Annotated[str, Field(min_length=1)]
@@ -116,7 +116,7 @@ class EffectModel(StrictModel):
     parameters: dict[str, float] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _one_place(self) -> EffectModel:
+    def _one_place(self) -> PlantedEffectModel:
         if (self.axis is None) == (self.joint is None):
             raise ValueError("axis, or joint for a passive joint: one of them")
         return self
@@ -142,7 +142,7 @@ class SimulationModel(StrictModel):
     start_mm: tuple[float | None, ...] = ()
     axes: Annotated[tuple[AxisSpec, ...], Field(min_length=1, max_length=32)]
     payloads: dict[str, Body] = Field(default_factory=dict)
-    effects: tuple[EffectModel, ...] = ()
+    effects: tuple[PlantedEffectModel, ...] = ()
     faults: tuple[FaultModel, ...] = ()
     closures: tuple[Closure, ...] = ()
     motors: tuple[str, ...] = ()

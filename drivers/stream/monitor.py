@@ -39,7 +39,7 @@ class ReadingSource(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Refusal:
+class ObjectRefusal:
     """Answer without the value of an object."""
 
     entry: ObjectEntry  #: the object
@@ -58,7 +58,7 @@ class AxisReading:
     lost: int  #: SYNCs or requests without an answer since the monitor began
     heard: bool = True  #: whether the axis sent anything since the last reading, or in the last ABANDONED_S
     delay_s: float | None = None  #: longest time until an answer to a request since the last reading, None without one
-    refused: tuple[Refusal, ...] = ()  #: objects that its last answers did not give
+    refused: tuple[ObjectRefusal, ...] = ()  #: objects that its last answers did not give
 
     @property
     def is_late(self) -> bool:
@@ -96,7 +96,7 @@ class _AxisWatch:
         self.due_ns = 0
         self.heard_ns: int | None = None
         self.delay_ns: int | None = None
-        self.refused: dict[int, Refusal] = {}  # by column
+        self.refused: dict[int, ObjectRefusal] = {}  # by column
 
     def take(self, nmt: int | None, since_ns: int, now_ns: int) -> AxisReading:
         """Return a reading and begin the next."""
@@ -140,7 +140,7 @@ class _AxisWatch:
         self.asked_ns = None
         self.values[self.asked] = answer.value
         if answer.value is None:
-            self.refused[self.asked] = Refusal(self.entries[self.asked], answer.abort_code)
+            self.refused[self.asked] = ObjectRefusal(self.entries[self.asked], answer.abort_code)
         else:
             self.refused.pop(self.asked, None)
         if self.asked == len(self.entries) - 1 and not self.refused:

@@ -67,14 +67,6 @@ def test_every_name_of_a_front_door_is_there(package: ModuleType) -> None:
 SAME_NAME = {
     "main": "`daq.cli` imports no typer before the program runs, and then `daq.cli.app`",
     "calibration_of": "front doors: of an identification in `ident`, of a fit of logs in `daq`",
-    "decode": "still to do: `drivers` publishes that of a statusword; that of `daq.ledger.audit` is an entry's",
-    "EffectModel": "still to do: names of published schemas; that of a cell and of a simulated cell",
-    "Fitted": "still to do: `daq.documents.session_state` and `daq.jobs.cell_fit`",
-    "Refusal": "still to do: `daq.writeback.gates.gate` and `drivers.stream.monitor`",
-    "Target": "still to do: `daq.documents.session_state` and `daq.writeback.target`",
-    "judge": "still to do: `daq.ledger.audit` and `daq.writeback.judgement`",
-    "rollback": "still to do: the verb of `daq.cli.apply`; `daq` publishes that of `daq.writeback.target`",
-    "sign": "still to do: `daq.writeback.gates.target` and `daq.writeback.signature`",
 }
 """Names that two modules define, with the reason."""
 

@@ -87,7 +87,7 @@ GATES: tuple[GateRow, ...] = (
         "longer recording, more exciting moves, a heavier payload",
         f"`max_std_percent: {_LIMITS.max_std_percent:g}`",
     ),
-    GateRow(Gate.SIGN, (target.sign,), "check directions of encoder and current"),
+    GateRow(Gate.SIGN, (target.same_sign,), "check directions of encoder and current"),
     GateRow(
         Gate.CHANGE,
         (target.change_bound,),

@@ -42,7 +42,7 @@ def uncertainty(context: GateContext) -> Iterator[GateFinding]:
             yield change.axis, f"σ {change.std_percent:.2f} %", f"at most {bound:g} %", remedy
 
 
-def sign(context: GateContext) -> Iterator[GateFinding]:
+def same_sign(context: GateContext) -> Iterator[GateFinding]:
     """Require the sign of the gain in the controller and of the nameplate."""
     for change in _finite_changes(context):
         if not _keeps_sign(change):

@@ -31,7 +31,7 @@ from daq.config.cell_file import bundle
 from daq.documents.calibration_file import as_document, load_calibration
 from daq.errors import ConfigurationMissing, DaqError, ExitCode, LogMissing, OutputFailed, UsageError, WorkersLost
 from daq.jobs import fleet as fleet_module
-from daq.jobs.cell_fit import Failure, Fitted, Loop, fit_cell, open_cache
+from daq.jobs.cell_fit import Failure, FleetFit, Loop, fit_cell, open_cache
 from daq.jobs.fleet import FleetRow, WorkerPool, each, fit_fleet, worker_pool
 from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, UnknownLog, at_hand, by_cell, list_logs, survey
 from daq.workflow.fit import calibration_of, fit
@@ -286,7 +286,7 @@ def test_a_folder_that_comes_in_the_place_of_a_note_meanwhile_is_reported_by_its
     shelf, made = open_cache(tmp_path / "out", Loop.OPEN), fit_cell(cell, Loop.OPEN, CREATED)
     note = shelf.file(cell).with_suffix(".json")
     note.mkdir()
-    assert isinstance(made, Fitted)
+    assert isinstance(made, FleetFit)
     with pytest.raises(OutputFailed, match=re.escape(str(note))):
         shelf.store(cell, made)
 
@@ -489,7 +489,7 @@ def test_another_file_is_never_replaced_by_a_table(few: Path, tmp_path: Path) ->
 
 def test_an_error_that_no_one_expected_is_a_row(few: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
-    def sometimes(cell: CellLogs, loop: Loop, created: datetime) -> Fitted | Failure:
+    def sometimes(cell: CellLogs, loop: Loop, created: datetime) -> FleetFit | Failure:
         if cell.cell == "cell-002":
             raise MemoryError
         return fit_cell(cell, loop, created)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
-from daq.documents.session_state import Outcome, SessionState, Target
+from daq.documents.session_state import Outcome, PlannedWrite, SessionState
 from daq.errors import ExitCode, JobHeld
 from daq.jobs.context import CLOCK_SLACK, require_clock
 from daq.jobs.recording import calibration_of_session
@@ -168,7 +168,7 @@ def test_two_cells_never_share_a_file_of_metrics(cells: list[str]) -> None:
 
 def test_what_to_do_can_be_typed_in_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    target = Target(file="gains.yaml", base_sha256="a" * 64, after_sha256="b" * 64)
+    target = PlannedWrite(file="gains.yaml", base_sha256="a" * 64, after_sha256="b" * 64)
     for outcome in (Outcome.PROPOSED, Outcome.APPLIED):
         session = begin(tmp_path, BASIS, BEGAN).update(target=target, outcome=outcome)
         lines = to_do(Conclusion(outcome, 0, session, ""), Path("cells/demo.yaml"))

@@ -29,7 +29,7 @@ from daq.ledger.audit import (
     append,
     encode,
     entry,
-    judge,
+    judge_chain,
     read,
     verify,
 )
@@ -68,7 +68,7 @@ def _filled(path: Path, count: int = 6) -> tuple[AuditEntry, ...]:
 
 
 def _judge(lines: list[bytes]) -> audit.AuditVerdict:
-    return judge(b"".join(line + b"\n" for line in lines), lambda _: None)
+    return judge_chain(b"".join(line + b"\n" for line in lines), lambda _: None)
 
 
 def _lines(path: Path) -> list[bytes]:
