@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Protocol
 
 from daq.config.cell import Cell, MotionPolicy
 from daq.config.controller import Controller
@@ -21,17 +22,69 @@ from daq.ledger.ledger import Ledger, read_history
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.interlock import Runner, release_check, run_command
 from daq.workflow.plan import Plan, plan
-from daq.workflow.record import Recorded, record
+from daq.workflow.record import Recorded, RecordingRequest, record
 from daq.workflow.safeguards import FreeBytes, agree, free_bytes
 from daq.writeback.file_access import resolve_links
-from daq.writeback.file_target import FileEdit
+from daq.writeback.file_target import FileEdit, FileTarget
+from daq.writeback.request import Request
 from daq.writeback.target import Proposal, Written, apply, propose
 from drivers.canopen.network import SignalBlocker
 from drivers.errors import MotionRefused
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account, account
+from ident.discovery.evidence import Evidence
+from ident.discovery.loop import Step
 
 CLOCK_SLACK = timedelta(minutes=1)  #: A time service sets a clock back by less
+
+
+class Planner(Protocol):
+    """Makes a plan of a cell."""
+
+    def __call__(self, cell: Cell, *, seed: int, duration_s: float) -> Plan:
+        """As `daq.workflow.plan.plan`."""
+
+
+class Recorder(Protocol):
+    """Records a run; the axes move."""
+
+    def __call__(
+        self,
+        request: RecordingRequest,
+        *,
+        free: FreeBytes,
+        block_signals: SignalBlocker,
+        require_released: Callable[[], None],
+    ) -> Recorded:
+        """As `daq.workflow.record.record`."""
+
+
+class Fitter(Protocol):
+    """Fits the logs of a session."""
+
+    def __call__(self, logs: Sequence[Path], *, holdout: Sequence[Path]) -> Fit:
+        """As `daq.workflow.fit.fit`."""
+
+
+class LoopCloser(Protocol):
+    """Adds the effects that a fit lacks."""
+
+    def __call__(self, start: Fit, seed: int, progress: Callable[[str], None]) -> Fit:
+        """As `daq.workflow.fit.close_loop`."""
+
+
+class Proposer(Protocol):
+    """Plans a write to a controller's file."""
+
+    def __call__(self, target: FileTarget, request: Request) -> Proposal[FileEdit]:
+        """As `daq.writeback.target.propose`."""
+
+
+class ChangeWriter(Protocol):
+    """Writes what was planned."""
+
+    def __call__(self, proposal: Proposal[FileEdit], now: datetime, *, audit: Path, who: str) -> Written | None:
+        """As `daq.writeback.target.apply`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +94,14 @@ class Tools:
     save_report: Callable[[Fit, Account, Calibration, Path], None]  #: writes the report of a fit into a folder
     #: Checks the drives before anything moves, and takes over those of a killed recorder if the last argument says so.
     drives: Callable[[Cell, SignalBlocker, bool], None] = check_drives
-    plan: Callable[..., Plan] = plan
-    record: Callable[..., Recorded] = record
-    fit: Callable[..., Fit] = fit
-    close_loop: Callable[..., Fit] = close_loop
+    plan: Planner = plan
+    record: Recorder = record
+    fit: Fitter = fit
+    close_loop: LoopCloser = close_loop
     calibration: Callable[[Fit, datetime], Calibration] = calibration_of
-    account: Callable[..., Account] = account
-    propose: Callable[..., Proposal[FileEdit]] = propose
-    apply: Callable[..., Written | None] = apply
+    account: Callable[[Evidence, Sequence[Step]], Account] = account
+    propose: Proposer = propose
+    apply: ChangeWriter = apply
     run: Runner = run_command  #: runs a command of the cell
     free: FreeBytes = free_bytes  #: free bytes of a folder's disk
     now: Callable[[], datetime] = lambda: datetime.now(UTC)  #: wall clock with time zone

@@ -79,7 +79,7 @@ class Made:
             save_report=lambda _fit, _account, _calibration, folder: (folder / "report.html").touch(),
             drives=lambda _cell, _undisturbed, _take_over: None,
             record=copied,
-            fit=lambda _logs, **_: self.fitted,
+            fit=lambda logs, *, holdout: self.fitted,
             close_loop=lambda _fit, _seed, _report: self.closed,
             calibration=in_this_cell,
         )
