@@ -16,6 +16,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter
 
+from daq.advice import for_command_line
 from daq.config.yaml_file import MAX_BYTES
 from daq.documents.calibration_file import as_document, decode_calibration, encode_calibration
 from daq.environment import software
@@ -140,7 +141,7 @@ def failure_of(error: BaseException, paths: Mapping[Path, StoredLog] | None = No
     Args:
         paths: temporary copies; the text names the logs instead.
     """
-    text = str(error) or type(error).__name__
+    text = for_command_line(str(error)) or type(error).__name__
     for path, log in (paths or {}).items():
         text = text.replace(str(path), log.address)
     return Failure(type(error).__name__, text, int(exit_code(type(error)) or ExitCode.UNEXPECTED))

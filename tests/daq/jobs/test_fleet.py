@@ -31,7 +31,7 @@ from daq.config.cell_file import bundle
 from daq.documents.calibration_file import as_document, load_calibration
 from daq.errors import ConfigurationMissing, DaqError, ExitCode, LogMissing, OutputFailed, UsageError, WorkersLost
 from daq.jobs import fleet as fleet_module
-from daq.jobs.cell_fit import Failure, FleetFit, Loop, fit_cell, open_cache
+from daq.jobs.cell_fit import Failure, FleetFit, Loop, failure_of, fit_cell, open_cache
 from daq.jobs.fleet import FleetRow, WorkerPool, each, fit_fleet, worker_pool
 from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, UnknownLog, at_hand, by_cell, list_logs, survey
 from daq.workflow.fit import calibration_of, fit
@@ -642,3 +642,8 @@ def test_a_log_that_cannot_be_read_is_reported_by_its_name(tmp_path: Path) -> No
     (found,) = survey([StoredLog(str(tmp_path / "gone.mcap"), "gone.mcap")])
     assert isinstance(found, UnknownLog)
     assert isinstance(found.error, DaqError)
+
+
+def test_a_failure_names_options_of_the_command_line() -> None:
+    error = DataUnfit("run", "no `Run.payload`")
+    assert "record --payload NAME --mass KG" in failure_of(error).text
