@@ -35,6 +35,7 @@ from daq.jobs.cell_fit import Failure, FleetFit, Loop, failure_of, fit_cell, ope
 from daq.jobs.fleet import FleetRow, WorkerPool, each, fit_fleet, worker_pool
 from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, UnknownLog, at_hand, by_cell, list_logs, survey
 from daq.workflow.fit import calibration_of, fit
+from ident.errors import DataUnfit
 from tests.bench.fleet_cells import FleetCell, make_cell, plans_of
 from tests.daq.logs import content, samples, write
 
