@@ -26,7 +26,7 @@ from daq.cli.terminal import (
     say_last,
     write_output,
 )
-from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
+from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json, taking
 from daq.environment import login
 from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, ExitCode, UsageError
 from daq.report.text import terminal_text
@@ -49,31 +49,37 @@ SaveUnknownOption = Annotated[
 ]
 
 
-def apply_verb(
-    cell: Annotated[Path, typer.Argument(help="Cell file; it names the controller file and its keys.")],
-    calibration: CalibrationArgument,
-    to: Annotated[Path | None, typer.Option(help="Controller file, instead of the one that the cell names.")] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Write; without it the change is only shown.")] = False,
+@dataclass(frozen=True, slots=True)
+class ApplyOptions:
+    """A write of gains to a controller, as the command line asks for it."""
+
+    cell: Annotated[Path, typer.Argument(help="Cell file; it names the controller file and its keys.")]
+    calibration: CalibrationArgument
+    to: Annotated[Path | None, typer.Option(help="Controller file, instead of the one that the cell names.")] = None
+    yes: Annotated[bool, typer.Option("--yes", help="Write; without it the change is only shown.")] = False
     base: Annotated[
         str | None, typer.Option("--base", help="Write only the change with this BEFORE-AFTER of its dry run.")
-    ] = None,
-    by: ByOption = None,
+    ] = None
+    by: ByOption = None
     payload_mass: Annotated[
         list[str] | None, typer.Option(help="NAME=KG from the scale, for a payload recorded without --mass.")
-    ] = None,
-    max_change_percent: Annotated[float | None, typer.Option(help="Tighter bound on the change [%].", min=0.0)] = None,
+    ] = None
+    max_change_percent: Annotated[float | None, typer.Option(help="Tighter bound on the change [%].", min=0.0)] = None
     max_nameplate_percent: Annotated[
         float | None, typer.Option(help="Tighter bound on the distance from the nameplate [%].", min=0.0)
-    ] = None,
-    max_std_percent: Annotated[float | None, typer.Option(help="Tighter bound on σ [%].", min=0.0)] = None,
+    ] = None
+    max_std_percent: Annotated[float | None, typer.Option(help="Tighter bound on σ [%].", min=0.0)] = None
     configuration_changed: Annotated[
         bool, typer.Option("--configuration-changed", help="Accept a cell file that changed since the recording.")
-    ] = False,
-    drives: DrivesOption = False,
-    ram_only: RamOnlyOption = False,
-    save_unknown: SaveUnknownOption = False,
-    json: JsonOption = False,
-) -> None:
+    ] = False
+    drives: DrivesOption = False
+    ram_only: RamOnlyOption = False
+    save_unknown: SaveUnknownOption = False
+    json: JsonOption = False
+
+
+@taking(ApplyOptions)
+def apply_verb(options: ApplyOptions) -> None:
     """Write identified gains to the controller file: dry run and diff first, --yes to write, with a backup.
 
     The bounds of the gates are in the cell's `policy: {apply: ...}`; see docs/reference/gates.md.
@@ -83,32 +89,53 @@ def apply_verb(
     from daq.writeback.file_target import FileTarget
     from daq.writeback.request import Request
 
-    saving = saving_of(ram_only, save_unknown, drives=drives)
-    declared, actor = load_cell(cell), applier(by)
-    content = read_calibration_bytes(calibration)
-    fitted = decode_calibration(content, str(calibration))
+    saving = saving_of(options.ram_only, options.save_unknown, drives=options.drives)
+    declared = load_cell(options.cell)
+    actor = applier(options.by)
+    content = read_calibration_bytes(options.calibration)
+    fitted = decode_calibration(content, str(options.calibration))
     request = Request(
         fitted,
         datetime.now(UTC),
-        policy=tightened(declared.apply, max_change_percent, max_nameplate_percent, max_std_percent),
-        accepts_changed_configuration=configuration_changed,
-        entered_kg=entered_masses(payload_mass or (), fitted),
-        base=base,
+        policy=tightened(
+            declared.apply, options.max_change_percent, options.max_nameplate_percent, options.max_std_percent
+        ),
+        accepts_changed_configuration=options.configuration_changed,
+        entered_kg=entered_masses(options.payload_mass or (), fitted),
+        base=options.base,
         appliers=actor.names,
-        file=calibration,
+        file=options.calibration,
         content=content,
     )
-    audit = audit_of(declared, (cell, calibration, to))
-    undo = f"drivegain rollback {shlex.quote(str(cell))}"
-    if drives:
-        at_most_one(drives=drives, to=to)
-        opening = drives_on_the_bus(declared, saving)
-        apply_to(opening, declared, request, actor=actor, audit=audit, undo=f"{undo} --drives", yes=yes, json=json)
+    audit = audit_of(declared, (options.cell, options.calibration, options.to))
+    undo = f"drivegain rollback {shlex.quote(str(options.cell))}"
+    if options.drives:
+        at_most_one(drives=True, to=options.to)
+        apply_to(
+            drives_on_the_bus(declared, saving),
+            declared,
+            request,
+            actor=actor,
+            audit=audit,
+            undo=f"{undo} --drives",
+            yes=options.yes,
+            json=options.json,
+        )
         return
-    undo += "" if to is None else f" --to {shlex.quote(str(to))}"
-    file, whole = nullcontext(FileTarget.of(declared, to)), delay_signals()
+    if options.to is not None:
+        undo += f" --to {shlex.quote(str(options.to))}"
     with interruptible():
-        apply_to(file, declared, request, actor=actor, audit=audit, undo=undo, yes=yes, json=json, whole=whole)
+        apply_to(
+            nullcontext(FileTarget.of(declared, options.to)),
+            declared,
+            request,
+            actor=actor,
+            audit=audit,
+            undo=undo,
+            yes=options.yes,
+            json=options.json,
+            whole=delay_signals(),
+        )
 
 
 def apply_to(

@@ -5,12 +5,13 @@ from __future__ import annotations
 import shlex
 import uuid
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CellArgument, JsonOption, Verb, judged_output, print_json, say_next
+from daq.cli.verb import CellArgument, JsonOption, Verb, judged_output, print_json, say_next, taking
 from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError
 from daq.files import is_taken
 from drivers.errors import POWERED, DriverError, SampleLost, all_notes, error_chain
@@ -20,27 +21,33 @@ if TYPE_CHECKING:
     from ident.model.bodies import Payload
 
 
-def record_verb(
-    cell: CellArgument,
-    plan: Annotated[Path, typer.Argument(help="Plan written by `drivegain plan`.")],
-    out: Annotated[Path, typer.Option("--out", help="Log to write (.mcap); must not exist.", callback=judged_output)],
+@dataclass(frozen=True, slots=True)
+class RecordOptions:
+    """A recording, as the command line asks for it."""
+
+    cell: CellArgument
+    plan: Annotated[Path, typer.Argument(help="Plan written by `drivegain plan`.")]
+    out: Annotated[Path, typer.Option("--out", help="Log to write (.mcap); must not exist.", callback=judged_output)]
     enable_motion: Annotated[
         bool,
         typer.Option(
             "--enable-motion",
             help="Allow motion. Without it nothing moves, whatever the cell file says.",
         ),
-    ] = False,
-    payload: Annotated[str | None, typer.Option(help="Mounted payload, by its name in the cell file.")] = None,
-    mass: Annotated[float | None, typer.Option(help="Mass of the payload read off the scale [kg].", min=0.0)] = None,
-    operator: Annotated[str | None, typer.Option(help="Operator of this recording; you, by default.")] = None,
-    speed: Annotated[float, typer.Option(help="Share of the plan's speed, for a first run.", min=0.05, max=1.0)] = 1.0,
+    ] = False
+    payload: Annotated[str | None, typer.Option(help="Mounted payload, by its name in the cell file.")] = None
+    mass: Annotated[float | None, typer.Option(help="Mass of the payload read off the scale [kg].", min=0.0)] = None
+    operator: Annotated[str | None, typer.Option(help="Operator of this recording; you, by default.")] = None
+    speed: Annotated[float, typer.Option(help="Share of the plan's speed, for a first run.", min=0.05, max=1.0)] = 1.0
     unguarded: Annotated[
         bool,
         typer.Option("--unguarded", help="Move axes that do not stop by themselves when this program is killed."),
-    ] = False,
-    json: JsonOption = False,
-) -> None:
+    ] = False
+    json: JsonOption = False
+
+
+@taking(RecordOptions)
+def record_verb(options: RecordOptions) -> None:
     """Execute the moves of a plan and log every sample; Ctrl-C and SIGTERM stop the axes.
 
     Where the cell file has an interlock (`recalibration`), it must release the robot: exit code
@@ -58,33 +65,34 @@ def record_verb(
     from daq.workflow.record import RecordingRequest, record
     from daq.workflow.safeguards import check_entered_mass
 
-    declared = load_cell(cell)
-    moves = slowed(declared, load_plan(plan, declared), speed)
-    who = operator or login()
-    carried = mounted(declared, payload)
-    check_entered_mass(declared, carried, mass)
+    declared = load_cell(options.cell)
+    moves = slowed(declared, load_plan(options.plan, declared), options.speed)
+    who = options.operator or login()
+    carried = mounted(declared, options.payload)
+    check_entered_mass(declared, carried, options.mass)
+    out = options.out
     part = _free(out)
-    not_weighed = carried is not None and mass is None
-    for line in _before_motion(declared, plan, not_weighed):
+    not_weighed = carried is not None and options.mass is None
+    for line in _before_motion(declared, options.plan, not_weighed):
         typer.echo(line, err=True)
     request = RecordingRequest(
-        cell,
+        options.cell,
         declared,
         moves,
         out,
         payload=carried,
         operator=who,
-        granted_by=who if enable_motion else None,
+        granted_by=who if options.enable_motion else None,
         run_id=str(uuid.uuid4()),
-        speed=speed,
-        entered_kg=mass,
-        unguarded=unguarded,
+        speed=options.speed,
+        entered_kg=options.mass,
+        unguarded=options.unguarded,
     )
     try:
         with (
             bus_lock(declared),
             interruptible() as block_signals,
-            Feed(cell) as feed,
+            Feed(options.cell) as feed,
             progress_bar("recording") as report_progress,
         ):
             if feed.remark:
@@ -104,7 +112,7 @@ def record_verb(
         raise
     for warning in done.warnings:
         typer.echo(warning, err=True)
-    if json:
+    if options.json:
         print_json(record_report(out, done, declared))
     else:
         verdict = "complete" if done.log.valid else f"INVALID: {done.log.reason}; a fit will refuse it"
@@ -112,8 +120,8 @@ def record_verb(
     if not done.log.valid:
         # The log is kept; the exit code keeps a script from using it.
         raise typer.Exit(ExitCode.DATA_UNFIT)
-    if not json:
-        _say_next(cell, declared, plan, out, carried)
+    if not options.json:
+        _say_next(options.cell, declared, options.plan, out, carried)
 
 
 def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:
