@@ -39,9 +39,31 @@ EXPLAINED = 0.9
 more. A sine between two turning points may pass too: its trapezoid resembles it, which is all that is asked."""
 
 
-def with_demand(data: Dataset, drive_train: DriveTrain, conditioning: Conditioning) -> Dataset:
-    """Add the motion that the drives were asked for, filtered as the recorded one; unchanged where it is unknown."""
-    position = demanded_positions(data, drive_train)
+class Demands:
+    """Set-points of runs, each rebuilt when it is first asked for: a search asks for those of the same runs often."""
+
+    def __init__(self) -> None:
+        self._found: dict[int, tuple[Dataset, FloatArray | None]] = {}
+
+    def of(self, data: Dataset, drive_train: DriveTrain) -> FloatArray | None:
+        """Return `demanded_positions` of a run; the run is told by its identity, and kept."""
+        if id(data) not in self._found:
+            self._found[id(data)] = (data, demanded_positions(data, drive_train))
+        return self._found[id(data)][1]
+
+
+def with_demand(
+    data: Dataset, drive_train: DriveTrain, conditioning: Conditioning, demands: Demands | None = None
+) -> Dataset:
+    """Add the motion that the drives were asked for, filtered as the recorded one; unchanged where it is unknown.
+
+    Args:
+        data: a run of n joints.
+        drive_train: R, for the trapezoids of coupled motors.
+        conditioning: its low-pass.
+        demands: of the runs that were asked for before.
+    """
+    position = demanded_positions(data, drive_train) if demands is None else demands.of(data, drive_train)
     if position is None:
         return data
     smooth = low_pass(position.T, data.rate_hz, conditioning.position_cutoff_hz, conditioning.position_order)

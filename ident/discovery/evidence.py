@@ -13,7 +13,7 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
-from ident.data.demand import as_demanded, with_demand
+from ident.data.demand import Demands, as_demanded, with_demand
 from ident.data.run import Run
 from ident.discovery.gates import own_unknowns, values_of
 from ident.effects.effect import PlacedEffect, effect_torque
@@ -58,6 +58,7 @@ class Evidence:
     #: Effects whose applied part has corrected model, runs and rows (`ident.effects.geometry_corrections`).
     corrections: tuple[PlacedEffect, ...] = ()
     uncorrected: Uncorrected | None = None  #: as they were before; None where nothing was corrected
+    demands: Demands = field(default_factory=Demands, repr=False, compare=False)  #: of the runs as they were given
     _identification: list[Identification] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
@@ -237,10 +238,10 @@ def by_instruments(evidence: Evidence) -> Estimate | None:
 
 def _with_instruments(evidence: Evidence) -> System | None:
     """System with instruments from the demanded motion; None where none is known or the drive is redundant."""
-    model, conditioning = evidence.model, evidence.conditioning
+    model = evidence.model
     if model.is_redundant:
         return None
-    asked = tuple(with_demand(data, model.drive_train, conditioning) for data in evidence.fit_runs)
+    asked = tuple(_with_demand(evidence, index) for index in range(len(evidence.fit_runs)))
     if all(data.demanded is None for data in asked):
         return None
     demanded = on_demanded_motion(model, asked, evidence.training)
@@ -250,6 +251,19 @@ def _with_instruments(evidence: Evidence) -> System | None:
         del datasets
     del asked  # free the copies of the runs before the equations are built
     return evidence.training.system(demanded)
+
+
+def _with_demand(evidence: Evidence, index: int) -> Dataset:
+    """A run of the fit with its demanded motion, in the corrected description.
+
+    The demand is rebuilt from the run as it was given: what corrects the recorded positions corrects it, too.
+    """
+    given = evidence.datasets if evidence.uncorrected is None else evidence.uncorrected.datasets
+    asked = with_demand(given[index], evidence.model.drive_train, evidence.conditioning, evidence.demands)
+    if asked.demanded is None:
+        return evidence.datasets[index]
+    corrected = corrected_dataset(as_demanded(asked), evidence.corrections)
+    return replace(evidence.datasets[index], demanded=corrected.motion())
 
 
 def _torques(

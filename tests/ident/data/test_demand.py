@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
-from ident.data.demand import as_demanded, demanded_positions, with_demand
+from ident.data.demand import Demands, as_demanded, demanded_positions, with_demand
 from ident.data.run import Run
+from ident.effects.effect import PlacedEffect
+from ident.effects.geometry_corrections import LatePosition, corrected_dataset
 from ident.model.model import DriveTrain
 
 FloatArray = NDArray[np.float64]
@@ -92,3 +94,24 @@ def test_derivatives_are_those_of_the_demanded_positions() -> None:
     speed = np.gradient(asked.position_rad, 1.0 / RATE_HZ, axis=0)
     assert np.max(np.abs(speed - asked.velocity_rad_s)) < 1e-9
     assert np.max(np.abs(asked.velocity_rad_s)) == pytest.approx(2.0, rel=0.05)
+
+
+def test_what_corrects_a_run_corrects_its_demand() -> None:
+    given = dataset(two_motors(4))
+    placed = (PlacedEffect(LatePosition(applied_s=0.004), 1),)
+    demanded_of_corrected = as_demanded(with_demand(corrected_dataset(given, placed), STRAIGHT, CONDITIONING))
+    corrected_demand = corrected_dataset(as_demanded(with_demand(given, STRAIGHT, CONDITIONING)), placed)
+    assert np.max(np.abs(corrected_demand.position_rad - demanded_of_corrected.position_rad)) < 1e-4
+    assert np.max(np.abs(corrected_demand.velocity_rad_s - demanded_of_corrected.velocity_rad_s)) < 0.02
+    assert np.max(np.abs(given.position_rad - demanded_of_corrected.position_rad)) > 0.005
+
+
+def test_the_demand_of_a_run_is_rebuilt_once() -> None:
+    demands, (one, other) = Demands(), (dataset(two_motors(5)), dataset(two_motors(6)))
+    first = demands.of(one, STRAIGHT)
+    assert demands.of(one, STRAIGHT) is first
+    assert first is not None
+    again = demanded_positions(one, STRAIGHT)
+    assert again is not None
+    assert np.array_equal(first, again)
+    assert demands.of(other, STRAIGHT) is not first
