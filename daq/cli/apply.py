@@ -5,6 +5,7 @@ Both are dry runs without --yes, but for the rollback of a file, whose backup ca
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import shlex
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
     from daq.writeback.target import E, Proposal, Target, Written
     from drivers.canopen.parameters import Saving
     from ident.calibration import Calibration
+
+_LOG = logging.getLogger("drivegain")
 
 ByOption = Annotated[str | None, typer.Option("--by", help="Name of the operator for the audit; by default the login.")]
 DrivesOption = Annotated[bool, typer.Option("--drives", help="The objects in the drives, not the controller's file.")]
@@ -271,6 +274,7 @@ def rollback_verb(
     values are in no file that could be reviewed.
     """
     from daq.config.cell_file import load_cell
+    from daq.ledger.ledger import MAY_LACK, is_damaged
     from daq.report.proposal import file_rollback_report, show_file_rollback
     from daq.writeback import target
     from daq.writeback.file_target import FileTarget
@@ -289,7 +293,12 @@ def rollback_verb(
         )
     if audit is not None:
         require_separate_audit(audit, (to,))
-    now, actor, audit = datetime.now(UTC), applier(by), audit if declared is None else audit_of(declared, (cell, to))
+    now = datetime.now(UTC)
+    actor = applier(by)
+    if declared is not None:
+        audit = audit_of(declared, (cell, to))
+    if audit is not None and is_damaged(audit):
+        _LOG.warning(MAY_LACK)
     if drives and declared is not None:
         rollback_drives(declared, now=now, actor=actor, saving=saving, audit=audit, yes=yes, json=json)
         return

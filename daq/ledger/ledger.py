@@ -145,6 +145,15 @@ def read_history(ledger: Ledger) -> History:
     return replace(history, may_lack=not verdict.holds)
 
 
+def is_damaged(audit: Path) -> bool:
+    """Whether an audit log is not what was written.
+
+    Raises:
+        AuditUnusable: it is no regular file, or it cannot be read.
+    """
+    return not verify(audit, noted_heads(audit)).holds
+
+
 def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
     """Check the audit log, and that the history has what it reports.
 

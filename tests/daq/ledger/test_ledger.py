@@ -394,7 +394,7 @@ def test_whoever_reads_the_history_of_a_damaged_log_is_told_that_it_may_lack_som
     assert read_history(ledger).may_lack
     assert verify_ledger(ledger).history.may_lack
     calibration = str(calibration_for(cell, 1.005))
-    for command in (["apply", str(cell), calibration], ["history", str(cell)]):
+    for command in (["apply", str(cell), calibration], ["history", str(cell)], ["rollback", str(cell)]):
         caplog.clear()
         assert main(command) == ExitCode.OK
         assert MAY_LACK in caplog.text
