@@ -1,0 +1,54 @@
+"""Documents as JSON: numbers that it lacks, names that are no text, keys that are left out."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daq.report.document import Figure, Report, json_text, json_tree
+
+
+class Part(Report):
+    """A part of the document."""
+
+    name: str
+    sigma: Figure
+
+
+class Whole(Report):
+    """A document with a key that may be left out."""
+
+    parts: list[Part]
+    sizes: tuple[Figure, ...]
+    by_name: dict[str, Figure]
+    remark: str = ""
+
+
+NAMES = st.text(st.characters(min_codepoint=1, max_codepoint=0x2FF) | st.sampled_from("\udc80\udcff\\udcff"))
+
+
+@given(name=NAMES)
+def test_a_name_of_any_bytes_comes_back_from_the_document(name: str) -> None:
+    made = Whole(parts=[Part(name=name, sigma=1.0)], sizes=(), by_name={name: 2.0})
+    assert json.loads(json_text(made)) == json_tree(made)
+    assert json_tree(made)["parts"][0]["name"] == name
+    assert list(json_tree(made)["by_name"]) == [name]
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_a_number_that_json_lacks_is_null_wherever_it_is(number: float) -> None:
+    made = Whole(parts=[Part(name="J1", sigma=number)], sizes=(1.0, number), by_name={"J1": number})
+    assert json_tree(made) == {
+        "parts": [{"name": "J1", "sigma": None}],
+        "sizes": [1.0, None],
+        "by_name": {"J1": None},
+    }
+
+
+def test_a_key_with_a_default_is_there_where_it_was_given() -> None:
+    assert "remark" not in json_tree(Whole(parts=[], sizes=(), by_name={}))
+    assert json_tree(Whole(parts=[], sizes=(), by_name={}, remark=""))["remark"] == ""
