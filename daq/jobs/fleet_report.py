@@ -14,7 +14,7 @@ from daq.jobs.cell_fit import Failure, Summary
 from daq.jobs.fleet import FleetRow
 from daq.report.gains import with_deviation
 from daq.report.job_schemas import FleetCell, FleetEffect, FleetFailure, FleetGain, FleetReport
-from daq.report.text import WholeTable, inert, inert_row, printable
+from daq.report.text import WholeTable, inert, inert_row, printable, spelled_bytes
 from ident.calibration import Gain
 
 FIRST_COLUMNS = ("cell", "configuration_sha256", "fit", "holdout")
@@ -130,11 +130,11 @@ def _fleet_cell(row: FleetRow) -> FleetCell:
     failure = result if isinstance(result, Failure) else None
     summary = result if isinstance(result, Summary) else None
     return FleetCell(
-        cell=row.cell,
+        cell=spelled_bytes(row.cell),
         configuration_sha256=row.configuration_sha256 or None,
         configurations=row.configurations,
-        fit=list(row.fit),
-        holdout=list(row.holdout),
+        fit=[spelled_bytes(name) for name in row.fit],
+        holdout=[spelled_bytes(name) for name in row.holdout],
         gains=[] if summary is None else [_fleet_gain(gain) for gain in summary.gains],
         worst=None if summary is None else _fleet_gain(summary.worst),
         error_percent=None if summary is None else summary.error_percent,
@@ -143,9 +143,9 @@ def _fleet_cell(row: FleetRow) -> FleetCell:
         partial=None if summary is None else summary.partial,
         seconds=row.seconds,
         kept=row.kept,
-        calibration=None if row.file is None else str(row.file),
+        calibration=None if row.file is None else spelled_bytes(str(row.file)),
         exit_code=0 if failure is None else failure.exit_code,
-        error=None if failure is None else FleetFailure(kind=failure.kind, text=failure.text),
+        error=None if failure is None else FleetFailure(kind=failure.kind, text=spelled_bytes(failure.text)),
     )
 
 
