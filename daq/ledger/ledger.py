@@ -285,22 +285,21 @@ def migrate(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) -> 
         DataError: the audit log is not what was written; nothing was changed.
         AuditUnusable, OutputFailed: a file cannot be written; the next call goes on.
     """
-    count, flaws = _take_over(ledger, who=who, at=at, forced=forced)
-    return Migrated(count, _put_aside(ledger, at), flaws)
+    taken = _take_over(ledger, who=who, at=at, forced=forced)
+    return replace(taken, aside=_put_aside(ledger, at))
 
 
-def _take_over(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) -> tuple[int, tuple[str, ...]]:
-    """Enter what only a history of an earlier version has; return the number of entries, and what is broken in it."""
+def _take_over(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) -> Migrated:
+    """Enter what only a history of an earlier version has; its file keeps its name."""
     if not ledger.outdated and not forced:
-        return 0, ()
+        return Migrated(0, None)
     stored = EMPTY
     flaws: tuple[str, ...] = ()
     try:
         stored = _read_stored(ledger)
-    except HistoryInaccessible:
-        raise
     except HistoryUnreadable as error:
-        if not forced:
+        may_be_sound = isinstance(error, HistoryInaccessible)
+        if may_be_sound or not forced:
             raise
         flaws = (error.found,)
     verdict = verify(ledger.audit, stored.noted.union(noted_heads(ledger.audit)))
@@ -312,7 +311,7 @@ def _take_over(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) 
     drafts = drafts_of(EMPTY if flaws else stored, verdict.entries, ledger.cell.name, who, at)
     for draft in drafts:
         _append(ledger, draft)
-    return len(drafts), flaws
+    return Migrated(len(drafts), None, flaws)
 
 
 class _NotPutAside(OutputFailed):
@@ -346,7 +345,7 @@ def audit_error(audit: Path, verdict: AuditVerdict) -> DataError:
             str(audit),
             found=f"no file; {first.says}",
             expected="the audit log with these entries",
-            remedy="restore it from a backup; without one, begin another one under a new name (`history.audit`)",
+            remedy="restore it from a backup; if there is none, begin a new log (another name in `history.audit`)",
         )
     cut_off = any(flaw.flaw is Flaw.CUT_OFF for flaw in verdict.flaws)
     note = f" (if the entries that are missing are of another log, remove {head_file(audit)})" if cut_off else ""

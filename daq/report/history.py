@@ -219,8 +219,8 @@ def say_verification(found: Verification, console: Console) -> None:
     console.print(f"{found.audit}: {len(verdict.entries)} entries, chain {'unbroken' if verdict.holds else 'BROKEN'}.")
     if not found.noted:
         console.print(
-            f"{head_file(found.audit).name} does not note its last entry: whether its end is missing cannot be seen. "
-            "The next entry is noted again."
+            f"No {head_file(found.audit).name} with the digest of the last entry: whether the end of the audit log is "
+            "missing cannot be seen. The next entry is noted again."
         )
     if verdict.torn:
         lines = ", ".join(map(str, verdict.torn))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import re
+import shutil
 import socket
 import threading
 from collections.abc import Iterator
@@ -16,16 +17,19 @@ import pytest
 from daq.advice import for_command_line
 from daq.cli.app import main
 from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
 from daq.console.live import Live
 from daq.console.results import Results
 from daq.console.server import CONNECTIONS, LARGEST_READERS, Page
 from daq.errors import ExitCode
+from daq.ledger.ledger import MAY_LACK
 from daq.log.feed import Feed
 from drivers.canopen.emcy import remedy_of
 from drivers.messages import CellEvent, EventKind
 from ident.calibration import Calibration
 from tests.daq.calibrations import demo_calibration
 from tests.daq.console.feeds import TOKEN, Recording, Served, arrivals, served
+from tests.daq.histories import calibration_of, enter, ledger_of
 
 
 @pytest.fixture(scope="module")
@@ -197,6 +201,24 @@ def test_more_pages_than_are_served_are_refused_also_at_once(console: Served) ->
         answers = [closing.enter_context(page.makefile("rb")).readline() for page in pages]
     assert sum(b" 200 " in line for line in answers) == LARGEST_READERS
     assert sum(b" 503 " in line for line in answers) == 2 * LARGEST_READERS
+
+
+def test_a_damaged_audit_log_is_a_problem_of_the_history_on_the_page(tmp_path: Path) -> None:
+    configs = tmp_path / "configs"
+    shutil.copytree(
+        Path(__file__).parents[3] / "configs", configs, ignore=shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
+    )
+    cell_file = configs / "cells" / "demo.yaml"
+    results = Results(cell_file, load_cell(cell_file))
+    ledger = ledger_of(cell_file)
+    for week in range(2):
+        enter(ledger, calibration_of(week))
+    assert results.document()["history"]["problem"] is None
+    lines = ledger.audit.read_bytes().splitlines(keepends=True)
+    ledger.audit.write_bytes(b"".join(lines[1:]))
+    shown = results.document()["history"]
+    assert shown["problem"] == MAY_LACK
+    assert shown["calibrations"] == 1
 
 
 def test_a_file_that_no_reader_expected_does_not_end_the_looking(cell: Cell, cell_file: Path) -> None:

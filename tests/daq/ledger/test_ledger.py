@@ -373,7 +373,7 @@ def test_a_calibration_that_cannot_be_read_is_a_finding(cell: Path, capsys: pyte
 
 
 @pytest.mark.parametrize("damage", ["edited", "first removed", "end cut off", "deleted"])
-def test_whoever_reads_the_history_of_a_damaged_log_is_told_that_it_may_lack_something(
+def test_a_damaged_log_is_reported_by_each_command_that_reads_or_adds_to_it(
     cell: Path, damage: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A calibration that is missing changes the judgement of a gain and of its drift."""
@@ -406,7 +406,7 @@ def test_a_log_without_its_note_is_said_to_be_one(cell: Path, capsys: pytest.Cap
     for spoil in (note.unlink, lambda: note.write_text("no digest\n")):
         spoil()
         assert main(["history", str(cell), "--verify"]) == ExitCode.OK
-        assert "whether its end is missing cannot be seen" in " ".join(capsys.readouterr().out.split())
+        assert "whether the end of the audit log is missing cannot be seen" in " ".join(capsys.readouterr().out.split())
     assert main(["history", str(cell), "--add", str(calibration_for(cell, 1.01))]) == ExitCode.OK
     capsys.readouterr()
     assert main(["history", str(cell), "--verify"]) == ExitCode.OK
