@@ -166,6 +166,10 @@ class EffectRefused(IdentificationError):
     """An effect was asked for that does not exist or does not fit the axis."""
 
 
+class EffectImpossible(EffectRefused):
+    """The data give a declared effect a coefficient that physics does not allow."""
+
+
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
     """Something wrong with a recording or fit that leaves usable numbers, and where to look."""

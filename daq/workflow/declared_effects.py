@@ -11,8 +11,9 @@ from daq.config.cell import Cell, model_of
 from daq.config.effects import place_effect
 from daq.config.yaml_file import Fault
 from daq.errors import ConfigurationInconsistent, UsageError
+from ident.discovery.declared import with_declared
 from ident.discovery.evidence import Evidence, gather, with_effects, without_effects
-from ident.discovery.loop import Step, with_declared
+from ident.discovery.loop import Step
 from ident.effects.effect import PlacedEffect
 from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.identify import estimate_with

@@ -48,6 +48,7 @@ from ident.equations.system import System
 from ident.errors import (
     ChannelsExchanged,
     Diagnosis,
+    EffectImpossible,
     GeometryTurned,
     ModelContradicted,
     NotConverged,
@@ -237,7 +238,7 @@ def named_causes(recordings: Recordings) -> Iterator[None]:
         yield
     except (ChannelsExchanged, GeometryTurned):
         raise
-    except (ModelContradicted, NotConverged, PayloadUnseen):
+    except (EffectImpossible, ModelContradicted, NotConverged, PayloadUnseen):
         turned = turned_geometry(recordings, (), None)
         if turned is not None:
             raise GeometryTurned(

@@ -38,12 +38,13 @@ from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
 from ident.discovery.acceptance import accept_on_holdout
 from ident.discovery.before_after import error_on, holdout_change
+from ident.discovery.declared import impossible_declared
 from ident.discovery.evidence import Evidence, gather, without_effects
 from ident.discovery.geometry_check import GeometryCheck
 from ident.discovery.geometry_covariance import evidence_with_geometry, geometry_covariance, with_geometry_covariance
 from ident.discovery.loop import Step, find_effects
 from ident.effects.friction import TemperatureFriction
-from ident.errors import Diagnosis, IdentificationError, PayloadUnseen
+from ident.errors import Diagnosis, EffectImpossible, IdentificationError, PayloadUnseen
 from ident.estimators.comparison import EstimatorComparison, try_estimators
 from ident.estimators.estimate import Estimate, Identification, RelativeError, of_squares
 from ident.estimators.geometry_estimate import GeometryFinding, Positions, estimate_geometry, thinned
@@ -438,6 +439,9 @@ def close_loop(
         last = replace(steps[-1], after=evidence_with_geometry(steps[-1].after, start.geometry_covariance))
         steps = (*steps[:-1], last)
     closed = replace(start, identification=before, steps=(*known, *steps))
+    wrong = impossible_declared(closed.steps[-1].after, places)
+    if wrong:  # the fit hoped for a correction of the geometry, and the search made none
+        raise EffectImpossible(f"the declared {wrong}")
     if closed.estimate is described:
         return closed
     with named_causes(closed.recordings):

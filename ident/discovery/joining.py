@@ -39,6 +39,7 @@ from ident.discovery.rotor_search import refined_rotor
 from ident.discovery.search import EffectKey, Finding, effect_key, is_better, rank_families
 from ident.discovery.structure import is_inadequate
 from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.geometry_corrections import is_correction
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import is_unnamed
 from ident.errors import NotConverged, RankDeficient
@@ -159,7 +160,8 @@ def _refit(model: JointFit, accepted: Finding) -> JointFit | SetAside:
         refitted = settled_corrections(first_order)
         if refitted is not first_order and (why := _refuted_by_instruments(refitted, last)):
             return SetAside(accepted, why)
-        joined = resettled(linearised_after(refitted, model))
+        joined = linearised_after(refitted, model)
+        joined = _all_resettled(joined) if is_correction(last) else resettled(joined)
     except UNFITTED as error:
         # The linearised problem distinguished the effect from the model, the whole one does not.
         return SetAside(accepted, f"it cannot be fitted: {error}")
@@ -178,19 +180,32 @@ def _moved_by(model: JointFit, found: Finding) -> tuple[tuple[int, float], ...]:
     return moved_gains(gain_shifts(problem.folds, torque), model.evidence.estimate.gains_std)
 
 
-def resettled(model: JointFit) -> JointFit:
-    """Refine the settings of the last effect around the joint fit and refit, until they stay as they are.
+def resettled(model: JointFit, index: int = -1) -> JointFit:
+    """Refine the settings of an effect around the joint fit and refit, until they stay as they are.
 
     The model without an effect may be far off, and the settings that fit its residual best with it.
+
+    Args:
+        model: the joint fit.
+        index: place of the effect among those of the model.
     """
     for _ in range(REFINEMENTS):
-        evidence, last = model.evidence, model.evidence.effects[-1]
-        effect = _refined_in(model, last)
-        if effect == last.effect:
+        evidence = model.evidence
+        placed = evidence.effects[index]
+        effect = _refined_in(model, placed)
+        if effect == placed.effect:
             break
-        others = evidence.effects[:-1]
-        refitted = with_effects(evidence, (*others, PlacedEffect(effect, last.axis)), model.search_problem.runs)
-        model = linearised_after(refitted, model)
+        effects = list(evidence.effects)
+        effects[index] = replace(placed, effect=effect)
+        refitted = with_effects(evidence, tuple(effects), model.search_problem.runs)
+        model = linearised_after(replace(refitted, declared=evidence.declared), model)
+    return model
+
+
+def _all_resettled(model: JointFit) -> JointFit:
+    """Refine the settings of every effect, which were those of another geometry."""
+    for index in range(len(model.evidence.effects)):
+        model = resettled(model, index)
     return model
 
 

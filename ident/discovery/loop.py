@@ -12,7 +12,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.discovery.balancer import propose_balancers
-from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, score_candidates
+from ident.discovery.candidates import ColumnCache, SearchProblem
 from ident.discovery.choice import choice_covariance, is_small
 from ident.discovery.effect_verdict import EffectVerdict
 from ident.discovery.evidence import Evidence, with_effects
@@ -25,7 +25,6 @@ from ident.discovery.gates import (
     probability_of_zero,
     values_of,
     whitened_columns,
-    without_effects_of,
 )
 from ident.discovery.joining import (
     UNFITTED,
@@ -37,11 +36,10 @@ from ident.discovery.joining import (
     linearised,
     linearised_after,
     refuted_by_structure,
-    resettled,
 )
 from ident.discovery.resonance import propose_resonances
 from ident.discovery.ripple import propose_orders
-from ident.discovery.rotor_search import declared_forms, propose_rotors
+from ident.discovery.rotor_search import propose_rotors
 from ident.discovery.search import (
     EffectKey,
     Finding,
@@ -57,7 +55,6 @@ from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.position import Counterbalance
 from ident.effects.transmission import Ripple
 from ident.effects.unnamed import is_unnamed
-from ident.errors import EffectRefused
 
 MAX_EFFECTS = 12  #: More effects than this on one robot mean that the declared model is wrong
 PIECES_PER_EFFECT = 3  #: Fewer pieces of moves than this for each effect cannot show that all of them are there
@@ -156,62 +153,6 @@ def find_effects(
     else:
         steps[-1] = _settled(steps[-1], model.search_problem, (), rng, gates)
     return (*steps[:-1], end_search(steps, model, gates))
-
-
-def with_declared(
-    start: Evidence,
-    declared: Sequence[PlacedEffect],
-    rng: np.random.Generator,
-    progress: Callable[[str], None] = lambda _: None,
-    axes: Sequence[str] = (),
-) -> tuple[Step, ...]:
-    """Add effects that the cell declares, and refit everything with each; settings that are refined are fitted, too.
-
-    Args:
-        start: identified by ``ml``, from `gather`, without effects.
-        declared: the effects, with the settings to begin with.
-        rng: of the bootstrap, for what the findings say; no gate keeps an effect out.
-        progress: called with a description of each step.
-        axes: their names in it; those of the robot's joints when empty.
-
-    Returns:
-        a step an effect; a search that begins with the last one's evidence keeps them.
-
-    Raises:
-        EffectRefused: the model contains an effect already, or its coefficients are impossible.
-        EffectRefused: a rotor's inertia is given where the load does not contain the rotor.
-        NotConverged, RankDeficient: see `ident.identify`.
-    """
-    gates, cache, evidence, steps = Gates(), ColumnCache(), start, list[Step]()
-    names = axes or [joint.name for joint in start.model.robot.places]
-    for placed in declared:
-        name = placed.name_among(names)
-        progress(f"fitting the declared {name}")
-        joined = _with_declared_form(evidence, declared_forms(placed, evidence.training, names))
-        model = resettled(linearised(replace(joined, declared=len(joined.effects)), cache))
-        evidence, estimate, last = model.evidence, model.evidence.estimate, model.evidence.effects[-1]
-        reduced = without_effects_of(model.search_problem, estimate, (last,))
-        problem, columns = reduced.search_problem, reduced.columns
-        (trial,) = score_candidates(problem.folds, columns, (slice(0, columns.shape[1]),))
-        own = own_unknowns(estimate, (last,))
-        wrong = impossible(last.effect.coefficients, values_of(estimate, own), estimate.parameters_std[own])
-        if trial is None or wrong:
-            raise EffectRefused(f"the declared {name}: {wrong or 'the model contains it already'}")
-        (finding,) = rank_families(problem, (FamilyTrials(last.axis, ((last.effect, trial),)),), rng, gates)
-        limits_nm = detection_limits_nm(model.search_problem, gates)
-        steps.append(Step((), (), limits_nm, finding, evidence, declared=True))
-    return tuple(steps)
-
-
-def _with_declared_form(evidence: Evidence, forms: Sequence[PlacedEffect]) -> Evidence:
-    """Refit with the first form of a declared effect that the data can fit; the last one must be possible."""
-    *richer, plain = forms
-    for form in richer:
-        try:
-            return with_effects(evidence, (*evidence.effects, form))
-        except UNFITTED:
-            continue
-    return with_effects(evidence, (*evidence.effects, plain))
 
 
 def end_search(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:

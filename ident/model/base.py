@@ -10,6 +10,7 @@ from scipy import linalg
 from ident.arrays import FloatArray
 
 SMALLEST_COLUMN = 1e-9  #: Norm of a column, relative to the largest, that is rounding error
+CLEAR = 1e-3  #: Share of a column's norm that is left of it where it is clearly independent of others
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,10 +23,12 @@ class BaseParameters:
 
 
 def independent_columns(matrix: FloatArray, tolerance: float = 1e-8, smallest: float = SMALLEST_COLUMN) -> list[int]:
-    """Indices of the columns that do not depend on the columns before them, ascending.
+    """Indices of a largest set of independent columns, ascending; of equals the first are taken.
 
-    A column is independent if, after projection off the chosen columns before it, more than ``tolerance`` of its norm
-    remains.
+    A column is independent if, after projection off the chosen columns, more than ``tolerance`` of its norm remains.
+    Columns of which more than CLEAR remains are taken first: where gravity is vertical but for a millionth, the mass
+    of a horizontal carriage and its rotor's inertia differ by a millionth of a constant force. The offset of the
+    friction is this force, and the choice; the difference of the two would stand for it with weights of a million.
 
     Args:
         matrix: shape (r, c).
@@ -34,18 +37,23 @@ def independent_columns(matrix: FloatArray, tolerance: float = 1e-8, smallest: f
             chosen, and the condition number would become 1e16.
     """
     norms = np.linalg.norm(matrix, axis=0)
-    present = norms > smallest * float(norms.max(initial=0.0))
+    left = np.flatnonzero(norms > smallest * float(norms.max(initial=0.0))).tolist()
     independent: list[int] = []
     basis = np.zeros((matrix.shape[0], 0))
-    for column in np.flatnonzero(present).tolist():
-        unit = matrix[:, column] / norms[column]
-        rest = unit - basis @ (basis.T @ unit)
-        rest -= basis @ (basis.T @ rest)  # twice is enough (Kahan): the first projection loses digits by cancellation
-        size = float(np.linalg.norm(rest))
-        if size > tolerance:
-            independent.append(column)
-            basis = np.column_stack((basis, rest / size))
-    return independent
+    for least in (max(CLEAR, tolerance), tolerance):
+        deferred: list[int] = []
+        for column in left:
+            unit = matrix[:, column] / norms[column]
+            rest = unit - basis @ (basis.T @ unit)
+            rest -= basis @ (basis.T @ rest)  # twice is enough (Kahan): the first projection cancels digits
+            size = float(np.linalg.norm(rest))
+            if size > least:
+                independent.append(column)
+                basis = np.column_stack((basis, rest / size))
+            elif size > tolerance:
+                deferred.append(column)
+        left = deferred
+    return sorted(independent)
 
 
 def base_parameters(triangle: FloatArray, names: tuple[str, ...], tolerance: float = 1e-8) -> BaseParameters:

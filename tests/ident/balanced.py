@@ -41,18 +41,23 @@ def _urdf(path: Path) -> str:
     return path.read_text(encoding="utf-8")
 
 
-def _balance(q: FloatArray) -> FloatArray:
+def _balance(q: FloatArray, free_m: float) -> FloatArray:
     """Slope of the energy k (s − s₀)²/2 of a spring from the foot to the end of the lever, by differences."""
 
     def energy(angle: FloatArray) -> FloatArray:
         lever = np.array([np.cos(angle - TOWARDS_RAD), np.sin(angle - TOWARDS_RAD)]) * LEVER_M
-        return np.asarray(0.5 * STIFFNESS_N_M * (np.hypot(lever[0] - FOOT_M, lever[1]) - FREE_M) ** 2)
+        return np.asarray(0.5 * STIFFNESS_N_M * (np.hypot(lever[0] - FOOT_M, lever[1]) - free_m) ** 2)
 
     return (energy(q + 1e-5) - energy(q - 1e-5)) / 2e-5
 
 
-def heavy_runs(balanced: bool) -> tuple[Run, ...]:
-    """Two runs without load and two with, 12 s each; coloured noise that leaves some 3 %."""
+def heavy_runs(balanced: bool, free_m: float = FREE_M) -> tuple[Run, ...]:
+    """Two runs without load and two with, 12 s each; coloured noise that leaves some 3 %.
+
+    Args:
+        balanced: whether the second joint has a balancer.
+        free_m: length of its spring without force.
+    """
     model, rng = heavy_model(), np.random.default_rng(1)
     links, _ = nominal_links(model.robot, _urdf(CONFIGS / "simulation/kr270-plant.urdf"))
     parameters = np.zeros(len(model.columns))
@@ -69,7 +74,7 @@ def heavy_runs(balanced: bool) -> tuple[Run, ...]:
         total = parameters.copy()
         total[model.flange] += body if payload else 0.0
         torque = model.torques(data.motion(), total)[2]
-        torque[AXIS] += _balance(data.position_rad[:, AXIS]) if balanced else 0.0
+        torque[AXIS] += _balance(data.position_rad[:, AXIS], free_m) if balanced else 0.0
         current = np.zeros_like(q)
         current[1:-1] = ((model.drive_train.to_motor @ torque) / GAINS[:, None]).T
         noise, stays = rng.standard_normal(current.shape) * NOISE_A, np.exp(-1.0 / (RATE_HZ * 0.005))

@@ -24,7 +24,7 @@ from ident.estimators.maximum_likelihood import ml
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import DriveTrain, Model
 from ident.model.urdf import robot_from_urdf
-from tests.ident.arms import THREE_AXES, TX40
+from tests.ident.arms import GANTRY, THREE_AXES, TX40
 
 FloatArray = NDArray[np.float64]
 
@@ -74,6 +74,16 @@ def three_axes_truth() -> Truth:
     friction = ((0.03, 7.0, 5.5), (0.03, 4.4, 7.7), (0.02, 1.6, 6.3))
     parameters = _parameters(model, (10.0, 5.0, 3.0), friction, np.random.default_rng(2))
     return Truth(model, parameters, np.array([33.9, 32.4, -24.2]))
+
+
+def gantry_truth() -> Truth:
+    """Three linear axes with a wrist of two, the arm in an upright gravity."""
+    model = Model(robot_from_urdf(GANTRY.urdf), DriveTrain(np.diag([120.0, 120.0, 150.0, 40.0, 50.0])))
+    friction = ((8.0, 20.0, 15.0), (6.0, 15.0, 12.0), (3.0, 10.0, 9.0), (0.03, 1.0, 2.0), (0.02, 0.8, 1.5))
+    parameters = _parameters(model, (15.0, 12.0, 8.0, 4.0, 2.0), friction, np.random.default_rng(3))
+    offset_n = [20.0, -15.0, 10.0]
+    parameters[[13, 27, 41]] = offset_n
+    return Truth(model, parameters, np.array([60.0, 55.0, 70.0, 8.0, 6.0]))
 
 
 def _parameters(

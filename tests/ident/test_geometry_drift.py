@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ident.calibration import Calibration, calibration_of
 from ident.data.dataset import differentiate
 from ident.data.run import Run
+from ident.discovery.declared import with_declared
 from ident.discovery.evidence import Evidence
-from ident.discovery.loop import with_declared
 from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import GravityDirection, rotation_by
 from ident.equations.rows import decimate_rows, row_masks

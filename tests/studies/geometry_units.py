@@ -16,8 +16,9 @@ import numpy as np
 from daq.config.cell import Cell, model_of
 from daq.workflow.declared_effects import declared_effects
 from ident.data.run import Run
+from ident.discovery.declared import with_declared
 from ident.discovery.evidence import Evidence, gather
-from ident.discovery.loop import find_effects, with_declared
+from ident.discovery.loop import find_effects
 from ident.errors import IdentificationError
 from ident.estimators.identify import identify
 from ident.estimators.method import Method

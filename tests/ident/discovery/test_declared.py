@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ident.arrays import FloatArray
 from ident.calibration import calibration_of
+from ident.discovery.declared import impossible_declared, with_declared
 from ident.discovery.evidence import Evidence, gather
 from ident.discovery.gates import Gates
-from ident.discovery.loop import Step, find_effects, with_declared
+from ident.discovery.loop import Step, find_effects
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect
 from ident.effects.position import Counterbalance
-from ident.errors import EffectRefused
+from ident.errors import EffectImpossible
 from ident.estimators.identify import identify
 from ident.prediction import predict_torque
 from tests.ident.balanced import (
@@ -29,6 +32,9 @@ from tests.ident.balanced import (
 
 GATES = Gates(draws=99)
 LIKE_IT = tuple(family for family in EFFECTS if family[0].name in ("counterbalance", "gravity-compensator", "spring"))
+JOINTS = ("J1", "J2", "J3", "J4", "J5", "J6")
+FREE_WITHOUT_PRELOAD_M = 0.53  #: Where the spring is shortest, it is 0.505 m long
+FREE_BEYOND_ITS_REACH_M = 0.7  #: It pushes where it should pull
 NEAR = PlacedEffect(Counterbalance(0.35, -1.2), AXIS)
 
 
@@ -107,12 +113,38 @@ def test_declared_where_there_is_none_it_bends_no_gain(unbalanced: Evidence) -> 
 
 
 def test_a_calibration_predicts_with_it(balanced: Evidence, declared: tuple[Step, ...]) -> None:
-    axes = [f"J{number}" for number in range(1, 7)]
-    made = calibration_of(balanced.identification, axes, GAINS, steps=declared)
+    made = calibration_of(balanced.identification, JOINTS, GAINS, steps=declared)
     assert [(effect.name, effect.axis) for effect in made.effects] == [("counterbalance", "J2")]
     data = balanced.datasets[0]
     torque = predict_torque(made, balanced.model, data)[:, AXIS]
     measured = GAINS[AXIS] * data.current_a[:, AXIS]
     assert np.linalg.norm(torque - measured) < 0.12 * np.linalg.norm(measured)
-    with pytest.raises(EffectRefused, match="physics allows"):
+    with pytest.raises(EffectImpossible, match="physics allows"):
         with_declared(balanced, [PlacedEffect(Counterbalance(0.35, 1.7), AXIS)], np.random.default_rng(0))
+
+
+def _leaning(free_m: float) -> Evidence:
+    """A fit with gravity declared three degrees off, and a balancer whose spring has this length without force."""
+    upright = heavy_model()
+    lean_rad = np.radians(-3.0)
+    declared = 9.81 * np.array([0.0, np.sin(lean_rad), -np.cos(lean_rad)])
+    model = replace(upright, robot=replace(upright.robot, gravity_m_s2=declared))
+    runs = heavy_runs(balanced=True, free_m=free_m)
+    return gather(identify(model, runs, CONDITIONING, keep_rows=True, judge=False))
+
+
+def test_a_balancer_that_only_a_leaning_base_makes_impossible_stays_and_the_search_corrects_gravity() -> None:
+    steps = with_declared(_leaning(FREE_WITHOUT_PRELOAD_M), [NEAR], np.random.default_rng(0))
+    before = steps[-1].after
+    assert "preload" in impossible_declared(before, JOINTS)
+    # Its own families apart: with this little preload another name of a spring explains as much.
+    found = find_effects(before, np.random.default_rng(0), GATES, families=())
+    after = found[-1].after
+    assert [placed.effect.name for placed in after.effects] == ["counterbalance", "gravity-direction"]
+    assert impossible_declared(after, JOINTS) == ""
+    assert np.max(np.abs(after.estimate.gains / GAINS - 1.0)) < 0.005
+
+
+def test_a_balancer_that_no_geometry_makes_possible_is_refused_under_a_leaning_base_too() -> None:
+    with pytest.raises(EffectImpossible, match="preload is -"):
+        with_declared(_leaning(FREE_BEYOND_ITS_REACH_M), [NEAR], np.random.default_rng(0))

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from ident.calibration import Calibration
 from ident.data.dataset import Dataset
+from ident.discovery.declared import with_declared
 from ident.discovery.evidence import Evidence, gather, with_effects
 from ident.discovery.gates import Gates
-from ident.discovery.loop import find_effects, with_declared
+from ident.discovery.loop import find_effects
 from ident.discovery.rotor_search import axes_with_rotor_in_load, largest_inertia
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.friction import LoadFriction

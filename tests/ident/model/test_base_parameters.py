@@ -56,3 +56,21 @@ def test_regrouping_keeps_the_product() -> None:
     assert found.names[1] == "b - 0.5*c"
     parameters = rng.normal(size=5)
     assert matrix[:, [0, 1, 3, 4]] @ (found.grouping @ parameters) == pytest.approx(matrix @ parameters)
+
+
+def test_columns_that_differ_by_a_millionth_of_another_give_no_weights_of_a_million() -> None:
+    """A carriage in a gravity that leans by a millionth: mass, rotor, and the offset of the friction."""
+    acceleration = np.random.default_rng(2).normal(size=50)
+    force = np.ones(50)
+    mass = acceleration + 1e-6 * force
+    found = base_parameters(np.column_stack((mass, acceleration, force)), ("m", "Ia", "off"))
+    assert found.independent == (0, 2)
+    assert found.names == ("m + 1.0*Ia", "off")
+    assert np.max(np.abs(found.grouping)) == pytest.approx(1.0)
+
+
+def test_columns_that_differ_by_a_millionth_of_what_is_nowhere_else_are_two() -> None:
+    rng = np.random.default_rng(3)
+    first = rng.normal(size=50)
+    second = first + 1e-6 * rng.normal(size=50)
+    assert base_parameters(np.column_stack((first, second)), ("a", "b")).independent == (0, 1)

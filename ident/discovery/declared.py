@@ -1,0 +1,145 @@
+"""Add the effects that a cell declares: they are fitted, not searched for.
+
+A declared effect must be possible: a balancer does not push where it must pull. Where its coefficients are not, the
+declaration is refused, unless a wrong zero, gravity or a late position is the cause: the torque of a balancer and that
+of gravity are alike, so that a base that leans by a degree makes a true balancer look impossible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ident.discovery.candidates import ColumnCache, FamilyTrials, score_candidates
+from ident.discovery.evidence import Evidence, with_effects
+from ident.discovery.gates import Gates, impossible, own_unknowns, values_of, without_effects_of
+from ident.discovery.geometry_check import check_geometry
+from ident.discovery.joining import UNFITTED, JointFit, linearised, resettled
+from ident.discovery.loop import Step
+from ident.discovery.rotor_search import declared_forms
+from ident.discovery.search import Finding, rank_families
+from ident.discovery.structure import detection_limits_nm
+from ident.effects.effect import PlacedEffect
+from ident.errors import EffectImpossible, EffectRefused, TooFewMoves
+
+
+def with_declared(
+    start: Evidence,
+    declared: Sequence[PlacedEffect],
+    rng: np.random.Generator,
+    progress: Callable[[str], None] = lambda _: None,
+    axes: Sequence[str] = (),
+) -> tuple[Step, ...]:
+    """Add effects that the cell declares, and refit everything with each; settings that are refined are fitted, too.
+
+    Args:
+        start: identified by ``ml``, from `gather`, without effects.
+        declared: the effects, with the settings to begin with.
+        rng: of the bootstrap, for what the findings say; no gate keeps an effect out.
+        progress: called with a description of each step.
+        axes: their names in it; those of the robot's joints when empty.
+
+    Returns:
+        a step an effect; a search that begins with the last one's evidence keeps them. Where the geometry is to blame
+        (`is_geometry_to_blame`), coefficients may be impossible until it is corrected.
+
+    Raises:
+        EffectImpossible: the coefficients of an effect are impossible.
+        EffectRefused: the model contains an effect already.
+        EffectRefused: a rotor's inertia is given where the load does not contain the rotor.
+        NotConverged, RankDeficient: see `ident.identify`.
+    """
+    gates = Gates()
+    cache = ColumnCache()
+    evidence = start
+    steps: list[Step] = []
+    names = axes or [joint.name for joint in start.model.robot.places]
+    for placed in declared:
+        name = placed.name_among(names)
+        progress(f"fitting the declared {name}")
+        joined = _with_declared_form(evidence, declared_forms(placed, evidence.training, names))
+        model = resettled(linearised(replace(joined, declared=len(joined.effects)), cache))
+        evidence = model.evidence
+        finding = _finding_beside_others(model, evidence.effects[-1], rng, gates)
+        if finding is None:
+            raise EffectRefused(f"the declared {name}: the model contains it already")
+        limits_nm = detection_limits_nm(model.search_problem, gates)
+        steps.append(Step((), (), limits_nm, finding, evidence, declared=True))
+    require_possible(evidence, rng, names)
+    return tuple(steps)
+
+
+def require_possible(evidence: Evidence, rng: np.random.Generator, axes: Sequence[str]) -> None:
+    """Refuse declared effects whose coefficients are impossible, unless the geometry is to blame.
+
+    Args:
+        evidence: identified by ``ml``, with the declared effects first.
+        rng: of the bootstrap in the test of the geometry.
+        axes: names of the axes.
+
+    Raises:
+        EffectImpossible: as said.
+    """
+    wrong = impossible_declared(evidence, axes)
+    if wrong and not is_geometry_to_blame(evidence, rng):
+        raise EffectImpossible(f"the declared {wrong}")
+
+
+def impossible_declared(evidence: Evidence, axes: Sequence[str]) -> str:
+    """Name the first declared effect with impossible coefficients, and say which; empty where all are possible."""
+    estimate = evidence.estimate
+    for placed in evidence.effects[: evidence.declared]:
+        own = own_unknowns(estimate, (placed,))
+        wrong = impossible(placed.effect.coefficients, values_of(estimate, own), estimate.parameters_std[own])
+        if wrong:
+            return f"{placed.name_among(axes)}: {wrong}"
+    return ""
+
+
+def is_geometry_to_blame(evidence: Evidence, rng: np.random.Generator) -> bool:
+    """Whether the data ask for another geometry, and all declared effects are possible with it.
+
+    Args:
+        evidence: identified by ``ml``, with the declared effects.
+        rng: of the bootstrap.
+    """
+    try:
+        mistake = check_geometry(evidence, rng).mistake
+    except TooFewMoves:
+        return False
+    if mistake is None:
+        return False
+    correction = PlacedEffect(mistake.effect, mistake.axis)
+    try:
+        corrected = with_effects(evidence, (*evidence.effects, correction))
+    except UNFITTED:
+        return False
+    names = [joint.name for joint in evidence.model.robot.places]
+    return not impossible_declared(replace(corrected, declared=evidence.declared), names)
+
+
+def _with_declared_form(evidence: Evidence, forms: Sequence[PlacedEffect]) -> Evidence:
+    """Refit with the first form of a declared effect that the data can fit; the last one must be possible."""
+    *richer, plain = forms
+    for form in richer:
+        try:
+            return with_effects(evidence, (*evidence.effects, form))
+        except UNFITTED:
+            continue
+    return with_effects(evidence, (*evidence.effects, plain))
+
+
+def _finding_beside_others(
+    model: JointFit, placed: PlacedEffect, rng: np.random.Generator, gates: Gates
+) -> Finding | None:
+    """What a declared effect explains beside all others in the model; None where they contain it."""
+    reduced = without_effects_of(model.search_problem, model.evidence.estimate, (placed,))
+    problem = reduced.search_problem
+    columns = reduced.columns
+    (trial,) = score_candidates(problem.folds, columns, (slice(0, columns.shape[1]),))
+    if trial is None:
+        return None
+    (finding,) = rank_families(problem, (FamilyTrials(placed.axis, ((placed.effect, trial),)),), rng, gates)
+    return finding
