@@ -8,14 +8,16 @@ what the model lacks. A zero offset is planted on every joint on which these run
     python -m tests.studies.geometry_study --only TX-40 --mistakes clean zero-offset --seeds 1
     python -m tests.studies.geometry_study --minutes 0               nothing is searched: the tables of what is there
 
-Layout: out/geometry-study/<unit>.csv, the row of one unit; out/geometry-study.csv has all. Real recordings whose
-gravity is turned by 90 and by 180 degrees are units of the study, too: their rows say whether the fit is refused, and
-what error it has.
+Layout: out/geometry-study/<unit>.csv, the row of one unit; out/geometry-study.csv has all. Where all units of the seeds
+are there, docs/evidence/data gets them with the summary. Real recordings whose
+gravity is turned by 90 and by 180 degrees are units of the study, too: their rows say what direction `fit` names, and
+what error the fit has as declared.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import time
 from collections.abc import Sequence
@@ -41,14 +43,15 @@ from tests.studies.geometry_units import (
     search_unit,
     turned_unit,
 )
-from tests.studies.output import print_line
+from tests.studies.output import as_csv, print_line
 from tests.studies.planted_mistakes import Mistake
 from tests.studies.real_runs import data_folder
 from tests.studies.side_by_side import Shard, shard
 from tests.studies.study_rows import finished_rows, rows_of_unit, to_csv, work_off
 
 OUT = Path("out/geometry-study")
-TABLE = Path("docs") / "evidence" / "data" / "geometry.csv"  # where all units are there
+TABLE = Path("docs") / "evidence" / "data" / "geometry.csv"
+SUMMARY = TABLE.with_name("geometry-summary.csv")
 SEEDS = (1, 2, 3, 4)
 
 
@@ -148,9 +151,10 @@ def main(arguments: list[str] | None = None) -> int:
     table = to_csv(MistakeRow, rows).encode()
     options.out.mkdir(parents=True, exist_ok=True)
     replace_file(options.out.with_suffix(".csv"), table)
-    every = units_of(options.out, STUDIED, SEEDS, kinds)
+    every = units_of(options.out, STUDIED, options.seeds, kinds)
     if len(rows) == len(every) and {unit.name for unit in every} == {unit.name for unit in units}:
         replace_file(TABLE, table)
+        replace_file(SUMMARY, as_csv(summary(rows)).encode())
     print_line(f"\n{left} units of this piece were not begun\n\n{summary(rows)}")
     return 0
 
@@ -162,7 +166,8 @@ def line_of(unit: MistakeUnit, row: MistakeRow) -> str:
     if row.refused:
         return f"{unit.name}: refused: {row.refused[:100]}"
     if unit.mistake == TURNED:
-        return f"{unit.name}: fitted with {row.error_before_percent:.2f} %"
+        found = f"{math.degrees(row.value):.1f} ± {math.degrees(row.std):.1f}°" if row.named else "not named"
+        return f"{unit.name}: fitted with {row.error_before_percent:.2f} %, gravity turned by {found}"
     found = f"{row.value:.4g} ± {row.std:.2g}" if row.named else "not named"
     gains = f"worst gain {row.gain_error_before_percent:.2f} -> {row.gain_error_after_percent:.2f} %"
     return (
