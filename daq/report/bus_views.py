@@ -12,14 +12,11 @@ from rich.text import Text
 from daq.config.cell import PacingMode
 from daq.config.cell_buses import bus_loads, bus_loads_percent, cell_address
 from daq.report.bus_schemas import (
-    ErrorCodeEntry,
     ErrorCodeReport,
     MonitoredAxis,
     MonitoredBus,
     MonitorReport,
     Notice,
-    PredictedCurrent,
-    PredictionState,
     RefusedObject,
     ScannedNode,
     ScanReport,
@@ -31,7 +28,7 @@ from drivers.profiles.cia402 import ENABLED, FAULTY, State, decode
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell, CellAxis
-    from daq.workflow.monitor import CellPrediction, WatchedCell
+    from daq.workflow.monitor import WatchedCell
     from drivers.canopen.emcy import ErrorCode
     from drivers.canopen.node_scan import FoundNode
     from drivers.messages import CellEvent
@@ -41,13 +38,7 @@ if TYPE_CHECKING:
 
 def error_code_report(found: ErrorCode) -> ErrorCodeReport:
     """Return an error code in words, and whether a standard names it."""
-    return ErrorCodeReport(
-        code=found.code,
-        hex=found.hex,
-        text=found.text,
-        remedy=found.remedy,
-        standard=found.code in CODES,
-    )
+    return ErrorCodeReport.of(found, standard=found.code in CODES)
 
 
 def scan_report(
@@ -66,14 +57,14 @@ def scan_report(
         mistyped: nameplates that `plan` and `record` would refuse.
         warnings: what `record` would warn of.
     """
-    return ScanReport(
+    return ScanReport.of(
         bus=str(cell_address(cell)),
-        nodes=list(nodes),
+        nodes=nodes,
         reset=list(faults),
-        faults=dict(faults),
+        faults=faults,
         current=current_signals(cell),
-        mistyped=list(mistyped),
-        warnings=list(warnings),
+        mistyped=mistyped,
+        warnings=warnings,
     )
 
 
@@ -203,17 +194,14 @@ def monitor_report(cell: Cell, watched: WatchedCell) -> MonitorReport:
     """Return one reading of the bus."""
     reading = watched.reading
     loads = bus_loads_percent(cell, reading)
-    return MonitorReport(
+    return MonitorReport.of(
+        watched,
+        reading,
         cell=cell.name,
-        source=reading.source.value,
-        recorder=watched.recorder,
-        seconds=reading.seconds,
-        sync_hz=reading.sync_hz,
         frames_per_s=sum(map(sum, reading.frames)) / reading.seconds,
         bus_load_percent=max(loads),
         buses=[MonitoredBus(bus=bus.name, load_percent=load) for bus, load in zip(cell.buses, loads, strict=True)],
         axes=[_monitored_axis(axis, watched, number) for number, axis in enumerate(cell.axes)],
-        prediction=_prediction_state(watched.prediction),
         events=[event.text for event in watched.events],
         notices=[_notice(cell, event) for event in watched.events],
     )
@@ -223,78 +211,37 @@ def _monitored_axis(declared: CellAxis, watched: WatchedCell, number: int) -> Mo
     from drivers.canopen.link import nmt_name  # noqa: PLC0415 - as above
 
     assert declared.node_id is not None  # a cell without nodes has no bus to read
-    axis, position, ampere_per_unit = watched.reading.axes[number], watched.position[number], watched.ampere[number]
-    raw, word = axis.current_raw, axis.statusword
-    state = None if word is None else decode(word)
+    axis = watched.reading.axes[number]
+    position = watched.position[number]
+    ampere_per_unit = watched.ampere[number]
+    raw = axis.current_raw
+    state = None if axis.statusword is None else decode(axis.statusword)
     in_fault = state in FAULTY
     # While another master prepares, it sends no SYNC, and no axis has to answer.
     addressed = watched.reading.source.value == "asked" or watched.reading.sync_hz > 0.0
-    return MonitoredAxis(
+    predicted = () if watched.prediction is None else watched.prediction.axes
+    return MonitoredAxis.of(
+        axis,
         axis=declared.name,
         node_id=declared.node_id,
         position=None if position is None else position / declared.unit.si,
         unit=declared.unit.name,
-        position_counts=axis.position_counts,
         current_a=None if raw is None or ampere_per_unit is None else raw * ampere_per_unit,
-        current_raw=raw,
         state=None if state is None else str(state),
         enabled=None if state is None else state in ENABLED,
         in_fault=in_fault,
-        statusword=word,
         nmt=None if axis.nmt is None else nmt_name(axis.nmt),
-        rate_hz=axis.rate_hz,
-        lost=axis.lost,
         silent=addressed and not axis.heard,
-        delay_s=axis.delay_s,
-        refused=[RefusedObject(object=str(one.entry), abort_code=one.abort_code) for one in axis.refused],
+        refused=[RefusedObject.of(one, object=str(one.entry)) for one in axis.refused],
         remark="; ".join(_answer_remarks(axis)),
-        fault=_error_code(watched.faults.get(declared.name)) if in_fault else None,
-        prediction=_predicted_current(watched.prediction, number),
+        fault=watched.faults.get(declared.name) if in_fault else None,
+        prediction=predicted[number] if predicted else None,
     )
-
-
-def _error_code(found: ErrorCode | None) -> ErrorCodeEntry | None:
-    if found is None:
-        return None
-    return ErrorCodeEntry(
-        code=found.code,
-        hex=found.hex,
-        text=found.text,
-        remedy=found.remedy,
-    )
-
-
-def _predicted_current(prediction: CellPrediction | None, number: int) -> PredictedCurrent | None:
-    if prediction is None or not prediction.axes:
-        return None
-    found = prediction.axes[number]
-    return PredictedCurrent(
-        measured=found.measured,
-        predicted=found.predicted,
-        band=found.band,
-        residual_rms=found.residual_rms,
-        outside_share=found.outside_share,
-        conspicuous=found.conspicuous,
-    )
-
-
-def _prediction_state(prediction: CellPrediction | None) -> PredictionState | None:
-    if prediction is None:
-        return None
-    return PredictionState(payload=prediction.payload, remark=prediction.remark)
 
 
 def _notice(cell: Cell, event: CellEvent) -> Notice:
     axis = None if event.axis is None else cell.axis_names[event.axis]
-    found = notice_of(event.kind, event.code, axis, event.text)
-    return Notice(
-        axis=found.axis,
-        kind=found.kind,
-        code=found.code,
-        text=found.text,
-        remedy=found.remedy,
-        alarm=found.alarm,
-    )
+    return Notice.of(notice_of(event.kind, event.code, axis, event.text))
 
 
 def _answer_remarks(axis: AxisReading) -> Iterator[str]:

@@ -23,9 +23,7 @@ from daq.report.controller_schemas import (
     EarlierCalibration,
 )
 from daq.report.effect_names import accepted_text, size_text
-from daq.report.fit import errors_of, errors_or_none
 from daq.report.gains import encoder_text, mass_texts
-from daq.report.proposal import refused_of
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.gates.gate import Gate, GateContext, Refusal
 from daq.writeback.gates.table import check_gates
@@ -357,22 +355,16 @@ def certificate_report(certificate: Certificate) -> CertificateReport:
     """Return the numbers of the page."""
     calibration, comparison = certificate.calibration, certificate.comparison
     edit, earlier = comparison.edit, certificate.earlier
-    return CertificateReport(
+    return CertificateReport.of(
+        certificate,
+        comparison,
+        calibration,
         format="drivegain-certificate",
         version=1,
-        cell=calibration.cell,
         identity=dict(identity(calibration)),
-        verdict=certificate.verdict.value,
-        sentence=certificate.sentence,
         controller=None if edit is None else str(edit.file),
         controller_unread=comparison.unread or None,
         axes=[_certified_gain(row, certificate.place) for row in certificate.rows],
-        refusals=[refused_of(refusal) for refusal in comparison.refusals],
-        holdout_error_percent=errors_or_none(calibration.holdout_error_percent),
-        nameplate_holdout_error_percent=errors_or_none(calibration.nameplate_holdout_error_percent),
-        relative_error_percent=errors_of(calibration.relative_error_percent),
-        payload_mass=list(calibration.payload_mass),
-        encoder_misfit=calibration.encoder_misfit,
         effects=[_certified_effect(effect, calibration) for effect in calibration.effects],
         beside=None if earlier is None else _beside(earlier, certificate.since),
     )
@@ -380,39 +372,24 @@ def certificate_report(certificate: Certificate) -> CertificateReport:
 
 def _certified_gain(row: AxisRow, place: str) -> CertifiedGain:
     change = row.change
-    return CertifiedGain(
-        axis=change.axis,
+    return CertifiedGain.of(
+        change,
+        row,
         key=change.key or None,
         line=change.line or None,
-        old=change.old,
-        new=change.new,
-        std=change.std,
-        std_percent=change.std_percent,
-        unit=change.unit,
-        nameplate=change.nameplate,
-        change_percent=change.change_percent,
         written=change.spelling or None,
-        allowed_percent=list(row.allowed_percent),
         change_sigmas=row.judged.sigmas,
-        significant=row.significant,
         verdict=row.words(place),
     )
 
 
 def _certified_effect(effect: AcceptedEffect, calibration: Calibration) -> CertifiedEffect:
-    return CertifiedEffect(
-        axis=effect.axis,
+    return CertifiedEffect.of(
+        effect,
         effect=accepted_text(effect, calibration),
         size=size_text(effect, calibration),
-        error_before_percent=effect.error_before_percent,
-        error_after_percent=effect.error_after_percent,
-        ambiguity=list(effect.ambiguity),
     )
 
 
 def _beside(earlier: Calibration, since: Sequence[AxisRow]) -> EarlierCalibration:
-    return EarlierCalibration(
-        created=earlier.created,
-        axes=[_certified_gain(row, EARLIER) for row in since],
-        holdout_error_percent=errors_or_none(earlier.holdout_error_percent),
-    )
+    return EarlierCalibration.of(earlier, axes=[_certified_gain(row, EARLIER) for row in since])

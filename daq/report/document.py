@@ -5,8 +5,12 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import is_dataclass
+from datetime import datetime
+from enum import Enum
+from pathlib import Path
+from typing import Any, Self
 
 from pydantic import model_validator
 
@@ -18,12 +22,50 @@ Figure = float | None
 
 
 class Report(StrictModel):
-    """A JSON document, or a part of one; when it is made, numbers that JSON lacks become null."""
+    """A JSON document, or a part of one; when it is made, numbers that JSON lacks become null.
+
+    A part may be given as the frozen dataclass whose attributes it has.
+    """
+
+    @classmethod
+    def of(cls, *sources: object, **others: Any) -> Self:
+        """Return the document of an object: `others`, and its attributes for the other fields, by their names.
+
+        Args:
+            sources: the object, or several; the first that has an attribute gives it.
+            others: fields that no source has, or not as the document says them.
+        """
+        given = {name: _plain(value) for name, value in others.items()}
+        for source in sources:
+            given = {**_attributes(cls, source), **given}
+        return cls(**given)
 
     @model_validator(mode="before")
     @classmethod
     def _make_valid(cls, values: Any) -> Any:
+        if is_dataclass(values):
+            values = _attributes(cls, values)
         return _changed(values, _without_surrogates)
+
+
+def _attributes(kind: type[Report], source: object) -> dict[str, Any]:
+    """Return the attributes of an object that are fields of a document."""
+    return {name: _plain(getattr(source, name)) for name in kind.model_fields if hasattr(source, name)}
+
+
+def _plain(value: Any) -> Any:
+    """Return an attribute as documents have it: text for a path or time, a list for a tuple, the value of an enum."""
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, datetime):
+        return value.isoformat()
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, Mapping):
+        return {_plain(key): _plain(item) for key, item in value.items()}
+    return value
 
 
 def json_tree(report: Report) -> dict[str, Any]:

@@ -18,11 +18,9 @@ from daq.report.fit_schemas import (
     CheckedGeometry,
     ComparedFit,
     ComparedGain,
-    Errors,
     FitReport,
     FoundGravity,
     GainWords,
-    RemovedParameter,
     Trial,
 )
 from daq.report.gains import (
@@ -45,7 +43,7 @@ from ident.calibration import Calibration, Parameter, PayloadMass
 from ident.discovery.evidence import Evidence, without_effects
 from ident.discovery.geometry_check import GeometryCheck, Gravity
 from ident.effects.effect import PlacedEffect
-from ident.estimators.comparison import EstimatorComparison, EstimatorTrial
+from ident.estimators.comparison import EstimatorComparison, EstimatorTrial, Removal
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import misjudged_joints
 from ident.estimators.method import Method
@@ -163,21 +161,15 @@ def with_calibration(kind: type[BodyT], calibration: Calibration, **others: obje
 
 def _compared(fitted: Fit, paper: Estimate) -> ComparedFit:
     axes = fitted.cell.axis_names
-    return ComparedFit(
+    return ComparedFit.of(
+        paper,
         gains=_gains(axes, paper.gains, paper.gains_std),
-        condition=paper.condition,
         misjudged=[axes[joint] for joint in misjudged_joints(fitted.final.system)],
     )
 
 
 def _gain_words(axis: str, gain: GainVerdict) -> GainWords:
-    return GainWords(
-        axis=axis,
-        std_percent=gain.std_percent,
-        verdict=gain.verdict.value,
-        seen_by=[source.value for source in gain.sources],
-        words=gain.words(axis),
-    )
+    return GainWords.of(gain, axis=axis, seen_by=gain.sources, words=gain.words(axis))
 
 
 def _gains(axes: tuple[str, ...], gains: FloatArray, stds: FloatArray) -> list[ComparedGain]:
@@ -194,19 +186,12 @@ def cases_report(fits: Mapping[str, CaseFit], calibrations: Mapping[str, Calibra
 
 
 def _case_report(case: Case, found: CaseFit, calibration: Calibration) -> CaseReport:
-    return with_calibration(
-        CaseReport,
-        calibration,
-        title=case.title,
-        known=case.known.value,
-        removed=_removed(found),
-    )
+    known = case.known.value
+    return with_calibration(CaseReport, calibration, title=case.title, known=known, removed=_removed(found))
 
 
-def _removed(found: CaseFit) -> list[RemovedParameter]:
-    if found.essential is None:
-        return []
-    return [RemovedParameter(name=step.name, std_percent=step.std_percent) for step in found.essential.removed]
+def _removed(found: CaseFit) -> Sequence[Removal]:
+    return () if found.essential is None else found.essential.removed
 
 
 def cases_view(fits: Mapping[str, CaseFit], tables: tuple[paper_tables.PaperTable, ...]) -> Iterator[RenderableType]:
@@ -227,16 +212,6 @@ def error_table(title: str, axes: tuple[str, ...], errors: Mapping[str, Relative
         if error is not None:
             table.add_row(name, *map(percent_text, (*error.axes, error.total)))
     return table
-
-
-def errors_of(error: RelativeError) -> Errors:
-    """Return relative errors for a document."""
-    return Errors(axes=list(error.axes), total=error.total)
-
-
-def errors_or_none(error: RelativeError | None) -> Errors | None:
-    """Return relative errors for a document; None where there are none."""
-    return None if error is None else errors_of(error)
 
 
 def start_of(fitted: Fit) -> Evidence:

@@ -110,14 +110,8 @@ def own_torques(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]) -> 
 def _own_torque(slope: TorqueSlope | None, gain: Gain) -> OwnTorque:
     if slope is None:
         return OwnTorque(axis=gain.axis, slope=None)
-    return OwnTorque(
-        axis=gain.axis,
-        slope=slope.value,
-        std=slope.std,
-        ratio=slope.value / gain.value,
-        ratio_std=_ratio_std(slope, gain),
-        readings=slope.readings,
-    )
+    ratio = slope.value / gain.value
+    return OwnTorque.of(slope, axis=gain.axis, slope=slope.value, ratio=ratio, ratio_std=_ratio_std(slope, gain))
 
 
 def _ratio_std(slope: TorqueSlope, gain: Gain) -> float:

@@ -17,15 +17,13 @@ from daq.config.cell import Cell
 from daq.errors import ControllerUnfit
 from daq.formats.document import decode_document, read_controller_file
 from daq.formats.scalar import Scalar, rewrite_gain
-from daq.ledger.audit import OpenWrite, head_file
-from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, drives_of
-from daq.ledger.fold import AuditedWrite, History
+from daq.ledger.audit import head_file
+from daq.ledger.entry import Entry, Event, WriteAction, drives_of
+from daq.ledger.fold import History
 from daq.ledger.ledger import Verification
 from daq.ledger.watch import Series, alarm_text, pattern_of, questions
 from daq.report.controller_schemas import (
-    Acknowledged,
     AuditReport,
-    FlawedLine,
     HistoryAxis,
     HistoryPoint,
     HistoryReport,
@@ -178,39 +176,33 @@ def history_report(
         in_force: digest of the calibration whose gains the controller has.
         checked: state of audit log and history; None where it was not asked for.
     """
-    audit = {} if checked is None else {"audit": audit_report(checked)}
-    return HistoryReport(
+    others = {} if checked is None else {"audit": audit_report(checked)}
+    return HistoryReport.of(
         cell=cell,
         calibrations=len(entries),
         in_force=in_force,
         chart=asdict(CHART),
-        pattern=pattern_of(all_series).value,
-        questions=list(questions(all_series)),
+        pattern=pattern_of(all_series),
+        questions=questions(all_series),
         axes=[_history_axis(series) for series in chosen],
-        **audit,
+        **others,
     )
+
+
+_OF_DRIFT = ("change_percent", "change_sigmas", "baseline", "baseline_std")
 
 
 def _history_axis(series: Series) -> HistoryAxis:
-    drift = series.drift
-    return HistoryAxis(
-        axis=series.axis,
-        unit=series.unit,
-        dispersion=series.dispersion,
-        alarmed=series.alarmed,
+    # A gain that was not calibrated since its last explanation has no drift.
+    unknown = dict.fromkeys(_OF_DRIFT) if series.drift is None else {}
+    return HistoryAxis.of(
+        series,
+        series.drift,
         alarm=alarm_text(series),
-        since=None if series.onset is None else series.onset.isoformat(),
-        change_percent=None if drift is None else drift.change_percent,
-        change_sigmas=None if drift is None else drift.change_sigmas,
-        baseline=None if drift is None else drift.baseline,
-        baseline_std=None if drift is None else drift.baseline_std,
-        acknowledged=[_acknowledged(one) for one in series.acknowledged],
+        since=series.onset,
         points=history_points(series),
+        **unknown,
     )
-
-
-def _acknowledged(one: Acknowledgement) -> Acknowledged:
-    return Acknowledged(since=one.since.isoformat(), at=one.at.isoformat(), who=one.who, why=one.why)
 
 
 def say_verification(found: Verification, console: Console) -> None:
@@ -244,39 +236,20 @@ def say_verification(found: Verification, console: Console) -> None:
 def audit_report(found: Verification) -> AuditReport:
     """Return the state of audit log and history."""
     verdict = found.verdict
-    return AuditReport(
-        file=str(found.audit),
+    return AuditReport.of(
+        verdict,
+        file=found.audit,
         entries=len(verdict.entries),
-        holds=verdict.holds,
         broken_line=verdict.broken,
-        flaws=[FlawedLine(line=one.line, flaw=one.flaw.value, says=one.says) for one in verdict.flaws],
-        torn_lines=list(verdict.torn),
-        open_writes=[_unended_write(one) for one in verdict.open_writes],
+        torn_lines=verdict.torn,
+        open_writes=[
+            UnendedWrite.of(one.begun, file=one.begun.subject, content=one.content) for one in verdict.open_writes
+        ],
         history_broken=[printable(one) for one in found.broken],
-        unknown_writes=[_unknown_write(one) for one in found.unknown],
-    )
-
-
-def _unended_write(write: OpenWrite) -> UnendedWrite:
-    entry = write.begun
-    return UnendedWrite(
-        number=entry.number,
-        at=entry.at,
-        who=entry.who,
-        file=entry.subject,
-        content=write.content.value,
-    )
-
-
-def _unknown_write(write: AuditedWrite) -> UnknownWrite:
-    entry = write.ended
-    return UnknownWrite(
-        number=entry.number,
-        at=entry.at,
-        who=entry.who,
-        file=entry.subject,
-        action=entry.action.value,
-        calibration_sha256=write.calibration,
+        unknown_writes=[
+            UnknownWrite.of(one.ended, file=one.ended.subject, calibration_sha256=one.calibration)
+            for one in found.unknown
+        ],
     )
 
 
@@ -366,13 +339,11 @@ def _history_point(series: Series, index: int) -> HistoryPoint:
     drift, place = stretch.drift, index - stretch.began
     alarm = series.alarm_at(index)
     last = entry.events[-1] if entry.events else None
-    return HistoryPoint(
+    return HistoryPoint.of(
+        entry,
+        gain,
         axis=series.axis,
-        recorded=entry.recorded.isoformat(),
         gain=gain.value,
-        std=gain.std,
-        unit=gain.unit,
-        nameplate=gain.nameplate,
         change_percent=None if change is None else change.percent,
         change_sigmas=None if change is None else change.sigmas,
         change_probability=None if change is None else change.probability,
@@ -380,20 +351,11 @@ def _history_point(series: Series, index: int) -> HistoryPoint:
         cusum_up=float(drift.upper[place]),
         cusum_down=float(drift.lower[place]),
         trend_sigmas=float(drift.trend[place]),
-        alarm=None if alarm is None else alarm.kind.value,
+        alarm=None if alarm is None else alarm.kind,
         baseline=drift.baseline,
-        applied_at=None if last is None else last.at.isoformat(),
+        applied_at=None if last is None else last.at,
         applied_by=None if last is None else last.who,
         applied_to=None if last is None else last.target,
-        error_percent=entry.error_percent,
-        holdout_percent=entry.holdout_percent,
-        rows=entry.rows,
-        method=entry.method,
-        software=entry.software,
-        configuration_sha256=entry.configuration_sha256,
-        created=entry.created.isoformat(),
-        entered=entry.entered.isoformat(),
-        digest=entry.digest,
     )
 
 

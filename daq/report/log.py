@@ -20,11 +20,8 @@ from daq.report.log_schemas import (
     BusLoadEntry,
     ImportReport,
     InfoReport,
-    LogEvent,
-    MountedPayload,
     RecordReport,
     SalvageReport,
-    StampSummary,
     TableReport,
 )
 from daq.report.text import entry_lines, printable
@@ -38,8 +35,6 @@ if TYPE_CHECKING:
     from daq.log.metadata import RunInfo, RunStatistics, Timing
     from daq.log.salvage import Salvaged
     from daq.workflow.record import Recorded
-    from drivers.messages import CellEvent
-    from ident.model.bodies import Payload
 
 _ROUTINE = {EventKind.MOVE_START, EventKind.MOVE_END, EventKind.NMT, EventKind.STATE}
 """Events of every run; all others are shown."""
@@ -47,15 +42,10 @@ _ROUTINE = {EventKind.MOVE_START, EventKind.MOVE_END, EventKind.NMT, EventKind.S
 
 def record_report(path: Path, recorded: Recorded, cell: Cell) -> RecordReport:
     """Return a finished recording: the log with its losses, warnings about the currents, and the load of the buses."""
-    statistics = recorded.log
-    return RecordReport(
-        log=str(path),
-        samples=statistics.samples,
-        lost_cycles=statistics.lost_cycles,
-        missing=list(statistics.missing),
-        valid=statistics.valid,
-        reason=statistics.reason,
-        warnings=list(recorded.warnings),
+    return RecordReport.of(
+        recorded.log,
+        recorded,
+        log=path,
         bus_load=[
             BusLoadEntry(bus=bus.name, mean_percent=100 * load.mean, worst_percent=100 * load.worst)
             for bus, load in bus_loads(cell)
@@ -65,62 +55,22 @@ def record_report(path: Path, recorded: Recorded, cell: Cell) -> RecordReport:
 
 def import_report(path: Path, imported: Imported) -> ImportReport:
     """Return the log of an import with its losses, and what was found out of its time stamps."""
-    statistics = imported.statistics
-    return ImportReport(
-        log=str(path),
-        samples=statistics.samples,
-        lost_cycles=statistics.lost_cycles,
-        missing=list(statistics.missing),
-        valid=statistics.valid,
-        reason=statistics.reason,
-        partial=statistics.partial,
-        wall_minus_monotonic_ns=statistics.wall_minus_monotonic_ns,
-        timing=_stamps(imported.timing),
-        remarks=list(imported.remarks),
-    )
+    return ImportReport.of(imported.statistics, imported, log=path)
 
 
 def salvage_report(path: Path, saved: Salvaged) -> SalvageReport:
     """Return the log of a salvage with its losses, and what was left out."""
-    statistics = saved.statistics
-    return SalvageReport(
-        log=str(path),
-        partial=statistics.partial,
-        samples=statistics.samples,
-        duration_s=saved.duration_s,
-        lost_cycles=statistics.lost_cycles,
-        missing=list(statistics.missing),
-        valid=statistics.valid,
-        reason=statistics.reason,
-        left_out_bytes=saved.left_out_bytes,
-        damage=saved.damage,
-    )
+    return SalvageReport.of(saved.statistics, saved, log=path)
 
 
 def table_report(log: Path, table: Path, kind: TableFormat, written: Exported) -> TableReport:
     """Return the table that was made of a log."""
-    return TableReport(
-        log=str(log),
-        table=str(table),
-        format=kind.value,
-        rows=written.rows,
-        columns=list(written.columns),
-        partial=written.partial,
-        valid=written.valid,
-    )
+    return TableReport.of(written, log=log, table=table, format=kind)
 
 
 def bag_report(log: Path, bag: Path, written: BagWritten, *, effort: bool) -> BagReport:
     """Return the bag that was made of a log; `effort` says whether a calibration gave its joint states efforts."""
-    return BagReport(
-        log=str(log),
-        bag=str(bag),
-        duration_s=written.duration_s,
-        messages=dict(written.messages),
-        effort=effort,
-        partial=written.partial,
-        valid=written.valid,
-    )
+    return BagReport.of(written, log=log, bag=bag, effort=effort)
 
 
 def info_report(path: Path) -> InfoReport:
@@ -146,53 +96,29 @@ def info_report(path: Path) -> InfoReport:
     head, statistics = reader.head, reader.statistics
     run, samples = head.run, reader.checks.samples
     valid, reason = log_verdict(cell, head, reader.checks, statistics, watch, lambda: LogReader(path))
-    return InfoReport(
-        log=str(path),
+    return InfoReport.of(
+        run,
+        statistics,
+        log=path,
         sha256=reader.digest,
-        run_id=run.run_id,
         cell=cell.name,
         cell_sha256=cell.digest,
-        axes=list(cell.axis_names),
+        axes=cell.axis_names,
         current=current_signals(cell),
-        role=run.role.value,
-        payload=_mounted(run.payload),
-        rate_hz=run.rate_hz,
-        speed=run.speed,
         samples=samples,
         duration_s=samples / run.rate_hz,
         stamped_duration_s=(last_ns - first_ns) * 1e-9,
         moves=sum(event.kind is EventKind.MOVE_START for event in reader.events),
-        slow_readings=dict(Counter(reading.quantity.value for reading in reader.readings)),
-        lost_cycles=statistics.lost_cycles,
+        slow_readings=Counter(reading.quantity.value for reading in reader.readings),
         missing=dict(zip(cell.axis_names, statistics.missing, strict=True)),
         partial=reader.partial,
         valid=valid,
         reason=reason,
-        events=[_event(event) for event in reader.events if event.kind not in _ROUTINE],
-        operator=run.operator,
-        software=run.software,
-        started=datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC).isoformat() if run.started_wall_ns else None,
+        events=[event for event in reader.events if event.kind not in _ROUTINE],
+        started=datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC) if run.started_wall_ns else None,
         wall_minus_monotonic_s=run.wall_minus_monotonic_ns * 1e-9,
         wall_clock_step_s=_wall_clock_step_s(run, statistics),
-        origin=run.origin,
-        timing=_stamps(run.timing),
         attachments={name: len(data) for name, data in sorted(head.files.items())},
-    )
-
-
-def _mounted(payload: Payload | None) -> MountedPayload | None:
-    if payload is None:
-        return None
-    return MountedPayload(name=payload.name, mounting=payload.mounting, known=dict(payload.known))
-
-
-def _event(event: CellEvent) -> LogEvent:
-    return LogEvent(
-        time_ns=event.time_ns,
-        axis=event.axis,
-        kind=event.kind.value,
-        code=event.code,
-        text=event.text,
     )
 
 
@@ -201,24 +127,6 @@ def _wall_clock_step_s(run: RunInfo, statistics: RunStatistics) -> float | None:
     if statistics.wall_minus_monotonic_ns is None:
         return None
     return (statistics.wall_minus_monotonic_ns - run.wall_minus_monotonic_ns) * 1e-9
-
-
-def _stamps(timing: Timing | None) -> StampSummary | None:
-    if timing is None:
-        return None
-    return StampSummary(
-        rows=timing.rows,
-        rate_hz=timing.rate_hz,
-        usual_step_s=timing.usual_step_s,
-        longest_step_s=timing.longest_step_s,
-        jitter_s=timing.jitter_s,
-        drift_s=timing.drift_s,
-        missing=timing.missing,
-        resampled=timing.resampled,
-        duplicates=timing.duplicates,
-        close=timing.close,
-        started_s=timing.started_s,
-    )
 
 
 def timing_text(timing: Timing) -> str:

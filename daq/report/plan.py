@@ -49,31 +49,28 @@ class PlanReport(Report):
 
 def plan_report(out: Path, cell: Cell, experiment: Experiment, made: Plan, judged: Identifiability) -> PlanReport:
     """Return a plan, with the verdict on the gain of each axis."""
-    return PlanReport(
-        plan=str(out),
-        cell=made.cell,
-        seed=made.seed,
+    return PlanReport.of(
+        made,
+        judged,
+        plan=out,
         payload=experiment.payload.name,
         moves=len(made.moves),
         duration_s=round(made.duration_s, 3),
         condition=round(made.condition, 1),
-        assumed=list(experiment.remarks),
-        rank=judged.rank,
-        known_preload_rank=judged.known_preload_rank,
-        hidden=list(judged.sentences(cell.axis_names)),
+        assumed=experiment.remarks,
+        hidden=judged.sentences(cell.axis_names),
         gains=[_planned_gain(axis.name, gain) for axis, gain in zip(cell.axes, judged.gains, strict=True)],
     )
 
 
 def _planned_gain(axis: str, gain: GainVerdict) -> PlannedGain:
-    return PlannedGain(
+    return PlannedGain.of(
+        gain,
         axis=axis,
         predicted_std_percent=round(gain.std_percent, 3),
         known_preload_std_percent=_finite(gain.known_preload_percent),
-        verdict=gain.verdict.value,
-        hidden_by=None if gain.hidden_by is None else gain.hidden_by.value,
-        seen_by=[source.value for source in gain.sources],
-        alone_percent={source.value: _finite(alone) for source, alone in gain.alone_percent.items()},
+        seen_by=gain.sources,
+        alone_percent={source: _finite(alone) for source, alone in gain.alone_percent.items()},
         words=gain.words(axis),
     )
 

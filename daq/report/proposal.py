@@ -17,14 +17,12 @@ from daq.report.controller_schemas import (
     FileChange,
     FileGain,
     FileRollback,
-    Refused,
     RestoredObject,
 )
 from daq.report.gains import with_deviation
 from daq.report.text import plain_table, terminal_lines, terminal_text
 from daq.writeback.drive_target import DriveEdit
 from daq.writeback.file_target import FileEdit
-from daq.writeback.gates.gate import Refusal
 from daq.writeback.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, judge, noise_note
 from daq.writeback.request import Edit, GainChange
 from daq.writeback.target import E, Proposal, Written
@@ -74,70 +72,33 @@ def proposal_report(
     if isinstance(edit, DriveEdit):
         return _drive_change(proposal, written)
     judged, _ = judge(edit.changes, known)
-    return FileChange(
-        file=str(edit.place),
-        base_sha256=edit.base_sha256,
-        base=edit.base,
+    return FileChange.of(
+        edit,
+        proposal,
+        file=edit.place,
         applied=written is not None,
         backup=None if written is None else str(written.backup),
         changes=[_file_gain(change, judged.get(change.axis, NOT_JUDGED)) for change in edit.changes],
-        refusals=[refused_of(refusal) for refusal in proposal.refusals],
         diff=edit.diff if isinstance(edit, FileEdit) else "",
     )
 
 
-def refused_of(refusal: Refusal) -> Refused:
-    """Return a failed check."""
-    return Refused(
-        gate=refusal.gate.value,
-        subject=refusal.subject,
-        found=refusal.found,
-        expected=refusal.expected,
-        remedy=refusal.remedy,
-    )
-
-
 def _file_gain(change: GainChange, judged: JudgedChange) -> FileGain:
-    return FileGain(
-        axis=change.axis,
-        key=change.key,
-        line=change.line,
-        old=change.old,
-        new=change.new,
-        change_percent=change.change_percent,
-        change_sigmas=judged.sigmas,
-        significant=judged.significant,
-        std_percent=change.std_percent,
-        nameplate=change.nameplate,
-        nameplate_percent=change.nameplate_percent,
-        unit=change.unit,
-    )
+    return FileGain.of(change, change_sigmas=judged.sigmas, significant=judged.significant)
 
 
 def _drive_change(proposal: Proposal[E], written: Written | None) -> DriveChange:
     edit, cell = proposal.edit, proposal.target.cell
     # A calibration restores no record.
     outcome = {} if written is None else {**_outcome(written), "source": None}
-    return DriveChange(
+    return DriveChange.of(
         cell=None if cell is None else cell.name,
         base_sha256=edit.base_sha256,
         base=edit.base,
         applied=written is not None,
-        changes=[_drive_gain(change) for change in edit.changes],
-        refusals=[refused_of(refusal) for refusal in proposal.refusals],
+        changes=[DriveGain.of(change, object=change.key) for change in edit.changes],
+        refusals=proposal.refusals,
         **outcome,
-    )
-
-
-def _drive_gain(change: GainChange) -> DriveGain:
-    return DriveGain(
-        axis=change.axis,
-        object=change.key,
-        old=change.old,
-        new=change.new,
-        std=change.std,
-        nameplate=change.nameplate,
-        unit=change.unit,
     )
 
 
@@ -159,12 +120,13 @@ def show_drive_rollback(edit: DriveEdit, console: Console) -> None:
 
 def drive_rollback_report(edit: DriveEdit, written: Written | None) -> DriveRollback:
     """Return a rollback of the drives; `written` is None where nothing was written."""
+    outcome = {} if written is None else _outcome(written)
     return DriveRollback(
         drives=edit.subject,
         source=str(edit.source),
         restored=written is not None,
         changes=[_restored(value, write) for value, write in zip(edit.values, edit.writes, strict=True)],
-        **({} if written is None else _outcome(written)),
+        **outcome,
     )
 
 
@@ -188,12 +150,12 @@ def show_file_rollback(written: Written, console: Console) -> None:
 
 def file_rollback_report(written: Written, audit: Path | None) -> FileRollback:
     """Return a rollback of the controller's file; `audit` is the log that has it."""
-    return FileRollback(
+    return FileRollback.of(
+        written,
         file=written.edit.subject,
         restored=str(written.edit.source),
-        backup=None if written.backup is None else str(written.backup),
         diff=_rollback_diff(written.edit),
-        audit=None if audit is None else str(audit),
+        audit=audit,
     )
 
 

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from typing import Any, TypeVar
 
 from rich.console import RenderableType
 from rich.table import Table
 
 from daq.report.effect_names import effect_text, size_text, variable_text
-from daq.report.fit import coefficients, error_table, errors_of, errors_or_none, identifiability_notes, with_calibration
+from daq.report.fit import coefficients, error_table, identifiability_notes, with_calibration
 from daq.report.fit_schemas import (
     AsideEntry,
     ChangedGain,
@@ -24,21 +25,20 @@ from daq.report.fit_schemas import (
     LeftOutRuns,
     ModelErrors,
     MotorNoise,
+    NamedEffect,
     NoiseFloor,
     PlacedEffectEntry,
     ResidualReport,
-    Skew,
-    SkewByInstruments,
     SplitNameEntry,
     TurnEntry,
     VerdictEntry,
 )
 from daq.report.gains import diagnosis_texts, gain_table, partial_note
-from daq.report.split_names import SplitName, names_by_split
+from daq.report.split_names import names_by_split
 from daq.report.text import Sentence, plain_table
 from daq.workflow.fit import Fit
 from ident.calibration import AcceptedEffect, Calibration
-from ident.discovery.before_after import Account, BeforeAfter, GainShift, RelativeErrors, RunError, RunErrors
+from ident.discovery.before_after import Account, BeforeAfter, RelativeErrors, RunErrors
 from ident.discovery.effect_verdict import EffectVerdict, Judgement
 from ident.discovery.gates import runs_to_leave_out
 from ident.discovery.gear_loss import CERTAIN, GearLoss, gear_losses, is_gear_loss
@@ -48,7 +48,7 @@ from ident.discovery.noise_floor import CONFIDENCE, FloorSource, MotorNoiseFloor
 from ident.discovery.search import Finding
 from ident.discovery.time_skew import CurrentDelay
 from ident.drift.change import FALSE_ALARM
-from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import is_correction
 from ident.effects.signals import session_began_s
 from ident.effects.unnamed import is_unnamed
@@ -61,6 +61,7 @@ SLIGHT = 0.1  #: Share of an error; an effect that lowers it by less is said to 
 
 ErrorRow = tuple[str, RelativeError]  #: Name of the error and of the data it is measured on, and the error [%]
 WHEN = ("before", "after")
+NamedT = TypeVar("NamedT", bound=NamedEffect)
 
 
 def residual_view(
@@ -577,13 +578,13 @@ def residual_report(fitted: Fit, account: Account, calibration: Calibration) -> 
     return with_calibration(
         ResidualReport,
         calibration,
-        summary=list(summary(fitted, account, calibration.effects)),
-        axes=list(axes),
+        summary=summary(fitted, account, calibration.effects),
+        axes=axes,
         metric=_METRIC,
         noise_floor=_noise_floor(account, axes),
-        time_skew=_stated_skew(account.skew),
-        time_skew_by_instruments=_skew_by_instruments(account.skew),
-        gear_loss=[_gear_loss(axis, gear) for axis, gear in zip(axes, gear_losses(last), strict=True)],
+        time_skew=account.skew if account.skew is not None and account.skew.confirmed else None,
+        time_skew_by_instruments=account.skew,
+        gear_loss=[GearLossEntry.of(gear, axis=axis) for axis, gear in zip(axes, gear_losses(last), strict=True)],
         before=_model_errors(account.total.before),
         after=_model_errors(account.total.after),
         gain_changes=_changed_gains(fitted, account.total),
@@ -595,62 +596,27 @@ def residual_report(fitted: Fit, account: Account, calibration: Calibration) -> 
 
 def _noise_floor(account: Account, axes: tuple[str, ...]) -> NoiseFloor:
     floors = zip(axes, account.floors, account.left_a.tolist(), strict=True)
-    return NoiseFloor(
+    return NoiseFloor.of(
         motors=[None if floor is None else _motor_noise(axis, floor, left_a) for axis, floor, left_a in floors],
-        relative_error_percent=errors_of(account.floor),
-        holdout_error_percent=errors_or_none(account.holdout_floor),
-        least_error_percent=errors_of(account.least_floor),
-        least_holdout_error_percent=errors_or_none(account.least_holdout_floor),
+        relative_error_percent=account.floor,
+        holdout_error_percent=account.holdout_floor,
+        least_error_percent=account.least_floor,
+        least_holdout_error_percent=account.least_holdout_floor,
         confidence=CONFIDENCE,
     )
 
 
 def _motor_noise(axis: str, floor: MotorNoiseFloor, left_a: float) -> MotorNoise:
-    return MotorNoise(
+    return MotorNoise.of(
+        floor,
         axis=axis,
         noise=floor.noise_a,
         least=floor.least_a if floor.is_bound else None,
-        source=floor.source.value,
-        std_percent=floor.std_percent,
         dwells=floor.parts if floor.source is FloorSource.STANDSTILL else None,
         pairs=floor.parts if floor.source is FloorSource.REPEATED_MOVES else None,
         degrees_of_freedom=floor.freedom,
         left=left_a,
         refuted=floor.is_refuted(left_a),
-    )
-
-
-def _stated_skew(skew: CurrentDelay | None) -> Skew | None:
-    """Return a time skew that instruments confirm; None for any other."""
-    if skew is None or not skew.confirmed:
-        return None
-    return Skew(seconds=skew.seconds, std=skew.std)
-
-
-def _skew_by_instruments(skew: CurrentDelay | None) -> SkewByInstruments | None:
-    if skew is None:
-        return None
-    return SkewByInstruments(
-        seconds=skew.seconds,
-        std=skew.std,
-        fit_seconds=skew.fit_seconds,
-        fit_std=skew.fit_std,
-        confirmed=skew.confirmed,
-        is_in_model=skew.is_in_model,
-    )
-
-
-def _gear_loss(axis: str, gear: GearLoss) -> GearLossEntry:
-    return GearLossEntry(
-        axis=axis,
-        motoring_rows=gear.motoring_rows,
-        motoring_torque=gear.motoring_torque,
-        loss=gear.loss,
-        loss_std=gear.loss_std,
-        efficiency=gear.efficiency,
-        gain_factor=gear.gain_factor,
-        hidden_shift=gear.hidden_shift,
-        gain_carries_it=gear.gain_carries_it,
     )
 
 
@@ -661,7 +627,7 @@ def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> TurnEntry:
         accepted=None if step.accepted is None else _finding(step.accepted, axes),
         added=[] if turn is None else [_added(step, placed, axes) for placed in turn.added],
         removed=[] if turn is None else [placed.name_among(axes) for placed in turn.removed],
-        names_by_split=[_split_name(name, axes) for name in names_by_split(step)],
+        names_by_split=[_named(SplitNameEntry, name.placed, axes, splits=name.splits) for name in names_by_split(step)],
         before=None if turn is None else _model_errors(turn.before),
         after=None if turn is None else _model_errors(turn.after),
         gain_changes=None if turn is None else _changed_gains(fitted, turn),
@@ -676,108 +642,61 @@ def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> TurnEntry:
 
 def _changed_gains(fitted: Fit, compared: BeforeAfter) -> list[ChangedGain]:
     changes = zip(fitted.cell.axes, compared.gains, strict=True)
-    return [_changed_gain(axis.name, axis.gain_unit, change) for axis, change in changes]
-
-
-def _changed_gain(axis: str, unit: str, change: GainShift) -> ChangedGain:
-    return ChangedGain(
-        axis=axis,
-        unit=unit,
-        before=change.before,
-        before_std=change.before_std,
-        after=change.after,
-        after_std=change.after_std,
-        choice_std=change.choice_std,
-        change_percent=change.change_percent,
-        change_std_percent=change.change_std_percent,
-        significant=change.significant,
-    )
+    return [ChangedGain.of(change, axis=axis.name, unit=axis.gain_unit) for axis, change in changes]
 
 
 def _model_errors(errors: RelativeErrors) -> ModelErrors:
-    return ModelErrors(
-        relative_error_percent=errors_of(errors.in_sample),
-        cross_validated_error_percent=errors_of(errors.cross_validated),
+    return ModelErrors.of(
+        relative_error_percent=errors.in_sample,
+        cross_validated_error_percent=errors.cross_validated,
         left_out_runs=None if errors.left_out_runs is None else _left_out_runs(errors.left_out_runs),
-        holdout_error_percent=errors_or_none(errors.holdout),
+        holdout_error_percent=errors.holdout,
     )
 
 
 def _left_out_runs(left_out: RunErrors) -> LeftOutRuns:
-    return LeftOutRuns(
-        error_percent=errors_or_none(left_out.together),
-        runs=[_left_out_run(run) for run in left_out.runs],
-    )
+    runs = [LeftOutRun.of(run, error_percent=run.error, reason=run.reason or None) for run in left_out.runs]
+    return LeftOutRuns.of(error_percent=left_out.together, runs=runs)
 
 
-def _left_out_run(run: RunError) -> LeftOutRun:
-    return LeftOutRun(run=run.run, error_percent=errors_or_none(run.error), reason=run.reason or None)
+def _named(kind: type[NamedT], placed: PlacedEffect, axes: tuple[str, ...], *sources: object, **others: Any) -> NamedT:
+    """Return what a document says of an effect, with its name, axis and settings."""
+    settings = {name: float(value) for name, value in placed.effect.settings.items()}
+    return kind.of(*sources, effect=placed.effect.name, axis=placed.axis_name(axes), settings=settings, **others)
 
 
 def _verdict(verdict: EffectVerdict, axes: tuple[str, ...]) -> VerdictEntry:
-    return VerdictEntry(
-        effect=verdict.placed.effect.name,
-        axis=verdict.placed.axis_name(axes),
-        settings=_settings(verdict.placed.effect),
-        judgement=verdict.judgement.value,
-        reason=verdict.reason,
-        written=verdict.written,
+    return _named(
+        VerdictEntry,
+        verdict.placed,
+        axes,
+        verdict,
         blocks=verdict.change.total.moves,
-        error_before_percent=errors_of(verdict.before),
-        error_after_percent=errors_of(verdict.after),
+        error_before_percent=verdict.before,
+        error_after_percent=verdict.after,
     )
-
-
-def _settings(effect: Effect) -> dict[str, float]:
-    return {name: float(value) for name, value in effect.settings.items()}
 
 
 def _added(step: Step, placed: PlacedEffect, axes: tuple[str, ...]) -> PlacedEffectEntry:
-    return PlacedEffectEntry(
-        effect=placed.effect.name,
-        axis=placed.axis_name(axes),
-        settings=_settings(placed.effect),
-        coefficients=[
-            Coefficient(name=one.name, value=one.value, std=one.std, unit=one.unit)
-            for one in coefficients(step.after, placed)
-        ],
-    )
-
-
-def _split_name(name: SplitName, axes: tuple[str, ...]) -> SplitNameEntry:
-    return SplitNameEntry(
-        effect=name.placed.effect.name,
-        axis=name.placed.axis_name(axes),
-        settings=_settings(name.placed.effect),
-        splits=name.splits,
-    )
+    return _named(PlacedEffectEntry, placed, axes, coefficients=coefficients(step.after, placed))
 
 
 def _finding(finding: Finding, axes: tuple[str, ...]) -> FindingEntry:
     sizes = zip(finding.effect.coefficients, finding.coefficients, finding.deviations, strict=True)
-    return FindingEntry(
-        effect=finding.effect.name,
-        axis=PlacedEffect(finding.effect, finding.axis).axis_name(axes),
-        settings=_settings(finding.effect),
-        variable=finding.effect.abscissa.value,
+    return _named(
+        FindingEntry,
+        PlacedEffect(finding.effect, finding.axis),
+        axes,
+        finding,
+        variable=finding.effect.abscissa,
         coefficients=[
             Coefficient(name=column.name, value=float(value), std=float(std), unit=column.unit)
             for column, value, std in sizes
         ],
-        probability=finding.probability,
-        folds_better=finding.folds_better,
-        explained=finding.explained,
-        error_before_percent=finding.error_before_percent,
-        error_after_percent=finding.error_after_percent,
-        error_fall=finding.error_fall,
-        held_out_fall=finding.held_out_fall,
-        passed=finding.passed,
-        share_of_excess=finding.share_of_excess,
-        refusals=list(finding.refusals),
         # For findings that failed a gate it would be most of the file and of no use.
         ambiguity=[rival.name_among(axes) for rival in finding.ambiguity] if finding.passed else None,
     )
 
 
 def _aside(aside: SetAside, axes: tuple[str, ...]) -> AsideEntry:
-    return AsideEntry(**dict(_finding(aside.finding, axes)), reason=aside.reason(axes))
+    return AsideEntry.of(_finding(aside.finding, axes), reason=aside.reason(axes))

@@ -12,7 +12,7 @@ from daq.report.document import Figure, Report
 from daq.report.fit_schemas import Errors
 from daq.report.text import plain_table, printable, terminal_text
 from daq.workflow.remaining_corrections import CORRECTIONS
-from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Shift, Updated
+from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
 from ident.calibration import Calibration
 from ident.physical.physical import MARGIN
 
@@ -135,17 +135,17 @@ def urdf_report(
         out: the URDF.
     """
     parameters = robot.parameters
-    change = parameters.torque_change_percent
-    return UrdfReport(
-        urdf=str(out),
+    return UrdfReport.of(
+        parameters,
+        urdf=out,
         calibration=calibration.cell,
         same_configuration=same_configuration,
-        exact=parameters.exact,
-        torque_change_percent=Errors(axes=list(change.axes), total=change.total),
-        shifts=[_shifted(shift) for shift in robot.shifts],
+        shifts=[
+            ShiftedParameter.of(one, physical=one.realised, standard_deviations=one.deviations) for one in robot.shifts
+        ],
         margin=MARGIN,
         joints=[_joint(robot, number, update, updated) for number, update in enumerate(updates.values())],
-        merged_links=list(updated.merged),
+        merged_links=updated.merged,
         not_in_urdf=[
             NotInUrdf(name=column.name, value=float(value), unit=column.unit)
             for column, value in zip(parameters.model.columns, parameters.standard, strict=True)
@@ -155,25 +155,15 @@ def urdf_report(
     )
 
 
-def _shifted(shift: Shift) -> ShiftedParameter:
-    return ShiftedParameter(
-        name=shift.name,
-        identified=shift.identified,
-        physical=shift.realised,
-        standard_deviations=shift.deviations,
-    )
-
-
 def _joint(robot: PhysicalRobot, number: int, update: JointUpdate, updated: Updated) -> UrdfJoint:
     name = robot.parameters.model.robot.joints[number].name
-    return UrdfJoint(
+    return UrdfJoint.of(
+        update,
+        update.body,
         name=name,
         link=updated.links[name],
-        mass_kg=update.body.mass_kg,
         centre_m=update.body.centre_m.tolist(),
         inertia_kg_m2=update.body.inertia_kg_m2.tolist(),
-        damping=update.damping,
-        friction=update.friction,
         smallest_eigenvalue=float(robot.parameters.eigenvalues[number]),
         prior_assumed=number in robot.prior.assumed,
     )

@@ -11,13 +11,10 @@ from rich.console import RenderableType
 
 from daq.files import replace_file
 from daq.report import paper_tables
-from daq.report.fit import errors_of
 from daq.report.fit_schemas import (
     CheckedLog,
     CheckedPayload,
-    DiagnosisEntry,
     FoundMass,
-    Together,
     ValidatedLog,
     ValidateReport,
 )
@@ -29,7 +26,6 @@ from daq.workflow.fit import DOUBTFUL_PERCENT
 from daq.workflow.validate import CheckedRun, CrossValidation, Mass, WeighedRun, conditioning_of, together
 from daq.workflow.validation import DataUse, Validation
 from ident.calibration import Calibration
-from ident.errors import Diagnosis
 
 
 def validation_view(calibration: Calibration, found: CrossValidation) -> Iterator[RenderableType]:
@@ -115,73 +111,43 @@ def validate_report(calibration: Calibration, found: CrossValidation, drawn: dic
         drawn: pictures by log.
     """
     validations = found.validations
-    return ValidateReport(
-        cell=calibration.cell,
+    return ValidateReport.of(
+        found,
+        calibration,
         axes=[gain.axis for gain in calibration.gains],
-        filter=calibration.filter,
-        fit_relative_error_percent=errors_of(calibration.relative_error_percent),
-        payload_mass=list(calibration.payload_mass),
+        fit_relative_error_percent=calibration.relative_error_percent,
         logs=[_validated_log(validation, drawn.get(validation.log)) for validation in validations],
-        together=Together(relative_error_percent=errors_of(together(validations))) if validations else None,
+        together={"relative_error_percent": together(validations)} if validations else None,
         calibrations=list(found.calibrations),
-        diagnoses=[_diagnosis(one) for one in found.diagnoses],
         runs=[_checked_log(run) for run in found.runs],
         payloads=[_checked_payload(run, with_bare_runs=found.with_bare_runs) for run in found.weighed],
     )
 
 
 def _validated_log(validation: Validation, picture: Path | None) -> ValidatedLog:
-    return ValidatedLog(
-        log=str(validation.log),
+    return ValidatedLog.of(
+        validation,
         sha256=validation.digest,
         seen_by_fit=validation.data_use is DataUse.FIT,
-        partial=validation.partial,
         held_out=validation.data_use is DataUse.HOLDOUT,
-        same_configuration=validation.same_configuration,
-        rows=validation.rows,
-        relative_error_percent=errors_of(validation.error),
-        picture=None if picture is None else str(picture),
-    )
-
-
-def _diagnosis(one: Diagnosis) -> DiagnosisEntry:
-    return DiagnosisEntry(
-        name=one.name,
-        runs=list(one.runs),
-        axes=list(one.axes),
-        found=one.found,
-        expected=one.expected,
-        remedy=one.remedy,
+        relative_error_percent=validation.error,
+        picture=picture,
     )
 
 
 def _checked_log(run: CheckedRun) -> CheckedLog:
-    return CheckedLog(
-        log=str(run.log),
-        condition=run.condition,
-        relative_error_percent={label: errors_of(error) for label, error in run.errors.items()},
-        left_out=run.left_out or None,
-        seen_by=list(run.seen_by),
-    )
+    return CheckedLog.of(run, relative_error_percent=run.errors, left_out=run.left_out or None)
 
 
 def _checked_payload(run: WeighedRun, *, with_bare_runs: bool) -> CheckedPayload:
-    return CheckedPayload(
-        log=str(run.log),
+    return CheckedPayload.of(
+        run,
+        run.payload,
         payload=run.payload.name,
-        mounting=run.payload.mounting,
-        weighed_kg=run.weighed_kg,
         with_bare_runs=with_bare_runs,
         masses={label: _found_mass(mass) for label, mass in run.masses.items()},
     )
 
 
 def _found_mass(mass: Mass | str) -> FoundMass:
-    if isinstance(mass, str):
-        return FoundMass(reason=mass)
-    return FoundMass(
-        mass_kg=mass.mass_kg,
-        std_percent=mass.std_percent,
-        std_with_gains_percent=mass.std_with_gains_percent,
-        error_percent=mass.error_percent,
-    )
+    return FoundMass(reason=mass) if isinstance(mass, str) else FoundMass.of(mass)

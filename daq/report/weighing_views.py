@@ -12,9 +12,7 @@ from rich.text import Text
 
 from daq.config.cell import Cell, robot_of
 from daq.files import replace_file
-from daq.report.fit import errors_of
 from daq.report.fit_schemas import (
-    AddedMoves,
     ContactAxis,
     ContactEntry,
     ContactReport,
@@ -30,11 +28,11 @@ from daq.report.text import plain_table, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
 from daq.workflow.weigh import Weighed
 from ident.arrays import FloatArray
-from ident.contact import Contact, ExternalTorque
+from ident.contact import ExternalTorque
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, pseudo_inertia
 from ident.model.robot import Place
 from ident.model.urdf import read_urdf
-from ident.weighing import KNOWN, Help, WeighedBody
+from ident.weighing import KNOWN, WeighedBody
 
 LISTED = 20  #: Contacts shown in a terminal; `--json` has all
 NOISE_ROWS = 4.0
@@ -139,20 +137,17 @@ def _platform(cell: Cell) -> tuple[str, Place] | None:
 def weigh_report(found: Weighed) -> WeighReport:
     """Return a body: mass, centre, inertia, and its ten parameters with the moves that would show them."""
     body, platform = found.body, _platform(found.cell)
-    return WeighReport(
+    return WeighReport.of(
+        found,
+        body,
         cell=found.cell.name,
-        logs=[str(log) for log in found.logs],
-        bare=[str(log) for log in found.bare],
-        part_of_the_fit=list(found.fitted),
-        declared_kg=found.declared_kg,
+        part_of_the_fit=found.fitted,
         mass_kg=WeighedValue(value=body.mass_kg, std=body.mass_std_kg),
         centre_m=_weighed_values(*body.centre_m),
         centre_in_platform_m=None if platform is None else _weighed_values(*body.centre_in(platform[1])),
         inertia_about_centre_kg_m2=_weighed_values(*body.inertia_kg_m2),
         parameters=_weighed_parameters(found),
-        relative_error_percent=errors_of(body.error),
-        moves=body.moves,
-        complete=body.complete,
+        relative_error_percent=body.error,
     )
 
 
@@ -163,9 +158,9 @@ def _weighed_values(value: FloatArray, std: FloatArray) -> WeighedValues:
 def _weighed_parameters(found: Weighed) -> list[WeighedParameter]:
     body = found.body
     moves_std = np.sqrt(np.diag(body.moves_covariance))
-    moves = {one.name: _added_moves(one) for one in found.help}
+    moves = {one.name: one for one in found.help}
     return [
-        WeighedParameter(
+        WeighedParameter.of(
             name=name,
             unit=unit,
             value=float(body.values[index]),
@@ -176,10 +171,6 @@ def _weighed_parameters(found: Weighed) -> list[WeighedParameter]:
         )
         for index, (name, unit) in enumerate(zip(LINK_PARAMETERS, LINK_UNITS, strict=True))
     ]
-
-
-def _added_moves(moves: Help) -> AddedMoves:
-    return AddedMoves(words=moves.words, seconds=moves.seconds, std=moves.std)
 
 
 def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
@@ -238,16 +229,16 @@ def not_judged(found: ExternalTorque, cell: Cell) -> dict[str, str]:
 
 def contact_report(found: ExternalTorque, cell: Cell, log: Path, picture: Path | None) -> ContactReport:
     """Return band and threshold of each axis, and the contacts."""
-    return ContactReport(
+    return ContactReport.of(
         cell=cell.name,
-        log=str(log),
+        log=log,
         band_from_this_log=found.from_itself,
         stretches_left_out=found.left_out,
         alarms_per_hour=found.band.alarms_per_hour,
         axes=_contact_axes(found, cell),
-        contacts=[_contact_entry(cell.axes[one.axis].name, one) for one in found.contacts],
+        contacts=[ContactEntry.of(one, axis=cell.axis_names[one.axis], peak=one.peak_nm) for one in found.contacts],
         not_judged=[NotJudged(axis=axis, reason=reason) for axis, reason in not_judged(found, cell).items()],
-        picture=None if picture is None else str(picture),
+        picture=picture,
     )
 
 
@@ -268,16 +259,6 @@ def _contact_axes(found: ExternalTorque, cell: Cell) -> list[ContactAxis]:
         )
         for index, (axis, (band, threshold, largest)) in enumerate(zip(cell.axes, _figures(found), strict=True))
     ]
-
-
-def _contact_entry(axis: str, contact: Contact) -> ContactEntry:
-    return ContactEntry(
-        axis=axis,
-        start_s=contact.start_s,
-        end_s=contact.end_s,
-        peak=contact.peak_nm,
-        peak_over_threshold=contact.peak_over_threshold,
-    )
 
 
 def _figures(found: ExternalTorque) -> Iterator[tuple[float, float, float]]:
