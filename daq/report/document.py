@@ -12,7 +12,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import model_validator
+from pydantic import ConfigDict, model_validator
 
 from daq.config.yaml_file import StrictModel
 from daq.report.text import spelled_bytes
@@ -24,20 +24,25 @@ Figure = float | None
 class Report(StrictModel):
     """A JSON document, or a part of one; when it is made, numbers that JSON lacks become null.
 
-    A part may be given as the frozen dataclass whose attributes it has.
+    A part may be given as the frozen dataclass whose attributes it has. The published schema describes a field by the
+    text below it.
     """
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
 
     @classmethod
     def of(cls, *sources: object, **others: Any) -> Self:
         """Return the document of an object: `others`, and its attributes for the other fields, by their names.
 
         Args:
-            sources: the object, or several; the first that has an attribute gives it.
+            sources: the object, or several; the first that has an attribute gives it. One that is None comes after the
+                others: it gives null to what they lack.
             others: fields that no source has, or not as the document says them.
         """
-        given = {name: _plain(value) for name, value in others.items()}
-        for source in sources:
-            given = {**_attributes(cls, source), **given}
+        given: dict[str, Any] = {}
+        for source in reversed(sources):
+            given |= _attributes(cls, source)
+        given |= {name: _plain(value) for name, value in others.items()}
         return cls(**given)
 
     @model_validator(mode="before")
@@ -45,11 +50,13 @@ class Report(StrictModel):
     def _make_valid(cls, values: Any) -> Any:
         if is_dataclass(values):
             values = _attributes(cls, values)
-        return _changed(values, _without_surrogates)
+        return json_safe(values, _without_surrogates)
 
 
 def _attributes(kind: type[Report], source: object) -> dict[str, Any]:
-    """Return the attributes of an object that are fields of a document."""
+    """Return the attributes of an object that are fields of a document; null for each of them without an object."""
+    if source is None:
+        return dict.fromkeys(name for name, field in kind.model_fields.items() if field.is_required())
     return {name: _plain(getattr(source, name)) for name in kind.model_fields if hasattr(source, name)}
 
 
@@ -70,7 +77,7 @@ def _plain(value: Any) -> Any:
 
 def json_tree(report: Report) -> dict[str, Any]:
     """Return a document as mappings, lists, text and numbers; a key with a default is left out where none was given."""
-    tree: dict[str, Any] = _changed(report.model_dump(mode="json", exclude_unset=True), _with_surrogates)
+    tree: dict[str, Any] = json_safe(report.model_dump(mode="json", exclude_unset=True), _with_surrogates)
     return tree
 
 
@@ -79,18 +86,18 @@ def json_text(report: Report) -> str:
     return spelled_bytes(json.dumps(json_tree(report), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
 
 
-def _changed(value: Any, change: Callable[[str], str]) -> Any:
-    """Copy a document with other texts, and with null for numbers that JSON lacks."""
+def json_safe(value: Any, change: Callable[[str], str] = str) -> Any:
+    """Copy a document with null for numbers that JSON lacks, and with other texts."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, str):
         return change(value)
     if isinstance(value, dict):
-        return {_changed(key, change): _changed(item, change) for key, item in value.items()}
+        return {json_safe(key, change): json_safe(item, change) for key, item in value.items()}
     if isinstance(value, list):
-        return [_changed(item, change) for item in value]
+        return [json_safe(item, change) for item in value]
     if isinstance(value, tuple):
-        return tuple(_changed(item, change) for item in value)
+        return tuple(json_safe(item, change) for item in value)
     return value
 
 

@@ -10,13 +10,17 @@ from daq.report.document import Report
 class ErrorReport(Report):
     """One line on stderr for a command that failed."""
 
-    error: str = Field(description="subject, or the whole message where that says what was found")
+    error: str
+    """subject, or the whole message where that says what was found"""
     found: str
     expected: str
     do: str
     exit_code: int
-    kind: str = Field(description="class of the error")
-    kept: str = Field(default="", description="files that were written before")
+    kind: str
+    """class of the error"""
+    kept: str = ""
+    """files that were written before"""
     hint: str = ""
-    axes: str = Field(default="", description="axes that had power and are not confirmed without it")
+    axes: str = ""
+    """axes that had power and are not confirmed without it"""
     unconfirmed: list[str] = Field(default=[], description="what could not be confirmed")

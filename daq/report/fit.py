@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from rich.console import RenderableType
@@ -24,13 +24,12 @@ from daq.report.fit_schemas import (
     Trial,
 )
 from daq.report.gains import (
-    diagnosis_texts,
     gain_table,
     mass_texts,
     own_torques,
-    partial_note,
     torque_sentences,
     torque_table,
+    warning_texts,
 )
 from daq.report.text import Sentence, percent_text, plain_table
 from daq.workflow.cases import CASES, Case, CaseFit
@@ -64,9 +63,7 @@ def fit_view(
     fitted = found.fitted
     axes, estimate = fitted.cell.axis_names, fitted.estimate
     yield gain_table(calibration.gains, title=f"Drive gains of {calibration.cell} by {calibration.method}")
-    if (note := partial_note(calibration)) is not None:
-        yield Sentence(note, "bold")
-    yield from (Sentence(text, "bold") for text in diagnosis_texts(calibration.diagnoses))
+    yield from (Sentence(text, "bold") for text in warning_texts(calibration))
     for effect in calibration.effects:
         yield Sentence(f"{effect.axis}: {effect.name}, declared in the cell file: {size_text(effect, calibration)}")
     if (note := actual_current_note(fitted.cell)) is not None:
@@ -237,7 +234,7 @@ def coefficients(evidence: Evidence, placed: PlacedEffect) -> tuple[Parameter, .
     )
 
 
-def identifiability_notes(fitted: Fit, influences: Sequence[PayloadMass]) -> tuple[str, ...]:
+def identifiability_notes(fitted: Fit, influences: Sequence[PayloadMass]) -> Iterator[str]:
     """Describe errors that leave no residual in these data.
 
     Args:
@@ -245,42 +242,39 @@ def identifiability_notes(fitted: Fit, influences: Sequence[PayloadMass]) -> tup
         influences: of each payload's mass on its gains, as in its calibration.
     """
     if fitted.estimate.gains_fixed:
-        return ()
-    texts = mass_texts(influences)
-    masses = f" ({'; '.join(texts)})" if texts else ""
+        return
     drawn = [payload.name for payload in fitted.identification.system.payloads if len(payload.known) > 1]
-    return (
-        *(
-            (
-                f"More than the mass of {', '.join(drawn)} is taken as exact. A drawing that is wrong by some per cent "
-                "shifts the gains by as much, which σ does not show: compare with --known mass, better in the paper.",
-            )
-            if drawn
-            else ()
-        ),
-        f"Not identifiable from these data: {_mass_mistake(drawn)}{masses}; so does a wrong value of gravity. A gear "
-        "efficiency that is the same in both directions is part of its gain.",
+    mistake = "a wrong payload mass scales all gains alike and leaves no residual"
+    if drawn:
+        mistake = "a wrong payload mass bends all gains, and leaves little of it in the residual"
+        yield (
+            f"More than the mass of {', '.join(drawn)} is taken as exact. A drawing that is wrong by some per cent "
+            "shifts the gains by as much, which σ does not show: compare with --known mass, better in the paper."
+        )
+    texts = "; ".join(mass_texts(influences))
+    masses = f" ({texts})" if texts else ""
+    yield (
+        f"Not identifiable from these data: {mistake}{masses}; so does a wrong value of gravity. A gear "
+        "efficiency that is the same in both directions is part of its gain."
     )
 
 
-def geometry_notes(check: GeometryCheck | None, axes: Sequence[str]) -> tuple[str, ...]:
-    """Sentences on the direction of gravity and on the zeros that the data do not show; none where nothing was tested.
+def geometry_notes(check: GeometryCheck | None, axes: Sequence[str]) -> Iterator[str]:
+    """Say the direction of gravity, and the zeros that the data do not show; nothing where nothing was tested.
 
     Args:
         check: beside the fit.
         axes: their names.
     """
     if check is None:
-        return ()
-    texts: list[str] = []
+        return
     if check.gravity is not None:
         turn = np.degrees(check.gravity.turn_rad)
         std = np.degrees(check.gravity.turn_std_rad)
-        texts.append(f"Gravity, by the torques: {turn:.2f} ± {std:.2f}° from the direction in the cell file.")
+        yield f"Gravity, by the torques: {turn:.2f} ± {std:.2f}° from the direction in the cell file."
     hidden = hidden_zeros_text(check, axes)
     if hidden:
-        texts.append(hidden)
-    return tuple(texts)
+        yield hidden
 
 
 def checked_geometry(check: GeometryCheck | None, axes: Sequence[str]) -> CheckedGeometry | None:
@@ -302,26 +296,21 @@ def _found_gravity(gravity: Gravity) -> FoundGravity:
     )
 
 
-def _mass_mistake(drawn: Sequence[str]) -> str:
-    """Say what a wrong mass does; `drawn` are the payloads of which more than the mass is known."""
-    if drawn:
-        return "a wrong payload mass bends all gains, and leaves little of it in the residual"
-    return "a wrong payload mass scales all gains alike and leaves no residual"
-
-
-def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> tuple[str, ...]:
+def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> Iterator[str]:
     """Describe which data identify each uncertain gain, and which moves would help."""
-    if fitted.estimate.gains_fixed:
-        return ()
     error = fitted.final.training_error.total
+    if fitted.estimate.gains_fixed:
+        return
     if error > DOUBTFUL_PERCENT:
-        return (
+        yield (
             f"DOUBTFUL: the model leaves {error:.3g} % of the torque, expected some 3 to 15 %. σ does not cover "
-            "this error: check channels, signs, drive train, gravity and payload against the cell file.",
+            "this error: check channels, signs, drive train, gravity and payload against the cell file."
         )
-    if not judged:
-        return (f"Excitation: every gain is known to {GOOD_PERCENT:g} % or better.",)
-    return ("Excitation:", *(f"  {gain.words(fitted.cell.axis_names[gain.axis])}" for gain in judged))
+    elif not judged:
+        yield f"Excitation: every gain is known to {GOOD_PERCENT:g} % or better."
+    else:
+        yield "Excitation:"
+        yield from (f"  {gain.words(fitted.cell.axis_names[gain.axis])}" for gain in judged)
 
 
 def comparison_tables(comparison: EstimatorComparison, axes: tuple[str, ...]) -> tuple[Table, Table]:
@@ -342,18 +331,15 @@ def comparison_tables(comparison: EstimatorComparison, axes: tuple[str, ...]) ->
 
 
 def _trial(trial: EstimatorTrial, axes: tuple[str, ...]) -> Trial:
-    if trial.gains is None or trial.std is None:
-        return Trial(
-            estimator=trial.estimator,
-            position_cutoff_hz=trial.position_cutoff_hz,
-            decimation_cutoff_hz=trial.decimation_cutoff_hz,
-            gains=None,
-            reason=trial.reason,
-        )
+    gains = None
+    outcome: dict[str, Any] = {"reason": trial.reason}
+    if trial.gains is not None and trial.std is not None:
+        gains = _gains(axes, trial.gains, trial.std)
+        outcome = {"relative_error_percent": trial.relative_error_percent}
     return Trial(
         estimator=trial.estimator,
         position_cutoff_hz=trial.position_cutoff_hz,
         decimation_cutoff_hz=trial.decimation_cutoff_hz,
-        gains=_gains(axes, trial.gains, trial.std),
-        relative_error_percent=trial.relative_error_percent,
+        gains=gains,
+        **outcome,
     )

@@ -1,4 +1,4 @@
-"""What `fit`, `residual`, `validate`, `weigh` and `contact` print under `--json`.
+"""What `fit` and `residual` print under `--json`.
 
 docs/reference/residual-json.md describes the keys of `residual`.
 """
@@ -11,7 +11,6 @@ from pydantic import Field
 
 from daq.documents.calibration_file import CalibrationBody
 from daq.report.document import Figure, Report
-from ident.calibration import PayloadMass
 
 
 class Errors(Report):
@@ -128,14 +127,17 @@ class MotorNoise(Report):
     """Noise of one motor at rest or between repeated moves."""
 
     axis: str
-    noise: float = Field(description="estimate, in the unit of the current reference")
-    least: Figure = Field(description="its lower limit where that bounds any model's error: known from repeated moves")
+    noise: float
+    """estimate, in the unit of the current reference"""
+    least: Figure
+    """its lower limit where that bounds any model's error: known from repeated moves"""
     source: str
     std_percent: Figure
     dwells: int | None
     pairs: int | None
     degrees_of_freedom: Figure
-    left: Figure = Field(description="what the last model leaves in motion")
+    left: Figure
+    """what the last model leaves in motion"""
     refuted: bool
 
 
@@ -247,7 +249,8 @@ class FindingEntry(NamedEffect):
 
     variable: str
     coefficients: list[Coefficient]
-    probability: Figure = Field(description="by noise alone; null where it rests on too few moves for a test")
+    probability: Figure
+    """by noise alone; null where it rests on too few moves for a test"""
     folds_better: float
     explained: Figure
     error_before_percent: Figure
@@ -335,180 +338,3 @@ class ResidualFormat(Report):
 # The keys of the last base come first.
 class ResidualFile(ResidualReport, ResidualFormat):
     """`residual.json`."""
-
-
-class ValidatedLog(Report):
-    """Errors of one log."""
-
-    log: str
-    sha256: str
-    seen_by_fit: bool
-    partial: bool
-    held_out: bool
-    same_configuration: bool
-    rows: int
-    relative_error_percent: Errors
-    picture: str | None
-
-
-class Together(Report):
-    """Errors of all logs together."""
-
-    relative_error_percent: Errors
-
-
-class CheckedLog(Report):
-    """One log under every calibration."""
-
-    log: str
-    condition: Figure
-    relative_error_percent: dict[str, Errors | None]
-    left_out: str | None
-    seen_by: list[str]
-
-
-class FoundMass(Report):
-    """Mass of a payload by one calibration, or why it was not found."""
-
-    reason: str = ""
-    mass_kg: Figure = None
-    std_percent: Figure = None
-    std_with_gains_percent: Figure = None
-    error_percent: Figure = None
-
-
-class CheckedPayload(Report):
-    """A weighed payload."""
-
-    log: str
-    payload: str
-    mounting: str
-    weighed_kg: Figure
-    with_bare_runs: bool
-    masses: dict[str, FoundMass]
-
-
-# Not the `Diagnosis` of `ident`: the name of a run is that of its file, which only a `Report` makes fit for JSON.
-class DiagnosisEntry(Report):
-    """Something wrong with a recording or a fit, and where to look."""
-
-    name: str
-    runs: list[str]
-    axes: list[str]
-    found: str
-    expected: str
-    remedy: str
-
-
-class ValidateReport(Report):
-    """`validate`."""
-
-    cell: str
-    axes: list[str]
-    filter: dict[str, int | float | list[float]]
-    fit_relative_error_percent: Errors
-    payload_mass: list[PayloadMass]
-    logs: list[ValidatedLog]
-    together: Together | None
-    calibrations: list[str]
-    diagnoses: list[DiagnosisEntry]
-    runs: list[CheckedLog]
-    payloads: list[CheckedPayload]
-
-
-class WeighedValue(Report):
-    """A number and its σ."""
-
-    value: Figure
-    std: Figure
-
-
-class WeighedValues(Report):
-    """Numbers and their σ."""
-
-    value: list[Figure]
-    std: list[Figure]
-
-
-class AddedMoves(Report):
-    """Moves that would show a parameter."""
-
-    words: str
-    seconds: float
-    std: Figure
-
-
-class WeighedParameter(Report):
-    """One of the ten parameters of a body."""
-
-    name: str
-    unit: str
-    value: Figure
-    std: Figure
-    std_of_moves: Figure
-    identifiable: bool
-    add: AddedMoves | None
-
-
-class WeighReport(Report):
-    """`weigh`."""
-
-    cell: str
-    logs: list[str]
-    bare: list[str]
-    part_of_the_fit: list[str]
-    declared_kg: Figure
-    mass_kg: WeighedValue
-    centre_m: WeighedValues
-    centre_in_platform_m: WeighedValues | None
-    inertia_about_centre_kg_m2: WeighedValues
-    parameters: list[WeighedParameter]
-    relative_error_percent: Errors
-    moves: int
-    complete: bool
-
-
-class ContactAxis(Report):
-    """Band and threshold of one axis; medians over the motion in `unit`."""
-
-    axis: str
-    unit: str
-    scale: list[Figure]
-    band_over_scale: Figure
-    threshold_over_scale: Figure
-    correlation_s: Figure
-    quiet_s: Figure
-    band: Figure
-    threshold: Figure
-    largest: Figure
-
-
-class ContactEntry(Report):
-    """A stretch beyond the threshold."""
-
-    axis: str
-    start_s: float
-    end_s: float
-    peak: float
-    peak_over_threshold: float
-
-
-class NotJudged(Report):
-    """An axis that cannot show a contact."""
-
-    axis: str
-    reason: str
-
-
-class ContactReport(Report):
-    """`contact`."""
-
-    cell: str
-    log: str
-    band_from_this_log: bool
-    stretches_left_out: int
-    alarms_per_hour: float
-    axes: list[ContactAxis]
-    contacts: list[ContactEntry]
-    not_judged: list[NotJudged]
-    picture: str | None

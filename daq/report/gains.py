@@ -12,7 +12,7 @@ from daq.report.fit_schemas import OwnTorque
 from daq.report.picture import BLUE, GREEN, GREY, legend_below, render, single
 from daq.report.text import SHOWN_SIGMAS, plain_table, terminal_text
 from daq.workflow.geometry_diagnoses import misfit_text
-from ident.calibration import Calibration, EncoderMisfit, Gain, GeometryCorrection, PayloadMass
+from ident.calibration import Calibration, EncoderMisfit, Gain, GeometryCorrection, Parameter, PayloadMass
 from ident.data.torque_channel import TorqueSlope
 from ident.errors import Diagnosis
 
@@ -119,17 +119,21 @@ def _ratio_std(slope: TorqueSlope, gain: Gain) -> float:
     return math.hypot(slope.std / gain.value, slope.value * gain.std / gain.value**2)
 
 
-def partial_note(calibration: Calibration) -> str | None:
-    """Warning for a calibration from a log that is partial or lost frames, None for any other."""
+def partial_note(calibration: Calibration) -> Iterator[str]:
+    """Warn of a calibration from a log that is partial or lost frames."""
     partial = [source.name for source in calibration.sources if source.partial]
-    return (
-        f"PARTIAL or lossy data ({', '.join(partial)}): not for a controller; `apply` refuses it." if partial else None
-    )
+    if partial:
+        yield f"PARTIAL or lossy data ({', '.join(partial)}): not for a controller; `apply` refuses it."
 
 
 def diagnosis_texts(diagnoses: Iterable[Diagnosis]) -> tuple[str, ...]:
     """One sentence for each diagnosis, for a view or a page."""
     return tuple(f"CHECK {one.text}." for one in diagnoses)
+
+
+def warning_texts(calibration: Calibration) -> tuple[str, ...]:
+    """Say what to check before the gains are used, for a view or a page."""
+    return (*partial_note(calibration), *diagnosis_texts(calibration.diagnoses))
 
 
 def encoder_text(misfit: EncoderMisfit) -> str:
@@ -202,6 +206,11 @@ def mass_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
                 f"{gain.tolerance_std:.2g}" if one.tolerance_kg > 0.0 else "-",
                 units.get(gain.axis, ""),
             )
+
+
+def value_rows(parameters: Iterable[Parameter]) -> list[tuple[str, str, str]]:
+    """Return rows of a table of parameters: name, value ± σ, unit."""
+    return [(one.name, with_deviation(one.value, one.std), one.unit) for one in parameters]
 
 
 def with_deviation(value: float, std: float) -> str:

@@ -10,6 +10,7 @@ from dataclasses import asdict
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -22,14 +23,7 @@ from daq.ledger.entry import Entry, Event, WriteAction, drives_of
 from daq.ledger.fold import History
 from daq.ledger.ledger import Verification
 from daq.ledger.watch import Series, alarm_text, pattern_of, questions
-from daq.report.controller_schemas import (
-    AuditReport,
-    HistoryAxis,
-    HistoryPoint,
-    HistoryReport,
-    UnendedWrite,
-    UnknownWrite,
-)
+from daq.report.document import Figure, Report
 from daq.report.gains import with_deviation
 from daq.report.picture import BLUE, GREY, ORANGE, PURPLE, SKY, legend_below, panels, render, unformatted
 from daq.report.text import SHOWN_SIGMAS, inert_row, plain_table, printable
@@ -38,6 +32,132 @@ from ident.drift.change import CHART
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+
+class Acknowledged(Report):
+    """A change that was explained."""
+
+    since: str
+    at: str
+    who: str
+    why: str
+
+
+class HistoryPoint(Report):
+    """One calibration of a gain; the columns of `--csv`."""
+
+    axis: str
+    recorded: str
+    gain: float
+    std: float
+    unit: str
+    nameplate: float
+    change_percent: Figure
+    change_sigmas: Figure
+    change_probability: Figure
+    deviation_sigmas: Figure
+    cusum_up: Figure
+    cusum_down: Figure
+    trend_sigmas: Figure
+    alarm: str | None
+    baseline: Figure
+    applied_at: str | None
+    applied_by: str | None
+    applied_to: str | None
+    error_percent: Figure
+    holdout_percent: Figure
+    rows: int
+    method: str
+    software: str
+    configuration_sha256: str
+    created: str
+    entered: str
+    digest: str
+
+
+class HistoryAxis(Report):
+    """One gain over time."""
+
+    axis: str
+    unit: str
+    dispersion: Figure
+    alarmed: bool
+    alarm: str | None
+    since: str | None
+    change_percent: Figure
+    change_sigmas: Figure
+    baseline: Figure
+    baseline_std: Figure
+    acknowledged: list[Acknowledged]
+    points: list[HistoryPoint]
+
+
+class FlawedLine(Report):
+    """A line of the audit log that is not what was written."""
+
+    line: int
+    """in the file, from 1"""
+    flaw: str
+    says: str
+    """the same as a sentence"""
+
+
+class NamedEntry(Report):
+    """An entry of the audit log."""
+
+    number: int
+    """from 1"""
+    at: str
+    who: str
+    file: str
+    """the controller's file, or the drives"""
+
+
+class UnendedWrite(NamedEntry):
+    """A write that was begun and never ended."""
+
+    content: str
+    """of the file afterwards"""
+
+
+class UnknownWrite(NamedEntry):
+    """A write that the history lacks."""
+
+    action: str
+    calibration_sha256: str | None
+
+
+class AuditReport(Report):
+    """State of the audit log and of the history in it."""
+
+    file: str
+    entries: int
+    holds: bool
+    """no line was changed or removed, as far as the chain shows it"""
+    broken_line: int | None
+    """the first that is not what was written"""
+    flaws: list[FlawedLine]
+    torn_lines: list[int]
+    """left by a writer that was killed; they are no flaw"""
+    open_writes: list[UnendedWrite]
+    history_broken: list[str]
+    """what the history cannot show"""
+    unknown_writes: list[UnknownWrite]
+
+
+class HistoryReport(Report):
+    """`history`."""
+
+    cell: str
+    calibrations: int
+    in_force: str | None
+    chart: dict[str, int | float]
+    """limits of the control chart"""
+    pattern: str
+    questions: list[str]
+    axes: list[HistoryAxis]
+    audit: AuditReport | None = None
+    """with --verify"""
 
 
 def show_history(
@@ -121,9 +241,11 @@ def history_gain_table(all_series: Sequence[Series]) -> Table:
         gain = series.points[-1].gain
         count = len(series.points) - series.began
         drift = series.drift if count > 1 else None
-        state = (
-            "ALARM" if series.alarmed else "ok" if count > CHART.baseline else f"baseline: {count} of {CHART.baseline}"
-        )
+        state = f"baseline: {count} of {CHART.baseline}"
+        if series.alarmed:
+            state = "ALARM"
+        elif count > CHART.baseline:
+            state = "ok"
         table.add_row(
             printable(series.axis),
             with_deviation(gain.value, gain.std),
@@ -189,19 +311,13 @@ def history_report(
     )
 
 
-_OF_DRIFT = ("change_percent", "change_sigmas", "baseline", "baseline_std")
-
-
 def _history_axis(series: Series) -> HistoryAxis:
-    # A gain that was not calibrated since its last explanation has no drift.
-    unknown = dict.fromkeys(_OF_DRIFT) if series.drift is None else {}
     return HistoryAxis.of(
         series,
         series.drift,
         alarm=alarm_text(series),
         since=series.onset,
         points=history_points(series),
-        **unknown,
     )
 
 
@@ -372,21 +488,22 @@ def plot_history(all_series: Sequence[Series], kind: str, *, title: str) -> byte
 
     dates: Any = matplotlib.dates  # without types
     columns = min(_COLUMNS, len(all_series))
-    bands = -(-len(all_series) // columns)
+    bands = math.ceil(len(all_series) / columns)
     figure, places = panels(2 * columns * bands, columns, unformatted(title))
     for number, series in enumerate(all_series):
         band, column = divmod(number, columns)
-        above, beneath = (places[(2 * band + row) * columns + column] for row in range(2))
-        _draw_gains(above, series)
-        _draw_limits(beneath, series)
+        _draw_gains(places[2 * band * columns + column], series)
+        _draw_limits(places[(2 * band + 1) * columns + column], series)
     for empty in range(len(all_series), columns * bands):
         for row in range(2):
             places[(2 * (bands - 1) + row) * columns + empty % columns].set_axis_off()
     days = [_days(point.entry.recorded) for series in all_series for point in series.points]
     # Of a single day there would be no range to label.
     beside = max(0.5, 0.03 * (max(days) - min(days)))
+    begin = max(min(days) - beside, _FIRST_DAY)
+    end = min(max(days) + beside, _LAST_DAY)
     for place in places:
-        place.set_xlim(max(min(days) - beside, _FIRST_DAY), min(max(days) + beside, _LAST_DAY))
+        place.set_xlim(begin, end)
         # At most so many labels as fit beside each other.
         locator = dates.AutoDateLocator(maxticks=7)
         place.xaxis.set_major_locator(locator)
@@ -401,22 +518,22 @@ def plot_history(all_series: Sequence[Series], kind: str, *, title: str) -> byte
 
 
 def _draw_gains(place: Axes, series: Series) -> None:
-    times = [_days(point.entry.recorded) for point in series.points]
-    values = [point.gain.value for point in series.points]
-    widths = [SHOWN_SIGMAS * series.dispersion * point.gain.std for point in series.points]
+    points = series.points
+    times = np.array([_days(point.entry.recorded) for point in points])
+    values = np.array([point.gain.value for point in points])
+    widths = [SHOWN_SIGMAS * series.dispersion * point.gain.std for point in points]
+    label = f"gain ± {SHOWN_SIGMAS:g} σ"
     place.errorbar(times, values, yerr=widths, fmt="none", ecolor=BLUE, elinewidth=1.0, capsize=2)
-    place.plot(
-        times, values, "o", color=BLUE, markerfacecolor="white", markersize=4, label=f"gain ± {SHOWN_SIGMAS:g} σ"
-    )
-    held = [(_days(point.entry.recorded), point.gain.value) for point in series.points if point.entry.applied]
-    place.plot(*_columns(held), "o", color=BLUE, markersize=4, label="applied")
-    alarmed = [(times[i], values[i]) for i in range(len(times)) if series.alarm_at(i) is not None]
-    place.plot(*_columns(alarmed), "o", color=ORANGE, markerfacecolor="none", markersize=9, label="alarm")
+    place.plot(times, values, "o", color=BLUE, markerfacecolor="white", markersize=4, label=label)
+    held = np.array([point.entry.applied for point in points], dtype=np.bool_)
+    place.plot(times[held], values[held], "o", color=BLUE, markersize=4, label="applied")
+    alarmed = np.array([series.alarm_at(index) is not None for index in range(len(points))], dtype=np.bool_)
+    place.plot(times[alarmed], values[alarmed], "o", color=ORANGE, markerfacecolor="none", markersize=9, label="alarm")
     for stretch in series.stretches:
         drift = stretch.drift
-        ends = [times[stretch.began], times[stretch.ended - 1]]
-        low, high = (drift.baseline + sign * SHOWN_SIGMAS * drift.baseline_std for sign in (-1.0, 1.0))
-        place.fill_between(ends, low, high, color=SKY, alpha=0.3, linewidth=0)
+        ends = times[[stretch.began, stretch.ended - 1]]
+        half = SHOWN_SIGMAS * drift.baseline_std
+        place.fill_between(ends, drift.baseline - half, drift.baseline + half, color=SKY, alpha=0.3, linewidth=0)
         place.plot(ends, [drift.baseline] * 2, color=GREY, linestyle="--", linewidth=1.2, label="baseline")
         if drift.steady:
             reached = drift.baseline * (1.0 + drift.change_percent / 100.0)
@@ -443,7 +560,3 @@ def _draw_limits(place: Axes, series: Series) -> None:
 def _days(at: datetime) -> float:
     """As matplotlib counts dates: days since 1970, UTC."""
     return at.timestamp() / 86_400.0
-
-
-def _columns(points: list[tuple[float, float]]) -> tuple[list[float], list[float]]:
-    return [when for when, _ in points], [value for _, value in points]

@@ -15,15 +15,7 @@ from daq.config.cell_file import cell_from_bundle
 from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import LogReader
 from daq.report.bus_views import current_signals
-from daq.report.log_schemas import (
-    BagReport,
-    BusLoadEntry,
-    ImportReport,
-    InfoReport,
-    RecordReport,
-    SalvageReport,
-    TableReport,
-)
+from daq.report.document import Figure, Report
 from daq.report.text import entry_lines, printable
 from drivers.messages import EventKind
 
@@ -35,6 +27,156 @@ if TYPE_CHECKING:
     from daq.log.metadata import RunInfo, RunStatistics, Timing
     from daq.log.salvage import Salvaged
     from daq.workflow.record import Recorded
+
+
+class BusLoadEntry(Report):
+    """Load of one bus [%]."""
+
+    bus: str
+    mean_percent: float
+    worst_percent: float
+
+
+class NewLog(Report):
+    """A log that was written, with its losses."""
+
+    log: str
+    samples: int
+    lost_cycles: int
+    missing: list[int]
+    """samples without an answer, an axis each"""
+    valid: bool
+    reason: str
+    """why it is not valid"""
+
+
+class RecordReport(NewLog):
+    """`record`."""
+
+    warnings: list[str]
+    bus_load: list[BusLoadEntry]
+
+
+class StampSummary(Report):
+    """Time stamps of an imported recording, and the uniform clock that its log has."""
+
+    rows: int
+    rate_hz: float
+    usual_step_s: float
+    longest_step_s: float
+    jitter_s: float
+    drift_s: float
+    missing: int
+    resampled: bool
+    duplicates: int
+    close: int
+    started_s: Figure
+
+
+class MountedPayload(Report):
+    """Payload of a log."""
+
+    name: str
+    mounting: str
+    known: dict[str, float]
+
+
+class LogEvent(Report):
+    """Event of a recording that is no routine."""
+
+    time_ns: int
+    axis: int | None
+    """index from 0; null for the cell"""
+    kind: str
+    code: int
+    text: str
+
+
+class InfoReport(Report):
+    """`info`."""
+
+    log: str
+    sha256: str
+    run_id: str
+    cell: str
+    cell_sha256: str
+    axes: list[str]
+    current: dict[str, str]
+    role: str
+    payload: MountedPayload | None
+    rate_hz: float
+    speed: float
+    samples: int
+    duration_s: float
+    stamped_duration_s: float
+    moves: int
+    slow_readings: dict[str, int]
+    lost_cycles: int
+    missing: dict[str, int]
+    partial: bool
+    valid: bool
+    reason: str
+    events: list[LogEvent]
+    operator: str
+    software: str
+    started: str | None
+    wall_minus_monotonic_s: float
+    wall_clock_step_s: Figure
+    origin: str
+    timing: StampSummary | None
+    attachments: dict[str, int]
+    """size of each [bytes]"""
+
+
+class ImportReport(NewLog):
+    """`import`."""
+
+    partial: bool
+    wall_minus_monotonic_ns: int | None
+    timing: StampSummary | None
+    remarks: list[str]
+
+
+class SalvageReport(Report):
+    """`salvage`."""
+
+    log: str
+    partial: bool
+    samples: int
+    duration_s: float
+    lost_cycles: int
+    missing: list[int]
+    """samples without an answer, an axis each"""
+    valid: bool
+    reason: str
+    """why it is not valid"""
+    left_out_bytes: int
+    damage: str
+
+
+class TableReport(Report):
+    """`export log`."""
+
+    log: str
+    table: str
+    format: str
+    rows: int
+    columns: list[str]
+    partial: bool
+    valid: bool
+
+
+class BagReport(Report):
+    """`export bag`."""
+
+    log: str
+    bag: str
+    duration_s: float
+    messages: dict[str, int]
+    effort: bool
+    partial: bool
+    valid: bool
+
 
 _ROUTINE = {EventKind.MOVE_START, EventKind.MOVE_END, EventKind.NMT, EventKind.STATE}
 """Events of every run; all others are shown."""

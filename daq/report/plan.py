@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from daq.config.cell import Cell, joint_unit
 from daq.report.document import Figure, Report
@@ -22,11 +22,14 @@ class PlannedGain(Report):
 
     axis: str
     predicted_std_percent: Figure
-    known_preload_std_percent: Figure = Field(description="σ if internal preload of redundant motors were known [%]")
+    known_preload_std_percent: Figure
+    """σ if internal preload of redundant motors were known [%]"""
     verdict: str
-    hidden_by: Literal["preload", "motion"] | None = Field(description="why the gain is unseen, or weak by preload")
+    hidden_by: Literal["preload", "motion"] | None
+    """why the gain is unseen, or weak by preload"""
     seen_by: list[str]
-    alone_percent: dict[str, Figure] = Field(description="σ that each source of information gives alone [%]")
+    alone_percent: dict[str, Figure]
+    """σ that each source of information gives alone [%]"""
     words: str
 
 
@@ -41,9 +44,12 @@ class PlanReport(Report):
     duration_s: float
     condition: float
     assumed: list[str]
-    rank: int = Field(description="independent directions of the gains that the moves determine to 10 %")
-    known_preload_rank: int | None = Field(description="the same if internal preload were known")
-    hidden: list[str] = Field(description="sentences on gains that the moves do not show, with what to do")
+    rank: int
+    """independent directions of the gains that the moves determine to 10 %"""
+    known_preload_rank: int | None
+    """the same if internal preload were known"""
+    hidden: list[str]
+    """sentences on gains that the moves do not show, with what to do"""
     gains: list[PlannedGain]
 
 
@@ -79,29 +85,28 @@ def _finite(std_percent: float | None) -> float | None:
     return None if std_percent is None or not math.isfinite(std_percent) else round(std_percent, 3)
 
 
-def _nothing_hidden(judged: Identifiability) -> tuple[str, ...]:
-    if judged.known_preload_rank is None:
-        return ()
-    directions = f"{judged.rank} of {len(judged.gains)} independent directions of the gains"
-    return (f"Internal preload obscures no gain: these moves determine {directions}.",)
-
-
-def _to_get_good(cell: Cell, made: Plan, judged: Identifiability) -> tuple[str, ...]:
-    """Say what makes weak gains good; σ falls with the square root of the time."""
+def _on_all_gains(cell: Cell, made: Plan, judged: Identifiability) -> Iterator[str]:
+    """Say which gains are hidden, and what makes weak ones good; σ falls with the square root of the time."""
+    hidden = judged.sentences(cell.axis_names)
+    yield from hidden
+    if not hidden and judged.known_preload_rank is not None:
+        directions = f"{judged.rank} of {len(judged.gains)} independent directions of the gains"
+        yield f"Internal preload obscures no gain: these moves determine {directions}."
     weak = [gain for gain in judged.gains if gain.verdict is not Visibility.GOOD]
     if not weak:
-        return ()
+        return
+    ways = ["a heavier payload", "wider limits of position, speed and acceleration in the cell file"]
     seconds = made.duration_s * (max(gain.std_percent for gain in weak) / GOOD_PERCENT) ** 2
-    longer = f"a longer run (some --duration {10.0 * math.ceil(seconds / 10.0):.0f})" if seconds <= LONGEST_S else ""
-    ways = (longer, "a heavier payload", "wider limits of position, speed and acceleration in the cell file")
+    if seconds <= LONGEST_S:
+        ways.insert(0, f"a longer run (some --duration {10.0 * math.ceil(seconds / 10.0):.0f})")
     names = ", ".join(cell.axes[gain.axis].name for gain in weak)
-    return (f"For good gains ({GOOD_PERCENT:g} %) of {names}: {'; or '.join(way for way in ways if way)}.",)
+    yield f"For good gains ({GOOD_PERCENT:g} %) of {names}: {'; or '.join(ways)}."
 
 
-def _assembly(cell: Cell, experiment: Experiment) -> tuple[str, ...]:
+def _assembly(cell: Cell, experiment: Experiment) -> Iterator[str]:
     """Positions of the joints without a motor that close the loops, to compare with the real robot."""
     if cell.chain is None:
-        return ()
+        return
     robot = experiment.scene.checker.robot
     position = experiment.design.expectation.model.assembly.position_rad
 
@@ -112,9 +117,9 @@ def _assembly(cell: Cell, experiment: Experiment) -> tuple[str, ...]:
         parts = zip(joints, values, units, strict=True)
         return ", ".join(f"{robot.joints[joint].name} {value:g} {unit.name}" for joint, value, unit in parts)
 
-    return (
+    yield (
         f"Assembly pose, to compare with the robot: {listed(robot.passive_joints)} while the motors' joints are at "
-        f"{listed(robot.axis_joints)}.",
+        f"{listed(robot.axis_joints)}."
     )
 
 
@@ -123,6 +128,9 @@ def plan_text(
 ) -> str:
     """Describe a plan in lines for the operator, who looks at its preview, if there is one."""
     look = ", or look at it (--preview PAGE)" if preview is None else f": {preview} shows the moves"
+    way = "`record` checks the way to its first target from where the robot stands."
+    if cell.clearance is None:
+        way = "The way to its first target is not checked: the cell file declares no `workspace` and no `clearance`."
     width = max(len(name) for name in (*cell.axis_names, "axis"))
     lines = [
         f"{out}: {len(made.moves)} moves in {made.duration_s:.0f} s, condition {made.condition:.0f}",
@@ -132,16 +140,10 @@ def plan_text(
             for axis, gain in zip(cell.axes, judged.gains, strict=True)
         ),
         *(f"  {gain.words(axis.name)}" for axis, gain in zip(cell.axes, judged.gains, strict=True)),
-        *(judged.sentences(cell.axis_names) or _nothing_hidden(judged)),
-        *_to_get_good(cell, made, judged),
+        *_on_all_gains(cell, made, judged),
         *_assembly(cell, experiment),
         "Assumed:",
         *(f"  {remark}" for remark in experiment.remarks),
-        f"Read the plan before the robot executes it{look}. "
-        + (
-            "`record` checks the way to its first target from where the robot stands."
-            if cell.clearance is not None
-            else "The way to its first target is not checked: the cell file declares no `workspace` and no `clearance`."
-        ),
+        f"Read the plan before the robot executes it{look}. {way}",
     ]
     return "\n".join(lines)

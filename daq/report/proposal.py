@@ -10,15 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from daq.report.controller_schemas import (
-    DriveChange,
-    DriveGain,
-    DriveRollback,
-    FileChange,
-    FileGain,
-    FileRollback,
-    RestoredObject,
-)
+from daq.report.document import Figure, Report
 from daq.report.gains import with_deviation
 from daq.report.text import plain_table, terminal_lines, terminal_text
 from daq.writeback.drive_target import DriveEdit
@@ -27,6 +19,104 @@ from daq.writeback.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, j
 from daq.writeback.request import Edit, GainChange
 from daq.writeback.target import E, Proposal, Written
 from drivers.canopen.parameters import ParameterValue, ParameterWrite
+
+
+class Refused(Report):
+    """A check that failed."""
+
+    gate: str
+    subject: str
+    found: str
+    expected: str
+    remedy: str
+
+
+class FileGain(Report):
+    """A gain in the controller's file and its planned value."""
+
+    axis: str
+    key: str
+    line: int
+    old: Figure
+    new: Figure
+    """as it is read back; null where there is none to write"""
+    change_percent: Figure
+    change_sigmas: Figure
+    """signed as change_percent"""
+    significant: bool
+    std_percent: Figure
+    nameplate: float
+    nameplate_percent: Figure
+    unit: str
+
+
+class FileChange(Report):
+    """`apply` to the controller's file."""
+
+    file: str
+    base_sha256: str
+    base: str
+    """BEFORE-AFTER of this change, for --base"""
+    applied: bool
+    backup: str | None
+    changes: list[FileGain]
+    refusals: list[Refused]
+    diff: str
+
+
+class RestoredObject(Report):
+    """An object in a drive before and after."""
+
+    axis: str
+    object: str
+    old: Figure
+    """null where the drive has no number"""
+    new: Figure
+
+
+class DriveGain(RestoredObject):
+    """An object in a drive and its planned value."""
+
+    std: float
+    nameplate: float
+    unit: str
+
+
+class DriveChange(Report):
+    """`apply --drives`; `record`, `source` and `saved` are there once the drives are written."""
+
+    cell: str | None
+    base_sha256: str
+    base: str
+    applied: bool
+    record: str = ""
+    source: str | None = None
+    saved: bool = False
+    changes: list[DriveGain]
+    refusals: list[Refused]
+
+
+class FileRollback(Report):
+    """`rollback` of the controller's file."""
+
+    file: str
+    restored: str
+    """backup that was restored"""
+    backup: str | None
+    """of the content before"""
+    diff: str
+    audit: str | None
+
+
+class DriveRollback(Report):
+    """`rollback --drives`; the last two are there once the drives are written."""
+
+    drives: str
+    source: str
+    restored: bool
+    changes: list[RestoredObject]
+    record: str = ""
+    saved: bool = False
 
 
 def show_proposal(proposal: Proposal[E], console: Console, known: Spread = NOTHING) -> None:

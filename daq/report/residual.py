@@ -34,7 +34,7 @@ from daq.report.fit_schemas import (
     VerdictEntry,
 )
 from daq.report.gains import diagnosis_texts, gain_table, partial_note
-from daq.report.split_names import names_by_split
+from daq.report.split_names import names_by_split, placed_by
 from daq.report.text import Sentence, plain_table
 from daq.workflow.fit import Fit
 from ident.calibration import AcceptedEffect, Calibration
@@ -68,8 +68,7 @@ def residual_view(
     fitted: Fit, account: Account, calibration: Calibration, *, verbose: bool = False
 ) -> Iterator[RenderableType]:
     """One screen: what was found, and the gains; if verbose, all that the report says of the search, too."""
-    if (note := partial_note(calibration)) is not None:
-        yield Sentence(note, "bold")
+    yield from (Sentence(note, "bold") for note in partial_note(calibration))
     if verbose:
         yield from turns_view(fitted)
         yield from map(Sentence, effect_sizes(calibration))
@@ -101,7 +100,7 @@ def effect_sizes(calibration: Calibration) -> Iterator[str]:
 
 def turns_view(fitted: Fit) -> Iterator[RenderableType]:
     """Candidates of each turn of the loop, and the one that was added."""
-    declared = declared_sentences(fitted)
+    declared = list(declared_sentences(fitted))
     yield from map(Sentence, declared)
     for number, step in enumerate(searched_steps(fitted), start=1):
         if number > 1 or declared:
@@ -139,29 +138,23 @@ def candidate_rows(fitted: Fit, step: Step, count: int) -> Iterator[tuple[str, .
         )
 
 
-def declared_sentences(fitted: Fit) -> list[str]:
+def declared_sentences(fitted: Fit) -> Iterator[str]:
     """Name the effects that the cell file declares."""
-    sentences: list[str] = []
     for step in fitted.steps:
         if step.declared and step.accepted is not None:
-            placed = PlacedEffect(step.accepted.effect, step.accepted.axis)
-            sentences.append(f"Declared in the cell file: {placed.name_among(fitted.cell.place_names)}.")
-    return sentences
+            name = placed_by(step.accepted).name_among(fitted.cell.place_names)
+            yield f"Declared in the cell file: {name}."
 
 
-def turn_sentences(fitted: Fit, step: Step) -> list[str]:
+def turn_sentences(fitted: Fit, step: Step) -> Iterator[str]:
     """Say what a turn of the search added, and what it refused and why."""
     places = fitted.cell.place_names
-    sentences: list[str] = []
     for aside in step.set_aside:
-        placed = PlacedEffect(aside.finding.effect, aside.finding.axis)
-        sentences.append(f"Not added: {placed.name_among(places)}: {aside.reason(places)}.")
+        yield f"Not added: {placed_by(aside.finding).name_among(places)}: {aside.reason(places)}."
     if step.accepted is None:
-        sentences.append("No candidate passes every gate; nothing is added.")
+        yield "No candidate passes every gate; nothing is added."
     else:
-        placed = PlacedEffect(step.accepted.effect, step.accepted.axis)
-        sentences.append(f"Added: {placed.name_among(places)}.")
-    return sentences
+        yield f"Added: {placed_by(step.accepted).name_among(places)}."
 
 
 def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
@@ -194,7 +187,8 @@ def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -
         for placed in turn.added
         if placed in kept
     )
-    (before, _), (after, where) = _strictest_error(account.total.before), _strictest_error(account.total.after)
+    before, _ = _strictest_error(account.total.before)
+    after, where = _strictest_error(account.total.after)
     floor = _floor(account).total
     noise = f" ({_floor_text(floor)})" if math.isfinite(floor) else ""
     ending = (*_skew_sentence(account.skew), *_holdout_verdict(fitted, account))
@@ -318,7 +312,7 @@ def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
     axes, last = fitted.cell.place_names, fitted.steps[-1]
     for aside in step.set_aside:
         finding = aside.finding
-        axis = PlacedEffect(finding.effect, finding.axis).axis_name(axes)
+        axis = placed_by(finding).axis_name(axes)
         replaced = aside.rival is not None and aside.rival in last.after.effects
         if aside.rival is not None and aside.moved and step is last:
             yield (
@@ -349,7 +343,7 @@ def _refused(fitted: Fit) -> Iterator[str]:
         if failed and (finding.axis not in strongest or finding.explained > strongest[finding.axis].explained):
             strongest[finding.axis] = finding
     for axis, finding in first.items():
-        name = PlacedEffect(finding.effect, axis).axis_name(axes)
+        name = placed_by(finding).axis_name(axes)
         if finding.impossible and finding.refusals == (finding.impossible,):
             yield (
                 f"{name}: {effect_text(finding.effect, axes)} ranks first on this axis, but its sign or size is "
@@ -358,7 +352,7 @@ def _refused(fitted: Fit) -> Iterator[str]:
             if strongest.get(axis) is finding:
                 strongest.pop(axis)
     for finding in strongest.values():
-        name = PlacedEffect(finding.effect, finding.axis).axis_name(axes)
+        name = placed_by(finding).axis_name(axes)
         yield (
             f"{name}: {effect_text(finding.effect, axes)} would explain {100.0 * finding.explained:.0f} % of the "
             f"squared residual, but failed a check: {'; '.join(finding.refusals)}. The cause may be another one."
@@ -382,15 +376,16 @@ def floor_sentences(account: Account, axes: Sequence[str]) -> list[str]:
     ]
 
 
-def _holdout_verdict(fitted: Fit, account: Account) -> list[str]:
+def _holdout_verdict(fitted: Fit, account: Account) -> Iterator[str]:
     if account.holdout_change is None or not account.holdout_change.is_rise:
-        return []
+        return
     if fitted.accept_worse_holdout:
-        return [
+        yield (
             "The effects raise the error of the held-out runs by more than its noise. They were accepted all the same, "
             "because --accept-worse-holdout was given."
-        ]
-    return ["The effects raise the error of the held-out runs by more than its noise: no calibration was written."]
+        )
+    else:
+        yield "The effects raise the error of the held-out runs by more than its noise: no calibration was written."
 
 
 def _skew_sentence(skew: CurrentDelay | None) -> Iterator[str]:
@@ -450,27 +445,30 @@ def _gear_sentence(name: str, gear: GearLoss, *, in_model: bool) -> str:
     )
 
 
+def errors_by_data(errors: RelativeErrors) -> dict[str, RelativeError | None]:
+    """Return the errors of one model, by the data that they are measured on."""
+    left_out = errors.left_out_runs
+    return {
+        "fit": errors.in_sample,
+        "moves left out": errors.cross_validated,
+        "runs left out": None if left_out is None else left_out.together,
+        "held out": errors.holdout,
+    }
+
+
 def error_rows(account: Account) -> tuple[ErrorRow, ...]:
     """Rows of the table of errors; errors that were not computed or are unknown are left out."""
-    before, after = account.total.before, account.total.after
-    first, second = (
-        None if errors.left_out_runs is None else errors.left_out_runs.together for errors in (before, after)
-    )
-    pairs = (
-        ("fit", before.in_sample, after.in_sample),
-        ("moves left out", before.cross_validated, after.cross_validated),
-        ("runs left out", first, second),
-        ("held out", before.holdout, after.holdout),
-    )
-    floors = (
-        ("noise, estimate", account.floor),
-        ("noise, estimate, held out", account.holdout_floor),
-        ("noise, at least", account.least_floor),
-        ("noise, at least, held out", account.least_holdout_floor),
-    )
-    named = [(f"{name}, {when}", error) for name, *both in pairs for when, error in zip(WHEN, both, strict=True)]
+    after = errors_by_data(account.total.after)
+    rows: dict[str, RelativeError | None] = {}
+    for data, before in errors_by_data(account.total.before).items():
+        rows[f"{data}, before"] = before
+        rows[f"{data}, after"] = after[data]
+    rows["noise, estimate"] = account.floor
+    rows["noise, estimate, held out"] = account.holdout_floor
+    rows["noise, at least"] = account.least_floor
+    rows["noise, at least, held out"] = account.least_holdout_floor
     return tuple(
-        (name, error) for name, error in (*named, *floors) if error is not None and any(map(math.isfinite, error.axes))
+        (name, error) for name, error in rows.items() if error is not None and any(map(math.isfinite, error.axes))
     )
 
 
@@ -502,28 +500,23 @@ def error_change_text(before_percent: float, after_percent: float) -> str:
 def _effect_sentence(fitted: Fit, account: Account, turn: BeforeAfter, placed: PlacedEffect, step: Step) -> str:
     axes = fitted.cell.place_names
     name = axes[placed.axis]
-    share_of_excess = None if step.accepted is None else step.accepted.share_of_excess
     what = effect_text(placed.effect, axes)
     if doubt := doubted_name(step, placed, axes):
         what = f"a torque that depends on {variable_text(placed.effect, axes)} ({doubt})"
     place = placed.axis if placed.effect.has_axis else None
     before, where = _strictest_error(turn.before, place)
     after, _ = _strictest_error(turn.after, place)
-    floor = _floor(account).at(placed.axis)
-    floor_text = _floor_text(floor)
-    excess = ""
-    if is_unnamed(placed.effect) and share_of_excess is not None:
-        excess = f" (about {100.0 * share_of_excess:.0f} % of the residual beyond noise)"
     if not placed.effect.has_axis:
-        change = error_change_text(before.total, after.total)
-        return f"The recording has {what}: the error {where} {change}."
-    if before.at(placed.axis) * (1.0 - SLIGHT) < after.at(placed.axis) <= before.at(placed.axis):
-        excess += ", a small effect"
-    whose = f" of {name}" if placed.axis < len(fitted.cell.axes) else " of all axes"
-    return (
-        f"{name} has {what}{excess}: the error{whose} {where} "
-        f"{error_change_text(before.at(placed.axis), after.at(placed.axis))} ({floor_text})."
-    )
+        return f"The recording has {what}: the error {where} {error_change_text(before.total, after.total)}."
+    without = before.at(placed.axis)
+    with_it = after.at(placed.axis)
+    if is_unnamed(placed.effect) and step.accepted is not None and step.accepted.share_of_excess is not None:
+        what += f" (about {100.0 * step.accepted.share_of_excess:.0f} % of the residual beyond noise)"
+    if without * (1.0 - SLIGHT) < with_it <= without:
+        what += ", a small effect"
+    whose = name if placed.axis < len(fitted.cell.axes) else "all axes"
+    noise = _floor_text(_floor(account).at(placed.axis))
+    return f"{name} has {what}: the error of {whose} {where} {error_change_text(without, with_it)} ({noise})."
 
 
 def doubted_name(step: Step, placed: PlacedEffect, axes: Sequence[str]) -> str:
@@ -685,7 +678,7 @@ def _finding(finding: Finding, axes: tuple[str, ...]) -> FindingEntry:
     sizes = zip(finding.effect.coefficients, finding.coefficients, finding.deviations, strict=True)
     return _named(
         FindingEntry,
-        PlacedEffect(finding.effect, finding.axis),
+        placed_by(finding),
         axes,
         finding,
         variable=finding.effect.abscissa,

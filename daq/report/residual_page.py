@@ -14,7 +14,7 @@ from daq.report.document import json_text
 from daq.report.effect_names import effect_text, variable_text
 from daq.report.fit import coefficients, identifiability_notes, start_of
 from daq.report.fit_schemas import ResidualFile
-from daq.report.gains import with_deviation
+from daq.report.gains import value_rows, with_deviation
 from daq.report.html import MARK, figure, folded, html_list, pair, paragraph, table
 from daq.report.plots import draw_effect, draw_torques, drawn_axis, plot_ranking
 from daq.report.residual import (
@@ -26,6 +26,7 @@ from daq.report.residual import (
     doubted_name,
     effect_sizes,
     error_rows,
+    errors_by_data,
     gains_sentence,
     residual_report,
     searched_steps,
@@ -122,32 +123,25 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
     shown_axis = axes[drawn_axis(before, step.after, placed)]
     of_joint = "" if has_motor else f" of {axis}"
     kept = placed in final.effects
-    doubts: list[str] = []
+    sentences = [f"Name in files and commands: `{placed.name_among(axes)}`."]
     if doubt := doubted_name(step, placed, axes):
-        doubts.append(f"Its name is not certain. Chosen without an eighth of the moves, each in turn, {doubt}.")
-    rivals = () if step.accepted is None else step.accepted.ambiguity
-    ambiguous = "; ".join(f"{axes[one.axis]}: {effect_text(one.effect, axes)}" for one in rivals)
-    sentences = (
-        f"Name in files and commands: `{placed.name_among(axes)}`.",
-        *doubts,
-        f"These data cannot distinguish it from: {ambiguous}."
-        if ambiguous
-        else "Every other candidate is clearly worse.",
-        *(() if kept else ("A later round removed it again, because it no longer reduced the error.",)),
-    )
-    pairs = (
-        ("fit", turn.before.in_sample, turn.after.in_sample),
-        ("moves left out", turn.before.cross_validated, turn.after.cross_validated),
-        ("held out", turn.before.holdout, turn.after.holdout),
-    )
-    errors = [
-        (name, percent_text(first.at(placed.axis)), percent_text(second.at(placed.axis)))
-        for name, first, second in pairs
-        if first is not None and second is not None
-    ]
+        sentences.append(f"Its name is not certain. Chosen without an eighth of the moves, each in turn, {doubt}.")
+    if step.accepted is not None and step.accepted.ambiguity:
+        rivals = "; ".join(f"{axes[one.axis]}: {effect_text(one.effect, axes)}" for one in step.accepted.ambiguity)
+        sentences.append(f"These data cannot distinguish it from: {rivals}.")
+    else:
+        sentences.append("Every other candidate is clearly worse.")
+    if not kept:
+        sentences.append("A later round removed it again, because it no longer reduced the error.")
+    before_by_data = errors_by_data(turn.before)
+    after_by_data = errors_by_data(turn.after)
+    errors = []
+    for data in ("fit", "moves left out", "held out"):
+        first, second = before_by_data[data], after_by_data[data]
+        if first is not None and second is not None:
+            errors.append((data, percent_text(first.at(placed.axis)), percent_text(second.at(placed.axis))))
     # The coefficients of a term without a name mean nothing one by one; the certificate draws its curve.
-    found = () if is_unnamed(placed.effect) else coefficients(final if kept else step.after, placed)
-    sizes = [(one.name, with_deviation(one.value, one.std), one.unit) for one in found]
+    sizes = [] if is_unnamed(placed.effect) else value_rows(coefficients(final if kept else step.after, placed))
     return folded(
         f"{axis}: {effect_text(placed.effect, axes)}",
         paragraph(" ".join(sentences)),

@@ -168,6 +168,11 @@ def plain_table(
     return table
 
 
+def known_text(value: float | None, form: str, unknown: str = "-") -> str:
+    """Format a number by a format specification; `unknown` for one that is not known."""
+    return unknown if value is None else format(value, form)
+
+
 def percent_text(percent: float) -> str:
     """Two decimals; a dash for an unknown value."""
     return f"{percent:.2f}" if math.isfinite(percent) else "-"
@@ -176,17 +181,6 @@ def percent_text(percent: float) -> str:
 def spelled_bytes(text: str) -> str:
     """Spell out the bytes of a file's name that are not UTF-8, which no document can hold, as `\\udcff`."""
     return text.encode(errors="backslashreplace").decode()
-
-
-def json_safe(value: Any) -> Any:
-    """Copy a document, with null for numbers that JSON lacks."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, dict):
-        return {str(key): json_safe(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [json_safe(item) for item in value]
-    return value
 
 
 _FORMULA = tuple("=+-@\t\n＝＋－＠")

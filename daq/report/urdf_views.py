@@ -80,13 +80,19 @@ def urdf_view(
     table = plain_table(("joint", "link", "mass kg", "centre of mass m", "damping", "friction"), left=(0, 1))
     for name, update in updates.items():
         centre = " ".join(f"{value:+.3f}" for value in update.body.centre_m)
-        figures = f"{update.body.mass_kg:.3g}", centre, f"{update.damping:.3g}", f"{update.friction:.3g}"
-        table.add_row(terminal_text(name), terminal_text(updated.links[name]), *figures)
+        table.add_row(
+            terminal_text(name),
+            terminal_text(updated.links[name]),
+            f"{update.body.mass_kg:.3g}",
+            centre,
+            f"{update.damping:.3g}",
+            f"{update.friction:.3g}",
+        )
     yield table
-    change, joints = robot.parameters.torque_change_percent, robot.parameters.model.robot.joints
     if robot.parameters.exact:
         yield "The torque of these bodies is exactly the identified one."
     else:
+        change = robot.parameters.torque_change_percent
         axes = ", ".join(f"{value:.2f}" for value in change.axes)
         shifts = ", ".join(f"{shift.name} by {shift.deviations:.1f} σ" for shift in robot.shifts[:_SHOWN_SHIFTS])
         yield (
@@ -94,6 +100,7 @@ def urdf_view(
             f"{change.total:.2g} % (axes: {axes} %). Largest shifts: {shifts}."
         )
     if robot.prior.assumed:
+        joints = robot.parameters.model.robot.joints
         names = ", ".join(joints[number].name for number in robot.prior.assumed)
         yield printable(
             f"The URDF has no possible inertia behind {names}; a ball was assumed where the data have none."
@@ -101,7 +108,8 @@ def urdf_view(
     if updated.merged:
         yield printable(f"Merged into the moving link that carries them: {', '.join(updated.merged)}.")
     left_out = ["rotor inertias", "offsets"]
-    left_out += ["friction of coupled motors"] if robot.parameters.model.drive_train.coupled else []
+    if robot.parameters.model.drive_train.coupled:
+        left_out.append("friction of coupled motors")
     corrected: list[str] = []
     for effect in calibration.effects:
         name = f"{effect.name} on {effect.axis}"

@@ -11,13 +11,8 @@ from rich.console import RenderableType
 
 from daq.files import replace_file
 from daq.report import paper_tables
-from daq.report.fit_schemas import (
-    CheckedLog,
-    CheckedPayload,
-    FoundMass,
-    ValidatedLog,
-    ValidateReport,
-)
+from daq.report.document import Figure, Report
+from daq.report.fit_schemas import Errors
 from daq.report.gains import diagnosis_texts
 from daq.report.plots import plot_torques
 from daq.report.svg import sheet
@@ -25,7 +20,86 @@ from daq.report.text import Sentence, percent_text, plain_table, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
 from daq.workflow.validate import CheckedRun, CrossValidation, Mass, WeighedRun, conditioning_of, together
 from daq.workflow.validation import DataUse, Validation
-from ident.calibration import Calibration
+from ident.calibration import Calibration, PayloadMass
+
+
+class ValidatedLog(Report):
+    """Errors of one log."""
+
+    log: str
+    sha256: str
+    seen_by_fit: bool
+    partial: bool
+    held_out: bool
+    same_configuration: bool
+    rows: int
+    relative_error_percent: Errors
+    picture: str | None
+
+
+class Together(Report):
+    """Errors of all logs together."""
+
+    relative_error_percent: Errors
+
+
+class CheckedLog(Report):
+    """One log under every calibration."""
+
+    log: str
+    condition: Figure
+    relative_error_percent: dict[str, Errors | None]
+    left_out: str | None
+    seen_by: list[str]
+
+
+class FoundMass(Report):
+    """Mass of a payload by one calibration, or why it was not found."""
+
+    reason: str = ""
+    mass_kg: Figure = None
+    std_percent: Figure = None
+    std_with_gains_percent: Figure = None
+    error_percent: Figure = None
+
+
+class CheckedPayload(Report):
+    """A weighed payload."""
+
+    log: str
+    payload: str
+    mounting: str
+    weighed_kg: Figure
+    with_bare_runs: bool
+    masses: dict[str, FoundMass]
+
+
+# Not the `Diagnosis` of `ident`: the name of a run is that of its file, which only a `Report` makes fit for JSON.
+class DiagnosisEntry(Report):
+    """Something wrong with a recording or a fit, and where to look."""
+
+    name: str
+    runs: list[str]
+    axes: list[str]
+    found: str
+    expected: str
+    remedy: str
+
+
+class ValidateReport(Report):
+    """`validate`."""
+
+    cell: str
+    axes: list[str]
+    filter: dict[str, int | float | list[float]]
+    fit_relative_error_percent: Errors
+    payload_mass: list[PayloadMass]
+    logs: list[ValidatedLog]
+    together: Together | None
+    calibrations: list[str]
+    diagnoses: list[DiagnosisEntry]
+    runs: list[CheckedLog]
+    payloads: list[CheckedPayload]
 
 
 def validation_view(calibration: Calibration, found: CrossValidation) -> Iterator[RenderableType]:
@@ -34,8 +108,10 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
     headings = ("log", *(gain.axis for gain in calibration.gains), "total", "")
     table = plain_table(headings, title="Relative error ‖ρ‖/‖Y‖ [%]", left=(0, len(headings) - 1), wrap=(0,))
     errors = [(validation.run, validation.error, validation.data_use.value) for validation in validations]
-    errors += [("together", together(validations), "")] if len(validations) > 1 else []
-    for name, error, use in (*errors, ("fit", calibration.relative_error_percent, "")):
+    if len(validations) > 1:
+        errors.append(("together", together(validations), ""))
+    errors.append(("fit", calibration.relative_error_percent, ""))
+    for name, error, use in errors:
         table.add_row(terminal_text(name), *map(percent_text, (*error.axes, error.total)), use)
     yield table
     filter_ = conditioning_of(calibration)
@@ -43,37 +119,37 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
         f"Position filter {filter_.position_cutoff_hz:g} Hz, decimation {filter_.decimation_cutoff_hz:g} Hz, as in the "
         "fit. Compare relative errors only under the same filters."
     )
-    doubts: list[str] = []
-    names = {validation.run for validation in validations}
-    for diagnosis, text in zip(found.diagnoses, diagnosis_texts(found.diagnoses), strict=True):
-        # What these runs show again is theirs.
-        is_of_fit = diagnosis in calibration.diagnoses and names.isdisjoint(diagnosis.runs)
-        doubts.append(f"The fit of this calibration found: {text}" if is_of_fit else text)
-    doubts += [
-        f"{validation.log} carries another cell configuration than the logs of the fit; check the difference."
-        for validation in validations
-        if not validation.same_configuration
-    ]
-    doubts += [
-        f"{validation.run} contradicts the calibration: it leaves {validation.error.total:.3g} % of the torque. "
-        "Was the payload mounted as the log says, and is it the same robot?"
-        for validation in validations
-        if validation.error.total > DOUBTFUL_PERCENT
-    ]
-    doubts += [f"{run.run}: {run.left_out}" for run in found.runs if run.left_out]
-    yield from (Sentence(doubt, "bold") for doubt in doubts)
+    yield from (Sentence(doubt, "bold") for doubt in _doubts(calibration, found))
     for paper_table in validation_tables(found, complete=False):
         yield ""
         yield from paper_table.view(numbered=False)
 
 
+def _doubts(calibration: Calibration, found: CrossValidation) -> Iterator[str]:
+    validations = found.validations
+    names = {validation.run for validation in validations}
+    for diagnosis, text in zip(found.diagnoses, diagnosis_texts(found.diagnoses), strict=True):
+        # What these runs show again is theirs.
+        is_of_fit = diagnosis in calibration.diagnoses and names.isdisjoint(diagnosis.runs)
+        yield f"The fit of this calibration found: {text}" if is_of_fit else text
+    for validation in validations:
+        if not validation.same_configuration:
+            yield f"{validation.log} carries another cell configuration than the logs of the fit; check the difference."
+    for validation in validations:
+        if validation.error.total > DOUBTFUL_PERCENT:
+            yield (
+                f"{validation.run} contradicts the calibration: it leaves {validation.error.total:.3g} % of the torque."
+                " Was the payload mounted as the log says, and is it the same robot?"
+            )
+    yield from (f"{run.run}: {run.left_out}" for run in found.runs if run.left_out)
+
+
 def validation_tables(found: CrossValidation, *, complete: bool) -> list[paper_tables.PaperTable]:
     """Tables 5 to 8 of the paper; unless complete, Table 6 is left out where the table of errors shows the same."""
-    return [
-        paper_tables.condition_table(found),
-        *([paper_tables.paper_error_table(found)] if complete or len(found.calibrations) > 1 else []),
-        *paper_tables.mass_tables(found),
-    ]
+    tables = [paper_tables.condition_table(found)]
+    if complete or len(found.calibrations) > 1:
+        tables.append(paper_tables.paper_error_table(found))
+    return [*tables, *paper_tables.mass_tables(found)]
 
 
 def draw_validations(calibration: Calibration, validations: tuple[Validation, ...], folder: Path) -> dict[Path, Path]:

@@ -12,16 +12,8 @@ from rich.text import Text
 
 from daq.config.cell import Cell, robot_of
 from daq.files import replace_file
-from daq.report.fit_schemas import (
-    ContactAxis,
-    ContactEntry,
-    ContactReport,
-    NotJudged,
-    WeighedParameter,
-    WeighedValue,
-    WeighedValues,
-    WeighReport,
-)
+from daq.report.document import Figure, Report
+from daq.report.fit_schemas import Errors
 from daq.report.gains import with_deviation
 from daq.report.picture import BLACK, ORANGE, SKY, legend_below, panels, render, unformatted
 from daq.report.text import plain_table, terminal_text
@@ -34,6 +26,105 @@ from ident.model.robot import Place
 from ident.model.urdf import read_urdf
 from ident.weighing import KNOWN, WeighedBody
 
+
+class WeighedValue(Report):
+    """A number and its σ."""
+
+    value: Figure
+    std: Figure
+
+
+class WeighedValues(Report):
+    """Numbers and their σ."""
+
+    value: list[Figure]
+    std: list[Figure]
+
+
+class AddedMoves(Report):
+    """Moves that would show a parameter."""
+
+    words: str
+    seconds: float
+    std: Figure
+
+
+class WeighedParameter(Report):
+    """One of the ten parameters of a body."""
+
+    name: str
+    unit: str
+    value: Figure
+    std: Figure
+    std_of_moves: Figure
+    identifiable: bool
+    add: AddedMoves | None
+
+
+class WeighReport(Report):
+    """`weigh`."""
+
+    cell: str
+    logs: list[str]
+    bare: list[str]
+    part_of_the_fit: list[str]
+    declared_kg: Figure
+    mass_kg: WeighedValue
+    centre_m: WeighedValues
+    centre_in_platform_m: WeighedValues | None
+    inertia_about_centre_kg_m2: WeighedValues
+    parameters: list[WeighedParameter]
+    relative_error_percent: Errors
+    moves: int
+    complete: bool
+
+
+class ContactAxis(Report):
+    """Band and threshold of one axis; medians over the motion in `unit`."""
+
+    axis: str
+    unit: str
+    scale: list[Figure]
+    band_over_scale: Figure
+    threshold_over_scale: Figure
+    correlation_s: Figure
+    quiet_s: Figure
+    band: Figure
+    threshold: Figure
+    largest: Figure
+
+
+class ContactEntry(Report):
+    """A stretch beyond the threshold."""
+
+    axis: str
+    start_s: float
+    end_s: float
+    peak: float
+    peak_over_threshold: float
+
+
+class NotJudged(Report):
+    """An axis that cannot show a contact."""
+
+    axis: str
+    reason: str
+
+
+class ContactReport(Report):
+    """`contact`."""
+
+    cell: str
+    log: str
+    band_from_this_log: bool
+    stretches_left_out: int
+    alarms_per_hour: float
+    axes: list[ContactAxis]
+    contacts: list[ContactEntry]
+    not_judged: list[NotJudged]
+    picture: str | None
+
+
 LISTED = 20  #: Contacts shown in a terminal; `--json` has all
 NOISE_ROWS = 4.0
 """Longest correlation of noise, in rows. The simulated cell has 1; an undeclared plate of 1.7 kg makes it 6 to 90."""
@@ -41,8 +132,10 @@ NOISE_ROWS = 4.0
 
 def weighed_view(found: Weighed) -> Iterator[RenderableType]:
     """Mass, centre and inertia, the ten parameters, and doubts."""
-    body, carrier = found.body, "flange" if found.cell.chain is None else "platform"
-    nothing, turns = _shows_nothing(body), not np.isnan(body.values[:-1]).all()
+    body = found.body
+    carrier = "flange" if found.cell.chain is None else "platform"
+    nothing = _shows_nothing(body)
+    turns = not np.isnan(body.values[:-1]).all()
     shown = turns and not nothing
     if nothing:
         yield Text("No body shows: the mass is within two σ of nothing.", style="bold")
@@ -87,15 +180,15 @@ def _shows_nothing(body: WeighedBody) -> bool:
 
 def _add_centre_and_inertia(table: Table, found: Weighed) -> None:
     body = found.body
-    (centre, centre_std), (inertia, inertia_std) = body.centre_m, body.inertia_kg_m2
-    for name, value, std in zip("xyz", 1000.0 * centre, 1000.0 * centre_std, strict=True):
-        table.add_row(f"centre {name}", with_deviation(value, std), "mm")
+    centres = {"": body.centre_m}
     platform = _platform(found.cell)
     if platform is not None:
-        link, (centre, centre_std) = platform[0], body.centre_in(platform[1])
-        for name, value, std in zip("xyz", 1000.0 * centre, 1000.0 * centre_std, strict=True):
-            table.add_row(terminal_text(f"centre {name} in {link}"), with_deviation(value, std), "mm")
-    for name, value, std in zip(LINK_PARAMETERS[:6], inertia, inertia_std, strict=True):
+        link, frame = platform
+        centres[f" in {link}"] = body.centre_in(frame)
+    for where, (centre_m, std_m) in centres.items():
+        for name, value, std in zip("xyz", 1000.0 * centre_m, 1000.0 * std_m, strict=True):
+            table.add_row(terminal_text(f"centre {name}{where}"), with_deviation(value, std), "mm")
+    for name, value, std in zip(LINK_PARAMETERS[:6], *body.inertia_kg_m2, strict=True):
         table.add_row(f"{name} about the centre", with_deviation(value, std), "kg m²")
 
 
@@ -181,9 +274,10 @@ def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
         seconds = f"{found.band.quiet_s[index]:.0f}"
         table.add_row(axis.name, seconds, _digits(band), _digits(threshold), _digits(largest), axis.unit.force)
     yield table
-    stretches = "1 stretch that is" if found.left_out == 1 else f"{found.left_out} stretches that are"
-    itself = f"this log less {stretches} far out" if found.left_out else "this log"
-    source = itself if found.from_itself else "the quiet logs"
+    source = "this log" if found.from_itself else "the quiet logs"
+    if found.from_itself and found.left_out:
+        stretches = "1 stretch that is" if found.left_out == 1 else f"{found.left_out} stretches that are"
+        source = f"this log less {stretches} far out"
     yield (
         f"Band (95 %) and threshold from {source}; less than {found.band.alarms_per_hour:g} false alarm in an hour of "
         "motion like that, all axes together. Standstill is not judged."
@@ -199,8 +293,14 @@ def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
     listed = plain_table(("axis", "from s", "to s", "peak", "unit", "× threshold"), title="Contacts", left=(0, 4))
     for one in contacts[:LISTED]:
         axis = cell.axes[one.axis]
-        numbers = f"{one.start_s:.2f}", f"{one.end_s:.2f}", f"{one.peak_nm:+.3g}", axis.unit.force
-        listed.add_row(axis.name, *numbers, f"{one.peak_over_threshold:.2f}")
+        listed.add_row(
+            axis.name,
+            f"{one.start_s:.2f}",
+            f"{one.end_s:.2f}",
+            f"{one.peak_nm:+.3g}",
+            axis.unit.force,
+            f"{one.peak_over_threshold:.2f}",
+        )
     yield listed
     if len(contacts) > LISTED:
         yield f"… and {len(contacts) - LISTED} more; --json lists all."

@@ -37,7 +37,7 @@ from daq.report import (
     validation,
     weighing_views,
 )
-from daq.report.bus_schemas import ScannedNode
+from daq.report.bus_views import ScannedNode
 from daq.report.log import log_lines
 from daq.report.text import WholeTable
 from daq.workflow.live_prediction import RecentCurrent
