@@ -11,7 +11,7 @@ from rich.text import Text
 
 from daq.config.cell import PacingMode
 from daq.config.cell_buses import bus_loads, bus_loads_percent, cell_address
-from daq.report.document import Report
+from daq.report.document import Figure, Report
 from daq.report.text import known_text, plain_table, printable, terminal_text
 from daq.workflow.events import notice_of
 from drivers.canopen.emcy import CODES
@@ -46,13 +46,13 @@ class ErrorCodeReport(ErrorCodeEntry):
 class PredictedCurrent(Report):
     """Current of one axis by a calibration, half a second ago, filtered as in the fit [unit of the gain's current]."""
 
-    measured: float | None
+    measured: Figure
     """null at standstill, or where the scale of the current is unknown"""
-    predicted: float | None
+    predicted: Figure
     """null at standstill"""
-    band: float | None
+    band: Figure
     """null for a calibration that does not say what it left of the currents"""
-    residual_rms: float | None
+    residual_rms: Figure
     """over the last 10 s in which the axis moved; null before any"""
     outside_share: float
     """share of that time in which the residual is outside the band"""
@@ -74,11 +74,11 @@ class MonitoredAxis(Report):
 
     axis: str
     node_id: int
-    position: float | None
+    position: Figure
     unit: str
     """of the position"""
     position_counts: int | None
-    current_a: float | None
+    current_a: Figure
     current_raw: int | None
     state: str | None
     """state of CiA 402"""
@@ -94,7 +94,7 @@ class MonitoredAxis(Report):
     """SYNCs or requests without an answer"""
     silent: bool
     """it should answer, and sent nothing at all, not even a heartbeat"""
-    delay_s: float | None
+    delay_s: Figure
     """longest time until an answer; null where nothing was asked or answered"""
     refused: list[RefusedObject]
     remark: str

@@ -19,7 +19,7 @@ from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationRefused, DaqError
 from daq.report.document import Figure, Report
 from daq.report.effect_names import accepted_text, size_text
-from daq.report.fit_schemas import Errors
+from daq.report.fit import Errors
 from daq.report.gains import encoder_text, mass_texts
 from daq.report.proposal import Refused
 from daq.writeback.file_target import FileEdit, FileTarget

@@ -61,7 +61,9 @@ def _attributes(kind: type[Report], source: object) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Return an attribute as documents have it: text for a path or time, a list for a tuple, the value of an enum."""
+    """Return an attribute as documents have it: a path or time as text, a tuple or array as a list."""
+    if hasattr(value, "tolist"):  # an array of numpy, or a number from one
+        value = value.tolist()
     if isinstance(value, Enum):
         return value.value
     if isinstance(value, Path):

@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
+from pydantic import Field
 from rich.console import RenderableType
 from rich.table import Table
 
 from daq.documents.calibration_file import CalibrationBody, as_document
 from daq.report import paper_tables
+from daq.report.document import Figure, Report
 from daq.report.effect_names import size_text
-from daq.report.fit_schemas import (
-    CaseReport,
-    CasesReport,
-    CheckedGeometry,
-    ComparedFit,
-    ComparedGain,
-    FitReport,
-    FoundGravity,
-    GainWords,
-    Trial,
-)
 from daq.report.gains import (
+    OwnTorque,
     gain_table,
     mass_texts,
     own_torques,
@@ -32,7 +24,7 @@ from daq.report.gains import (
     warning_texts,
 )
 from daq.report.text import Sentence, percent_text, plain_table
-from daq.workflow.cases import CASES, Case, CaseFit
+from daq.workflow.cases import CASES, CaseFit
 from daq.workflow.description import hidden_zeros_text
 from daq.workflow.fit import DOUBTFUL_PERCENT, Fit
 from daq.workflow.nameplates import actual_current_note
@@ -40,13 +32,113 @@ from daq.workflow.verdicts import needed_verdicts
 from ident.arrays import FloatArray
 from ident.calibration import Calibration, Parameter, PayloadMass
 from ident.discovery.evidence import Evidence, without_effects
-from ident.discovery.geometry_check import GeometryCheck, Gravity
+from ident.discovery.geometry_check import GeometryCheck
 from ident.effects.effect import PlacedEffect
 from ident.estimators.comparison import EstimatorComparison, EstimatorTrial, Removal
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import misjudged_joints
 from ident.estimators.method import Method
 from ident.planning.gain_verdict import GOOD_PERCENT, GainVerdict
+
+
+class Errors(Report):
+    """Relative errors [%]; null for an axis that did not move, and in total where none did."""
+
+    axes: list[Figure]
+    total: Figure
+
+
+class ComparedGain(Report):
+    """A gain by another estimator."""
+
+    axis: str
+    value: float
+    std_percent: Figure
+
+
+class ComparedFit(Report):
+    """The paper's total least squares on the same rows."""
+
+    gains: list[ComparedGain]
+    condition: Figure
+    #: Axes for which σ_W^j (eq. 22) is not the noise of a current, so that these gains are bent.
+    misjudged: list[str]
+
+
+class RemovedParameter(Report):
+    """Parameter that is not essential."""
+
+    name: str
+    std_percent: Figure
+
+
+class GainWords(Report):
+    """Verdict on how well the data of a fit show a gain."""
+
+    axis: str
+    std_percent: Figure
+    verdict: str
+    seen_by: list[str]
+    words: str
+
+
+class Trial(Report):
+    """One estimator under one filter."""
+
+    estimator: str
+    position_cutoff_hz: float
+    decimation_cutoff_hz: float
+    gains: list[ComparedGain] | None
+    relative_error_percent: Figure = None
+    reason: str = ""
+
+
+class FoundGravity(Report):
+    """Direction of gravity by the torques, beside the declared one."""
+
+    declared_m_s2: list[Figure]
+    found_m_s2: list[Figure]
+    turn_deg: Figure
+    turn_std_deg: Figure
+
+
+class CheckedGeometry(Report):
+    """What the torques say of the description of the robot."""
+
+    gravity: FoundGravity | None
+    hidden_zeros: list[str]
+
+
+class FitReport(CalibrationBody, Report):
+    """`fit`."""
+
+    compared: dict[Literal["tls"], ComparedFit]
+    geometry: CheckedGeometry | None
+    torque_channel: list[OwnTorque] = Field(default=[])
+    removed: list[RemovedParameter]
+    verdicts: list[GainWords]
+    comparison: list[Trial] = Field(default=[])
+
+
+class CaseTitle(Report):
+    """Name of a case, and what it takes as known of the payload."""
+
+    title: str
+    known: str
+
+
+# The keys of the last base come first.
+class CaseReport(CalibrationBody, CaseTitle):
+    """One case of the paper."""
+
+    removed: list[RemovedParameter]
+
+
+class CasesReport(Report):
+    """`fit --cases`."""
+
+    cases: dict[str, CaseReport]
+
 
 TLS_APART_SIGMAS = 3.0
 TLS_APART_PERCENT = 2.0
@@ -139,7 +231,10 @@ def fit_report(found: CaseFit, calibration: Calibration, comparison: EstimatorCo
         compared={} if fitted.paper is None else {"tls": _compared(fitted, fitted.paper)},
         geometry=checked_geometry(fitted.description, axes),
         removed=_removed(found),
-        verdicts=[_gain_words(axes[gain.axis], gain) for gain in needed_verdicts(fitted)],
+        verdicts=[
+            GainWords.of(gain, axis=axes[gain.axis], seen_by=gain.sources, words=gain.words(axes[gain.axis]))
+            for gain in needed_verdicts(fitted)
+        ],
         **sometimes,
     )
 
@@ -165,26 +260,26 @@ def _compared(fitted: Fit, paper: Estimate) -> ComparedFit:
     )
 
 
-def _gain_words(axis: str, gain: GainVerdict) -> GainWords:
-    return GainWords.of(gain, axis=axis, seen_by=gain.sources, words=gain.words(axis))
-
-
 def _gains(axes: tuple[str, ...], gains: FloatArray, stds: FloatArray) -> list[ComparedGain]:
     return [
-        ComparedGain(axis=axis, value=float(value), std_percent=100.0 * float(std / abs(value)))
+        ComparedGain.of(axis=axis, value=value, std_percent=100.0 * (std / abs(value)))
         for axis, value, std in zip(axes, gains, stds, strict=True)
     ]
 
 
 def cases_report(fits: Mapping[str, CaseFit], calibrations: Mapping[str, Calibration]) -> CasesReport:
     """Return the paper's cases and ours; both arguments are by the name of the case."""
-    cases = {case.name: _case_report(case, fits[case.name], calibrations[case.name]) for case in CASES}
+    cases = {
+        case.name: with_calibration(
+            CaseReport,
+            calibrations[case.name],
+            title=case.title,
+            known=case.known.value,
+            removed=_removed(fits[case.name]),
+        )
+        for case in CASES
+    }
     return CasesReport(cases=cases)
-
-
-def _case_report(case: Case, found: CaseFit, calibration: Calibration) -> CaseReport:
-    known = case.known.value
-    return with_calibration(CaseReport, calibration, title=case.title, known=known, removed=_removed(found))
 
 
 def _removed(found: CaseFit) -> Sequence[Removal]:
@@ -281,19 +376,12 @@ def checked_geometry(check: GeometryCheck | None, axes: Sequence[str]) -> Checke
     """Return what the torques say of the description of the robot; None where nothing was tested."""
     if check is None:
         return None
-    return CheckedGeometry(
-        gravity=None if check.gravity is None else _found_gravity(check.gravity),
-        hidden_zeros=[axes[axis] for axis in check.hidden_zeros],
-    )
-
-
-def _found_gravity(gravity: Gravity) -> FoundGravity:
-    return FoundGravity(
-        declared_m_s2=gravity.declared_m_s2.tolist(),
-        found_m_s2=gravity.found_m_s2.tolist(),
-        turn_deg=float(np.degrees(gravity.turn_rad)),
-        turn_std_deg=float(np.degrees(gravity.turn_std_rad)),
-    )
+    gravity = None
+    if check.gravity is not None:
+        turn_deg = np.degrees(check.gravity.turn_rad)
+        turn_std_deg = np.degrees(check.gravity.turn_std_rad)
+        gravity = FoundGravity.of(check.gravity, turn_deg=turn_deg, turn_std_deg=turn_std_deg)
+    return CheckedGeometry(gravity=gravity, hidden_zeros=[axes[axis] for axis in check.hidden_zeros])
 
 
 def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> Iterator[str]:

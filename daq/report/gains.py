@@ -8,13 +8,25 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 from rich.table import Table
 
-from daq.report.fit_schemas import OwnTorque
+from daq.report.document import Figure, Report
 from daq.report.picture import BLUE, GREEN, GREY, legend_below, render, single
 from daq.report.text import SHOWN_SIGMAS, plain_table, terminal_text
 from daq.workflow.geometry_diagnoses import misfit_text
 from ident.calibration import Calibration, EncoderMisfit, Gain, GeometryCorrection, Parameter, PayloadMass
 from ident.data.torque_channel import TorqueSlope
 from ident.errors import Diagnosis
+
+
+class OwnTorque(Report):
+    """Slope of the drive's own torque over the current."""
+
+    axis: str
+    slope: Figure
+    std: Figure = None
+    ratio: Figure = None
+    ratio_std: Figure = None
+    readings: int = 0
+
 
 CERTAIN_SIGMAS = 3.0  #: Of the ratio of a drive's own torque to the gain, before a difference is said
 
@@ -155,8 +167,7 @@ def encoder_text(misfit: EncoderMisfit) -> str:
 
 def _correction_text(one: GeometryCorrection) -> str:
     """Write what has to be added to a number of the description."""
-    scale = 180.0 / math.pi if one.unit == "rad" else 1e3
-    unit = "deg" if one.unit == "rad" else "mm"
+    scale, unit = (180.0 / math.pi, "deg") if one.unit == "rad" else (1e3, "mm")
     place = one.joint if not one.end else f"{one.joint} to {one.end}"
     return f"the {one.kind} of {place} {scale * one.change:+.4f} ± {max(scale * one.std, 5e-5):.4f} {unit}"
 

@@ -450,28 +450,32 @@ def history_points(series: Series) -> list[HistoryPoint]:
 
 
 def _history_point(series: Series, index: int) -> HistoryPoint:
-    point, stretch = series.points[index], series.stretch_at(index)
-    entry, gain, change = point.entry, point.gain, point.change
-    drift, place = stretch.drift, index - stretch.began
-    alarm = series.alarm_at(index)
-    last = entry.events[-1] if entry.events else None
+    point = series.points[index]
+    stretch = series.stretch_at(index)
+    drift = stretch.drift
+    place = index - stretch.began
+    known: dict[str, object] = {}
+    if point.change is not None:
+        known["change_percent"] = point.change.percent
+        known["change_sigmas"] = point.change.sigmas
+        known["change_probability"] = point.change.probability
+    if alarm := series.alarm_at(index):
+        known["alarm"] = alarm.kind
+    if point.entry.events:
+        last = point.entry.events[-1]
+        known |= {"applied_at": last.at, "applied_by": last.who, "applied_to": last.target}
     return HistoryPoint.of(
-        entry,
-        gain,
+        point.entry,
+        point.gain,
+        None,
         axis=series.axis,
-        gain=gain.value,
-        change_percent=None if change is None else change.percent,
-        change_sigmas=None if change is None else change.sigmas,
-        change_probability=None if change is None else change.probability,
-        deviation_sigmas=float(drift.deviations[place]),
-        cusum_up=float(drift.upper[place]),
-        cusum_down=float(drift.lower[place]),
-        trend_sigmas=float(drift.trend[place]),
-        alarm=None if alarm is None else alarm.kind,
+        gain=point.gain.value,
+        deviation_sigmas=drift.deviations[place],
+        cusum_up=drift.upper[place],
+        cusum_down=drift.lower[place],
+        trend_sigmas=drift.trend[place],
         baseline=drift.baseline,
-        applied_at=None if last is None else last.at,
-        applied_by=None if last is None else last.who,
-        applied_to=None if last is None else last.target,
+        **known,
     )
 
 
@@ -490,30 +494,29 @@ def plot_history(all_series: Sequence[Series], kind: str, *, title: str) -> byte
     columns = min(_COLUMNS, len(all_series))
     bands = math.ceil(len(all_series) / columns)
     figure, places = panels(2 * columns * bands, columns, unformatted(title))
+    grid = np.array(places).reshape(bands, 2, columns)
     for number, series in enumerate(all_series):
         band, column = divmod(number, columns)
-        _draw_gains(places[2 * band * columns + column], series)
-        _draw_limits(places[(2 * band + 1) * columns + column], series)
-    for empty in range(len(all_series), columns * bands):
-        for row in range(2):
-            places[(2 * (bands - 1) + row) * columns + empty % columns].set_axis_off()
+        _draw_gains(grid[band, 0, column], series)
+        _draw_limits(grid[band, 1, column], series)
+    in_last_band = len(all_series) - columns * (bands - 1)
+    for place in grid[-1, :, in_last_band:].flat:
+        place.set_axis_off()
     days = [_days(point.entry.recorded) for series in all_series for point in series.points]
     # Of a single day there would be no range to label.
     beside = max(0.5, 0.03 * (max(days) - min(days)))
-    begin = max(min(days) - beside, _FIRST_DAY)
-    end = min(max(days) + beside, _LAST_DAY)
     for place in places:
-        place.set_xlim(begin, end)
+        place.set_xlim(max(min(days) - beside, _FIRST_DAY), min(max(days) + beside, _LAST_DAY))
         # At most so many labels as fit beside each other.
         locator = dates.AutoDateLocator(maxticks=7)
         place.xaxis.set_major_locator(locator)
         place.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
-    upper = [place for row in range(0, len(places), 2 * columns) for place in places[row : row + columns]]
-    legend_below(figure, *upper)
+    legend_below(figure, *grid[:, 0].flat)
     # One legend for both kinds of panels would be wider than the picture of one axis.
-    handles, labels = places[columns].get_legend_handles_labels()
+    limits = grid[0, 1, 0]
+    handles, labels = limits.get_legend_handles_labels()
     once = list(dict(zip(labels, handles, strict=True)).values())
-    places[columns].legend(loc="best", ncols=2, fontsize=7, edgecolor="none", handles=once)
+    limits.legend(loc="best", ncols=2, fontsize=7, edgecolor="none", handles=once)
     return render(figure, kind)
 
 

@@ -223,8 +223,7 @@ def info_report(path: Path) -> InfoReport:
         ConfigurationError: the cell in it is inconsistent.
     """
     reader = LogReader(path)
-    first_ns: int | None = None
-    last_ns = 0
+    first_ns = last_ns = 0
     watch: MotionWatch | None = None
     for block in reader:
         if watch is None:
@@ -233,8 +232,7 @@ def info_report(path: Path) -> InfoReport:
             watch = MotionWatch(cell, reader.head)
         watch.take(block)
         last_ns = int(block.time_ns[-1])
-    assert first_ns is not None  # the reader refuses a log without samples
-    assert watch is not None
+    assert watch is not None  # the reader refuses a log without samples
     head, statistics = reader.head, reader.statistics
     run, samples = head.run, reader.checks.samples
     valid, reason = log_verdict(cell, head, reader.checks, statistics, watch, lambda: LogReader(path))

@@ -187,22 +187,22 @@ def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -
             if mass.error_percent is not None:
                 errors[label].append(mass.error_percent)
         names = (f"{run.run}, kg", "σ %, moves alone", "σ %, with the calibration's", ERROR_ROW)
-        figures = zip(names, *columns, strict=True)
-        rows += [row for row in figures if row[0] != ERROR_ROW or run.weighed_kg is not None]
-    weighed = runs[0].weighed_kg
-    if weighed is not None:
+        *figures, difference = zip(names, *columns, strict=True)
+        rows += figures
+        if run.weighed_kg is not None:
+            rows.append(difference)
+    weighed = "not weighed"
+    if runs[0].weighed_kg is not None:
+        weighed = f"{runs[0].weighed_kg:g} kg"
         rows.append((f"mean {ERROR_ROW}", *(percent(_mean(errors[label])) for label in labels)))
-    of = f"{weighed:g} kg" if weighed is not None else "not weighed"
-    how = (
-        "robot and payload together, from this run and the runs without load"
-        if found.with_bare_runs
-        else "the payload and the joints' friction, on the robot of the calibration"
-    )
+    how = "the payload and the joints' friction, on the robot of the calibration"
+    if found.with_bare_runs:
+        how = "robot and payload together, from this run and the runs without load"
     # The label of gains that no calibration has is for documents; a reader knows them by the cell file's word.
     shown = ("nameplate" if label == MANUFACTURER and label not in found.calibrations else label for label in labels)
     return PaperTable(
         number=number,
-        title=f"mass of payload {name} ({mounting}), {of}",
+        title=f"mass of payload {name} ({mounting}), {weighed}",
         headings=("run", *shown),
         rows=tuple(rows),
         notes=(

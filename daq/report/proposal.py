@@ -15,10 +15,9 @@ from daq.report.gains import with_deviation
 from daq.report.text import plain_table, terminal_lines, terminal_text
 from daq.writeback.drive_target import DriveEdit
 from daq.writeback.file_target import FileEdit
-from daq.writeback.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, judge, noise_note
+from daq.writeback.judgement import NOT_JUDGED, NOTHING, Spread, judge, noise_note
 from daq.writeback.request import Edit, GainChange
 from daq.writeback.target import E, Proposal, Written
-from drivers.canopen.parameters import ParameterValue, ParameterWrite
 
 
 class Refused(Report):
@@ -161,20 +160,20 @@ def proposal_report(
     edit = proposal.edit
     if isinstance(edit, DriveEdit):
         return _drive_change(proposal, written)
-    judged, _ = judge(edit.changes, known)
+    judgements, _ = judge(edit.changes, known)
+    changes = []
+    for change in edit.changes:
+        judged = judgements.get(change.axis, NOT_JUDGED)
+        changes.append(FileGain.of(change, judged, change_sigmas=judged.sigmas))
     return FileChange.of(
         edit,
         proposal,
         file=edit.place,
         applied=written is not None,
         backup=None if written is None else str(written.backup),
-        changes=[_file_gain(change, judged.get(change.axis, NOT_JUDGED)) for change in edit.changes],
+        changes=changes,
         diff=edit.diff if isinstance(edit, FileEdit) else "",
     )
-
-
-def _file_gain(change: GainChange, judged: JudgedChange) -> FileGain:
-    return FileGain.of(change, change_sigmas=judged.sigmas, significant=judged.significant)
 
 
 def _drive_change(proposal: Proposal[E], written: Written | None) -> DriveChange:
@@ -215,17 +214,16 @@ def drive_rollback_report(edit: DriveEdit, written: Written | None) -> DriveRoll
         drives=edit.subject,
         source=str(edit.source),
         restored=written is not None,
-        changes=[_restored(value, write) for value, write in zip(edit.values, edit.writes, strict=True)],
+        changes=[
+            RestoredObject(
+                axis=value.axis.name,
+                object=str(value.parameter),
+                old=value.value,
+                new=value.parameter.value(write.word),
+            )
+            for value, write in zip(edit.values, edit.writes, strict=True)
+        ],
         **outcome,
-    )
-
-
-def _restored(value: ParameterValue, write: ParameterWrite) -> RestoredObject:
-    return RestoredObject(
-        axis=value.axis.name,
-        object=str(value.parameter),
-        old=value.value,
-        new=value.parameter.value(write.word),
     )
 
 

@@ -7,44 +7,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, TypeVar
 
 from rich.console import RenderableType
 from rich.table import Table
 
 from daq.report.effect_names import effect_text, size_text, variable_text
-from daq.report.fit import coefficients, error_table, identifiability_notes, with_calibration
-from daq.report.fit_schemas import (
-    AsideEntry,
-    ChangedGain,
-    Coefficient,
-    DetectionLimit,
-    FindingEntry,
-    GearLossEntry,
-    LeftOutRun,
-    LeftOutRuns,
-    ModelErrors,
-    MotorNoise,
-    NamedEffect,
-    NoiseFloor,
-    PlacedEffectEntry,
-    ResidualReport,
-    SplitNameEntry,
-    TurnEntry,
-    VerdictEntry,
-)
+from daq.report.fit import error_table, identifiability_notes
 from daq.report.gains import diagnosis_texts, gain_table, partial_note
 from daq.report.split_names import names_by_split, placed_by
 from daq.report.text import Sentence, plain_table
 from daq.workflow.fit import Fit
 from ident.calibration import AcceptedEffect, Calibration
-from ident.discovery.before_after import Account, BeforeAfter, RelativeErrors, RunErrors
-from ident.discovery.effect_verdict import EffectVerdict, Judgement
+from ident.discovery.before_after import Account, BeforeAfter, RelativeErrors
+from ident.discovery.effect_verdict import Judgement
 from ident.discovery.gates import runs_to_leave_out
 from ident.discovery.gear_loss import CERTAIN, GearLoss, gear_losses, is_gear_loss
-from ident.discovery.joining import SetAside
 from ident.discovery.loop import MAX_EFFECTS, Step
-from ident.discovery.noise_floor import CONFIDENCE, FloorSource, MotorNoiseFloor
+from ident.discovery.noise_floor import FloorSource
 from ident.discovery.search import Finding
 from ident.discovery.time_skew import CurrentDelay
 from ident.drift.change import FALSE_ALARM
@@ -61,7 +40,6 @@ SLIGHT = 0.1  #: Share of an error; an effect that lowers it by less is said to 
 
 ErrorRow = tuple[str, RelativeError]  #: Name of the error and of the data it is measured on, and the error [%]
 WHEN = ("before", "after")
-NamedT = TypeVar("NamedT", bound=NamedEffect)
 
 
 def residual_view(
@@ -180,13 +158,11 @@ def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -
     """
     kept = fitted.steps[-1].after.effects
     first = (*diagnosis_texts(fitted.diagnoses), *_correction_sentence(kept))
-    found = tuple(
-        _effect_sentence(fitted, account, turn, placed, step)
-        for step, turn in zip(fitted.steps, account.turns, strict=True)
-        if step.accepted is not None and turn is not None
-        for placed in turn.added
-        if placed in kept
-    )
+    found: list[str] = []
+    for step, turn in zip(fitted.steps, account.turns, strict=True):
+        if step.accepted is not None and turn is not None:
+            added = [placed for placed in turn.added if placed in kept]
+            found += [_effect_sentence(fitted, account, turn, placed, step) for placed in added]
     before, _ = _strictest_error(account.total.before)
     after, where = _strictest_error(account.total.after)
     floor = _floor(account).total
@@ -198,8 +174,9 @@ def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -
         return (*first, f"{none}: the error {where} is {after.total:.1f} %{noise}.", *judged, *ending)
     change = error_change_text(before.total, after.total)
     whole = f"All axes together: the error {where} {change}{noise}{_unconfirmed(account)}."
-    gains = gains_sentence(fitted, account)
-    return (*first, *found, whole, *judged, *_to_be_refused(effects), *((gains,) if gains else ()), *ending)
+    sentences = (*first, *found, whole, *judged, *_to_be_refused(effects), gains_sentence(fitted, account), *ending)
+    # Of gains that were held there is nothing to say.
+    return tuple(sentence for sentence in sentences if sentence)
 
 
 def _correction_sentence(kept: Sequence[PlacedEffect]) -> Iterator[str]:
@@ -264,29 +241,22 @@ def _unconfirmed(account: Account) -> str:
 def _to_be_refused(effects: Sequence[AcceptedEffect]) -> Iterator[str]:
     """Name the effects with which `apply` refuses a calibration (`daq.writeback.gates.fit.effect`)."""
     refused = [one for one in effects if not one.is_confirmed]
-    if not refused:
-        return
-    first, *others = refused
-    more = "".join(
-        f"; {one.name} on {one.axis}: {one.error_after_percent:.2f} % with it, {one.error_before_percent:.2f} % without"
-        for one in others
-    )
-    yield (
-        f"`apply` refuses a calibration with {first.name} on {first.axis}: on data that the fit did not use, the "
-        f"torque error is {first.error_after_percent:.2f} % with it, {first.error_before_percent:.2f} % without{more}. "
-        "Record more runs for the fit, or take `drivegain fit`, which adds no effects."
-    )
+    errors = [f"{one.error_after_percent:.2f} % with it, {one.error_before_percent:.2f} % without" for one in refused]
+    names = [f"{one.name} on {one.axis}" for one in refused]
+    if refused:
+        more = "".join(f"; {name}: {error}" for name, error in zip(names[1:], errors[1:], strict=True))
+        yield (
+            f"`apply` refuses a calibration with {names[0]}: on data that the fit did not use, the torque error is "
+            f"{errors[0]}{more}. Record more runs for the fit, or take `drivegain fit`, which adds no effects."
+        )
 
 
 def gains_sentence(fitted: Fit, account: Account) -> str:
     """Say which gains the effects change by more than noise; empty where the gains were held."""
     if fitted.estimate.gains_fixed:
         return ""
-    changed = [
-        f"{axis} by {change.change_percent:+.1f} %"
-        for axis, change in zip(fitted.cell.axis_names, account.total.gains, strict=True)
-        if change.significant
-    ]
+    changes = zip(fitted.cell.axis_names, account.total.gains, strict=True)
+    changed = [f"{axis} by {change.change_percent:+.1f} %" for axis, change in changes if change.significant]
     if not changed:
         return "With and without the effects, the gains are the same within noise."
     return (
@@ -359,21 +329,25 @@ def _refused(fitted: Fit) -> Iterator[str]:
         )
 
 
-def floor_sentences(account: Account, axes: Sequence[str]) -> list[str]:
+_FLOOR_CAUSES = {
+    FloorSource.STANDSTILL: (
+        "at standstill",
+        "a brake that takes the load over, dither, an axis that hunts, or axes that move meanwhile",
+    ),
+    FloorSource.REPEATED_MOVES: ("between repeated moves", "warm-up, or moves that are not quite the same"),
+}
+"""When a noise was measured, and what else than noise may be in it."""
+
+
+def floor_sentences(account: Account, axes: Sequence[str]) -> Iterator[str]:
     """Name the axes whose noise estimate is far above what the model leaves, and possible causes."""
-    causes = {
-        FloorSource.STANDSTILL: (
-            "at standstill",
-            "a brake that takes the load over, dither, an axis that hunts, or axes that move meanwhile",
-        ),
-        FloorSource.REPEATED_MOVES: ("between repeated moves", "warm-up, or moves that are not quite the same"),
-    }
-    return [
-        f"{axis} has no noise floor: its current {causes[floor.source][0]} scatters {floor.noise_a / left_a:.1f} times "
-        f"as much as the model's error in motion; possible causes: {causes[floor.source][1]}."
-        for axis, floor, left_a in zip(axes, account.floors, account.left_a, strict=True)
-        if floor is not None and floor.is_refuted(left_a)
-    ]
+    for axis, floor, left_a in zip(axes, account.floors, account.left_a, strict=True):
+        if floor is not None and floor.is_refuted(left_a):
+            when, causes = _FLOOR_CAUSES[floor.source]
+            yield (
+                f"{axis} has no noise floor: its current {when} scatters {floor.noise_a / left_a:.1f} times "
+                f"as much as the model's error in motion; possible causes: {causes}."
+            )
 
 
 def _holdout_verdict(fitted: Fit, account: Account) -> Iterator[str]:
@@ -415,34 +389,30 @@ def _unconfirmed_skew(skew: CurrentDelay | None) -> Iterator[str]:
         )
 
 
-def gear_sentences(fitted: Fit) -> list[str]:
+def gear_sentences(fitted: Fit) -> Iterator[str]:
     """Say which gains carry the efficiency of their gear, and what a loss in the model means for its gain."""
     if fitted.estimate.gains_fixed:
-        return []
-    in_model = {placed.axis for placed in fitted.steps[-1].after.effects if is_gear_loss(placed.effect)}
-    judged = zip(fitted.cell.axis_names, gear_losses(fitted.steps[-1]), strict=True)
-    return [
-        sentence
-        for axis, (name, gear) in enumerate(judged)
-        if (sentence := _gear_sentence(name, gear, in_model=axis in in_model))
-    ]
+        return
+    last = fitted.steps[-1]
+    in_model = {placed.axis for placed in last.after.effects if is_gear_loss(placed.effect)}
+    for axis, (name, gear) in enumerate(zip(fitted.cell.axis_names, gear_losses(last), strict=True)):
+        yield from _gear_sentence(name, gear, in_model=axis in in_model)
 
 
-def _gear_sentence(name: str, gear: GearLoss, *, in_model: bool) -> str:
+def _gear_sentence(name: str, gear: GearLoss, *, in_model: bool) -> Iterator[str]:
     if in_model and gear.efficiency is not None and gear.gain_factor is not None:
-        return (
+        yield (
             f"The loss in the gear of {name} is an efficiency of {100.0 * gear.efficiency:.1f} % if motor and load "
             f"lose the same share; its motor's gain is then {100.0 * (gear.gain_factor - 1.0):.2f} % larger than the "
             "one found, which no residual can show."
         )
-    if not gear.gain_carries_it or gear.hidden_shift is None or gear.loss_std is None:
-        return ""
-    side, share = ("motor", gear.motoring_torque) if gear.lean > 0.0 else ("load", 1.0 - gear.motoring_torque)
-    return (
-        f"The gain of {name} carries the efficiency of its gear: the {side} drives in {100.0 * share:.0f} % of the "
-        f"squared load torque, and a loss of up to {100.0 * CERTAIN * gear.loss_std:.1f} % would not show; it would "
-        f"change the gain by {100.0 * gear.hidden_shift:.1f} %."
-    )
+    elif gear.gain_carries_it and gear.hidden_shift is not None and gear.loss_std is not None:
+        side, share = ("motor", gear.motoring_torque) if gear.lean > 0.0 else ("load", 1.0 - gear.motoring_torque)
+        yield (
+            f"The gain of {name} carries the efficiency of its gear: the {side} drives in {100.0 * share:.0f} % of the "
+            f"squared load torque, and a loss of up to {100.0 * CERTAIN * gear.loss_std:.1f} % would not show; it "
+            f"would change the gain by {100.0 * gear.hidden_shift:.1f} %."
+        )
 
 
 def errors_by_data(errors: RelativeErrors) -> dict[str, RelativeError | None]:
@@ -557,139 +527,3 @@ def _silence(fitted: Fit) -> str:
         f"{ended}An effect that the declared model cannot mimic would have been detected above this torque (root mean "
         f"square in motion): {limits}.{unseen}"
     )
-
-
-_METRIC = (
-    "‖e‖/‖v‖ of each motor's current over the rows that count; in total √(Σ w²‖e‖²/Σ w²‖v‖²), w the gains of the "
-    "declared model"
-)
-
-
-def residual_report(fitted: Fit, account: Account, calibration: Calibration) -> ResidualReport:
-    """Return the closed loop: the calibration, the errors before and after, and every turn of the search."""
-    axes, last = fitted.cell.axis_names, fitted.steps[-1]
-    return with_calibration(
-        ResidualReport,
-        calibration,
-        summary=summary(fitted, account, calibration.effects),
-        axes=axes,
-        metric=_METRIC,
-        noise_floor=_noise_floor(account, axes),
-        time_skew=account.skew if account.skew is not None and account.skew.confirmed else None,
-        time_skew_by_instruments=account.skew,
-        gear_loss=[GearLossEntry.of(gear, axis=axis) for axis, gear in zip(axes, gear_losses(last), strict=True)],
-        before=_model_errors(account.total.before),
-        after=_model_errors(account.total.after),
-        gain_changes=_changed_gains(fitted, account.total),
-        worse_holdout=None if account.holdout_change is None else account.holdout_change.is_rise,
-        verdicts=[_verdict(verdict, fitted.cell.place_names) for verdict in last.verdicts],
-        turns=[_turn(fitted, step, turn) for step, turn in zip(fitted.steps, account.turns, strict=True)],
-    )
-
-
-def _noise_floor(account: Account, axes: tuple[str, ...]) -> NoiseFloor:
-    floors = zip(axes, account.floors, account.left_a.tolist(), strict=True)
-    return NoiseFloor.of(
-        motors=[None if floor is None else _motor_noise(axis, floor, left_a) for axis, floor, left_a in floors],
-        relative_error_percent=account.floor,
-        holdout_error_percent=account.holdout_floor,
-        least_error_percent=account.least_floor,
-        least_holdout_error_percent=account.least_holdout_floor,
-        confidence=CONFIDENCE,
-    )
-
-
-def _motor_noise(axis: str, floor: MotorNoiseFloor, left_a: float) -> MotorNoise:
-    return MotorNoise.of(
-        floor,
-        axis=axis,
-        noise=floor.noise_a,
-        least=floor.least_a if floor.is_bound else None,
-        dwells=floor.parts if floor.source is FloorSource.STANDSTILL else None,
-        pairs=floor.parts if floor.source is FloorSource.REPEATED_MOVES else None,
-        degrees_of_freedom=floor.freedom,
-        left=left_a,
-        refuted=floor.is_refuted(left_a),
-    )
-
-
-def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> TurnEntry:
-    axes = fitted.cell.place_names
-    limits = zip(fitted.cell.axes, step.limits_nm, strict=True)
-    return TurnEntry(
-        accepted=None if step.accepted is None else _finding(step.accepted, axes),
-        added=[] if turn is None else [_added(step, placed, axes) for placed in turn.added],
-        removed=[] if turn is None else [placed.name_among(axes) for placed in turn.removed],
-        names_by_split=[_named(SplitNameEntry, name.placed, axes, splits=name.splits) for name in names_by_split(step)],
-        before=None if turn is None else _model_errors(turn.before),
-        after=None if turn is None else _model_errors(turn.after),
-        gain_changes=None if turn is None else _changed_gains(fitted, turn),
-        findings=[_finding(finding, axes) for finding in step.findings],
-        structures=[_finding(finding, axes) for finding in step.structures],
-        set_aside=[_aside(aside, axes) for aside in step.set_aside],
-        detection_limits=[
-            DetectionLimit(axis=axis.name, rms=float(limit), unit=axis.unit.force) for axis, limit in limits
-        ],
-    )
-
-
-def _changed_gains(fitted: Fit, compared: BeforeAfter) -> list[ChangedGain]:
-    changes = zip(fitted.cell.axes, compared.gains, strict=True)
-    return [ChangedGain.of(change, axis=axis.name, unit=axis.gain_unit) for axis, change in changes]
-
-
-def _model_errors(errors: RelativeErrors) -> ModelErrors:
-    return ModelErrors.of(
-        relative_error_percent=errors.in_sample,
-        cross_validated_error_percent=errors.cross_validated,
-        left_out_runs=None if errors.left_out_runs is None else _left_out_runs(errors.left_out_runs),
-        holdout_error_percent=errors.holdout,
-    )
-
-
-def _left_out_runs(left_out: RunErrors) -> LeftOutRuns:
-    runs = [LeftOutRun.of(run, error_percent=run.error, reason=run.reason or None) for run in left_out.runs]
-    return LeftOutRuns.of(error_percent=left_out.together, runs=runs)
-
-
-def _named(kind: type[NamedT], placed: PlacedEffect, axes: tuple[str, ...], *sources: object, **others: Any) -> NamedT:
-    """Return what a document says of an effect, with its name, axis and settings."""
-    settings = {name: float(value) for name, value in placed.effect.settings.items()}
-    return kind.of(*sources, effect=placed.effect.name, axis=placed.axis_name(axes), settings=settings, **others)
-
-
-def _verdict(verdict: EffectVerdict, axes: tuple[str, ...]) -> VerdictEntry:
-    return _named(
-        VerdictEntry,
-        verdict.placed,
-        axes,
-        verdict,
-        blocks=verdict.change.total.moves,
-        error_before_percent=verdict.before,
-        error_after_percent=verdict.after,
-    )
-
-
-def _added(step: Step, placed: PlacedEffect, axes: tuple[str, ...]) -> PlacedEffectEntry:
-    return _named(PlacedEffectEntry, placed, axes, coefficients=coefficients(step.after, placed))
-
-
-def _finding(finding: Finding, axes: tuple[str, ...]) -> FindingEntry:
-    sizes = zip(finding.effect.coefficients, finding.coefficients, finding.deviations, strict=True)
-    return _named(
-        FindingEntry,
-        placed_by(finding),
-        axes,
-        finding,
-        variable=finding.effect.abscissa,
-        coefficients=[
-            Coefficient(name=column.name, value=float(value), std=float(std), unit=column.unit)
-            for column, value, std in sizes
-        ],
-        # For findings that failed a gate it would be most of the file and of no use.
-        ambiguity=[rival.name_among(axes) for rival in finding.ambiguity] if finding.passed else None,
-    )
-
-
-def _aside(aside: SetAside, axes: tuple[str, ...]) -> AsideEntry:
-    return AsideEntry.of(_finding(aside.finding, axes), reason=aside.reason(axes))

@@ -13,7 +13,6 @@ from daq.report.certificate_page import certificate_page
 from daq.report.document import json_text
 from daq.report.effect_names import effect_text, variable_text
 from daq.report.fit import coefficients, identifiability_notes, start_of
-from daq.report.fit_schemas import ResidualFile
 from daq.report.gains import value_rows, with_deviation
 from daq.report.html import MARK, figure, folded, html_list, pair, paragraph, table
 from daq.report.plots import draw_effect, draw_torques, drawn_axis, plot_ranking
@@ -28,18 +27,17 @@ from daq.report.residual import (
     error_rows,
     errors_by_data,
     gains_sentence,
-    residual_report,
     searched_steps,
     summary,
     turn_sentences,
 )
+from daq.report.residual_document import ResidualFile, residual_report
 from daq.report.svg import Interval, intervals
 from daq.report.text import percent_text
 from daq.workflow.fit import Fit
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account, BeforeAfter
 from ident.discovery.evidence import Evidence
-from ident.discovery.joining import SetAside
 from ident.discovery.loop import Step
 from ident.effects.effect import PlacedEffect
 from ident.effects.unnamed import is_unnamed
@@ -199,7 +197,10 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
             "Candidates by how much they reduce the error of left-out moves. Full: passed every check. Pale: these "
             "data cannot distinguish it from the added one. Hollow: failed a check.",
         )
-    in_words = [_in_words(fitted, aside) for aside in step.set_aside]
+    in_words = [
+        f"Not added to {axes[aside.finding.axis]}: {effect_text(aside.finding.effect, axes)}: {aside.reason(axes)}."
+        for aside in step.set_aside
+    ]
     if added is not None:
         in_words.append(f"Added to {axes[added.axis]}: {effect_text(added.effect, axes)}.")
     return folded(
@@ -210,24 +211,20 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
     )
 
 
-def _in_words(fitted: Fit, aside: SetAside) -> str:
-    axes = fitted.cell.place_names
-    words = effect_text(aside.finding.effect, axes)
-    return f"Not added to {axes[aside.finding.axis]}: {words}: {aside.reason(axes)}."
-
-
 def _limits(fitted: Fit, calibration: Calibration) -> str:
-    held = fitted.estimate.gains_fixed
-    limits = (
+    limits = [
         *identifiability_notes(fitted, calibration.payload_mass),
         "A torque constant that is wrong by a constant factor is part of the gain, and an effect that is the same at "
         "every speed, load and position is part of the parameters: neither leaves a residual.",
-        *(("The gains were held: an error in them is hidden in the parameters.",) if held else ()),
+    ]
+    if fitted.estimate.gains_fixed:
+        limits.append("The gains were held: an error in them is hidden in the parameters.")
+    limits += [
         "Backlash or elasticity behind an encoder on the motor may leave no trace in these signals.",
         "An effect is named after the variable it depends on and the shape of that dependence; another cause with the "
         "same dependence would get the same name. Indistinguishable effects are listed with each effect.",
         "Noise that was measured at standstill alone bounds nothing: in motion it may be smaller or larger. Between "
         "repeated moves its lower limit bounds any model's error (95 % confidence), often loosely: an error above it "
         "need not be an effect.",
-    )
+    ]
     return folded("What these data can and cannot show", html_list(limits))

@@ -7,7 +7,7 @@ from typing import Any
 from daq.report.bus_views import ErrorCodeReport, MonitorReport, ScanReport
 from daq.report.certificate import CertificateReport
 from daq.report.demo_schemas import DemoReport
-from daq.report.fit_schemas import CasesReport, FitReport, ResidualReport
+from daq.report.fit import CasesReport, FitReport
 from daq.report.history import HistoryReport
 from daq.report.job_schemas import (
     DryRunReport,
@@ -21,6 +21,7 @@ from daq.report.job_schemas import (
 from daq.report.log import BagReport, ImportReport, InfoReport, RecordReport, SalvageReport, TableReport
 from daq.report.plan import PlanReport
 from daq.report.proposal import DriveChange, DriveRollback, FileChange, FileRollback
+from daq.report.residual_document import ResidualReport
 from daq.report.urdf_views import UrdfReport
 from daq.report.validation import ValidateReport
 from daq.report.weighing_views import ContactReport, WeighReport

@@ -237,18 +237,18 @@ _COLUMNS = 2  #: Drawings beside each other
 def sheet(drawings: Sequence[str], title: str) -> bytes:
     """Return a file of its own with several drawings under a title, in the colours of paper."""
     heights = [float(found[1]) for one in drawings if (found := re.search(r'viewBox="0 0 \S+ ([\d.]+)"', one))]
-    row, across, gap = max(heights), min(_COLUMNS, len(drawings)), 24.0
-    width, height = across * (_WIDTH + gap) + gap, -(-len(drawings) // across) * (row + gap) + 48.0
+    across = min(_COLUMNS, len(drawings))
+    gap = 24.0
+    column_width = _WIDTH + gap
+    row_height = max(heights) + gap
+    width = across * column_width + gap
+    height = math.ceil(len(drawings) / across) * row_height + 48.0
     style = re.sub(r"var\(--(\w+)\)", lambda found: LIGHT[found[1]], DRAWING)
-    placed = (
-        one.replace(
-            "<svg ",
-            f'<svg x="{gap + number % across * (_WIDTH + gap):g}" y="{48 + number // across * (row + gap):g}" '
-            f'width="{_WIDTH:g}" height="{height_of:g}" ',
-            1,
-        )
-        for number, (one, height_of) in enumerate(zip(drawings, heights, strict=True))
-    )
+    placed = []
+    for number, (drawing, own_height) in enumerate(zip(drawings, heights, strict=True)):
+        row, column = divmod(number, across)
+        place = f'x="{gap + column * column_width:g}" y="{48 + row * row_height:g}"'
+        placed.append(drawing.replace("<svg ", f'<svg {place} width="{_WIDTH:g}" height="{own_height:g}" ', 1))
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" width="{width:g}" '
         f'height="{height:g}"><style>{style}</style><rect width="100%" height="100%" fill="{LIGHT["paper"]}"/>'

@@ -20,7 +20,11 @@ SHOWN_SIGMAS = 2.0  #: Half width of the intervals and bands of reports and pict
 
 def printable(text: str) -> str:
     """Spell out control characters, which could command a terminal; line ends stay."""
-    return "".join(c if c.isprintable() or c == "\n" else _spelled(c) for c in text)
+    return _spelled_out(text, "\n")
+
+
+def _spelled_out(text: str, kept: str = "") -> str:
+    return "".join(c if c.isprintable() or c in kept else _spelled(c) for c in text)
 
 
 def _spelled(character: str) -> str:
@@ -31,13 +35,12 @@ def _spelled(character: str) -> str:
 
 def terminal_text(text: str) -> Text:
     """One line of text that rich does not read as markup; control characters and line ends are spelled out."""
-    return Text("".join(c if c.isprintable() else _spelled(c) for c in text))
+    return Text(_spelled_out(text))
 
 
 def terminal_lines(text: str) -> str:
     """Lines of a diff: control characters except tabs spelled out, line ends as \\n."""
-    lines = text.splitlines()
-    return "\n".join("".join(c if c.isprintable() or c == "\t" else _spelled(c) for c in line) for line in lines)
+    return "\n".join(_spelled_out(line, "\t") for line in text.splitlines())
 
 
 @dataclass(frozen=True, slots=True)

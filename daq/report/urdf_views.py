@@ -9,7 +9,7 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from daq.report.document import Figure, Report
-from daq.report.fit_schemas import Errors
+from daq.report.fit import Errors
 from daq.report.text import plain_table, printable, terminal_text
 from daq.workflow.remaining_corrections import CORRECTIONS
 from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
@@ -155,7 +155,7 @@ def urdf_report(
         joints=[_joint(robot, number, update, updated) for number, update in enumerate(updates.values())],
         merged_links=updated.merged,
         not_in_urdf=[
-            NotInUrdf(name=column.name, value=float(value), unit=column.unit)
+            NotInUrdf.of(column, value=value)
             for column, value in zip(parameters.model.columns, parameters.standard, strict=True)
             if column.name.startswith(("Ia", "off", "fvm", "fsm"))
         ],
@@ -170,8 +170,6 @@ def _joint(robot: PhysicalRobot, number: int, update: JointUpdate, updated: Upda
         update.body,
         name=name,
         link=updated.links[name],
-        centre_m=update.body.centre_m.tolist(),
-        inertia_kg_m2=update.body.inertia_kg_m2.tolist(),
-        smallest_eigenvalue=float(robot.parameters.eigenvalues[number]),
+        smallest_eigenvalue=robot.parameters.eigenvalues[number],
         prior_assumed=number in robot.prior.assumed,
     )

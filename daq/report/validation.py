@@ -12,13 +12,13 @@ from rich.console import RenderableType
 from daq.files import replace_file
 from daq.report import paper_tables
 from daq.report.document import Figure, Report
-from daq.report.fit_schemas import Errors
+from daq.report.fit import Errors
 from daq.report.gains import diagnosis_texts
 from daq.report.plots import plot_torques
 from daq.report.svg import sheet
 from daq.report.text import Sentence, percent_text, plain_table, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
-from daq.workflow.validate import CheckedRun, CrossValidation, Mass, WeighedRun, conditioning_of, together
+from daq.workflow.validate import CrossValidation, Mass, WeighedRun, conditioning_of, together
 from daq.workflow.validation import DataUse, Validation
 from ident.calibration import Calibration, PayloadMass
 
@@ -195,7 +195,9 @@ def validate_report(calibration: Calibration, found: CrossValidation, drawn: dic
         logs=[_validated_log(validation, drawn.get(validation.log)) for validation in validations],
         together={"relative_error_percent": together(validations)} if validations else None,
         calibrations=list(found.calibrations),
-        runs=[_checked_log(run) for run in found.runs],
+        runs=[
+            CheckedLog.of(run, relative_error_percent=run.errors, left_out=run.left_out or None) for run in found.runs
+        ],
         payloads=[_checked_payload(run, with_bare_runs=found.with_bare_runs) for run in found.weighed],
     )
 
@@ -209,10 +211,6 @@ def _validated_log(validation: Validation, picture: Path | None) -> ValidatedLog
         relative_error_percent=validation.error,
         picture=picture,
     )
-
-
-def _checked_log(run: CheckedRun) -> CheckedLog:
-    return CheckedLog.of(run, relative_error_percent=run.errors, left_out=run.left_out or None)
 
 
 def _checked_payload(run: WeighedRun, *, with_bare_runs: bool) -> CheckedPayload:

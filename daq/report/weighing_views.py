@@ -13,7 +13,7 @@ from rich.text import Text
 from daq.config.cell import Cell, robot_of
 from daq.files import replace_file
 from daq.report.document import Figure, Report
-from daq.report.fit_schemas import Errors
+from daq.report.fit import Errors
 from daq.report.gains import with_deviation
 from daq.report.picture import BLACK, ORANGE, SKY, legend_below, panels, render, unformatted
 from daq.report.text import plain_table, terminal_text
@@ -245,7 +245,7 @@ def weigh_report(found: Weighed) -> WeighReport:
 
 
 def _weighed_values(value: FloatArray, std: FloatArray) -> WeighedValues:
-    return WeighedValues(value=value.tolist(), std=std.tolist())
+    return WeighedValues.of(value=value, std=std)
 
 
 def _weighed_parameters(found: Weighed) -> list[WeighedParameter]:
@@ -256,10 +256,10 @@ def _weighed_parameters(found: Weighed) -> list[WeighedParameter]:
         WeighedParameter.of(
             name=name,
             unit=unit,
-            value=float(body.values[index]),
-            std=float(body.std[index]),
-            std_of_moves=float(moves_std[index]),
-            identifiable=bool(body.identifiable[index]),
+            value=body.values[index],
+            std=body.std[index],
+            std_of_moves=moves_std[index],
+            identifiable=body.identifiable[index],
             add=moves.get(name),
         )
         for index, (name, unit) in enumerate(zip(LINK_PARAMETERS, LINK_UNITS, strict=True))
@@ -345,14 +345,14 @@ def contact_report(found: ExternalTorque, cell: Cell, log: Path, picture: Path |
 def _contact_axes(found: ExternalTorque, cell: Cell) -> list[ContactAxis]:
     learned = found.band
     return [
-        ContactAxis(
+        ContactAxis.of(
             axis=axis.name,
             unit=axis.unit.force,
-            scale=learned.scale[index].tolist(),
-            band_over_scale=float(learned.factor[index]),
-            threshold_over_scale=float(learned.threshold[index]),
-            correlation_s=float(learned.correlation_s[index]),
-            quiet_s=float(learned.quiet_s[index]),
+            scale=learned.scale[index],
+            band_over_scale=learned.factor[index],
+            threshold_over_scale=learned.threshold[index],
+            correlation_s=learned.correlation_s[index],
+            quiet_s=learned.quiet_s[index],
             band=band,
             threshold=threshold,
             largest=largest,
