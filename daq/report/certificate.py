@@ -7,7 +7,7 @@ controller was not read, the nameplate takes its place, and the limit of a chang
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from enum import Enum
@@ -28,7 +28,7 @@ from daq.writeback.gates.table import check_gates
 from daq.writeback.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, judge, noise_note, query_history
 from daq.writeback.request import Edit, GainChange, Request
 from daq.writeback.target import Proposal, propose
-from ident.calibration import AcceptedEffect, Calibration, EncoderMisfit, PayloadMass
+from ident.calibration import Calibration, EncoderMisfit, PayloadMass
 from ident.data.run import Recording
 
 
@@ -375,7 +375,7 @@ def identity(calibration: Calibration) -> dict[str, str]:
     return names
 
 
-def payload_texts(calibration: Calibration) -> tuple[str, ...]:
+def payload_texts(calibration: Calibration) -> Iterator[str]:
     """The mass of each payload as it was entered twice: in the cell file, and from the scale at each recording."""
     mounted: dict[tuple[str, float | None], list[float]] = {}
     for source in calibration.sources:
@@ -384,14 +384,12 @@ def payload_texts(calibration: Calibration) -> tuple[str, ...]:
             masses = mounted.setdefault((source.payload, source.mass_kg), [])
             if entered is not None and entered not in masses:
                 masses.append(entered)
-    texts: list[str] = []
     for (name, declared), masses in mounted.items():
         entry = "no mass in the cell file" if declared is None else f"{declared:g} kg in the cell file"
         scale = "not weighed a second time"
         if masses:
             scale = f"{' and '.join(f'{one:g}' for one in masses)} kg on the scale"
-        texts.append(f"{name}: {entry}, {scale}")
-    return tuple(texts)
+        yield f"{name}: {entry}, {scale}"
 
 
 def _period(times_s: Sequence[float]) -> str:
@@ -426,7 +424,11 @@ def _minute(iso: str) -> str:
 def certificate_report(certificate: Certificate) -> CertificateReport:
     """Return the numbers of the page."""
     calibration, comparison = certificate.calibration, certificate.comparison
-    edit, earlier = comparison.edit, certificate.earlier
+    edit = comparison.edit
+    beside = None
+    if certificate.earlier is not None:
+        since = [_certified_gain(row, EARLIER) for row in certificate.since]
+        beside = EarlierCalibration.of(certificate.earlier, axes=since)
     return CertificateReport.of(
         certificate,
         comparison,
@@ -437,8 +439,11 @@ def certificate_report(certificate: Certificate) -> CertificateReport:
         controller=None if edit is None else str(edit.file),
         controller_unread=comparison.unread or None,
         axes=[_certified_gain(row, certificate.place) for row in certificate.rows],
-        effects=[_certified_effect(effect, calibration) for effect in calibration.effects],
-        beside=None if earlier is None else _beside(earlier, certificate.since),
+        effects=[
+            CertifiedEffect.of(one, effect=accepted_text(one, calibration), size=size_text(one, calibration))
+            for one in calibration.effects
+        ],
+        beside=beside,
     )
 
 
@@ -453,15 +458,3 @@ def _certified_gain(row: AxisRow, place: str) -> CertifiedGain:
         change_sigmas=row.judged.sigmas,
         verdict=row.words(place),
     )
-
-
-def _certified_effect(effect: AcceptedEffect, calibration: Calibration) -> CertifiedEffect:
-    return CertifiedEffect.of(
-        effect,
-        effect=accepted_text(effect, calibration),
-        size=size_text(effect, calibration),
-    )
-
-
-def _beside(earlier: Calibration, since: Sequence[AxisRow]) -> EarlierCalibration:
-    return EarlierCalibration.of(earlier, axes=[_certified_gain(row, EARLIER) for row in since])

@@ -12,7 +12,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import ConfigDict, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from daq.config.yaml_file import StrictModel
 from daq.report.text import spelled_bytes
@@ -51,6 +51,25 @@ class Report(StrictModel):
         if is_dataclass(values):
             values = _attributes(cls, values)
         return json_safe(values, _without_surrogates)
+
+
+class ErrorReport(Report):
+    """One line on stderr for a command that failed."""
+
+    error: str
+    """subject, or the whole message where that says what was found"""
+    found: str
+    expected: str
+    do: str
+    exit_code: int
+    kind: str
+    """class of the error"""
+    kept: str = ""
+    """files that were written before"""
+    hint: str = ""
+    axes: str = ""
+    """axes that had power and are not confirmed without it"""
+    unconfirmed: list[str] = Field(default=[], description="what could not be confirmed")
 
 
 def _attributes(kind: type[Report], source: object) -> dict[str, Any]:

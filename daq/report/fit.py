@@ -414,7 +414,8 @@ def comparison_tables(comparison: EstimatorComparison, axes: tuple[str, ...]) ->
             values = (f"{gain:.4g}" for gain in trial.gains)
             gains.add_row(trial.estimator, *values, f"{trial.relative_error_percent:.2f}")
         spread = comparison.spread_percent(trial.estimator)
-        spreads.add_row(trial.estimator, *("-" if spread is None else f"{spread[i]:.2f}" for i in range(len(axes))))
+        shares = ["-"] * len(axes) if spread is None else [f"{share:.2f}" for share in spread]
+        spreads.add_row(trial.estimator, *shares)
     return gains, spreads
 
 

@@ -172,33 +172,25 @@ def _correction_text(one: GeometryCorrection) -> str:
     return f"the {one.kind} of {place} {scale * one.change:+.4f} ± {max(scale * one.std, 5e-5):.4f} {unit}"
 
 
-def mass_texts(influences: Iterable[PayloadMass]) -> tuple[str, ...]:
+def mass_texts(influences: Iterable[PayloadMass]) -> Iterator[str]:
     """Say of each payload how a wrong mass changes the gains, and what its declared tolerance makes of them."""
-    return tuple(f"{_mass_influence(one)}{_mass_tolerance(one)}" for one in influences)
-
-
-def _is_proportional(one: PayloadMass) -> bool:
-    """Whether every gain is proportional to the mass, to a hundredth."""
-    return all(round(gain.percent_per_percent, 2) == 1.0 for gain in one.gains)
-
-
-def _mass_influence(one: PayloadMass) -> str:
-    if _is_proportional(one):
-        return f"with a mass of {one.payload} that is wrong by 1 %, every gain is wrong by 1 %"
-    listed = ", ".join(f"{gain.axis} {gain.percent_per_percent:.2f} %" for gain in one.gains)
-    return f"with a mass of {one.payload} that is wrong by 1 %, the gains are wrong by: {listed}"
-
-
-def _mass_tolerance(one: PayloadMass) -> str:
-    if not one.tolerance_kg > 0.0:
-        return ""
-    largest = max(abs(gain.percent_per_percent) for gain in one.gains)
-    share_percent = 100.0 * one.tolerance_kg / one.mass_kg * largest
-    at_most = "" if _is_proportional(one) else "at most "
-    return (
-        f"; {one.payload} was weighed to {one.mass_kg:g} kg ± {one.tolerance_kg:g} kg, which is {at_most}"
-        f"± {share_percent:.2g} % of every gain, not in σ"
-    )
+    for one in influences:
+        is_proportional = all(round(gain.percent_per_percent, 2) == 1.0 for gain in one.gains)
+        wrong = "every gain is wrong by 1 %"
+        at_most = ""
+        if not is_proportional:
+            listed = ", ".join(f"{gain.axis} {gain.percent_per_percent:.2f} %" for gain in one.gains)
+            wrong = f"the gains are wrong by: {listed}"
+            at_most = "at most "
+        text = f"with a mass of {one.payload} that is wrong by 1 %, {wrong}"
+        if one.tolerance_kg > 0.0:
+            largest = max(abs(gain.percent_per_percent) for gain in one.gains)
+            share_percent = 100.0 * one.tolerance_kg / one.mass_kg * largest
+            text += (
+                f"; {one.payload} was weighed to {one.mass_kg:g} kg ± {one.tolerance_kg:g} kg, which is {at_most}"
+                f"± {share_percent:.2g} % of every gain, not in σ"
+            )
+        yield text
 
 
 MASS_HEADINGS = ("payload", "axis", "gain per kg", "gain % per % of mass", "σ by the tolerance", "unit")

@@ -393,10 +393,10 @@ def in_force(cell: Cell, history: History) -> str | None:
     numbers = dict(zip(cell.axis_names, zip(scalars, controller.factors, strict=True), strict=True))
     known = history.in_force(target)
     writes = [event.digest for event in history.events]
-    # Where several have these numbers: the one that the history names, else the one that was written last.
-    order = [digest for digest in (known, *reversed(writes)) if digest is not None]
     having = [entry.digest for entry in reversed(history.entries) if _has(entry, numbers)]
-    return next((digest for digest in (*order, *having) if digest in having), None)
+    # Where several have these numbers: the one that the history names, else the one that was written last.
+    order = (known, *reversed(writes), *having)
+    return next((digest for digest in order if digest in having), None)
 
 
 def describe_actions(entries: Sequence[Entry], events: Sequence[Event], digest_in_force: str | None) -> dict[str, str]:
@@ -466,10 +466,12 @@ def _history_point(series: Series, index: int) -> HistoryPoint:
         known |= {"applied_at": last.at, "applied_by": last.who, "applied_to": last.target}
     return HistoryPoint.of(
         point.entry,
-        point.gain,
         None,
         axis=series.axis,
         gain=point.gain.value,
+        std=point.gain.std,
+        unit=point.gain.unit,
+        nameplate=point.gain.nameplate,
         deviation_sigmas=drift.deviations[place],
         cusum_up=drift.upper[place],
         cusum_down=drift.lower[place],

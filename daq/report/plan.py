@@ -70,19 +70,16 @@ def plan_report(out: Path, cell: Cell, experiment: Experiment, made: Plan, judge
 
 
 def _planned_gain(axis: str, gain: GainVerdict) -> PlannedGain:
+    known_percent = gain.known_preload_percent
     return PlannedGain.of(
         gain,
         axis=axis,
         predicted_std_percent=round(gain.std_percent, 3),
-        known_preload_std_percent=_finite(gain.known_preload_percent),
+        known_preload_std_percent=None if known_percent is None else round(known_percent, 3),
         seen_by=gain.sources,
-        alone_percent={source: _finite(alone) for source, alone in gain.alone_percent.items()},
+        alone_percent={source: round(alone, 3) for source, alone in gain.alone_percent.items()},
         words=gain.words(axis),
     )
-
-
-def _finite(std_percent: float | None) -> float | None:
-    return None if std_percent is None or not math.isfinite(std_percent) else round(std_percent, 3)
 
 
 def _on_all_gains(cell: Cell, made: Plan, judged: Identifiability) -> Iterator[str]:

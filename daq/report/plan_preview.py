@@ -31,11 +31,10 @@ _AXES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B58900", "#3B9BD6", "#7F7
 _AXES_DARK = ("#4BA3E3", "#F08A4B", "#2FC298", "#E39BC4", "#E0B73C", "#9AD5FF", "#B5B5B5", "#D77AA8")
 _LIGHT = {"base": "#8a8a8a", "swept": "#b9cbe0", "swept-edge": "#33567f", "footprint": "#a3a3a3"}
 _DARK = {"base": "#8f8f8f", "swept": "#4d6e93", "swept-edge": "#bcd6f2", "footprint": "#6d6d6d"}
+_LIGHT |= {f"axis-{number}": colour for number, colour in enumerate(_AXES)}
+_DARK |= {f"axis-{number}": colour for number, colour in enumerate(_AXES_DARK)}
 _STYLE = (
-    palette(
-        {**_LIGHT, **{f"axis-{number}": colour for number, colour in enumerate(_AXES)}},
-        {**_DARK, **{f"axis-{number}": colour for number, colour in enumerate(_AXES_DARK)}},
-    )
+    palette(_LIGHT, _DARK)
     + """\
 body { font: 16px/1.45 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 64rem;
   margin: 1rem auto; padding: 0 1rem; overflow-wrap: anywhere; }

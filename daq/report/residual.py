@@ -38,7 +38,6 @@ _SHOWN_RIVALS = 3
 MUCH = 0.2  #: Share of the squared residual; a candidate that would explain it, and failed a check, is named
 SLIGHT = 0.1  #: Share of an error; an effect that lowers it by less is said to be small
 
-ErrorRow = tuple[str, RelativeError]  #: Name of the error and of the data it is measured on, and the error [%]
 WHEN = ("before", "after")
 
 
@@ -137,7 +136,7 @@ def turn_sentences(fitted: Fit, step: Step) -> Iterator[str]:
 
 def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
     """Relative error of each axis before and after, and what noise alone would leave."""
-    return error_table("Relative error ‖e‖/‖v‖ of the motor currents by ml [%]", axes, dict(error_rows(account)))
+    return error_table("Relative error ‖e‖/‖v‖ of the motor currents by ml [%]", axes, error_rows(account))
 
 
 def summary(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -> tuple[str, ...]:
@@ -279,7 +278,8 @@ def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:
 
 def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
     """Sentences on findings that did not join the model, where the last model still lacks them."""
-    axes, last = fitted.cell.place_names, fitted.steps[-1]
+    axes = fitted.cell.place_names
+    last = fitted.steps[-1]
     for aside in step.set_aside:
         finding = aside.finding
         axis = placed_by(finding).axis_name(axes)
@@ -302,14 +302,15 @@ def _refused(fitted: Fit) -> Iterator[str]:
     """Sentences on candidates that failed a check: of each axis the strongest, where it would explain much of the
     residual, and the first one, where physics alone does not allow it.
     """
-    axes, last = fitted.cell.place_names, fitted.steps[-1]
+    axes = fitted.cell.place_names
+    last = fitted.steps[-1]
     # Those are reported with the reason already.
-    reported = {(aside.finding.effect, aside.finding.axis) for aside in last.set_aside}
+    reported = [placed_by(aside.finding) for aside in last.set_aside]
     first: dict[int, Finding] = {}
     strongest: dict[int, Finding] = {}
     for finding in last.findings:
         first.setdefault(finding.axis, finding)
-        failed = finding.explained >= MUCH and finding.refusals and (finding.effect, finding.axis) not in reported
+        failed = finding.explained >= MUCH and finding.refusals and placed_by(finding) not in reported
         if failed and (finding.axis not in strongest or finding.explained > strongest[finding.axis].explained):
             strongest[finding.axis] = finding
     for axis, finding in first.items():
@@ -426,8 +427,8 @@ def errors_by_data(errors: RelativeErrors) -> dict[str, RelativeError | None]:
     }
 
 
-def error_rows(account: Account) -> tuple[ErrorRow, ...]:
-    """Rows of the table of errors; errors that were not computed or are unknown are left out."""
+def error_rows(account: Account) -> dict[str, RelativeError]:
+    """Return the errors [%] by their names and the data they are measured on; those that are not known are left out."""
     after = errors_by_data(account.total.after)
     rows: dict[str, RelativeError | None] = {}
     for data, before in errors_by_data(account.total.before).items():
@@ -437,9 +438,7 @@ def error_rows(account: Account) -> tuple[ErrorRow, ...]:
     rows["noise, estimate, held out"] = account.holdout_floor
     rows["noise, at least"] = account.least_floor
     rows["noise, at least, held out"] = account.least_holdout_floor
-    return tuple(
-        (name, error) for name, error in rows.items() if error is not None and any(map(math.isfinite, error.axes))
-    )
+    return {name: error for name, error in rows.items() if error is not None and any(map(math.isfinite, error.axes))}
 
 
 def _strictest_error(errors: RelativeErrors, place: int | None = None) -> tuple[RelativeError, str]:

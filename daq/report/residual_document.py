@@ -11,7 +11,7 @@ from daq.report.residual import summary
 from daq.report.split_names import names_by_split, placed_by
 from daq.workflow.fit import Fit
 from ident.calibration import Calibration
-from ident.discovery.before_after import Account, BeforeAfter, RelativeErrors, RunErrors
+from ident.discovery.before_after import Account, BeforeAfter, RelativeErrors
 from ident.discovery.effect_verdict import EffectVerdict
 from ident.discovery.gear_loss import gear_losses
 from ident.discovery.loop import Step
@@ -325,17 +325,19 @@ def _changed_gains(fitted: Fit, compared: BeforeAfter) -> list[ChangedGain]:
 
 
 def _model_errors(errors: RelativeErrors) -> ModelErrors:
+    left_out = None
+    if errors.left_out_runs is not None:
+        runs = errors.left_out_runs.runs
+        left_out = LeftOutRuns.of(
+            error_percent=errors.left_out_runs.together,
+            runs=[LeftOutRun.of(run, error_percent=run.error, reason=run.reason or None) for run in runs],
+        )
     return ModelErrors.of(
         relative_error_percent=errors.in_sample,
         cross_validated_error_percent=errors.cross_validated,
-        left_out_runs=None if errors.left_out_runs is None else _left_out_runs(errors.left_out_runs),
+        left_out_runs=left_out,
         holdout_error_percent=errors.holdout,
     )
-
-
-def _left_out_runs(left_out: RunErrors) -> LeftOutRuns:
-    runs = [LeftOutRun.of(run, error_percent=run.error, reason=run.reason or None) for run in left_out.runs]
-    return LeftOutRuns.of(error_percent=left_out.together, runs=runs)
 
 
 def _named(kind: type[NamedT], placed: PlacedEffect, axes: tuple[str, ...], *sources: object, **others: Any) -> NamedT:

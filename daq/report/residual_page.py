@@ -32,6 +32,7 @@ from daq.report.residual import (
     turn_sentences,
 )
 from daq.report.residual_document import ResidualFile, residual_report
+from daq.report.split_names import placed_by
 from daq.report.svg import Interval, intervals
 from daq.report.text import percent_text
 from daq.workflow.fit import Fit
@@ -80,8 +81,9 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration, compa
     """Build the certificate of a closed loop with the account of its turns folded below."""
     axes = fitted.cell.axis_names
     comparison = comparison or beside_nameplate(fitted, calibration)
-    errors = [(name, *map(percent_text, (*error.axes, error.total))) for name, error in error_rows(account)]
-    sections, before = [], start_of(fitted)
+    errors = [(name, *map(percent_text, (*error.axes, error.total))) for name, error in error_rows(account).items()]
+    sections = []
+    before = start_of(fitted)
     for step, turn in zip(fitted.steps, account.turns, strict=True):
         if turn is not None:
             sections += [_effect(fitted, before, step, turn, placed) for placed in turn.added]
@@ -154,26 +156,23 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
 
 
 def _gains(fitted: Fit, account: Account) -> str:
-    axes, changes = fitted.cell.axis_names, account.total.gains
     if fitted.estimate.gains_fixed:
         return folded("Gains without and with the effects", paragraph("The gains were held at their nameplate values."))
-    rows = [
-        (
-            axis.name,
-            with_deviation(change.before, change.before_std),
-            f"{with_deviation(change.after, change.after_std)} {axis.gain_unit}",
-            f"{change.change_percent:+.2f} ± {change.change_std_percent:.2f}",
-            "more than noise" if change.significant else "within noise",
+    rows = []
+    shifts = []
+    for axis, change in zip(fitted.cell.axes, account.total.gains, strict=True):
+        percent = change.change_percent
+        std_percent = change.change_std_percent
+        rows.append(
+            (
+                axis.name,
+                with_deviation(change.before, change.before_std),
+                f"{with_deviation(change.after, change.after_std)} {axis.gain_unit}",
+                f"{percent:+.2f} ± {std_percent:.2f}",
+                "more than noise" if change.significant else "within noise",
+            )
         )
-        for axis, change in zip(fitted.cell.axes, changes, strict=True)
-    ]
-    shifts = [
-        Interval(
-            *(name, one.change_percent, 2.0 * one.change_std_percent, -math.inf, math.inf),
-            f"{one.change_percent:+.2f} %",
-        )
-        for name, one in zip(axes, changes, strict=True)
-    ]
+        shifts.append(Interval(axis.name, percent, 2.0 * std_percent, -math.inf, math.inf, f"{percent:+.2f} %"))
     return folded(
         "Gains without and with the effects",
         table("", ("axis", *WHEN, "change ± σ [%]", "verdict"), rows, "words"),
@@ -187,8 +186,9 @@ def _gains(fitted: Fit, account: Account) -> str:
 def _turn(fitted: Fit, number: int, step: Step) -> str:
     axes, added = fitted.cell.place_names, step.accepted
     named = step.ranked(_SHOWN)
-    own = [(one.effect, one.axis) for one in named]
-    shown = (*named, *(o for o in step.structures[:_SHOWN] if o.passed and (o.effect, o.axis) not in own))
+    own = [placed_by(one) for one in named]
+    structures = [one for one in step.structures[:_SHOWN] if one.passed and placed_by(one) not in own]
+    shown = (*named, *structures)
     ranking = paragraph("No candidate could be tried.")
     if shown:
         ranked = sorted(shown, key=lambda finding: -finding.held_out_fall)

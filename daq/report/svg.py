@@ -132,14 +132,14 @@ def chart(
     def down(y: FloatArray) -> FloatArray:
         return top + (high - y) / (high - low) * (height - top)
 
-    ticks = np.array(list(_ticks(low, high)))
     parts = []
-    for tick, y in zip(ticks.tolist(), down(ticks).tolist(), strict=True):
+    for tick in _ticks(low, high):
+        y = float(down(np.array(tick)))
         parts.append(_line(left, y, across, y, "zero" if tick == 0.0 else "grid"))
         parts.append(_text(left - 5, y + 4, f"{tick:g}", "soft end"))
-    ticks = np.array(list(_ticks(begin, end)))
-    for tick, x in zip(ticks.tolist(), right(ticks).tolist(), strict=True):
-        parts.append(_text(x, height + 17, f"{tick:g}", "soft mid"))
+    for tick in _ticks(begin, end):
+        x = float(right(np.array(tick)))
+        parts += [_text(x, height + 17, f"{tick:g}", "soft mid")]
     if half is not None:
         xs = np.concatenate([first.x, first.x[::-1]])
         ys = np.concatenate([first.y + half, (first.y - half)[::-1]])

@@ -16,7 +16,7 @@ from daq.report.document import Figure, Report
 from daq.report.fit import Errors
 from daq.report.gains import with_deviation
 from daq.report.picture import BLACK, ORANGE, SKY, legend_below, panels, render, unformatted
-from daq.report.text import plain_table, terminal_text
+from daq.report.text import known_text, plain_table, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
 from daq.workflow.weigh import Weighed
 from ident.arrays import FloatArray
@@ -270,9 +270,9 @@ def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
     """Band and threshold of each axis, and the contacts."""
     headings = ("axis", "quiet s", "band ±", "threshold", "largest", "unit")
     table = plain_table(headings, title="External torque (medians over the motion)", left=(0, 5))
-    for index, (axis, (band, threshold, largest)) in enumerate(zip(cell.axes, _figures(found), strict=True)):
-        seconds = f"{found.band.quiet_s[index]:.0f}"
-        table.add_row(axis.name, seconds, _digits(band), _digits(threshold), _digits(largest), axis.unit.force)
+    for shown, quiet_s in zip(_contact_axes(found, cell), found.band.quiet_s, strict=True):
+        figures = (known_text(figure, ".3g") for figure in (shown.band, shown.threshold, shown.largest))
+        table.add_row(shown.axis, f"{quiet_s:.0f}", *figures, shown.unit)
     yield table
     source = "this log" if found.from_itself else "the quiet logs"
     if found.from_itself and found.left_out:
@@ -344,34 +344,30 @@ def contact_report(found: ExternalTorque, cell: Cell, log: Path, picture: Path |
 
 def _contact_axes(found: ExternalTorque, cell: Cell) -> list[ContactAxis]:
     learned = found.band
-    return [
-        ContactAxis.of(
-            axis=axis.name,
-            unit=axis.unit.force,
-            scale=learned.scale[index],
-            band_over_scale=learned.factor[index],
-            threshold_over_scale=learned.threshold[index],
-            correlation_s=learned.correlation_s[index],
-            quiet_s=learned.quiet_s[index],
-            band=band,
-            threshold=threshold,
-            largest=largest,
-        )
-        for index, (axis, (band, threshold, largest)) in enumerate(zip(cell.axes, _figures(found), strict=True))
-    ]
-
-
-def _figures(found: ExternalTorque) -> Iterator[tuple[float, float, float]]:
-    """Median band and threshold and the largest torque of each joint over its motion; NaN where it did not move."""
-    for band, threshold, torque, use in zip(found.band_nm, found.threshold_nm, found.torque_nm, found.use, strict=True):
+    axes = []
+    for index, axis in enumerate(cell.axes):
+        use = found.use[index]
+        # None of these is known of an axis that did not move.
+        figures = dict.fromkeys(("band", "threshold", "largest"))
         if use.any():
-            yield float(np.median(band[use])), float(np.median(threshold[use])), float(np.abs(torque[use]).max())
-        else:
-            yield np.nan, np.nan, np.nan
-
-
-def _digits(value: float) -> str:
-    return f"{value:.3g}" if np.isfinite(value) else "-"
+            figures = {
+                "band": np.median(found.band_nm[index, use]),
+                "threshold": np.median(found.threshold_nm[index, use]),
+                "largest": np.abs(found.torque_nm[index, use]).max(),
+            }
+        axes.append(
+            ContactAxis.of(
+                axis=axis.name,
+                unit=axis.unit.force,
+                scale=learned.scale[index],
+                band_over_scale=learned.factor[index],
+                threshold_over_scale=learned.threshold[index],
+                correlation_s=learned.correlation_s[index],
+                quiet_s=learned.quiet_s[index],
+                **figures,
+            )
+        )
+    return axes
 
 
 def draw_contact(found: ExternalTorque, cell: Cell, log: Path, folder: Path) -> Path:

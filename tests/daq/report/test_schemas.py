@@ -15,8 +15,7 @@ from pydantic import TypeAdapter
 
 import daq.report
 from daq.cli.app import VERBS
-from daq.report.document import Report
-from daq.report.error_schema import ErrorReport
+from daq.report.document import ErrorReport, Report
 from daq.report.job_schemas import ProposalReport
 from daq.report.residual_document import ResidualFile
 from daq.report.schemas import REPORTS
