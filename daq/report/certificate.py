@@ -296,11 +296,10 @@ def certify(calibration: Calibration, comparison: Comparison, earlier: Calibrati
         CalibrationRefused: one of the two has not one error for each gain, or the earlier one is of another cell or of
             other axes.
     """
-    for one in (calibration, earlier):
-        if one is not None:
-            _require_whole(one)
+    _require_whole(calibration)
     since: tuple[AxisRow, ...] = ()
     if earlier is not None:
+        _require_whole(earlier)
         _require_same(calibration, earlier)
         changes = _changes_from({gain.axis: gain.value for gain in earlier.gains}, calibration)
         known = Spread({gain.axis: gain.std for gain in earlier.gains})

@@ -33,8 +33,11 @@ _FILTERS = {
     "standstill_share": "share of standstill in the filter's window, at most",
 }
 _METHODS = {
-    **{"ls": "least squares", "wls": "weighted least squares", "tls": "total least squares"},
-    **{"ml": "maximum likelihood", "iv": "instrumental variables"},
+    "ls": "least squares",
+    "wls": "weighted least squares",
+    "tls": "total least squares",
+    "ml": "maximum likelihood",
+    "iv": "instrumental variables",
 }
 _ROLES = {"holdout": "held out"}
 
@@ -178,11 +181,10 @@ def _limit(allowed: tuple[float, float]) -> str:
 def _effects(calibration: Calibration, consequence: str) -> str:
     if not calibration.effects:
         return section("Effects", paragraph("The calibration holds no effect beyond the declared model."))
-    return section(
-        "Effects",
-        *(_effect(effect, calibration) for effect in calibration.effects),
-        *(paragraph(consequence) for _ in range(bool(consequence))),
-    )
+    body = [_effect(effect, calibration) for effect in calibration.effects]
+    if consequence:
+        body.append(paragraph(consequence))
+    return section("Effects", *body)
 
 
 def _effect(effect: AcceptedEffect, calibration: Calibration) -> str:

@@ -176,9 +176,12 @@ def fit_view(
         f"{estimate.condition:.0f}; position filter {filter_.position_cutoff_hz:g} Hz, decimation "
         f"{filter_.decimation_cutoff_hz:g} Hz. Compare relative errors only under the same filters."
     )
-    yield from map(Sentence, geometry_notes(fitted.description, axes))
-    yield from map(Sentence, identifiability_notes(fitted, calibration.payload_mass))
-    yield from map(Sentence, advice(fitted, needed_verdicts(fitted)))
+    notes = (
+        *geometry_notes(fitted.description, axes),
+        *identifiability_notes(fitted, calibration.payload_mass),
+        *advice(fitted, needed_verdicts(fitted)),
+    )
+    yield from map(Sentence, notes)
     if comparison is not None:
         for table in comparison_tables(comparison, axes):
             yield ""

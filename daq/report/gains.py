@@ -39,8 +39,8 @@ def plot_gains(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
     """
     figure, place = single(title, 3.2)
     positions = np.arange(len(gains))
-    change = np.array([gain.change_percent for gain in gains])
-    width = np.array([SHOWN_SIGMAS * 100.0 * gain.std / abs(gain.nameplate) for gain in gains])
+    change = [gain.change_percent for gain in gains]
+    width = [SHOWN_SIGMAS * 100.0 * gain.std / abs(gain.nameplate) for gain in gains]
     place.axhline(0.0, color=GREY, linewidth=1.4, linestyle="--", label="nameplate")
     place.vlines(positions, 0.0, change, color=BLUE, linewidth=5, alpha=0.25)
     place.errorbar(

@@ -128,7 +128,7 @@ def plan_text(
     way = "`record` checks the way to its first target from where the robot stands."
     if cell.clearance is None:
         way = "The way to its first target is not checked: the cell file declares no `workspace` and no `clearance`."
-    width = max(len(name) for name in (*cell.axis_names, "axis"))
+    width = max(map(len, (*cell.axis_names, "axis")))
     lines = [
         f"{out}: {len(made.moves)} moves in {made.duration_s:.0f} s, condition {made.condition:.0f}",
         f"  {'axis':{width}}  predicted σ  verdict",

@@ -155,11 +155,12 @@ def _reach(ends_m: FloatArray, checker: Checker) -> tuple[FloatArray, FloatArray
     Returns:
         lower and upper end in the base frame, shape (3,) each, and largest distance from its z axis.
     """
-    moving = [index for index, capsule in enumerate(checker.scene.capsules) if capsule.link != BASE]
-    if not moving:
+    capsules = checker.scene.capsules
+    moving = np.array([capsule.link != BASE for capsule in capsules], dtype=np.bool_)
+    if not moving.any():
         return np.zeros(3), np.zeros(3), 0.0
     ends = ends_m[:, moving]
-    radius_m = np.array([checker.scene.capsules[index].radius_m for index in moving])[None, :, None]
+    radius_m = np.array([capsule.radius_m for capsule in capsules])[moving, None]
     lower = (ends - radius_m[..., None]).min(axis=(0, 1, 2))
     upper = (ends + radius_m[..., None]).max(axis=(0, 1, 2))
     return lower, upper, float((np.hypot(ends[..., 0], ends[..., 1]) + radius_m).max())

@@ -26,6 +26,7 @@ from ident.effects.effect import PlacedEffect
 from ident.effects.signals import fitted_signals, session_began_s
 from ident.equations.observation import Observation
 from ident.equations.rows import decimate_rows
+from ident.estimators.estimate import relative_error
 
 
 def draw_fit(fitted: Fit, calibration: Calibration, truth: dict[str, float] | None, out: Path) -> None:
@@ -77,7 +78,7 @@ def plot_torques(
     predicted_nm: FloatArray,
     axes: tuple[str, ...],
     *,
-    forces: tuple[str, ...] = (),
+    forces: tuple[str, ...],
 ) -> tuple[str, ...]:
     """Draw τ = V g with the identified gains (wide) and the model's τ (dashed), one panel an axis (paper Fig. 2).
 
@@ -88,21 +89,18 @@ def plot_torques(
         measured_nm: torque from current and identified gain, shape (k, n) [forces]; NaN where a row was left out.
         predicted_nm: torque from the model, same shape [forces].
         axes: names of the n axes.
-        forces: "Nm" or, along a prismatic joint, "N", for each axis; all are "Nm" when left out.
+        forces: "Nm" or, along a prismatic joint, "N", for each axis.
     """
     shown = time_s <= time_s[0] + SHOWN_S
     drawn = []
-    for index, (name, unit) in enumerate(zip(axes, forces or ("Nm",) * len(axes), strict=True)):
-        measured, predicted = measured_nm[:, index], predicted_nm[:, index]
-        both = np.isfinite(measured) & np.isfinite(predicted)
-        norm = float(np.linalg.norm(measured[both]))
-        # ‖ρ‖/‖Y‖ (paper, Table 6); unknown without samples.
-        error = 100.0 * float(np.linalg.norm((measured - predicted)[both])) / norm if norm else float("nan")
+    use = np.isfinite(measured_nm) & np.isfinite(predicted_nm)
+    errors = relative_error(measured_nm.T, predicted_nm.T, use.T)
+    for index, (name, unit) in enumerate(zip(axes, forces, strict=True)):
         lines = (
-            Line(time_s[shown], measured[shown], "wide", "current × gain"),
-            Line(time_s[shown], predicted[shown], "dashed", "model"),
+            Line(time_s[shown], measured_nm[shown, index], "wide", "current × gain"),
+            Line(time_s[shown], predicted_nm[shown, index], "dashed", "model"),
         )
-        label = f"{name}: {QUANTITY[unit]} [{unit}], error {error:.1f} %"
+        label = f"{name}: {QUANTITY[unit]} [{unit}], error {errors.axes[index]:.1f} %"
         drawn.append(chart(lines, f"Measured and predicted {QUANTITY[unit]} of {name}", ("time [s]", label)))
     return tuple(drawn)
 

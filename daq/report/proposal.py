@@ -153,9 +153,7 @@ def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING, place
     return table
 
 
-def proposal_report(
-    proposal: Proposal[E], written: Written | None, known: Spread = NOTHING
-) -> FileChange | DriveChange:
+def proposal_report(proposal: Proposal[E], written: Written | None, known: Spread) -> FileChange | DriveChange:
     """Return a proposal and its outcome; `written` is None where nothing was written."""
     edit = proposal.edit
     if isinstance(edit, DriveEdit):

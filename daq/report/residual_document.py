@@ -296,7 +296,7 @@ def _motor_noise(axis: str, floor: MotorNoiseFloor, left_a: float) -> MotorNoise
 def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> TurnEntry:
     axes = fitted.cell.place_names
     limits = zip(fitted.cell.axes, step.limits_nm, strict=True)
-    changes: dict[str, Any] = {"added": [], "removed": [], "before": None, "after": None, "gain_changes": None}
+    changes: dict[str, Any] = {"added": [], "removed": []}
     if turn is not None:
         changes = {
             "added": [
@@ -308,7 +308,8 @@ def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> TurnEntry:
             "after": _model_errors(turn.after),
             "gain_changes": _changed_gains(fitted, turn),
         }
-    return TurnEntry(
+    return TurnEntry.of(
+        None,
         **changes,
         accepted=None if step.accepted is None else _finding(step.accepted, axes),
         names_by_split=[_named(SplitNameEntry, name.placed, axes, splits=name.splits) for name in names_by_split(step)],

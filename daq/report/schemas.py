@@ -6,10 +6,10 @@ from typing import Any
 
 from daq.report.bus_views import ErrorCodeReport, MonitorReport, ScanReport
 from daq.report.certificate import CertificateReport
-from daq.report.demo_schemas import DemoReport
 from daq.report.fit import CasesReport, FitReport
 from daq.report.history import HistoryReport
 from daq.report.job_schemas import (
+    DemoReport,
     DryRunReport,
     FleetReport,
     JobReport,

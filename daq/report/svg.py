@@ -137,9 +137,9 @@ def chart(
         y = float(down(np.array(tick)))
         parts.append(_line(left, y, across, y, "zero" if tick == 0.0 else "grid"))
         parts.append(_text(left - 5, y + 4, f"{tick:g}", "soft end"))
-    for tick in _ticks(begin, end):
-        x = float(right(np.array(tick)))
-        parts += [_text(x, height + 17, f"{tick:g}", "soft mid")]
+    parts.extend(
+        _text(float(right(np.array(tick))), height + 17, f"{tick:g}", "soft mid") for tick in _ticks(begin, end)
+    )
     if half is not None:
         xs = np.concatenate([first.x, first.x[::-1]])
         ys = np.concatenate([first.y + half, (first.y - half)[::-1]])

@@ -112,7 +112,8 @@ class WholeTable(Table):
 
     def _only(self, chosen: list[int]) -> Table:
         part = Table(box=self.box, show_edge=False, pad_edge=False, collapse_padding=self.collapse_padding)
-        for column in (self.columns[index] for index in chosen):
+        columns = [self.columns[index] for index in chosen]
+        for column in columns:
             part.add_column(
                 column.header,
                 justify=column.justify,
@@ -120,8 +121,8 @@ class WholeTable(Table):
                 overflow=column.overflow,
                 ratio=column.ratio,
             )
-        cells = [[*self.columns[index].cells] for index in chosen]
-        for row, values in zip(self.rows, zip(*cells, strict=True), strict=True):
+        cells = zip(*(column.cells for column in columns), strict=True)
+        for row, values in zip(self.rows, cells, strict=True):
             part.add_row(*values, style=row.style)
         return part
 
