@@ -223,6 +223,13 @@ def fit_report(found: CaseFit, calibration: Calibration, comparison: EstimatorCo
     """Return a fit: the calibration, what other estimators find, and what the data cannot show."""
     fitted = found.fitted
     axes = fitted.cell.axis_names
+    compared = {}
+    if fitted.paper is not None:
+        compared["tls"] = ComparedFit.of(
+            fitted.paper,
+            gains=_gains(axes, fitted.paper.gains, fitted.paper.gains_std),
+            misjudged=[axes[joint] for joint in misjudged_joints(fitted.final.system)],
+        )
     sometimes: dict[str, object] = {}
     if fitted.torque_slopes:
         sometimes["torque_channel"] = own_torques(fitted.torque_slopes, calibration.gains)
@@ -231,7 +238,7 @@ def fit_report(found: CaseFit, calibration: Calibration, comparison: EstimatorCo
     return with_calibration(
         FitReport,
         calibration,
-        compared={} if fitted.paper is None else {"tls": _compared(fitted, fitted.paper)},
+        compared=compared,
         geometry=checked_geometry(fitted.description, axes),
         removed=_removed(found),
         verdicts=[
@@ -252,15 +259,6 @@ def with_calibration(kind: type[BodyT], calibration: Calibration, **others: obje
     """
     # Not strictly: `as_document` makes lists of the tuples that the type has.
     return kind.model_validate({**as_document(calibration), **others}, strict=False)
-
-
-def _compared(fitted: Fit, paper: Estimate) -> ComparedFit:
-    axes = fitted.cell.axis_names
-    return ComparedFit.of(
-        paper,
-        gains=_gains(axes, paper.gains, paper.gains_std),
-        misjudged=[axes[joint] for joint in misjudged_joints(fitted.final.system)],
-    )
 
 
 def _gains(axes: tuple[str, ...], gains: FloatArray, stds: FloatArray) -> list[ComparedGain]:

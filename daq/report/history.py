@@ -306,18 +306,17 @@ def history_report(
         chart=asdict(CHART),
         pattern=pattern_of(all_series),
         questions=questions(all_series),
-        axes=[_history_axis(series) for series in chosen],
+        axes=[
+            HistoryAxis.of(
+                series,
+                series.drift,
+                alarm=alarm_text(series),
+                since=series.onset,
+                points=history_points(series),
+            )
+            for series in chosen
+        ],
         **others,
-    )
-
-
-def _history_axis(series: Series) -> HistoryAxis:
-    return HistoryAxis.of(
-        series,
-        series.drift,
-        alarm=alarm_text(series),
-        since=series.onset,
-        points=history_points(series),
     )
 
 
@@ -392,10 +391,9 @@ def in_force(cell: Cell, history: History) -> str | None:
         return None
     numbers = dict(zip(cell.axis_names, zip(scalars, controller.factors, strict=True), strict=True))
     known = history.in_force(target)
-    writes = [event.digest for event in history.events]
     having = [entry.digest for entry in reversed(history.entries) if _has(entry, numbers)]
     # Where several have these numbers: the one that the history names, else the one that was written last.
-    order = (known, *reversed(writes), *having)
+    order = (known, *(event.digest for event in reversed(history.events)), *having)
     return next((digest for digest in order if digest in having), None)
 
 

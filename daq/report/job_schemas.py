@@ -1,4 +1,4 @@
-"""What `recalibrate`, `fleet`, `sign` and `demo` print under `--json`, and what a recalibration leaves in its folder."""
+"""What `recalibrate`, `fleet`, `sign` and `demo` print under `--json`, and what a recalibration leaves behind."""
 
 from __future__ import annotations
 

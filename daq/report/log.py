@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from daq.log.bag_writer import BagWritten
     from daq.log.export import Exported, TableFormat
     from daq.log.importing import Imported
-    from daq.log.metadata import RunInfo, RunStatistics, Timing
+    from daq.log.metadata import Timing
     from daq.log.salvage import Salvaged
     from daq.workflow.record import Recorded
 
@@ -236,6 +236,9 @@ def info_report(path: Path) -> InfoReport:
     head, statistics = reader.head, reader.statistics
     run, samples = head.run, reader.checks.samples
     valid, reason = log_verdict(cell, head, reader.checks, statistics, watch, lambda: LogReader(path))
+    clock_step_s = None  # how far the wall clock was set during the run; it may not have been read at the end
+    if statistics.wall_minus_monotonic_ns is not None:
+        clock_step_s = (statistics.wall_minus_monotonic_ns - run.wall_minus_monotonic_ns) * 1e-9
     return InfoReport.of(
         run,
         statistics,
@@ -257,16 +260,9 @@ def info_report(path: Path) -> InfoReport:
         events=[event for event in reader.events if event.kind not in _ROUTINE],
         started=datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC) if run.started_wall_ns else None,
         wall_minus_monotonic_s=run.wall_minus_monotonic_ns * 1e-9,
-        wall_clock_step_s=_wall_clock_step_s(run, statistics),
+        wall_clock_step_s=clock_step_s,
         attachments={name: len(data) for name, data in sorted(head.files.items())},
     )
-
-
-def _wall_clock_step_s(run: RunInfo, statistics: RunStatistics) -> float | None:
-    """How far the wall clock was set during the run; None where it was not read at the end."""
-    if statistics.wall_minus_monotonic_ns is None:
-        return None
-    return (statistics.wall_minus_monotonic_ns - run.wall_minus_monotonic_ns) * 1e-9
 
 
 def timing_text(timing: Timing) -> str:

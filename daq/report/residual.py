@@ -156,7 +156,13 @@ def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -
     The arguments are those of `summary`. The diagnoses come first, a sentence each.
     """
     kept = fitted.steps[-1].after.effects
-    first = (*diagnosis_texts(fitted.diagnoses), *_correction_sentence(kept))
+    first = list(diagnosis_texts(fitted.diagnoses))
+    if any(is_correction(placed) for placed in kept):
+        # Its gains are right, although the cell file is not yet.
+        first.append(
+            "The model corrects the description of the robot: gains and errors below are those of the corrected one. "
+            "Correct the cell file all the same, and fit again."
+        )
     found: list[str] = []
     for step, turn in zip(fitted.steps, account.turns, strict=True):
         if step.accepted is not None and turn is not None:
@@ -176,15 +182,6 @@ def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -
     sentences = (*first, *found, whole, *judged, *_to_be_refused(effects), gains_sentence(fitted, account), *ending)
     # Of gains that were held there is nothing to say.
     return tuple(sentence for sentence in sentences if sentence)
-
-
-def _correction_sentence(kept: Sequence[PlacedEffect]) -> Iterator[str]:
-    """Say that the model corrects the description: its gains are right, although the cell file is not yet."""
-    if any(is_correction(placed) for placed in kept):
-        yield (
-            "The model corrects the description of the robot: gains and errors below are those of the corrected one. "
-            "Correct the cell file all the same, and fit again."
-        )
 
 
 def verdict_sentences(fitted: Fit) -> Iterator[str]:

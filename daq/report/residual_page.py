@@ -58,17 +58,13 @@ def save_report(
     Raises:
         OutputFailed: the file system refuses.
     """
-    document = _residual_file(fitted, account, calibration)
+    body = residual_report(fitted, account, calibration)
+    # Not strictly: a document that is made takes every sequence for a list, and a calibration has tuples.
+    document = ResidualFile.model_validate({"format": FORMAT, "version": VERSION, **dict(body)}, strict=False)
     content = {PAGE: residual_page(fitted, account, calibration, comparison), DOCUMENT: json_text(document)}
     with writing(folder):
         for name, text in content.items():
             replace_file(folder / name, text.encode())
-
-
-def _residual_file(fitted: Fit, account: Account, calibration: Calibration) -> ResidualFile:
-    body = residual_report(fitted, account, calibration)
-    # Not strictly: a document that is made takes every sequence for a list, and a calibration has tuples.
-    return ResidualFile.model_validate({"format": FORMAT, "version": VERSION, **dict(body)}, strict=False)
 
 
 def beside_nameplate(fitted: Fit, calibration: Calibration) -> Comparison:

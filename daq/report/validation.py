@@ -192,24 +192,23 @@ def validate_report(calibration: Calibration, found: CrossValidation, drawn: dic
         calibration,
         axes=[gain.axis for gain in calibration.gains],
         fit_relative_error_percent=calibration.relative_error_percent,
-        logs=[_validated_log(validation, drawn.get(validation.log)) for validation in validations],
+        logs=[
+            ValidatedLog.of(
+                validation,
+                sha256=validation.digest,
+                seen_by_fit=validation.data_use is DataUse.FIT,
+                held_out=validation.data_use is DataUse.HOLDOUT,
+                relative_error_percent=validation.error,
+                picture=drawn.get(validation.log),
+            )
+            for validation in validations
+        ],
         together={"relative_error_percent": together(validations)} if validations else None,
         calibrations=list(found.calibrations),
         runs=[
             CheckedLog.of(run, relative_error_percent=run.errors, left_out=run.left_out or None) for run in found.runs
         ],
         payloads=[_checked_payload(run, with_bare_runs=found.with_bare_runs) for run in found.weighed],
-    )
-
-
-def _validated_log(validation: Validation, picture: Path | None) -> ValidatedLog:
-    return ValidatedLog.of(
-        validation,
-        sha256=validation.digest,
-        seen_by_fit=validation.data_use is DataUse.FIT,
-        held_out=validation.data_use is DataUse.HOLDOUT,
-        relative_error_percent=validation.error,
-        picture=picture,
     )
 
 
