@@ -25,7 +25,7 @@ from daq.config.drive import DriveModel
 from daq.config.import_description import ImportDescription
 from daq.documents.calibration_file import CalibrationDocument
 from daq.errors import DaqError, exit_code
-from daq.report.error_schema import ErrorReport
+from daq.report.document import ErrorReport
 from daq.report.schemas import REPORTS
 from daq.simulation.simulation_file import SimulationModel
 from daq.writeback.gates.table import GATES

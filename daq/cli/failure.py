@@ -24,7 +24,7 @@ from drivers import errors as driver
 from ident import errors as identification
 
 if TYPE_CHECKING:
-    from daq.report.error_schema import ErrorReport
+    from daq.report.document import ErrorReport
 
 WITH_EVIDENCE = (
     identification.ModelContradicted | identification.PayloadMissing | identification.CurrentUnsigned
@@ -189,7 +189,7 @@ class ErrorParts:
 
         It is made unchecked: an error is reported whatever is in it, and bytes of file names that are not UTF-8 stay.
         """
-        from daq.report.error_schema import ErrorReport
+        from daq.report.document import ErrorReport
 
         sometimes: dict[str, Any] = dict(self.notes)
         if self.powered:

@@ -309,7 +309,8 @@ def residual_verb(request: ResidualRequest) -> None:
     from daq.cli.terminal import print_view, status, write_output
     from daq.errors import OutputFailed
     from daq.report.fit import start_of
-    from daq.report.residual import residual_report, residual_view
+    from daq.report.residual import residual_view
+    from daq.report.residual_document import residual_report
     from daq.report.residual_page import save_report
     from daq.workflow.fit import calibration_of, check_holdout
     from ident.discovery.before_after import account

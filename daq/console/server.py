@@ -31,7 +31,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from daq.config.cell import Cell
 from daq.console.live import KEPT_POINTS, Live, Reader
 from daq.console.results import UNREADABLE, Results
-from daq.report.text import json_safe
+from daq.report.document import json_safe
 
 TICK_S = 0.04  #: Time between two messages to a page: 25 a second
 RESULTS_S = 2.0  #: Time between two looks at the files

@@ -11,27 +11,15 @@ from rich.text import Text
 
 from daq.config.cell import PacingMode
 from daq.config.cell_buses import bus_loads, bus_loads_percent, cell_address
-from daq.report.bus_schemas import (
-    ErrorCodeEntry,
-    ErrorCodeReport,
-    MonitoredAxis,
-    MonitoredBus,
-    MonitorReport,
-    Notice,
-    PredictedCurrent,
-    PredictionState,
-    RefusedObject,
-    ScannedNode,
-    ScanReport,
-)
-from daq.report.text import plain_table, printable, terminal_text
+from daq.report.document import Figure, Report
+from daq.report.text import known_text, plain_table, printable, terminal_text
 from daq.workflow.events import notice_of
 from drivers.canopen.emcy import CODES
 from drivers.profiles.cia402 import ENABLED, FAULTY, State, decode
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell, CellAxis
-    from daq.workflow.monitor import CellPrediction, WatchedCell
+    from daq.workflow.monitor import WatchedCell
     from drivers.canopen.emcy import ErrorCode
     from drivers.canopen.node_scan import FoundNode
     from drivers.messages import CellEvent
@@ -39,15 +27,176 @@ if TYPE_CHECKING:
     from drivers.stream.monitor import AxisReading
 
 
+class ErrorCodeEntry(Report):
+    """An error code of EMCY or 603Fh in words."""
+
+    code: int
+    hex: str
+    text: str
+    remedy: str
+
+
+class ErrorCodeReport(ErrorCodeEntry):
+    """`explain-emcy`."""
+
+    standard: bool
+    """whether CiA 301 or CiA 402 names it; else its class is described"""
+
+
+class PredictedCurrent(Report):
+    """Current of one axis by a calibration, half a second ago, filtered as in the fit [unit of the gain's current]."""
+
+    measured: Figure
+    """null at standstill, or where the scale of the current is unknown"""
+    predicted: Figure
+    """null at standstill"""
+    band: Figure
+    """null for a calibration that does not say what it left of the currents"""
+    residual_rms: Figure
+    """over the last 10 s in which the axis moved; null before any"""
+    outside_share: float
+    """share of that time in which the residual is outside the band"""
+    conspicuous: bool
+    """it is outside for more than half of at least 2 s of motion"""
+
+
+class RefusedObject(Report):
+    """Object that an axis does not give."""
+
+    object: str
+    """index and sub-index, as 6041h:00"""
+    abort_code: int | None
+    """of the SDO abort; null for an answer that is no value of this size"""
+
+
+class MonitoredAxis(Report):
+    """One axis."""
+
+    axis: str
+    node_id: int
+    position: Figure
+    unit: str
+    """of the position"""
+    position_counts: int | None
+    current_a: Figure
+    current_raw: int | None
+    state: str | None
+    """state of CiA 402"""
+    enabled: bool | None
+    """whether the motor has torque"""
+    in_fault: bool
+    statusword: int | None
+    nmt: str | None
+    """NMT state of CiA 301"""
+    rate_hz: float
+    """of complete answers"""
+    lost: int
+    """SYNCs or requests without an answer"""
+    silent: bool
+    """it should answer, and sent nothing at all, not even a heartbeat"""
+    delay_s: Figure
+    """longest time until an answer; null where nothing was asked or answered"""
+    refused: list[RefusedObject]
+    remark: str
+    """answers that are late or without a value; empty if there are none"""
+    fault: ErrorCodeEntry | None
+    """of an axis in fault, where its code is known"""
+    prediction: PredictedCurrent | None
+
+
+class MonitoredBus(Report):
+    """Load of one bus."""
+
+    bus: str
+    load_percent: float
+    """with every frame as long as bit stuffing can make it"""
+
+
+class PredictionState(Report):
+    """Premise of the predicted currents."""
+
+    payload: str | None
+    remark: str
+    """why there are none; empty if there are"""
+
+
+class Notice(Report):
+    """A recent event."""
+
+    axis: str | None
+    kind: str
+    code: int
+    text: str
+    remedy: str
+    alarm: bool
+
+
+class MonitorReport(Report):
+    """`monitor`."""
+
+    cell: str
+    source: str
+    """asked, or overheard while another master leads the bus"""
+    recorder: bool
+    """whether a recording or job of drivegain has the bus"""
+    seconds: float
+    sync_hz: float
+    frames_per_s: float
+    bus_load_percent: float
+    """of the most loaded bus"""
+    buses: list[MonitoredBus]
+    axes: list[MonitoredAxis]
+    prediction: PredictionState | None
+    """null without --calibration"""
+    events: list[str]
+    """texts of recent events"""
+    notices: list[Notice]
+    """the same events with what to do"""
+
+
+class ScannedNode(Report):
+    """A node that is in the cell file or on the bus."""
+
+    bus: str
+    node_id: int
+    axis: str | None
+    vendor_id: int | None
+    product_code: int | None
+    serial: int | None
+    device_name: str | None
+    nmt: str | None
+    """NMT state of CiA 301"""
+    state: str | None
+    """state of CiA 402"""
+    enabled: bool | None
+    """whether the motor has torque"""
+    in_fault: bool
+    verdict: str
+    remarks: list[str]
+    """what is wrong with it"""
+
+
+class ScanReport(Report):
+    """`scan`."""
+
+    bus: str
+    """address of all buses"""
+    nodes: list[ScannedNode]
+    reset: list[str]
+    """axes whose fault was reset"""
+    faults: dict[str, str]
+    """the fault of each of them"""
+    current: dict[str, str]
+    """recorded current of each axis"""
+    mistyped: list[str]
+    """nameplate gains that plan or record would refuse"""
+    warnings: list[str]
+    """what record would warn of, such as a gain that is near √2 times the drive's"""
+
+
 def error_code_report(found: ErrorCode) -> ErrorCodeReport:
     """Return an error code in words, and whether a standard names it."""
-    return ErrorCodeReport(
-        code=found.code,
-        hex=found.hex,
-        text=found.text,
-        remedy=found.remedy,
-        standard=found.code in CODES,
-    )
+    return ErrorCodeReport.of(found, standard=found.code in CODES)
 
 
 def scan_report(
@@ -66,14 +215,14 @@ def scan_report(
         mistyped: nameplates that `plan` and `record` would refuse.
         warnings: what `record` would warn of.
     """
-    return ScanReport(
+    return ScanReport.of(
         bus=str(cell_address(cell)),
-        nodes=list(nodes),
+        nodes=nodes,
         reset=list(faults),
-        faults=dict(faults),
+        faults=faults,
         current=current_signals(cell),
-        mistyped=list(mistyped),
-        warnings=list(warnings),
+        mistyped=mistyped,
+        warnings=warnings,
     )
 
 
@@ -118,25 +267,33 @@ def _scanned_node(
     axis = home if home is not None and home.bus == bus else None
     identity = None if node is None else node.identity
     misfit = "" if axis is None else misfits.get(axis.name, "")
+    remarks = [] if node is None else list(_remarks(node, None if axis is None else axis.identity))
+    if misfit:
+        remarks.append(misfit)
     in_fault = node is not None and node.state in FAULTY
     verdict = _verdict(home, axis, node, misfit)
     if in_fault:
         verdict = "in fault" if verdict == "ok" else f"{verdict}, in fault"
-    return ScannedNode(
+    return ScannedNode.of(
+        node,
+        identity,
         bus=bus,
         node_id=node_id,
         axis=None if home is None else home.name,
-        vendor_id=None if identity is None else identity.vendor_id,
-        product_code=None if identity is None else identity.product_code,
-        serial=None if identity is None else identity.serial,
-        device_name=None if node is None else node.device_name,
         nmt=None if node is None or node.nmt is None else nmt_name(node.nmt),
-        state=None if node is None or node.state is None else str(node.state),
-        enabled=None if node is None or node.state is None else node.state in ENABLED,
+        **_state(None if node is None else node.statusword),
         in_fault=in_fault,
         verdict=verdict,
-        remarks=[*_remarks(node, None if axis is None else axis.identity), *([misfit] if misfit else [])],
+        remarks=remarks,
     )
+
+
+def _state(statusword: int | None) -> dict[str, str | bool | None]:
+    """Return name and power of a state of CiA 402; null where it is not known."""
+    if statusword is None:
+        return {"state": None, "enabled": None}
+    state = decode(statusword)
+    return {"state": str(state), "enabled": state in ENABLED}
 
 
 def _verdict(home: CellAxis | None, axis: CellAxis | None, node: FoundNode | None, misfit: str) -> str:
@@ -147,23 +304,16 @@ def _verdict(home: CellAxis | None, axis: CellAxis | None, node: FoundNode | Non
         return "not configured" if home is None else f"belongs on {home.bus}"
     if node.shared:
         return "two devices"
-    verdict = _identity_verdict(axis.identity, node.identity)
-    return "profile does not fit" if misfit and verdict == "ok" else verdict
-
-
-def _identity_verdict(expected: Identity | None, found: Identity | None) -> str:
-    if expected is None:
-        return "ok"
-    if found is None:
+    expected = axis.identity
+    if expected is not None and node.identity is None:
         return "no identity"
-    differing = expected.differences(found)
-    return f"other {differing[0].partition(' 1018h')[0]}" if differing else "ok"
+    if expected is not None and node.identity is not None and (differing := expected.differences(node.identity)):
+        return f"other {differing[0].partition(' 1018h')[0]}"
+    return "profile does not fit" if misfit else "ok"
 
 
-def _remarks(node: FoundNode | None, expected: Identity | None) -> Iterator[str]:
+def _remarks(node: FoundNode, expected: Identity | None) -> Iterator[str]:
     """Describe what is wrong with a node."""
-    if node is None:
-        return
     if node.shared:
         yield f"found {node.shared}; two devices have this node id, give one of them another"
     if expected is not None and node.identity is not None:
@@ -176,26 +326,26 @@ _POWER = {True: "ENABLED", False: "off", None: "?"}
 
 def scan_table(nodes: Sequence[ScannedNode]) -> Table:
     """Table of the nodes; first what decides whether a recording can start, then the identity."""
-    several = len({node.bus for node in nodes}) > 1
-    headings = ("node", "axis", "power", "verdict", "state", "vendor", "product", "serial", "NMT", "name")
-    columns = (*(("bus",) if several else ()), *headings)
-    table = plain_table(columns, left=range(len(columns)), keys=2 + several)
+    headings = ("bus", "node", "axis", "power", "verdict", "state", "vendor", "product", "serial", "NMT", "name")
+    # A single bus needs no column.
+    first = 0 if len({node.bus for node in nodes}) > 1 else 1
+    table = plain_table(headings[first:], left=range(len(headings)), keys=3 - first)
     for node in nodes:
         cells = (
-            *((node.bus,) if several else ()),
+            node.bus,
             str(node.node_id),
             node.axis or "",
             _POWER[node.enabled],
             node.verdict,
             (node.state or "").lower(),
-            "" if node.vendor_id is None else f"{node.vendor_id:#x}",
-            "" if node.product_code is None else f"{node.product_code:#x}",
-            "" if node.serial is None else str(node.serial),
+            known_text(node.vendor_id, "#x", ""),
+            known_text(node.product_code, "#x", ""),
+            known_text(node.serial, "d", ""),
             (node.nmt or "").lower(),
             node.device_name or "",
         )
         style = "bold red" if node.enabled or node.verdict != "ok" else None
-        table.add_row(*map(terminal_text, cells), style=style)
+        table.add_row(*map(terminal_text, cells[first:]), style=style)
     return table
 
 
@@ -203,17 +353,14 @@ def monitor_report(cell: Cell, watched: WatchedCell) -> MonitorReport:
     """Return one reading of the bus."""
     reading = watched.reading
     loads = bus_loads_percent(cell, reading)
-    return MonitorReport(
+    return MonitorReport.of(
+        watched,
+        reading,
         cell=cell.name,
-        source=reading.source.value,
-        recorder=watched.recorder,
-        seconds=reading.seconds,
-        sync_hz=reading.sync_hz,
         frames_per_s=sum(map(sum, reading.frames)) / reading.seconds,
         bus_load_percent=max(loads),
         buses=[MonitoredBus(bus=bus.name, load_percent=load) for bus, load in zip(cell.buses, loads, strict=True)],
         axes=[_monitored_axis(axis, watched, number) for number, axis in enumerate(cell.axes)],
-        prediction=_prediction_state(watched.prediction),
         events=[event.text for event in watched.events],
         notices=[_notice(cell, event) for event in watched.events],
     )
@@ -223,78 +370,35 @@ def _monitored_axis(declared: CellAxis, watched: WatchedCell, number: int) -> Mo
     from drivers.canopen.link import nmt_name  # noqa: PLC0415 - as above
 
     assert declared.node_id is not None  # a cell without nodes has no bus to read
-    axis, position, ampere_per_unit = watched.reading.axes[number], watched.position[number], watched.ampere[number]
-    raw, word = axis.current_raw, axis.statusword
-    state = None if word is None else decode(word)
-    in_fault = state in FAULTY
+    axis = watched.reading.axes[number]
+    position = watched.position[number]
+    ampere_per_unit = watched.ampere[number]
+    raw = axis.current_raw
+    in_fault = axis.statusword is not None and decode(axis.statusword) in FAULTY
     # While another master prepares, it sends no SYNC, and no axis has to answer.
     addressed = watched.reading.source.value == "asked" or watched.reading.sync_hz > 0.0
-    return MonitoredAxis(
+    predicted = () if watched.prediction is None else watched.prediction.axes
+    return MonitoredAxis.of(
+        axis,
         axis=declared.name,
         node_id=declared.node_id,
         position=None if position is None else position / declared.unit.si,
         unit=declared.unit.name,
-        position_counts=axis.position_counts,
         current_a=None if raw is None or ampere_per_unit is None else raw * ampere_per_unit,
-        current_raw=raw,
-        state=None if state is None else str(state),
-        enabled=None if state is None else state in ENABLED,
+        **_state(axis.statusword),
         in_fault=in_fault,
-        statusword=word,
         nmt=None if axis.nmt is None else nmt_name(axis.nmt),
-        rate_hz=axis.rate_hz,
-        lost=axis.lost,
         silent=addressed and not axis.heard,
-        delay_s=axis.delay_s,
-        refused=[RefusedObject(object=str(one.entry), abort_code=one.abort_code) for one in axis.refused],
+        refused=[RefusedObject.of(one, object=str(one.entry)) for one in axis.refused],
         remark="; ".join(_answer_remarks(axis)),
-        fault=_error_code(watched.faults.get(declared.name)) if in_fault else None,
-        prediction=_predicted_current(watched.prediction, number),
+        fault=watched.faults.get(declared.name) if in_fault else None,
+        prediction=predicted[number] if predicted else None,
     )
-
-
-def _error_code(found: ErrorCode | None) -> ErrorCodeEntry | None:
-    if found is None:
-        return None
-    return ErrorCodeEntry(
-        code=found.code,
-        hex=found.hex,
-        text=found.text,
-        remedy=found.remedy,
-    )
-
-
-def _predicted_current(prediction: CellPrediction | None, number: int) -> PredictedCurrent | None:
-    if prediction is None or not prediction.axes:
-        return None
-    found = prediction.axes[number]
-    return PredictedCurrent(
-        measured=found.measured,
-        predicted=found.predicted,
-        band=found.band,
-        residual_rms=found.residual_rms,
-        outside_share=found.outside_share,
-        conspicuous=found.conspicuous,
-    )
-
-
-def _prediction_state(prediction: CellPrediction | None) -> PredictionState | None:
-    if prediction is None:
-        return None
-    return PredictionState(payload=prediction.payload, remark=prediction.remark)
 
 
 def _notice(cell: Cell, event: CellEvent) -> Notice:
     axis = None if event.axis is None else cell.axis_names[event.axis]
-    found = notice_of(event.kind, event.code, axis, event.text)
-    return Notice(
-        axis=found.axis,
-        kind=found.kind,
-        code=found.code,
-        text=found.text,
-        remedy=found.remedy,
-        alarm=found.alarm,
-    )
+    return Notice.of(notice_of(event.kind, event.code, axis, event.text))
 
 
 def _answer_remarks(axis: AxisReading) -> Iterator[str]:
@@ -322,19 +426,23 @@ def monitor_view(report: MonitorReport) -> Group:
     table = plain_table(("axis", "position", "current", "state", "rate Hz", "lost"), left=(0, 3))
     faults = []
     for axis in report.axes:
-        position = "?" if axis.position is None else f"{axis.position:.3f} {axis.unit}"
-        current = "?" if axis.current_raw is None else f"{axis.current_raw:+d} raw"
-        if axis.current_a is not None:
-            current = f"{axis.current_a:+.3f} A"
-        if axis.enabled is False:
-            current = "no power"  # the number is an old reference, or the offset of a sensor
-        note, style = (" (ENABLED)", "bold green") if axis.enabled else ("", None)
-        if axis.state in _ALARMING:
-            style = "bold red"
+        note = ""
+        style = None
+        if axis.enabled:
+            note = " (ENABLED)"
+            style = "bold green"
         if axis.silent:
-            note, style = " (SILENT)", "bold red"
-        state = (axis.state or "?").lower() + note
-        cells = (printable(axis.axis), position, current, state, f"{axis.rate_hz:.1f}", str(axis.lost))
+            note = " (SILENT)"
+        if axis.silent or axis.state in _ALARMING:
+            style = "bold red"
+        cells = (
+            printable(axis.axis),
+            "?" if axis.position is None else f"{axis.position:.3f} {axis.unit}",
+            _current_text(axis),
+            (axis.state or "?").lower() + note,
+            f"{axis.rate_hz:.1f}",
+            str(axis.lost),
+        )
         table.add_row(*map(Text, cells), style=style)
         if axis.remark:
             faults.append(Text(f"{printable(axis.axis)} {axis.remark}", "yellow"))
@@ -349,30 +457,37 @@ def monitor_view(report: MonitorReport) -> Group:
     return Group(head, table, load, *prediction_view(report), *faults, *map(_notice_text, report.notices))
 
 
+def _current_text(axis: MonitoredAxis) -> str:
+    if axis.enabled is False:
+        return "no power"  # the number is an old reference, or the offset of a sensor
+    if axis.current_a is not None:
+        return f"{axis.current_a:+.3f} A"
+    return "?" if axis.current_raw is None else f"{axis.current_raw:+d} raw"
+
+
 def prediction_view(report: MonitorReport) -> Iterator[RenderableType]:
     """Measured beside predicted current, or why there is none; nothing without a calibration."""
     if report.prediction is None:
         return
-    remark, payload = report.prediction.remark, report.prediction.payload
-    if remark:
-        yield Text(printable(remark))
+    if report.prediction.remark:
+        yield Text(printable(report.prediction.remark))
     table = plain_table(("axis", "measured", "predicted", "± band", "residual rms", "outside"))
     for axis in report.axes:
         found = axis.prediction
         if found is None:
             continue
-        measured = "-" if found.measured is None else f"{found.measured:+.3f}"
         cells = (
             printable(axis.axis),
-            "no power" if axis.enabled is False else measured,
-            "at rest" if found.predicted is None else f"{found.predicted:+.3f}",
-            "-" if found.band is None else f"{found.band:.3f}",
-            "-" if found.residual_rms is None else f"{found.residual_rms:.3f}",
+            "no power" if axis.enabled is False else known_text(found.measured, "+.3f"),
+            known_text(found.predicted, "+.3f", "at rest"),
+            known_text(found.band, ".3f"),
+            known_text(found.residual_rms, ".3f"),
             f"{100 * found.outside_share:.0f} %",
         )
         table.add_row(*map(Text, cells), style="bold yellow" if found.conspicuous else None)
     if not table.row_count:
         return
+    payload = report.prediction.payload
     carried = "without payload" if payload is None else f"with payload {printable(payload)}"
     yield Text(
         "Currents of half a second ago, in the unit of the gains' current, filtered as in the fit, "

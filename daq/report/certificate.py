@@ -7,32 +7,94 @@ controller was not read, the nameplate takes its place, and the limit of a chang
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from enum import Enum
+from typing import Literal
 
 from daq.config.cell import Cell
 from daq.config.policy import ApplyPolicy
 from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationRefused, DaqError
-from daq.report.controller_schemas import (
-    CertificateReport,
-    CertifiedEffect,
-    CertifiedGain,
-    EarlierCalibration,
-)
+from daq.report.document import Figure, Report
 from daq.report.effect_names import accepted_text, size_text
-from daq.report.fit import errors_of, errors_or_none
+from daq.report.fit import Errors
 from daq.report.gains import encoder_text, mass_texts
-from daq.report.proposal import refused_of
+from daq.report.proposal import Refused
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.gates.gate import Gate, GateContext, Refusal
 from daq.writeback.gates.table import check_gates
 from daq.writeback.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, judge, noise_note, query_history
 from daq.writeback.request import Edit, GainChange, Request
 from daq.writeback.target import Proposal, propose
-from ident.calibration import AcceptedEffect, Calibration
+from ident.calibration import Calibration, EncoderMisfit, PayloadMass
+from ident.data.run import Recording
+
+
+class CertifiedGain(Report):
+    """A gain beside the one in the controller, or beside the nameplate."""
+
+    axis: str
+    key: str | None
+    """in the controller's file; null where it was not read"""
+    line: int | None
+    old: Figure
+    new: Figure
+    std: float
+    std_percent: Figure
+    unit: str
+    nameplate: float
+    change_percent: Figure
+    written: str | None
+    allowed_percent: list[Figure]
+    """limits of the change; null: none"""
+    change_sigmas: Figure
+    """signed as change_percent"""
+    significant: bool
+    verdict: str
+
+
+class CertifiedEffect(Report):
+    """An effect in words."""
+
+    axis: str
+    effect: str
+    size: str
+    error_before_percent: Figure
+    error_after_percent: Figure
+    ambiguity: list[str]
+
+
+class EarlierCalibration(Report):
+    """An earlier calibration, and the gains beside it."""
+
+    created: str
+    axes: list[CertifiedGain]
+    holdout_error_percent: Errors | None
+
+
+class CertificateReport(Report):
+    """`report`: the numbers of the certificate."""
+
+    format: Literal["drivegain-certificate"]
+    version: Literal[1]
+    cell: str
+    identity: dict[str, str]
+    verdict: str
+    sentence: str
+    controller: str | None
+    controller_unread: str | None
+    axes: list[CertifiedGain]
+    refusals: list[Refused]
+    holdout_error_percent: Errors | None
+    nameplate_holdout_error_percent: Errors | None
+    relative_error_percent: Errors
+    payload_mass: list[PayloadMass]
+    encoder_misfit: EncoderMisfit | None
+    effects: list[CertifiedEffect]
+    beside: EarlierCalibration | None
+
 
 EARLIER = "earlier calibration"  #: What `since` compares with
 _OPERATORS = frozenset({Gate.SIGNATURE, Gate.BASE})
@@ -70,7 +132,8 @@ class Comparison:
         """Limits of the change of a gain [% of the one in the controller]; infinite where it has none."""
         if not change.old or not math.isfinite(change.old):
             return -math.inf, math.inf
-        nameplate, bound = change.nameplate / change.old, self.policy.max_nameplate_percent
+        nameplate = change.nameplate / change.old
+        bound = self.policy.max_nameplate_percent
         ends = [100.0 * (nameplate * (1.0 + sign * bound / 100.0) - 1.0) for sign in (-1.0, 1.0)]
         if self.edit is not None:
             most = self.policy.max_change_percent
@@ -89,7 +152,7 @@ def without_controller(calibration: Calibration, unread: str, now: datetime, cel
         now: wall-clock time, for the age of the logs.
         cell: from the logs, None where there is none; then the default limits hold.
     """
-    changes = tuple(GainChange.of(g, "", 0, g.nameplate, (g.value, "")) for g in calibration.gains)
+    changes = _changes_from({gain.axis: gain.nameplate for gain in calibration.gains}, calibration)
     edit = Edit(subject="", before=b"", after=b"", changes=changes)
     refusals = check_gates(GateContext(Request(calibration, now), edit, cell))
     return Comparison(
@@ -98,6 +161,11 @@ def without_controller(calibration: Calibration, unread: str, now: datetime, cel
         ApplyPolicy() if cell is None else cell.apply,
         unread=unread,
     )
+
+
+def _changes_from(old: Mapping[str, float], calibration: Calibration) -> tuple[GainChange, ...]:
+    """Return the changes of the gains from others, by axis, that are in no file."""
+    return tuple(GainChange.of(gain, "", 0, old[gain.axis], (gain.value, "")) for gain in calibration.gains)
 
 
 def compare(cell: Cell, request: Request, command: str = "") -> Comparison:
@@ -228,17 +296,14 @@ def certify(calibration: Calibration, comparison: Comparison, earlier: Calibrati
         CalibrationRefused: one of the two has not one error for each gain, or the earlier one is of another cell or of
             other axes.
     """
-    for one in (calibration, earlier):
-        if one is not None:
-            _require_whole(one)
+    _require_whole(calibration)
     since: tuple[AxisRow, ...] = ()
     if earlier is not None:
+        _require_whole(earlier)
         _require_same(calibration, earlier)
-        old = {gain.axis: gain for gain in earlier.gains}
-        changes = tuple(GainChange.of(g, "", 0, old[g.axis].value, (g.value, "")) for g in calibration.gains)
-        since = _rows(
-            replace(comparison, changes=changes, refusals=(), known=Spread({a: g.std for a, g in old.items()}))
-        )
+        changes = _changes_from({gain.axis: gain.value for gain in earlier.gains}, calibration)
+        known = Spread({gain.axis: gain.std for gain in earlier.gains})
+        since = _rows(replace(comparison, changes=changes, refusals=(), known=known))
     return Certificate(calibration, comparison, _rows(comparison), earlier, since)
 
 
@@ -274,68 +339,70 @@ def _require_whole(calibration: Calibration) -> None:
         calibration.nameplate_holdout_error_percent,
     )
     for error in known:
-        if not count or (error is not None and len(error.axes) != count):
+        if error is not None and not 0 < count == len(error.axes):
             raise CalibrationRefused(
                 f"calibration of cell {calibration.cell!r}",
-                found=f"{count} gains"
-                if error is None
-                else f"{count} gains and relative errors of {len(error.axes)} axes",
+                found=f"{count} gains and relative errors of {len(error.axes)} axes",
                 expected="at least one gain, and one error for each",
                 remedy="fit the logs again",
             )
 
 
-def identity(calibration: Calibration) -> tuple[tuple[str, str], ...]:
-    """Cell, drives, operator, payload, dates, encoders and software as pairs of name and text; what is missing is said.
+def identity(calibration: Calibration) -> dict[str, str]:
+    """Drives, operator, payload, dates, encoders and software as texts by their names; what is missing is said.
 
     Encoders are there where the robot has more of them than degrees of freedom.
     """
     recordings = [source.recording for source in calibration.sources if source.recording is not None]
     operators = sorted({one.operator for one in recordings if one.operator})
-    times = sorted(one.recorded_s for one in recordings if one.recorded_s is not None)
-    days = list(dict.fromkeys(datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M") for time_s in times))
-    same_day = bool(days) and days[0][:10] == days[-1][:10]
-    between = days[0] if len(days) == 1 else f"{days[0]} to {days[-1][11 if same_day else 0 :]}" if days else ""
     payloads = "; ".join(payload_texts(calibration))
-    # No residual shows a wrong mass: it must be on the sheet that a person signs.
-    influences = "; ".join(mass_texts(calibration.payload_mass))
-    # Calibrations of earlier versions do not say more.
-    influences = influences or "a wrong mass changes every gain, by the same share where nothing else of it is known"
-    weighed = f"{payloads}; {influences}" if payloads and not calibration.gains_fixed else payloads
-    misfit = calibration.encoder_misfit
-    encoders = () if misfit is None else (("Encoders", encoder_text(misfit)),)
-    return (
-        ("Serial numbers", _serials(calibration)),
-        ("Operator", ", ".join(operators) or "not known: the recordings name none"),
-        ("Payload", weighed or "none: every run was recorded without load"),
-        ("Recorded", f"{between} UTC" if between else "not known: the logs have no time of day"),
-        *encoders,
-        ("Fitted", f"{_minute(calibration.created)}, {calibration.software or 'software not known'}"),
-    )
+    if payloads and not calibration.gains_fixed:
+        # No residual shows a wrong mass: it must be on the sheet that a person signs.
+        influences = "; ".join(mass_texts(calibration.payload_mass))
+        # Calibrations of earlier versions do not say more.
+        known = influences or "a wrong mass changes every gain, by the same share where nothing else of it is known"
+        payloads = f"{payloads}; {known}"
+    names = {
+        "Serial numbers": _serials(calibration, recordings),
+        "Operator": ", ".join(operators) or "not known: the recordings name none",
+        "Payload": payloads or "none: every run was recorded without load",
+        "Recorded": _period([one.recorded_s for one in recordings if one.recorded_s is not None]),
+    }
+    if calibration.encoder_misfit is not None:
+        names["Encoders"] = encoder_text(calibration.encoder_misfit)
+    names["Fitted"] = f"{_minute(calibration.created)}, {calibration.software or 'software not known'}"
+    return names
 
 
-def payload_texts(calibration: Calibration) -> tuple[str, ...]:
+def payload_texts(calibration: Calibration) -> Iterator[str]:
     """The mass of each payload as it was entered twice: in the cell file, and from the scale at each recording."""
     mounted: dict[tuple[str, float | None], list[float]] = {}
     for source in calibration.sources:
         if source.payload is not None:
             entered = None if source.recording is None else source.recording.entered_kg
             masses = mounted.setdefault((source.payload, source.mass_kg), [])
-            masses += [entered] if entered is not None and entered not in masses else []
-    return tuple(
-        f"{name}: "
-        + ("no mass in the cell file" if declared is None else f"{declared:g} kg in the cell file")
-        + (
-            f", {' and '.join(f'{one:g}' for one in masses)} kg on the scale"
-            if masses
-            else ", not weighed a second time"
-        )
-        for (name, declared), masses in mounted.items()
-    )
+            if entered is not None and entered not in masses:
+                masses.append(entered)
+    for (name, declared), masses in mounted.items():
+        entry = "no mass in the cell file" if declared is None else f"{declared:g} kg in the cell file"
+        scale = "not weighed a second time"
+        if masses:
+            scale = f"{' and '.join(f'{one:g}' for one in masses)} kg on the scale"
+        yield f"{name}: {entry}, {scale}"
 
 
-def _serials(calibration: Calibration) -> str:
-    recordings = [source.recording for source in calibration.sources if source.recording is not None]
+def _period(times_s: Sequence[float]) -> str:
+    """Write the time between the first and the last recording to the minute, in UTC."""
+    if not times_s:
+        return "not known: the logs have no time of day"
+    first, last = (datetime.fromtimestamp(one, UTC).strftime("%Y-%m-%d %H:%M") for one in (min(times_s), max(times_s)))
+    if first == last:
+        return f"{first} UTC"
+    same_day = first[:10] == last[:10]
+    return f"{first} to {last[11:] if same_day else last} UTC"
+
+
+def _serials(calibration: Calibration, recordings: Sequence[Recording]) -> str:
     found = []
     for index, gain in enumerate(calibration.gains):
         serials = dict.fromkeys(one.serials[index] for one in recordings if index < len(one.serials))
@@ -356,63 +423,37 @@ def _minute(iso: str) -> str:
 def certificate_report(certificate: Certificate) -> CertificateReport:
     """Return the numbers of the page."""
     calibration, comparison = certificate.calibration, certificate.comparison
-    edit, earlier = comparison.edit, certificate.earlier
-    return CertificateReport(
+    edit = comparison.edit
+    beside = None
+    if certificate.earlier is not None:
+        since = [_certified_gain(row, EARLIER) for row in certificate.since]
+        beside = EarlierCalibration.of(certificate.earlier, axes=since)
+    return CertificateReport.of(
+        certificate,
+        comparison,
+        calibration,
         format="drivegain-certificate",
         version=1,
-        cell=calibration.cell,
-        identity=dict(identity(calibration)),
-        verdict=certificate.verdict.value,
-        sentence=certificate.sentence,
+        identity=identity(calibration),
         controller=None if edit is None else str(edit.file),
         controller_unread=comparison.unread or None,
         axes=[_certified_gain(row, certificate.place) for row in certificate.rows],
-        refusals=[refused_of(refusal) for refusal in comparison.refusals],
-        holdout_error_percent=errors_or_none(calibration.holdout_error_percent),
-        nameplate_holdout_error_percent=errors_or_none(calibration.nameplate_holdout_error_percent),
-        relative_error_percent=errors_of(calibration.relative_error_percent),
-        payload_mass=list(calibration.payload_mass),
-        encoder_misfit=calibration.encoder_misfit,
-        effects=[_certified_effect(effect, calibration) for effect in calibration.effects],
-        beside=None if earlier is None else _beside(earlier, certificate.since),
+        effects=[
+            CertifiedEffect.of(one, effect=accepted_text(one, calibration), size=size_text(one, calibration))
+            for one in calibration.effects
+        ],
+        beside=beside,
     )
 
 
 def _certified_gain(row: AxisRow, place: str) -> CertifiedGain:
     change = row.change
-    return CertifiedGain(
-        axis=change.axis,
+    return CertifiedGain.of(
+        change,
+        row,
         key=change.key or None,
         line=change.line or None,
-        old=change.old,
-        new=change.new,
-        std=change.std,
-        std_percent=change.std_percent,
-        unit=change.unit,
-        nameplate=change.nameplate,
-        change_percent=change.change_percent,
         written=change.spelling or None,
-        allowed_percent=list(row.allowed_percent),
         change_sigmas=row.judged.sigmas,
-        significant=row.significant,
         verdict=row.words(place),
-    )
-
-
-def _certified_effect(effect: AcceptedEffect, calibration: Calibration) -> CertifiedEffect:
-    return CertifiedEffect(
-        axis=effect.axis,
-        effect=accepted_text(effect, calibration),
-        size=size_text(effect, calibration),
-        error_before_percent=effect.error_before_percent,
-        error_after_percent=effect.error_after_percent,
-        ambiguity=list(effect.ambiguity),
-    )
-
-
-def _beside(earlier: Calibration, since: Sequence[AxisRow]) -> EarlierCalibration:
-    return EarlierCalibration(
-        created=earlier.created,
-        axes=[_certified_gain(row, EARLIER) for row in since],
-        holdout_error_percent=errors_or_none(earlier.holdout_error_percent),
     )

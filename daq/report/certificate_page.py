@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from daq.report.certificate import EARLIER, AxisRow, Certificate, Verdict, identity
 from daq.report.effect_names import WORDS, accepted_text, curve_of, size_text
-from daq.report.gains import MASS_HEADINGS, diagnosis_texts, mass_rows, partial_note, with_deviation
+from daq.report.gains import MASS_HEADINGS, mass_rows, value_rows, warning_texts, with_deviation
 from daq.report.html import element, figure, folded, html_list, html_page, pair, paragraph, section, table, terms
 from daq.report.picture import QUANTITY
 from daq.report.svg import Interval, Line, before_after_drawing, chart, intervals
@@ -33,8 +33,11 @@ _FILTERS = {
     "standstill_share": "share of standstill in the filter's window, at most",
 }
 _METHODS = {
-    **{"ls": "least squares", "wls": "weighted least squares", "tls": "total least squares"},
-    **{"ml": "maximum likelihood", "iv": "instrumental variables"},
+    "ls": "least squares",
+    "wls": "weighted least squares",
+    "tls": "total least squares",
+    "ml": "maximum likelihood",
+    "iv": "instrumental variables",
 }
 _ROLES = {"holdout": "held out"}
 
@@ -57,7 +60,7 @@ def certificate_page(certificate: Certificate, consequence: str = "", details: S
             paragraph(f"{_SIGN[certificate.verdict]} {certificate.sentence}", f"verdict {look}"),
             *_next(certificate, look),
             *_warnings(certificate),
-            terms(identity(calibration)),
+            terms(identity(calibration).items()),
             _gains(certificate),
             _effects(calibration, consequence),
             _write(certificate),
@@ -83,8 +86,7 @@ def _next(certificate: Certificate, look: str) -> Iterator[str]:
 
 def _warnings(certificate: Certificate) -> Iterator[str]:
     """Checks to make and actions to take; checks that failed alike are one entry."""
-    note = partial_note(certificate.calibration)
-    texts = (*(() if note is None else (note,)), *diagnosis_texts(certificate.calibration.diagnoses))
+    texts = warning_texts(certificate.calibration)
     failed: dict[str, list[str]] = {}
     for one in certificate.comparison.refusals:
         failed.setdefault(f"found {one.found}; expected {one.expected}; {one.remedy}", []).append(one.subject)
@@ -113,19 +115,16 @@ def _gains(certificate: Certificate) -> str:
     )
 
 
-def _interval(row: AxisRow, earlier: float = math.nan) -> Interval:
-    change, half = row.change, math.nan
-    if change.old and math.isfinite(change.std):
+def _interval(row: AxisRow) -> Interval:
+    change = row.change
+    value = change.change_percent
+    half = math.nan
+    if change.old:
         half = 100.0 * SHOWN_SIGMAS * change.std / abs(change.old)
-    known = math.isfinite(change.change_percent) and math.isfinite(half)
-    return Interval(
-        change.axis,
-        change.change_percent if known else math.nan,
-        half if known else 0.0,
-        *row.allowed_percent,
-        f"{_percent(change.change_percent)} %",
-        earlier,
-    )
+    if not math.isfinite(value) or not math.isfinite(half):
+        value = math.nan
+        half = 0.0
+    return Interval(change.axis, value, half, *row.allowed_percent, f"{_percent(change.change_percent)} %")
 
 
 def _changes(certificate: Certificate) -> str:
@@ -138,26 +137,30 @@ def _changes(certificate: Certificate) -> str:
 
 def _errors(calibration: Calibration) -> Iterator[str]:
     """Error of each axis and of all, before and after; NaN where it is not known."""
-    held, nameplate = calibration.holdout_error_percent, calibration.nameplate_holdout_error_percent
+    held = calibration.holdout_error_percent
     if held is None:
-        drawn = _beside(calibration, None, calibration.relative_error_percent, "error [%]")
         caption = "No run was held out: the error on data that the fit has not used is not known."
-        yield figure(drawn, f"Share of the torque that the model leaves. {caption}", "Error on the data of the fit")
+        yield figure(
+            _beside(calibration, None, calibration.relative_error_percent),
+            f"Share of the torque that the model leaves. {caption}",
+            "Error on the data of the fit",
+        )
         return
+    nameplate = calibration.nameplate_holdout_error_percent
     hollow = "" if nameplate is None else " Hollow: the same model with the nameplate gains."
     yield figure(
-        _beside(calibration, nameplate, held, "error [%]"),
+        _beside(calibration, nameplate, held),
         f"Share of the torque that the model leaves. Full: with the identified gains.{hollow}",
         "Error on held-out runs",
     )
 
 
-def _beside(calibration: Calibration, before: RelativeError | None, after: RelativeError, unit: str) -> str:
+def _beside(calibration: Calibration, before: RelativeError | None, after: RelativeError) -> str:
+    """Draw the error of each axis and of all; `before` is hollow."""
     names = (*(gain.axis for gain in calibration.gains), "all")
     first = (math.nan,) * len(names) if before is None else (*before.axes, before.total)
-    return before_after_drawing(
-        list(zip(names, first, (*after.axes, after.total), strict=True)), "Error of each axis", unit
-    )
+    rows = list(zip(names, first, (*after.axes, after.total), strict=True))
+    return before_after_drawing(rows, "Error of each axis", "error [%]")
 
 
 def _percent(percent: float) -> str:
@@ -178,37 +181,34 @@ def _limit(allowed: tuple[float, float]) -> str:
 def _effects(calibration: Calibration, consequence: str) -> str:
     if not calibration.effects:
         return section("Effects", paragraph("The calibration holds no effect beyond the declared model."))
-    return section(
-        "Effects",
-        *(_effect(effect, calibration) for effect in calibration.effects),
-        *(paragraph(consequence) for _ in range(bool(consequence))),
-    )
+    body = [_effect(effect, calibration) for effect in calibration.effects]
+    if consequence:
+        body.append(paragraph(consequence))
+    return section("Effects", *body)
 
 
 def _effect(effect: AcceptedEffect, calibration: Calibration) -> str:
-    words, size = accepted_text(effect, calibration), size_text(effect, calibration)
-    before, after = percent_text(effect.error_before_percent), percent_text(effect.error_after_percent)
+    before = percent_text(effect.error_before_percent)
+    after = percent_text(effect.error_after_percent)
     kept_out = any(source.role == "holdout" for source in calibration.sources)
     data = "On data that the fit has not used" if kept_out else "On moves left out in turn, which its choice has seen"
     text = paragraph(
-        f"{effect.axis} has {words}: {size}. {data}, the model without it leaves {before} % of the torque of "
-        f"{effect.axis}, with it {after} %."
+        f"{effect.axis} has {accepted_text(effect, calibration)}: {size_text(effect, calibration)}. {data}, the model "
+        f"without it leaves {before} % of the torque of {effect.axis}, with it {after} %."
     )
     shown = curve_of(effect, calibration)
     if shown is None:
         return text
     band = "The uncertainty is not known." if shown.half_nm is None else "Band: ± 2 σ."
     against = ", against the motion" if shown.turns else ""
-    line = Line(shown.x, shown.torque_nm)
     torque = f"{QUANTITY[shown.force]} [{shown.force}]{against}"
     title = f"{effect.axis}: {QUANTITY[shown.force]} that the declared model lacks"
-    drawn = chart((line,), title, (shown.variable, torque), half=shown.half_nm)
+    drawn = chart((Line(shown.x, shown.torque_nm),), title, (shown.variable, torque), half=shown.half_nm)
     return text + figure(drawn, band, title)
 
 
 def _write(certificate: Certificate) -> str:
-    comparison = certificate.comparison
-    edit = comparison.edit
+    edit = certificate.comparison.edit
     if edit is None:
         return ""
     if not edit.has_effect:
@@ -238,19 +238,13 @@ def _since(certificate: Certificate) -> Iterator[str]:
         )
         for gain, row in zip(calibration.gains, certificate.since, strict=True)
     ]
-    lists = {
-        name: {(e.axis, accepted_text(e, one)) for e in one.effects}
-        for name, one in (("a", earlier), ("b", calibration))
-    }
-    effects = [
-        *(f"New: {axis} has {words}." for axis, words in sorted(lists["b"] - lists["a"])),
-        *(f"No longer: {axis} has {words}." for axis, words in sorted(lists["a"] - lists["b"])),
-    ]
-    facts = [
-        f"{name}: {then}; now {now}."
-        for (name, then), (_, now) in zip(identity(earlier), identity(calibration), strict=True)
-        if then != now
-    ]
+    before, after = _effects_in_words(earlier), _effects_in_words(calibration)
+    facts = [f"New: {axis} has {words}." for axis, words in sorted(after - before)]
+    facts += [f"No longer: {axis} has {words}." for axis, words in sorted(before - after)]
+    now = identity(calibration)
+    for name, then in identity(earlier).items():
+        if now.get(name, then) != then:
+            facts.append(f"{name}: {then}; now {now[name]}.")
     change = figure(
         # The limits are those of a change from the controller, not of one from here.
         intervals(
@@ -261,17 +255,23 @@ def _since(certificate: Certificate) -> Iterator[str]:
         "0 is the earlier calibration. Bar: ± 2 σ of this one.",
         "Change from the earlier calibration",
     )
-    before, after = earlier.holdout_error_percent, calibration.holdout_error_percent
     errors = ""
-    if before is not None and after is not None and len(before.axes) == len(after.axes):
+    held = calibration.holdout_error_percent
+    # `certify` has refused calibrations of other axes, and errors of another number of them.
+    if earlier.holdout_error_percent is not None and held is not None:
         caption = "Hollow: earlier. Full: this one. The runs differ, so that only large differences count."
-        errors = figure(_beside(calibration, before, after, "error [%]"), caption, "Error on held-out runs")
+        drawn = _beside(calibration, earlier.holdout_error_percent, held)
+        errors = figure(drawn, caption, "Error on held-out runs")
     yield section(
         "Beside the earlier calibration",
         table("", ("axis", "earlier ± σ", "this one ± σ", "change [%]", "in σ of both", "verdict"), rows, "words"),
         pair((change, errors)),
-        html_list((*effects, *facts)),
+        html_list(facts),
     )
+
+
+def _effects_in_words(calibration: Calibration) -> set[tuple[str, str]]:
+    return {(effect.axis, accepted_text(effect, calibration)) for effect in calibration.effects}
 
 
 def _rival_text(rival: str) -> str:
@@ -302,6 +302,7 @@ def _evidence(calibration: Calibration) -> Iterator[str]:
             table("", MASS_HEADINGS, mass_rows(calibration), "names"),
         )
     of_effects = {one.name for effect in calibration.effects for one in effect.coefficients}
+    parameters = [one for one in calibration.parameters if one.name not in of_effects]
     yield folded(
         "Dynamic parameters",
         paragraph(
@@ -310,23 +311,12 @@ def _evidence(calibration: Calibration) -> Iterator[str]:
             "of a name (Iam, fvm, fsm): coupled motors. A sum is what motion shows of several links together; a name "
             "after a colon is a payload."
         ),
-        table(
-            "",
-            ("parameter", "value ± σ", "unit"),
-            [
-                (one.name, with_deviation(one.value, one.std), one.unit)
-                for one in calibration.parameters
-                if one.name not in of_effects
-            ],
-        ),
+        table("", ("parameter", "value ± σ", "unit"), value_rows(parameters)),
     )
-    filters = [
-        (
-            _FILTERS.get(name, name.replace("_", " ")),
-            ", ".join(f"{v:g}" for v in value) if isinstance(value, list) else f"{value:g}",
-        )
-        for name, value in calibration.filter.items()
-    ]
+    filters = []
+    for name, value in calibration.filter.items():
+        values = value if isinstance(value, list) else [value]
+        filters.append((_FILTERS.get(name, name.replace("_", " ")), ", ".join(f"{one:g}" for one in values)))
     logs = [(one.name, _ROLES.get(one.role, one.role), one.sha256) for one in calibration.sources]
     fit = calibration.relative_error_percent
     yield folded(

@@ -3,39 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
+from pydantic import Field
 from rich.console import RenderableType
 from rich.table import Table
 
 from daq.documents.calibration_file import CalibrationBody, as_document
 from daq.report import paper_tables
+from daq.report.document import Figure, Report
 from daq.report.effect_names import size_text
-from daq.report.fit_schemas import (
-    CaseReport,
-    CasesReport,
-    CheckedGeometry,
-    ComparedFit,
-    ComparedGain,
-    Errors,
-    FitReport,
-    FoundGravity,
-    GainWords,
-    RemovedParameter,
-    Trial,
-)
 from daq.report.gains import (
-    diagnosis_texts,
+    OwnTorque,
     gain_table,
     mass_texts,
     own_torques,
-    partial_note,
     torque_sentences,
     torque_table,
+    warning_texts,
 )
 from daq.report.text import Sentence, percent_text, plain_table
-from daq.workflow.cases import CASES, Case, CaseFit
+from daq.workflow.cases import CASES, CaseFit
 from daq.workflow.description import hidden_zeros_text
 from daq.workflow.fit import DOUBTFUL_PERCENT, Fit
 from daq.workflow.nameplates import actual_current_note
@@ -43,13 +32,113 @@ from daq.workflow.verdicts import needed_verdicts
 from ident.arrays import FloatArray
 from ident.calibration import Calibration, Parameter, PayloadMass
 from ident.discovery.evidence import Evidence, without_effects
-from ident.discovery.geometry_check import GeometryCheck, Gravity
+from ident.discovery.geometry_check import GeometryCheck
 from ident.effects.effect import PlacedEffect
-from ident.estimators.comparison import EstimatorComparison, EstimatorTrial
+from ident.estimators.comparison import EstimatorComparison, EstimatorTrial, Removal
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import misjudged_joints
 from ident.estimators.method import Method
 from ident.planning.gain_verdict import GOOD_PERCENT, GainVerdict
+
+
+class Errors(Report):
+    """Relative errors [%]; null for an axis that did not move, and in total where none did."""
+
+    axes: list[Figure]
+    total: Figure
+
+
+class ComparedGain(Report):
+    """A gain by another estimator."""
+
+    axis: str
+    value: float
+    std_percent: Figure
+
+
+class ComparedFit(Report):
+    """The paper's total least squares on the same rows."""
+
+    gains: list[ComparedGain]
+    condition: Figure
+    #: Axes for which σ_W^j (eq. 22) is not the noise of a current, so that these gains are bent.
+    misjudged: list[str]
+
+
+class RemovedParameter(Report):
+    """Parameter that is not essential."""
+
+    name: str
+    std_percent: Figure
+
+
+class GainWords(Report):
+    """Verdict on how well the data of a fit show a gain."""
+
+    axis: str
+    std_percent: Figure
+    verdict: str
+    seen_by: list[str]
+    words: str
+
+
+class Trial(Report):
+    """One estimator under one filter."""
+
+    estimator: str
+    position_cutoff_hz: float
+    decimation_cutoff_hz: float
+    gains: list[ComparedGain] | None
+    relative_error_percent: Figure = None
+    reason: str = ""
+
+
+class FoundGravity(Report):
+    """Direction of gravity by the torques, beside the declared one."""
+
+    declared_m_s2: list[Figure]
+    found_m_s2: list[Figure]
+    turn_deg: Figure
+    turn_std_deg: Figure
+
+
+class CheckedGeometry(Report):
+    """What the torques say of the description of the robot."""
+
+    gravity: FoundGravity | None
+    hidden_zeros: list[str]
+
+
+class FitReport(CalibrationBody, Report):
+    """`fit`."""
+
+    compared: dict[Literal["tls"], ComparedFit]
+    geometry: CheckedGeometry | None
+    torque_channel: list[OwnTorque] = Field(default=[])
+    removed: list[RemovedParameter]
+    verdicts: list[GainWords]
+    comparison: list[Trial] = Field(default=[])
+
+
+class CaseTitle(Report):
+    """Name of a case, and what it takes as known of the payload."""
+
+    title: str
+    known: str
+
+
+# The keys of the last base come first.
+class CaseReport(CalibrationBody, CaseTitle):
+    """One case of the paper."""
+
+    removed: list[RemovedParameter]
+
+
+class CasesReport(Report):
+    """`fit --cases`."""
+
+    cases: dict[str, CaseReport]
+
 
 TLS_APART_SIGMAS = 3.0
 TLS_APART_PERCENT = 2.0
@@ -66,9 +155,7 @@ def fit_view(
     fitted = found.fitted
     axes, estimate = fitted.cell.axis_names, fitted.estimate
     yield gain_table(calibration.gains, title=f"Drive gains of {calibration.cell} by {calibration.method}")
-    if (note := partial_note(calibration)) is not None:
-        yield Sentence(note, "bold")
-    yield from (Sentence(text, "bold") for text in diagnosis_texts(calibration.diagnoses))
+    yield from (Sentence(text, "bold") for text in warning_texts(calibration))
     for effect in calibration.effects:
         yield Sentence(f"{effect.axis}: {effect.name}, declared in the cell file: {size_text(effect, calibration)}")
     if (note := actual_current_note(fitted.cell)) is not None:
@@ -89,9 +176,12 @@ def fit_view(
         f"{estimate.condition:.0f}; position filter {filter_.position_cutoff_hz:g} Hz, decimation "
         f"{filter_.decimation_cutoff_hz:g} Hz. Compare relative errors only under the same filters."
     )
-    yield from map(Sentence, geometry_notes(fitted.description, axes))
-    yield from map(Sentence, identifiability_notes(fitted, calibration.payload_mass))
-    yield from map(Sentence, advice(fitted, needed_verdicts(fitted)))
+    notes = (
+        *geometry_notes(fitted.description, axes),
+        *identifiability_notes(fitted, calibration.payload_mass),
+        *advice(fitted, needed_verdicts(fitted)),
+    )
+    yield from map(Sentence, notes)
     if comparison is not None:
         for table in comparison_tables(comparison, axes):
             yield ""
@@ -133,6 +223,13 @@ def fit_report(found: CaseFit, calibration: Calibration, comparison: EstimatorCo
     """Return a fit: the calibration, what other estimators find, and what the data cannot show."""
     fitted = found.fitted
     axes = fitted.cell.axis_names
+    compared = {}
+    if fitted.paper is not None:
+        compared["tls"] = ComparedFit.of(
+            fitted.paper,
+            gains=_gains(axes, fitted.paper.gains, fitted.paper.gains_std),
+            misjudged=[axes[joint] for joint in misjudged_joints(fitted.final.system)],
+        )
     sometimes: dict[str, object] = {}
     if fitted.torque_slopes:
         sometimes["torque_channel"] = own_torques(fitted.torque_slopes, calibration.gains)
@@ -141,10 +238,13 @@ def fit_report(found: CaseFit, calibration: Calibration, comparison: EstimatorCo
     return with_calibration(
         FitReport,
         calibration,
-        compared={} if fitted.paper is None else {"tls": _compared(fitted, fitted.paper)},
+        compared=compared,
         geometry=checked_geometry(fitted.description, axes),
         removed=_removed(found),
-        verdicts=[_gain_words(axes[gain.axis], gain) for gain in needed_verdicts(fitted)],
+        verdicts=[
+            GainWords.of(gain, axis=axes[gain.axis], seen_by=gain.sources, words=gain.words(axes[gain.axis]))
+            for gain in needed_verdicts(fitted)
+        ],
         **sometimes,
     )
 
@@ -161,52 +261,30 @@ def with_calibration(kind: type[BodyT], calibration: Calibration, **others: obje
     return kind.model_validate({**as_document(calibration), **others}, strict=False)
 
 
-def _compared(fitted: Fit, paper: Estimate) -> ComparedFit:
-    axes = fitted.cell.axis_names
-    return ComparedFit(
-        gains=_gains(axes, paper.gains, paper.gains_std),
-        condition=paper.condition,
-        misjudged=[axes[joint] for joint in misjudged_joints(fitted.final.system)],
-    )
-
-
-def _gain_words(axis: str, gain: GainVerdict) -> GainWords:
-    return GainWords(
-        axis=axis,
-        std_percent=gain.std_percent,
-        verdict=gain.verdict.value,
-        seen_by=[source.value for source in gain.sources],
-        words=gain.words(axis),
-    )
-
-
 def _gains(axes: tuple[str, ...], gains: FloatArray, stds: FloatArray) -> list[ComparedGain]:
     return [
-        ComparedGain(axis=axis, value=float(value), std_percent=100.0 * float(std / abs(value)))
+        ComparedGain.of(axis=axis, value=value, std_percent=100.0 * (std / abs(value)))
         for axis, value, std in zip(axes, gains, stds, strict=True)
     ]
 
 
 def cases_report(fits: Mapping[str, CaseFit], calibrations: Mapping[str, Calibration]) -> CasesReport:
     """Return the paper's cases and ours; both arguments are by the name of the case."""
-    cases = {case.name: _case_report(case, fits[case.name], calibrations[case.name]) for case in CASES}
+    cases = {
+        case.name: with_calibration(
+            CaseReport,
+            calibrations[case.name],
+            title=case.title,
+            known=case.known.value,
+            removed=_removed(fits[case.name]),
+        )
+        for case in CASES
+    }
     return CasesReport(cases=cases)
 
 
-def _case_report(case: Case, found: CaseFit, calibration: Calibration) -> CaseReport:
-    return with_calibration(
-        CaseReport,
-        calibration,
-        title=case.title,
-        known=case.known.value,
-        removed=_removed(found),
-    )
-
-
-def _removed(found: CaseFit) -> list[RemovedParameter]:
-    if found.essential is None:
-        return []
-    return [RemovedParameter(name=step.name, std_percent=step.std_percent) for step in found.essential.removed]
+def _removed(found: CaseFit) -> Sequence[Removal]:
+    return () if found.essential is None else found.essential.removed
 
 
 def cases_view(fits: Mapping[str, CaseFit], tables: tuple[paper_tables.PaperTable, ...]) -> Iterator[RenderableType]:
@@ -227,16 +305,6 @@ def error_table(title: str, axes: tuple[str, ...], errors: Mapping[str, Relative
         if error is not None:
             table.add_row(name, *map(percent_text, (*error.axes, error.total)))
     return table
-
-
-def errors_of(error: RelativeError) -> Errors:
-    """Return relative errors for a document."""
-    return Errors(axes=list(error.axes), total=error.total)
-
-
-def errors_or_none(error: RelativeError | None) -> Errors | None:
-    """Return relative errors for a document; None where there are none."""
-    return None if error is None else errors_of(error)
 
 
 def start_of(fitted: Fit) -> Evidence:
@@ -262,7 +330,7 @@ def coefficients(evidence: Evidence, placed: PlacedEffect) -> tuple[Parameter, .
     )
 
 
-def identifiability_notes(fitted: Fit, influences: Sequence[PayloadMass]) -> tuple[str, ...]:
+def identifiability_notes(fitted: Fit, influences: Sequence[PayloadMass]) -> Iterator[str]:
     """Describe errors that leave no residual in these data.
 
     Args:
@@ -270,83 +338,68 @@ def identifiability_notes(fitted: Fit, influences: Sequence[PayloadMass]) -> tup
         influences: of each payload's mass on its gains, as in its calibration.
     """
     if fitted.estimate.gains_fixed:
-        return ()
-    texts = mass_texts(influences)
-    masses = f" ({'; '.join(texts)})" if texts else ""
+        return
     drawn = [payload.name for payload in fitted.identification.system.payloads if len(payload.known) > 1]
-    return (
-        *(
-            (
-                f"More than the mass of {', '.join(drawn)} is taken as exact. A drawing that is wrong by some per cent "
-                "shifts the gains by as much, which σ does not show: compare with --known mass, better in the paper.",
-            )
-            if drawn
-            else ()
-        ),
-        f"Not identifiable from these data: {_mass_mistake(drawn)}{masses}; so does a wrong value of gravity. A gear "
-        "efficiency that is the same in both directions is part of its gain.",
+    mistake = "a wrong payload mass scales all gains alike and leaves no residual"
+    if drawn:
+        mistake = "a wrong payload mass bends all gains, and leaves little of it in the residual"
+        yield (
+            f"More than the mass of {', '.join(drawn)} is taken as exact. A drawing that is wrong by some per cent "
+            "shifts the gains by as much, which σ does not show: compare with --known mass, better in the paper."
+        )
+    texts = "; ".join(mass_texts(influences))
+    masses = f" ({texts})" if texts else ""
+    yield (
+        f"Not identifiable from these data: {mistake}{masses}; so does a wrong value of gravity. A gear "
+        "efficiency that is the same in both directions is part of its gain."
     )
 
 
-def geometry_notes(check: GeometryCheck | None, axes: Sequence[str]) -> tuple[str, ...]:
-    """Sentences on the direction of gravity and on the zeros that the data do not show; none where nothing was tested.
+def geometry_notes(check: GeometryCheck | None, axes: Sequence[str]) -> Iterator[str]:
+    """Say the direction of gravity, and the zeros that the data do not show; nothing where nothing was tested.
 
     Args:
         check: beside the fit.
         axes: their names.
     """
     if check is None:
-        return ()
-    texts: list[str] = []
+        return
     if check.gravity is not None:
         turn = np.degrees(check.gravity.turn_rad)
         std = np.degrees(check.gravity.turn_std_rad)
-        texts.append(f"Gravity, by the torques: {turn:.2f} ± {std:.2f}° from the direction in the cell file.")
+        yield f"Gravity, by the torques: {turn:.2f} ± {std:.2f}° from the direction in the cell file."
     hidden = hidden_zeros_text(check, axes)
     if hidden:
-        texts.append(hidden)
-    return tuple(texts)
+        yield hidden
 
 
 def checked_geometry(check: GeometryCheck | None, axes: Sequence[str]) -> CheckedGeometry | None:
     """Return what the torques say of the description of the robot; None where nothing was tested."""
     if check is None:
         return None
-    return CheckedGeometry(
-        gravity=None if check.gravity is None else _found_gravity(check.gravity),
-        hidden_zeros=[axes[axis] for axis in check.hidden_zeros],
-    )
+    gravity = None
+    if check.gravity is not None:
+        turn_deg = np.degrees(check.gravity.turn_rad)
+        turn_std_deg = np.degrees(check.gravity.turn_std_rad)
+        gravity = FoundGravity.of(check.gravity, turn_deg=turn_deg, turn_std_deg=turn_std_deg)
+    return CheckedGeometry(gravity=gravity, hidden_zeros=[axes[axis] for axis in check.hidden_zeros])
 
 
-def _found_gravity(gravity: Gravity) -> FoundGravity:
-    return FoundGravity(
-        declared_m_s2=gravity.declared_m_s2.tolist(),
-        found_m_s2=gravity.found_m_s2.tolist(),
-        turn_deg=float(np.degrees(gravity.turn_rad)),
-        turn_std_deg=float(np.degrees(gravity.turn_std_rad)),
-    )
-
-
-def _mass_mistake(drawn: Sequence[str]) -> str:
-    """Say what a wrong mass does; `drawn` are the payloads of which more than the mass is known."""
-    if drawn:
-        return "a wrong payload mass bends all gains, and leaves little of it in the residual"
-    return "a wrong payload mass scales all gains alike and leaves no residual"
-
-
-def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> tuple[str, ...]:
+def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> Iterator[str]:
     """Describe which data identify each uncertain gain, and which moves would help."""
-    if fitted.estimate.gains_fixed:
-        return ()
     error = fitted.final.training_error.total
+    if fitted.estimate.gains_fixed:
+        return
     if error > DOUBTFUL_PERCENT:
-        return (
+        yield (
             f"DOUBTFUL: the model leaves {error:.3g} % of the torque, expected some 3 to 15 %. σ does not cover "
-            "this error: check channels, signs, drive train, gravity and payload against the cell file.",
+            "this error: check channels, signs, drive train, gravity and payload against the cell file."
         )
-    if not judged:
-        return (f"Excitation: every gain is known to {GOOD_PERCENT:g} % or better.",)
-    return ("Excitation:", *(f"  {gain.words(fitted.cell.axis_names[gain.axis])}" for gain in judged))
+    elif not judged:
+        yield f"Excitation: every gain is known to {GOOD_PERCENT:g} % or better."
+    else:
+        yield "Excitation:"
+        yield from (f"  {gain.words(fitted.cell.axis_names[gain.axis])}" for gain in judged)
 
 
 def comparison_tables(comparison: EstimatorComparison, axes: tuple[str, ...]) -> tuple[Table, Table]:
@@ -362,23 +415,21 @@ def comparison_tables(comparison: EstimatorComparison, axes: tuple[str, ...]) ->
             values = (f"{gain:.4g}" for gain in trial.gains)
             gains.add_row(trial.estimator, *values, f"{trial.relative_error_percent:.2f}")
         spread = comparison.spread_percent(trial.estimator)
-        spreads.add_row(trial.estimator, *("-" if spread is None else f"{spread[i]:.2f}" for i in range(len(axes))))
+        shares = ["-"] * len(axes) if spread is None else [f"{share:.2f}" for share in spread]
+        spreads.add_row(trial.estimator, *shares)
     return gains, spreads
 
 
 def _trial(trial: EstimatorTrial, axes: tuple[str, ...]) -> Trial:
-    if trial.gains is None or trial.std is None:
-        return Trial(
-            estimator=trial.estimator,
-            position_cutoff_hz=trial.position_cutoff_hz,
-            decimation_cutoff_hz=trial.decimation_cutoff_hz,
-            gains=None,
-            reason=trial.reason,
-        )
+    gains = None
+    outcome: dict[str, Any] = {"reason": trial.reason}
+    if trial.gains is not None and trial.std is not None:
+        gains = _gains(axes, trial.gains, trial.std)
+        outcome = {"relative_error_percent": trial.relative_error_percent}
     return Trial(
         estimator=trial.estimator,
         position_cutoff_hz=trial.position_cutoff_hz,
         decimation_cutoff_hz=trial.decimation_cutoff_hz,
-        gains=_gains(axes, trial.gains, trial.std),
-        relative_error_percent=trial.relative_error_percent,
+        gains=gains,
+        **outcome,
     )

@@ -8,13 +8,25 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 from rich.table import Table
 
-from daq.report.fit_schemas import OwnTorque
+from daq.report.document import Figure, Report
 from daq.report.picture import BLUE, GREEN, GREY, legend_below, render, single
 from daq.report.text import SHOWN_SIGMAS, plain_table, terminal_text
 from daq.workflow.geometry_diagnoses import misfit_text
-from ident.calibration import Calibration, EncoderMisfit, Gain, GeometryCorrection, PayloadMass
+from ident.calibration import Calibration, EncoderMisfit, Gain, GeometryCorrection, Parameter, PayloadMass
 from ident.data.torque_channel import TorqueSlope
 from ident.errors import Diagnosis
+
+
+class OwnTorque(Report):
+    """Slope of the drive's own torque over the current."""
+
+    axis: str
+    slope: Figure
+    std: Figure = None
+    ratio: Figure = None
+    ratio_std: Figure = None
+    readings: int = 0
+
 
 CERTAIN_SIGMAS = 3.0  #: Of the ratio of a drive's own torque to the gain, before a difference is said
 
@@ -27,8 +39,8 @@ def plot_gains(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
     """
     figure, place = single(title, 3.2)
     positions = np.arange(len(gains))
-    change = np.array([gain.change_percent for gain in gains])
-    width = np.array([SHOWN_SIGMAS * 100.0 * gain.std / abs(gain.nameplate) for gain in gains])
+    change = [gain.change_percent for gain in gains]
+    width = [SHOWN_SIGMAS * 100.0 * gain.std / abs(gain.nameplate) for gain in gains]
     place.axhline(0.0, color=GREY, linewidth=1.4, linestyle="--", label="nameplate")
     place.vlines(positions, 0.0, change, color=BLUE, linewidth=5, alpha=0.25)
     place.errorbar(
@@ -110,14 +122,8 @@ def own_torques(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]) -> 
 def _own_torque(slope: TorqueSlope | None, gain: Gain) -> OwnTorque:
     if slope is None:
         return OwnTorque(axis=gain.axis, slope=None)
-    return OwnTorque(
-        axis=gain.axis,
-        slope=slope.value,
-        std=slope.std,
-        ratio=slope.value / gain.value,
-        ratio_std=_ratio_std(slope, gain),
-        readings=slope.readings,
-    )
+    ratio = slope.value / gain.value
+    return OwnTorque.of(slope, axis=gain.axis, slope=slope.value, ratio=ratio, ratio_std=_ratio_std(slope, gain))
 
 
 def _ratio_std(slope: TorqueSlope, gain: Gain) -> float:
@@ -125,17 +131,21 @@ def _ratio_std(slope: TorqueSlope, gain: Gain) -> float:
     return math.hypot(slope.std / gain.value, slope.value * gain.std / gain.value**2)
 
 
-def partial_note(calibration: Calibration) -> str | None:
-    """Warning for a calibration from a log that is partial or lost frames, None for any other."""
+def partial_note(calibration: Calibration) -> Iterator[str]:
+    """Warn of a calibration from a log that is partial or lost frames."""
     partial = [source.name for source in calibration.sources if source.partial]
-    return (
-        f"PARTIAL or lossy data ({', '.join(partial)}): not for a controller; `apply` refuses it." if partial else None
-    )
+    if partial:
+        yield f"PARTIAL or lossy data ({', '.join(partial)}): not for a controller; `apply` refuses it."
 
 
 def diagnosis_texts(diagnoses: Iterable[Diagnosis]) -> tuple[str, ...]:
     """One sentence for each diagnosis, for a view or a page."""
     return tuple(f"CHECK {one.text}." for one in diagnoses)
+
+
+def warning_texts(calibration: Calibration) -> tuple[str, ...]:
+    """Say what to check before the gains are used, for a view or a page."""
+    return (*partial_note(calibration), *diagnosis_texts(calibration.diagnoses))
 
 
 def encoder_text(misfit: EncoderMisfit) -> str:
@@ -157,39 +167,30 @@ def encoder_text(misfit: EncoderMisfit) -> str:
 
 def _correction_text(one: GeometryCorrection) -> str:
     """Write what has to be added to a number of the description."""
-    scale = 180.0 / math.pi if one.unit == "rad" else 1e3
-    unit = "deg" if one.unit == "rad" else "mm"
+    scale, unit = (180.0 / math.pi, "deg") if one.unit == "rad" else (1e3, "mm")
     place = one.joint if not one.end else f"{one.joint} to {one.end}"
     return f"the {one.kind} of {place} {scale * one.change:+.4f} ± {max(scale * one.std, 5e-5):.4f} {unit}"
 
 
-def mass_texts(influences: Iterable[PayloadMass]) -> tuple[str, ...]:
+def mass_texts(influences: Iterable[PayloadMass]) -> Iterator[str]:
     """Say of each payload how a wrong mass changes the gains, and what its declared tolerance makes of them."""
-    return tuple(f"{_mass_influence(one)}{_mass_tolerance(one)}" for one in influences)
-
-
-def _is_proportional(one: PayloadMass) -> bool:
-    """Whether every gain is proportional to the mass, to a hundredth."""
-    return all(round(gain.percent_per_percent, 2) == 1.0 for gain in one.gains)
-
-
-def _mass_influence(one: PayloadMass) -> str:
-    if _is_proportional(one):
-        return f"with a mass of {one.payload} that is wrong by 1 %, every gain is wrong by 1 %"
-    listed = ", ".join(f"{gain.axis} {gain.percent_per_percent:.2f} %" for gain in one.gains)
-    return f"with a mass of {one.payload} that is wrong by 1 %, the gains are wrong by: {listed}"
-
-
-def _mass_tolerance(one: PayloadMass) -> str:
-    if not one.tolerance_kg > 0.0:
-        return ""
-    largest = max(abs(gain.percent_per_percent) for gain in one.gains)
-    share_percent = 100.0 * one.tolerance_kg / one.mass_kg * largest
-    at_most = "" if _is_proportional(one) else "at most "
-    return (
-        f"; {one.payload} was weighed to {one.mass_kg:g} kg ± {one.tolerance_kg:g} kg, which is {at_most}"
-        f"± {share_percent:.2g} % of every gain, not in σ"
-    )
+    for one in influences:
+        is_proportional = all(round(gain.percent_per_percent, 2) == 1.0 for gain in one.gains)
+        wrong = "every gain is wrong by 1 %"
+        at_most = ""
+        if not is_proportional:
+            listed = ", ".join(f"{gain.axis} {gain.percent_per_percent:.2f} %" for gain in one.gains)
+            wrong = f"the gains are wrong by: {listed}"
+            at_most = "at most "
+        text = f"with a mass of {one.payload} that is wrong by 1 %, {wrong}"
+        if one.tolerance_kg > 0.0:
+            largest = max(abs(gain.percent_per_percent) for gain in one.gains)
+            share_percent = 100.0 * one.tolerance_kg / one.mass_kg * largest
+            text += (
+                f"; {one.payload} was weighed to {one.mass_kg:g} kg ± {one.tolerance_kg:g} kg, which is {at_most}"
+                f"± {share_percent:.2g} % of every gain, not in σ"
+            )
+        yield text
 
 
 MASS_HEADINGS = ("payload", "axis", "gain per kg", "gain % per % of mass", "σ by the tolerance", "unit")
@@ -208,6 +209,11 @@ def mass_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
                 f"{gain.tolerance_std:.2g}" if one.tolerance_kg > 0.0 else "-",
                 units.get(gain.axis, ""),
             )
+
+
+def value_rows(parameters: Iterable[Parameter]) -> list[tuple[str, str, str]]:
+    """Return rows of a table of parameters: name, value ± σ, unit."""
+    return [(one.name, with_deviation(one.value, one.std), one.unit) for one in parameters]
 
 
 def with_deviation(value: float, std: float) -> str:

@@ -10,6 +10,7 @@ from dataclasses import asdict
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -17,21 +18,12 @@ from daq.config.cell import Cell
 from daq.errors import ControllerUnfit
 from daq.formats.document import decode_document, read_controller_file
 from daq.formats.scalar import Scalar, rewrite_gain
-from daq.ledger.audit import OpenWrite, head_file
-from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, drives_of
-from daq.ledger.fold import AuditedWrite, History
+from daq.ledger.audit import head_file
+from daq.ledger.entry import Entry, Event, WriteAction, drives_of
+from daq.ledger.fold import History
 from daq.ledger.ledger import Verification
 from daq.ledger.watch import Series, alarm_text, pattern_of, questions
-from daq.report.controller_schemas import (
-    Acknowledged,
-    AuditReport,
-    FlawedLine,
-    HistoryAxis,
-    HistoryPoint,
-    HistoryReport,
-    UnendedWrite,
-    UnknownWrite,
-)
+from daq.report.document import Figure, Report
 from daq.report.gains import with_deviation
 from daq.report.picture import BLUE, GREY, ORANGE, PURPLE, SKY, legend_below, panels, render, unformatted
 from daq.report.text import SHOWN_SIGMAS, inert_row, plain_table, printable
@@ -40,6 +32,132 @@ from ident.drift.change import CHART
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+
+class Acknowledged(Report):
+    """A change that was explained."""
+
+    since: str
+    at: str
+    who: str
+    why: str
+
+
+class HistoryPoint(Report):
+    """One calibration of a gain; the columns of `--csv`."""
+
+    axis: str
+    recorded: str
+    gain: float
+    std: float
+    unit: str
+    nameplate: float
+    change_percent: Figure
+    change_sigmas: Figure
+    change_probability: Figure
+    deviation_sigmas: Figure
+    cusum_up: Figure
+    cusum_down: Figure
+    trend_sigmas: Figure
+    alarm: str | None
+    baseline: Figure
+    applied_at: str | None
+    applied_by: str | None
+    applied_to: str | None
+    error_percent: Figure
+    holdout_percent: Figure
+    rows: int
+    method: str
+    software: str
+    configuration_sha256: str
+    created: str
+    entered: str
+    digest: str
+
+
+class HistoryAxis(Report):
+    """One gain over time."""
+
+    axis: str
+    unit: str
+    dispersion: Figure
+    alarmed: bool
+    alarm: str | None
+    since: str | None
+    change_percent: Figure
+    change_sigmas: Figure
+    baseline: Figure
+    baseline_std: Figure
+    acknowledged: list[Acknowledged]
+    points: list[HistoryPoint]
+
+
+class FlawedLine(Report):
+    """A line of the audit log that is not what was written."""
+
+    line: int
+    """in the file, from 1"""
+    flaw: str
+    says: str
+    """the same as a sentence"""
+
+
+class NamedEntry(Report):
+    """An entry of the audit log."""
+
+    number: int
+    """from 1"""
+    at: str
+    who: str
+    file: str
+    """the controller's file, or the drives"""
+
+
+class UnendedWrite(NamedEntry):
+    """A write that was begun and never ended."""
+
+    content: str
+    """of the file afterwards"""
+
+
+class UnknownWrite(NamedEntry):
+    """A write that the history lacks."""
+
+    action: str
+    calibration_sha256: str | None
+
+
+class AuditReport(Report):
+    """State of the audit log and of the history in it."""
+
+    file: str
+    entries: int
+    holds: bool
+    """no line was changed or removed, as far as the chain shows it"""
+    broken_line: int | None
+    """the first that is not what was written"""
+    flaws: list[FlawedLine]
+    torn_lines: list[int]
+    """left by a writer that was killed; they are no flaw"""
+    open_writes: list[UnendedWrite]
+    history_broken: list[str]
+    """what the history cannot show"""
+    unknown_writes: list[UnknownWrite]
+
+
+class HistoryReport(Report):
+    """`history`."""
+
+    cell: str
+    calibrations: int
+    in_force: str | None
+    chart: dict[str, int | float]
+    """limits of the control chart"""
+    pattern: str
+    questions: list[str]
+    axes: list[HistoryAxis]
+    audit: AuditReport | None = None
+    """with --verify"""
 
 
 def show_history(
@@ -123,9 +241,11 @@ def history_gain_table(all_series: Sequence[Series]) -> Table:
         gain = series.points[-1].gain
         count = len(series.points) - series.began
         drift = series.drift if count > 1 else None
-        state = (
-            "ALARM" if series.alarmed else "ok" if count > CHART.baseline else f"baseline: {count} of {CHART.baseline}"
-        )
+        state = f"baseline: {count} of {CHART.baseline}"
+        if series.alarmed:
+            state = "ALARM"
+        elif count > CHART.baseline:
+            state = "ok"
         table.add_row(
             printable(series.axis),
             with_deviation(gain.value, gain.std),
@@ -178,39 +298,26 @@ def history_report(
         in_force: digest of the calibration whose gains the controller has.
         checked: state of audit log and history; None where it was not asked for.
     """
-    audit = {} if checked is None else {"audit": audit_report(checked)}
-    return HistoryReport(
+    others = {} if checked is None else {"audit": audit_report(checked)}
+    return HistoryReport.of(
         cell=cell,
         calibrations=len(entries),
         in_force=in_force,
         chart=asdict(CHART),
-        pattern=pattern_of(all_series).value,
-        questions=list(questions(all_series)),
-        axes=[_history_axis(series) for series in chosen],
-        **audit,
+        pattern=pattern_of(all_series),
+        questions=questions(all_series),
+        axes=[
+            HistoryAxis.of(
+                series,
+                series.drift,
+                alarm=alarm_text(series),
+                since=series.onset,
+                points=history_points(series),
+            )
+            for series in chosen
+        ],
+        **others,
     )
-
-
-def _history_axis(series: Series) -> HistoryAxis:
-    drift = series.drift
-    return HistoryAxis(
-        axis=series.axis,
-        unit=series.unit,
-        dispersion=series.dispersion,
-        alarmed=series.alarmed,
-        alarm=alarm_text(series),
-        since=None if series.onset is None else series.onset.isoformat(),
-        change_percent=None if drift is None else drift.change_percent,
-        change_sigmas=None if drift is None else drift.change_sigmas,
-        baseline=None if drift is None else drift.baseline,
-        baseline_std=None if drift is None else drift.baseline_std,
-        acknowledged=[_acknowledged(one) for one in series.acknowledged],
-        points=history_points(series),
-    )
-
-
-def _acknowledged(one: Acknowledgement) -> Acknowledged:
-    return Acknowledged(since=one.since.isoformat(), at=one.at.isoformat(), who=one.who, why=one.why)
 
 
 def say_verification(found: Verification, console: Console) -> None:
@@ -244,39 +351,20 @@ def say_verification(found: Verification, console: Console) -> None:
 def audit_report(found: Verification) -> AuditReport:
     """Return the state of audit log and history."""
     verdict = found.verdict
-    return AuditReport(
-        file=str(found.audit),
+    return AuditReport.of(
+        verdict,
+        file=found.audit,
         entries=len(verdict.entries),
-        holds=verdict.holds,
         broken_line=verdict.broken,
-        flaws=[FlawedLine(line=one.line, flaw=one.flaw.value, says=one.says) for one in verdict.flaws],
-        torn_lines=list(verdict.torn),
-        open_writes=[_unended_write(one) for one in verdict.open_writes],
+        torn_lines=verdict.torn,
+        open_writes=[
+            UnendedWrite.of(one.begun, file=one.begun.subject, content=one.content) for one in verdict.open_writes
+        ],
         history_broken=[printable(one) for one in found.broken],
-        unknown_writes=[_unknown_write(one) for one in found.unknown],
-    )
-
-
-def _unended_write(write: OpenWrite) -> UnendedWrite:
-    entry = write.begun
-    return UnendedWrite(
-        number=entry.number,
-        at=entry.at,
-        who=entry.who,
-        file=entry.subject,
-        content=write.content.value,
-    )
-
-
-def _unknown_write(write: AuditedWrite) -> UnknownWrite:
-    entry = write.ended
-    return UnknownWrite(
-        number=entry.number,
-        at=entry.at,
-        who=entry.who,
-        file=entry.subject,
-        action=entry.action.value,
-        calibration_sha256=write.calibration,
+        unknown_writes=[
+            UnknownWrite.of(one.ended, file=one.ended.subject, calibration_sha256=one.calibration)
+            for one in found.unknown
+        ],
     )
 
 
@@ -303,11 +391,10 @@ def in_force(cell: Cell, history: History) -> str | None:
         return None
     numbers = dict(zip(cell.axis_names, zip(scalars, controller.factors, strict=True), strict=True))
     known = history.in_force(target)
-    writes = [event.digest for event in history.events]
-    # Where several have these numbers: the one that the history names, else the one that was written last.
-    order = [digest for digest in (known, *reversed(writes)) if digest is not None]
     having = [entry.digest for entry in reversed(history.entries) if _has(entry, numbers)]
-    return next((digest for digest in (*order, *having) if digest in having), None)
+    # Where several have these numbers: the one that the history names, else the one that was written last.
+    order = (known, *(event.digest for event in reversed(history.events)), *having)
+    return next((digest for digest in order if digest in having), None)
 
 
 def describe_actions(entries: Sequence[Entry], events: Sequence[Event], digest_in_force: str | None) -> dict[str, str]:
@@ -361,39 +448,34 @@ def history_points(series: Series) -> list[HistoryPoint]:
 
 
 def _history_point(series: Series, index: int) -> HistoryPoint:
-    point, stretch = series.points[index], series.stretch_at(index)
-    entry, gain, change = point.entry, point.gain, point.change
-    drift, place = stretch.drift, index - stretch.began
-    alarm = series.alarm_at(index)
-    last = entry.events[-1] if entry.events else None
-    return HistoryPoint(
+    point = series.points[index]
+    stretch = series.stretch_at(index)
+    drift = stretch.drift
+    place = index - stretch.began
+    known: dict[str, object] = {}
+    if point.change is not None:
+        known["change_percent"] = point.change.percent
+        known["change_sigmas"] = point.change.sigmas
+        known["change_probability"] = point.change.probability
+    if alarm := series.alarm_at(index):
+        known["alarm"] = alarm.kind
+    if point.entry.events:
+        last = point.entry.events[-1]
+        known |= {"applied_at": last.at, "applied_by": last.who, "applied_to": last.target}
+    return HistoryPoint.of(
+        point.entry,
+        None,
         axis=series.axis,
-        recorded=entry.recorded.isoformat(),
-        gain=gain.value,
-        std=gain.std,
-        unit=gain.unit,
-        nameplate=gain.nameplate,
-        change_percent=None if change is None else change.percent,
-        change_sigmas=None if change is None else change.sigmas,
-        change_probability=None if change is None else change.probability,
-        deviation_sigmas=float(drift.deviations[place]),
-        cusum_up=float(drift.upper[place]),
-        cusum_down=float(drift.lower[place]),
-        trend_sigmas=float(drift.trend[place]),
-        alarm=None if alarm is None else alarm.kind.value,
+        gain=point.gain.value,
+        std=point.gain.std,
+        unit=point.gain.unit,
+        nameplate=point.gain.nameplate,
+        deviation_sigmas=drift.deviations[place],
+        cusum_up=drift.upper[place],
+        cusum_down=drift.lower[place],
+        trend_sigmas=drift.trend[place],
         baseline=drift.baseline,
-        applied_at=None if last is None else last.at.isoformat(),
-        applied_by=None if last is None else last.who,
-        applied_to=None if last is None else last.target,
-        error_percent=entry.error_percent,
-        holdout_percent=entry.holdout_percent,
-        rows=entry.rows,
-        method=entry.method,
-        software=entry.software,
-        configuration_sha256=entry.configuration_sha256,
-        created=entry.created.isoformat(),
-        entered=entry.entered.isoformat(),
-        digest=entry.digest,
+        **known,
     )
 
 
@@ -410,16 +492,16 @@ def plot_history(all_series: Sequence[Series], kind: str, *, title: str) -> byte
 
     dates: Any = matplotlib.dates  # without types
     columns = min(_COLUMNS, len(all_series))
-    bands = -(-len(all_series) // columns)
+    bands = math.ceil(len(all_series) / columns)
     figure, places = panels(2 * columns * bands, columns, unformatted(title))
+    grid = np.array(places).reshape(bands, 2, columns)
     for number, series in enumerate(all_series):
         band, column = divmod(number, columns)
-        above, beneath = (places[(2 * band + row) * columns + column] for row in range(2))
-        _draw_gains(above, series)
-        _draw_limits(beneath, series)
-    for empty in range(len(all_series), columns * bands):
-        for row in range(2):
-            places[(2 * (bands - 1) + row) * columns + empty % columns].set_axis_off()
+        _draw_gains(grid[band, 0, column], series)
+        _draw_limits(grid[band, 1, column], series)
+    in_last_band = len(all_series) - columns * (bands - 1)
+    for place in grid[-1, :, in_last_band:].flat:
+        place.set_axis_off()
     days = [_days(point.entry.recorded) for series in all_series for point in series.points]
     # Of a single day there would be no range to label.
     beside = max(0.5, 0.03 * (max(days) - min(days)))
@@ -429,32 +511,32 @@ def plot_history(all_series: Sequence[Series], kind: str, *, title: str) -> byte
         locator = dates.AutoDateLocator(maxticks=7)
         place.xaxis.set_major_locator(locator)
         place.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
-    upper = [place for row in range(0, len(places), 2 * columns) for place in places[row : row + columns]]
-    legend_below(figure, *upper)
+    legend_below(figure, *grid[:, 0].flat)
     # One legend for both kinds of panels would be wider than the picture of one axis.
-    handles, labels = places[columns].get_legend_handles_labels()
+    limits = grid[0, 1, 0]
+    handles, labels = limits.get_legend_handles_labels()
     once = list(dict(zip(labels, handles, strict=True)).values())
-    places[columns].legend(loc="best", ncols=2, fontsize=7, edgecolor="none", handles=once)
+    limits.legend(loc="best", ncols=2, fontsize=7, edgecolor="none", handles=once)
     return render(figure, kind)
 
 
 def _draw_gains(place: Axes, series: Series) -> None:
-    times = [_days(point.entry.recorded) for point in series.points]
-    values = [point.gain.value for point in series.points]
-    widths = [SHOWN_SIGMAS * series.dispersion * point.gain.std for point in series.points]
+    points = series.points
+    times = np.array([_days(point.entry.recorded) for point in points])
+    values = np.array([point.gain.value for point in points])
+    widths = [SHOWN_SIGMAS * series.dispersion * point.gain.std for point in points]
+    label = f"gain ± {SHOWN_SIGMAS:g} σ"
     place.errorbar(times, values, yerr=widths, fmt="none", ecolor=BLUE, elinewidth=1.0, capsize=2)
-    place.plot(
-        times, values, "o", color=BLUE, markerfacecolor="white", markersize=4, label=f"gain ± {SHOWN_SIGMAS:g} σ"
-    )
-    held = [(_days(point.entry.recorded), point.gain.value) for point in series.points if point.entry.applied]
-    place.plot(*_columns(held), "o", color=BLUE, markersize=4, label="applied")
-    alarmed = [(times[i], values[i]) for i in range(len(times)) if series.alarm_at(i) is not None]
-    place.plot(*_columns(alarmed), "o", color=ORANGE, markerfacecolor="none", markersize=9, label="alarm")
+    place.plot(times, values, "o", color=BLUE, markerfacecolor="white", markersize=4, label=label)
+    held = np.array([point.entry.applied for point in points], dtype=np.bool_)
+    place.plot(times[held], values[held], "o", color=BLUE, markersize=4, label="applied")
+    alarmed = np.array([series.alarm_at(index) is not None for index in range(len(points))], dtype=np.bool_)
+    place.plot(times[alarmed], values[alarmed], "o", color=ORANGE, markerfacecolor="none", markersize=9, label="alarm")
     for stretch in series.stretches:
         drift = stretch.drift
-        ends = [times[stretch.began], times[stretch.ended - 1]]
-        low, high = (drift.baseline + sign * SHOWN_SIGMAS * drift.baseline_std for sign in (-1.0, 1.0))
-        place.fill_between(ends, low, high, color=SKY, alpha=0.3, linewidth=0)
+        ends = times[[stretch.began, stretch.ended - 1]]
+        half = SHOWN_SIGMAS * drift.baseline_std
+        place.fill_between(ends, drift.baseline - half, drift.baseline + half, color=SKY, alpha=0.3, linewidth=0)
         place.plot(ends, [drift.baseline] * 2, color=GREY, linestyle="--", linewidth=1.2, label="baseline")
         if drift.steady:
             reached = drift.baseline * (1.0 + drift.change_percent / 100.0)
@@ -481,7 +563,3 @@ def _draw_limits(place: Axes, series: Series) -> None:
 def _days(at: datetime) -> float:
     """As matplotlib counts dates: days since 1970, UTC."""
     return at.timestamp() / 86_400.0
-
-
-def _columns(points: list[tuple[float, float]]) -> tuple[list[float], list[float]]:
-    return [when for when, _ in points], [value for _, value in points]

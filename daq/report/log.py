@@ -15,18 +15,7 @@ from daq.config.cell_file import cell_from_bundle
 from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import LogReader
 from daq.report.bus_views import current_signals
-from daq.report.log_schemas import (
-    BagReport,
-    BusLoadEntry,
-    ImportReport,
-    InfoReport,
-    LogEvent,
-    MountedPayload,
-    RecordReport,
-    SalvageReport,
-    StampSummary,
-    TableReport,
-)
+from daq.report.document import Figure, Report
 from daq.report.text import entry_lines, printable
 from drivers.messages import EventKind
 
@@ -35,11 +24,159 @@ if TYPE_CHECKING:
     from daq.log.bag_writer import BagWritten
     from daq.log.export import Exported, TableFormat
     from daq.log.importing import Imported
-    from daq.log.metadata import RunInfo, RunStatistics, Timing
+    from daq.log.metadata import Timing
     from daq.log.salvage import Salvaged
     from daq.workflow.record import Recorded
-    from drivers.messages import CellEvent
-    from ident.model.bodies import Payload
+
+
+class BusLoadEntry(Report):
+    """Load of one bus [%]."""
+
+    bus: str
+    mean_percent: float
+    worst_percent: float
+
+
+class NewLog(Report):
+    """A log that was written, with its losses."""
+
+    log: str
+    samples: int
+    lost_cycles: int
+    missing: list[int]
+    """samples without an answer, an axis each"""
+    valid: bool
+    reason: str
+    """why it is not valid"""
+
+
+class RecordReport(NewLog):
+    """`record`."""
+
+    warnings: list[str]
+    bus_load: list[BusLoadEntry]
+
+
+class StampSummary(Report):
+    """Time stamps of an imported recording, and the uniform clock that its log has."""
+
+    rows: int
+    rate_hz: float
+    usual_step_s: float
+    longest_step_s: float
+    jitter_s: float
+    drift_s: float
+    missing: int
+    resampled: bool
+    duplicates: int
+    close: int
+    started_s: Figure
+
+
+class MountedPayload(Report):
+    """Payload of a log."""
+
+    name: str
+    mounting: str
+    known: dict[str, float]
+
+
+class LogEvent(Report):
+    """Event of a recording that is no routine."""
+
+    time_ns: int
+    axis: int | None
+    """index from 0; null for the cell"""
+    kind: str
+    code: int
+    text: str
+
+
+class InfoReport(Report):
+    """`info`."""
+
+    log: str
+    sha256: str
+    run_id: str
+    cell: str
+    cell_sha256: str
+    axes: list[str]
+    current: dict[str, str]
+    role: str
+    payload: MountedPayload | None
+    rate_hz: float
+    speed: float
+    samples: int
+    duration_s: float
+    stamped_duration_s: float
+    moves: int
+    slow_readings: dict[str, int]
+    lost_cycles: int
+    missing: dict[str, int]
+    partial: bool
+    valid: bool
+    reason: str
+    events: list[LogEvent]
+    operator: str
+    software: str
+    started: str | None
+    wall_minus_monotonic_s: float
+    wall_clock_step_s: Figure
+    origin: str
+    timing: StampSummary | None
+    attachments: dict[str, int]
+    """size of each [bytes]"""
+
+
+class ImportReport(NewLog):
+    """`import`."""
+
+    partial: bool
+    wall_minus_monotonic_ns: int | None
+    timing: StampSummary | None
+    remarks: list[str]
+
+
+class SalvageReport(Report):
+    """`salvage`."""
+
+    log: str
+    partial: bool
+    samples: int
+    duration_s: float
+    lost_cycles: int
+    missing: list[int]
+    """samples without an answer, an axis each"""
+    valid: bool
+    reason: str
+    """why it is not valid"""
+    left_out_bytes: int
+    damage: str
+
+
+class TableReport(Report):
+    """`export log`."""
+
+    log: str
+    table: str
+    format: str
+    rows: int
+    columns: list[str]
+    partial: bool
+    valid: bool
+
+
+class BagReport(Report):
+    """`export bag`."""
+
+    log: str
+    bag: str
+    duration_s: float
+    messages: dict[str, int]
+    effort: bool
+    partial: bool
+    valid: bool
+
 
 _ROUTINE = {EventKind.MOVE_START, EventKind.MOVE_END, EventKind.NMT, EventKind.STATE}
 """Events of every run; all others are shown."""
@@ -47,15 +184,10 @@ _ROUTINE = {EventKind.MOVE_START, EventKind.MOVE_END, EventKind.NMT, EventKind.S
 
 def record_report(path: Path, recorded: Recorded, cell: Cell) -> RecordReport:
     """Return a finished recording: the log with its losses, warnings about the currents, and the load of the buses."""
-    statistics = recorded.log
-    return RecordReport(
-        log=str(path),
-        samples=statistics.samples,
-        lost_cycles=statistics.lost_cycles,
-        missing=list(statistics.missing),
-        valid=statistics.valid,
-        reason=statistics.reason,
-        warnings=list(recorded.warnings),
+    return RecordReport.of(
+        recorded.log,
+        recorded,
+        log=path,
         bus_load=[
             BusLoadEntry(bus=bus.name, mean_percent=100 * load.mean, worst_percent=100 * load.worst)
             for bus, load in bus_loads(cell)
@@ -65,62 +197,22 @@ def record_report(path: Path, recorded: Recorded, cell: Cell) -> RecordReport:
 
 def import_report(path: Path, imported: Imported) -> ImportReport:
     """Return the log of an import with its losses, and what was found out of its time stamps."""
-    statistics = imported.statistics
-    return ImportReport(
-        log=str(path),
-        samples=statistics.samples,
-        lost_cycles=statistics.lost_cycles,
-        missing=list(statistics.missing),
-        valid=statistics.valid,
-        reason=statistics.reason,
-        partial=statistics.partial,
-        wall_minus_monotonic_ns=statistics.wall_minus_monotonic_ns,
-        timing=_stamps(imported.timing),
-        remarks=list(imported.remarks),
-    )
+    return ImportReport.of(imported.statistics, imported, log=path)
 
 
 def salvage_report(path: Path, saved: Salvaged) -> SalvageReport:
     """Return the log of a salvage with its losses, and what was left out."""
-    statistics = saved.statistics
-    return SalvageReport(
-        log=str(path),
-        partial=statistics.partial,
-        samples=statistics.samples,
-        duration_s=saved.duration_s,
-        lost_cycles=statistics.lost_cycles,
-        missing=list(statistics.missing),
-        valid=statistics.valid,
-        reason=statistics.reason,
-        left_out_bytes=saved.left_out_bytes,
-        damage=saved.damage,
-    )
+    return SalvageReport.of(saved.statistics, saved, log=path)
 
 
 def table_report(log: Path, table: Path, kind: TableFormat, written: Exported) -> TableReport:
     """Return the table that was made of a log."""
-    return TableReport(
-        log=str(log),
-        table=str(table),
-        format=kind.value,
-        rows=written.rows,
-        columns=list(written.columns),
-        partial=written.partial,
-        valid=written.valid,
-    )
+    return TableReport.of(written, log=log, table=table, format=kind)
 
 
 def bag_report(log: Path, bag: Path, written: BagWritten, *, effort: bool) -> BagReport:
     """Return the bag that was made of a log; `effort` says whether a calibration gave its joint states efforts."""
-    return BagReport(
-        log=str(log),
-        bag=str(bag),
-        duration_s=written.duration_s,
-        messages=dict(written.messages),
-        effort=effort,
-        partial=written.partial,
-        valid=written.valid,
-    )
+    return BagReport.of(written, log=log, bag=bag, effort=effort)
 
 
 def info_report(path: Path) -> InfoReport:
@@ -131,8 +223,7 @@ def info_report(path: Path) -> InfoReport:
         ConfigurationError: the cell in it is inconsistent.
     """
     reader = LogReader(path)
-    first_ns: int | None = None
-    last_ns = 0
+    first_ns = last_ns = 0
     watch: MotionWatch | None = None
     for block in reader:
         if watch is None:
@@ -141,83 +232,36 @@ def info_report(path: Path) -> InfoReport:
             watch = MotionWatch(cell, reader.head)
         watch.take(block)
         last_ns = int(block.time_ns[-1])
-    assert first_ns is not None  # the reader refuses a log without samples
-    assert watch is not None
+    assert watch is not None  # the reader refuses a log without samples
     head, statistics = reader.head, reader.statistics
     run, samples = head.run, reader.checks.samples
     valid, reason = log_verdict(cell, head, reader.checks, statistics, watch, lambda: LogReader(path))
-    return InfoReport(
-        log=str(path),
+    clock_step_s = None  # how far the wall clock was set during the run; it may not have been read at the end
+    if statistics.wall_minus_monotonic_ns is not None:
+        clock_step_s = (statistics.wall_minus_monotonic_ns - run.wall_minus_monotonic_ns) * 1e-9
+    return InfoReport.of(
+        run,
+        statistics,
+        log=path,
         sha256=reader.digest,
-        run_id=run.run_id,
         cell=cell.name,
         cell_sha256=cell.digest,
-        axes=list(cell.axis_names),
+        axes=cell.axis_names,
         current=current_signals(cell),
-        role=run.role.value,
-        payload=_mounted(run.payload),
-        rate_hz=run.rate_hz,
-        speed=run.speed,
         samples=samples,
         duration_s=samples / run.rate_hz,
         stamped_duration_s=(last_ns - first_ns) * 1e-9,
         moves=sum(event.kind is EventKind.MOVE_START for event in reader.events),
-        slow_readings=dict(Counter(reading.quantity.value for reading in reader.readings)),
-        lost_cycles=statistics.lost_cycles,
+        slow_readings=Counter(reading.quantity.value for reading in reader.readings),
         missing=dict(zip(cell.axis_names, statistics.missing, strict=True)),
         partial=reader.partial,
         valid=valid,
         reason=reason,
-        events=[_event(event) for event in reader.events if event.kind not in _ROUTINE],
-        operator=run.operator,
-        software=run.software,
-        started=datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC).isoformat() if run.started_wall_ns else None,
+        events=[event for event in reader.events if event.kind not in _ROUTINE],
+        started=datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC) if run.started_wall_ns else None,
         wall_minus_monotonic_s=run.wall_minus_monotonic_ns * 1e-9,
-        wall_clock_step_s=_wall_clock_step_s(run, statistics),
-        origin=run.origin,
-        timing=_stamps(run.timing),
+        wall_clock_step_s=clock_step_s,
         attachments={name: len(data) for name, data in sorted(head.files.items())},
-    )
-
-
-def _mounted(payload: Payload | None) -> MountedPayload | None:
-    if payload is None:
-        return None
-    return MountedPayload(name=payload.name, mounting=payload.mounting, known=dict(payload.known))
-
-
-def _event(event: CellEvent) -> LogEvent:
-    return LogEvent(
-        time_ns=event.time_ns,
-        axis=event.axis,
-        kind=event.kind.value,
-        code=event.code,
-        text=event.text,
-    )
-
-
-def _wall_clock_step_s(run: RunInfo, statistics: RunStatistics) -> float | None:
-    """How far the wall clock was set during the run; None where it was not read at the end."""
-    if statistics.wall_minus_monotonic_ns is None:
-        return None
-    return (statistics.wall_minus_monotonic_ns - run.wall_minus_monotonic_ns) * 1e-9
-
-
-def _stamps(timing: Timing | None) -> StampSummary | None:
-    if timing is None:
-        return None
-    return StampSummary(
-        rows=timing.rows,
-        rate_hz=timing.rate_hz,
-        usual_step_s=timing.usual_step_s,
-        longest_step_s=timing.longest_step_s,
-        jitter_s=timing.jitter_s,
-        drift_s=timing.drift_s,
-        missing=timing.missing,
-        resampled=timing.resampled,
-        duplicates=timing.duplicates,
-        close=timing.close,
-        started_s=timing.started_s,
     )
 
 

@@ -10,7 +10,7 @@ from rich.console import RenderableType
 
 from daq.report.text import plain_table, printable, terminal_text
 from daq.workflow.validate import MANUFACTURER, CrossValidation
-from ident.calibration import Calibration, Parameter
+from ident.calibration import Calibration, Gain, Parameter
 
 NONE = "—"
 ERROR_ROW = "difference from the scale, %"
@@ -62,26 +62,28 @@ def case_tables(calibrations: Mapping[str, Calibration]) -> tuple[PaperTable, ..
 
 def parameter_table(number: int, first: Calibration, second: Calibration, method: str) -> PaperTable:
     """Build Table 1 or 3: essential parameters with the payload's drawing (first) and with its mass alone (second)."""
-    values = [{parameter.name: parameter for parameter in c.parameters} for c in (first, second)]
-    names = _in_order([p.name for p in first.parameters], [p.name for p in second.parameters])
-    rows, differences = [], []
-    for name in names:
-        one, other = values[0].get(name), values[1].get(name)
+    ones = {parameter.name: parameter for parameter in first.parameters}
+    others = {parameter.name: parameter for parameter in second.parameters}
+    rows = []
+    differences = []
+    for name in _in_order(list(ones), list(others)):
+        one = ones.get(name)
+        other = others.get(name)
         difference = None
         if one is not None and other is not None and one.value:
             difference = 100.0 * abs((one.value - other.value) / one.value)
-        # The mean is over the parameters that both identified; one given by the drawing is no comparison.
-        if difference is not None and one is not None and one.std > 0.0:
-            differences.append(difference)
+            # The mean is over the parameters that both identified; one given by the drawing is no comparison.
+            if one.std > 0.0:
+                differences.append(difference)
         leading, *regrouped = name.split()
         short = f"{leading} R" if regrouped else leading
         rows.append((short, *_parameter(one), *_parameter(other), percent(difference)))
-    errors = "‖ρ‖/‖Y‖", *(cell for c in (first, second) for cell in (f"{c.relative_error_percent.total:.2f} %", "")), ""
+    left, other_left = (f"{fit.relative_error_percent.total:.2f} %" for fit in (first, second))
     return PaperTable(
         number=number,
         title=f"essential parameters, {method}",
         headings=("parameter", "10 CAD: value", "%σ", "mass alone: value", "%σ", "%e"),
-        rows=(*rows, errors),
+        rows=(*rows, ("‖ρ‖/‖Y‖", left, "", other_left, "", "")),
         notes=(
             f"%e is the difference from the first value; its mean is {percent(_mean(differences))} %. "
             f"R: other parameters are regrouped with this one. {NONE} for %σ: given. SI units.",
@@ -92,18 +94,10 @@ def parameter_table(number: int, first: Calibration, second: Calibration, method
 
 def paper_gain_table(number: int, first: Calibration, second: Calibration, method: str) -> PaperTable:
     """Build Table 2 or 4: a priori and identified gains, with the payload's drawing and with its mass alone."""
-    rows = tuple(
-        (
-            one.axis,
-            f"{one.nameplate:.4g}",
-            *(
-                cell
-                for g in (one, other)
-                for cell in (f"{g.value:.4g}", percent(g.std_percent), percent(abs(g.change_percent)))
-            ),
-        )
+    rows = [
+        (one.axis, f"{one.nameplate:.4g}", *_gain_cells(one), *_gain_cells(other))
         for one, other in zip(first.gains, second.gains, strict=True)
-    )
+    ]
     means = [_mean([abs(gain.change_percent) for gain in c.gains]) for c in (first, second)]
     return PaperTable(
         number=number,
@@ -112,6 +106,10 @@ def paper_gain_table(number: int, first: Calibration, second: Calibration, metho
         rows=(*rows, ("mean", "", "", "", percent(means[0]), "", "", percent(means[1]))),
         notes=("%e is the change from the a priori gain.", SIGMA_NOTE),
     )
+
+
+def _gain_cells(gain: Gain) -> tuple[str, str, str]:
+    return f"{gain.value:.4g}", percent(gain.std_percent), percent(abs(gain.change_percent))
 
 
 def condition_table(found: CrossValidation) -> PaperTable:
@@ -137,10 +135,6 @@ def paper_error_table(found: CrossValidation) -> PaperTable:
         for index, axis in enumerate(axes if run.errors else ()):
             cells = (NONE if error is None else percent(error.axes[index]) for error in errors)
             rows.append((f"{run.run}, {axis}", *cells))
-    means = [
-        _mean([value for run in found.runs if (error := run.errors.get(label)) is not None for value in error.axes])
-        for label in labels
-    ]
     reasons: dict[str, list[str]] = {}
     for run in found.runs:
         if run.left_out:
@@ -151,9 +145,18 @@ def paper_error_table(found: CrossValidation) -> PaperTable:
         number=6,
         title="relative error norms ‖ρ‖/‖Y‖ [%]",
         headings=("run, joint", *labels),
-        rows=(*rows, ("mean", *(percent(mean) for mean in means))),
+        rows=(*rows, ("mean", *(percent(_mean_error(found, label)) for label in labels))),
         notes=(*([f"Used by a fit: {', '.join(seen)}."] if seen else ()), *unmet),
     )
+
+
+def _mean_error(found: CrossValidation, label: str) -> float | None:
+    """Mean of the errors of all runs and joints by one calibration."""
+    errors: list[float] = []
+    for run in found.runs:
+        if label in run.errors:
+            errors.extend(run.errors[label].axes)
+    return _mean(errors)
 
 
 def mass_tables(found: CrossValidation) -> tuple[PaperTable, ...]:
@@ -184,22 +187,22 @@ def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -
             if mass.error_percent is not None:
                 errors[label].append(mass.error_percent)
         names = (f"{run.run}, kg", "σ %, moves alone", "σ %, with the calibration's", ERROR_ROW)
-        figures = zip(names, *columns, strict=True)
-        rows += [row for row in figures if row[0] != ERROR_ROW or run.weighed_kg is not None]
-    weighed = runs[0].weighed_kg
-    if weighed is not None:
+        *figures, difference = zip(names, *columns, strict=True)
+        rows += figures
+        if run.weighed_kg is not None:
+            rows.append(difference)
+    weighed = "not weighed"
+    if runs[0].weighed_kg is not None:
+        weighed = f"{runs[0].weighed_kg:g} kg"
         rows.append((f"mean {ERROR_ROW}", *(percent(_mean(errors[label])) for label in labels)))
-    of = f"{weighed:g} kg" if weighed is not None else "not weighed"
-    how = (
-        "robot and payload together, from this run and the runs without load"
-        if found.with_bare_runs
-        else "the payload and the joints' friction, on the robot of the calibration"
-    )
+    how = "the payload and the joints' friction, on the robot of the calibration"
+    if found.with_bare_runs:
+        how = "robot and payload together, from this run and the runs without load"
     # The label of gains that no calibration has is for documents; a reader knows them by the cell file's word.
     shown = ("nameplate" if label == MANUFACTURER and label not in found.calibrations else label for label in labels)
     return PaperTable(
         number=number,
-        title=f"mass of payload {name} ({mounting}), {of}",
+        title=f"mass of payload {name} ({mounting}), {weighed}",
         headings=("run", *shown),
         rows=tuple(rows),
         notes=(

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from daq.config.cell import Cell, joint_unit
 from daq.report.document import Figure, Report
@@ -22,11 +22,14 @@ class PlannedGain(Report):
 
     axis: str
     predicted_std_percent: Figure
-    known_preload_std_percent: Figure = Field(description="σ if internal preload of redundant motors were known [%]")
+    known_preload_std_percent: Figure
+    """σ if internal preload of redundant motors were known [%]"""
     verdict: str
-    hidden_by: Literal["preload", "motion"] | None = Field(description="why the gain is unseen, or weak by preload")
+    hidden_by: Literal["preload", "motion"] | None
+    """why the gain is unseen, or weak by preload"""
     seen_by: list[str]
-    alone_percent: dict[str, Figure] = Field(description="σ that each source of information gives alone [%]")
+    alone_percent: dict[str, Figure]
+    """σ that each source of information gives alone [%]"""
     words: str
 
 
@@ -41,70 +44,66 @@ class PlanReport(Report):
     duration_s: float
     condition: float
     assumed: list[str]
-    rank: int = Field(description="independent directions of the gains that the moves determine to 10 %")
-    known_preload_rank: int | None = Field(description="the same if internal preload were known")
-    hidden: list[str] = Field(description="sentences on gains that the moves do not show, with what to do")
+    rank: int
+    """independent directions of the gains that the moves determine to 10 %"""
+    known_preload_rank: int | None
+    """the same if internal preload were known"""
+    hidden: list[str]
+    """sentences on gains that the moves do not show, with what to do"""
     gains: list[PlannedGain]
 
 
 def plan_report(out: Path, cell: Cell, experiment: Experiment, made: Plan, judged: Identifiability) -> PlanReport:
     """Return a plan, with the verdict on the gain of each axis."""
-    return PlanReport(
-        plan=str(out),
-        cell=made.cell,
-        seed=made.seed,
+    return PlanReport.of(
+        made,
+        judged,
+        plan=out,
         payload=experiment.payload.name,
         moves=len(made.moves),
         duration_s=round(made.duration_s, 3),
         condition=round(made.condition, 1),
-        assumed=list(experiment.remarks),
-        rank=judged.rank,
-        known_preload_rank=judged.known_preload_rank,
-        hidden=list(judged.sentences(cell.axis_names)),
+        assumed=experiment.remarks,
+        hidden=judged.sentences(cell.axis_names),
         gains=[_planned_gain(axis.name, gain) for axis, gain in zip(cell.axes, judged.gains, strict=True)],
     )
 
 
 def _planned_gain(axis: str, gain: GainVerdict) -> PlannedGain:
-    return PlannedGain(
+    known_percent = gain.known_preload_percent
+    return PlannedGain.of(
+        gain,
         axis=axis,
         predicted_std_percent=round(gain.std_percent, 3),
-        known_preload_std_percent=_finite(gain.known_preload_percent),
-        verdict=gain.verdict.value,
-        hidden_by=None if gain.hidden_by is None else gain.hidden_by.value,
-        seen_by=[source.value for source in gain.sources],
-        alone_percent={source.value: _finite(alone) for source, alone in gain.alone_percent.items()},
+        known_preload_std_percent=None if known_percent is None else round(known_percent, 3),
+        seen_by=gain.sources,
+        alone_percent={source: round(alone, 3) for source, alone in gain.alone_percent.items()},
         words=gain.words(axis),
     )
 
 
-def _finite(std_percent: float | None) -> float | None:
-    return None if std_percent is None or not math.isfinite(std_percent) else round(std_percent, 3)
-
-
-def _nothing_hidden(judged: Identifiability) -> tuple[str, ...]:
-    if judged.known_preload_rank is None:
-        return ()
-    directions = f"{judged.rank} of {len(judged.gains)} independent directions of the gains"
-    return (f"Internal preload obscures no gain: these moves determine {directions}.",)
-
-
-def _to_get_good(cell: Cell, made: Plan, judged: Identifiability) -> tuple[str, ...]:
-    """Say what makes weak gains good; σ falls with the square root of the time."""
+def _on_all_gains(cell: Cell, made: Plan, judged: Identifiability) -> Iterator[str]:
+    """Say which gains are hidden, and what makes weak ones good; σ falls with the square root of the time."""
+    hidden = judged.sentences(cell.axis_names)
+    yield from hidden
+    if not hidden and judged.known_preload_rank is not None:
+        directions = f"{judged.rank} of {len(judged.gains)} independent directions of the gains"
+        yield f"Internal preload obscures no gain: these moves determine {directions}."
     weak = [gain for gain in judged.gains if gain.verdict is not Visibility.GOOD]
     if not weak:
-        return ()
+        return
+    ways = ["a heavier payload", "wider limits of position, speed and acceleration in the cell file"]
     seconds = made.duration_s * (max(gain.std_percent for gain in weak) / GOOD_PERCENT) ** 2
-    longer = f"a longer run (some --duration {10.0 * math.ceil(seconds / 10.0):.0f})" if seconds <= LONGEST_S else ""
-    ways = (longer, "a heavier payload", "wider limits of position, speed and acceleration in the cell file")
+    if seconds <= LONGEST_S:
+        ways.insert(0, f"a longer run (some --duration {10.0 * math.ceil(seconds / 10.0):.0f})")
     names = ", ".join(cell.axes[gain.axis].name for gain in weak)
-    return (f"For good gains ({GOOD_PERCENT:g} %) of {names}: {'; or '.join(way for way in ways if way)}.",)
+    yield f"For good gains ({GOOD_PERCENT:g} %) of {names}: {'; or '.join(ways)}."
 
 
-def _assembly(cell: Cell, experiment: Experiment) -> tuple[str, ...]:
+def _assembly(cell: Cell, experiment: Experiment) -> Iterator[str]:
     """Positions of the joints without a motor that close the loops, to compare with the real robot."""
     if cell.chain is None:
-        return ()
+        return
     robot = experiment.scene.checker.robot
     position = experiment.design.expectation.model.assembly.position_rad
 
@@ -115,9 +114,9 @@ def _assembly(cell: Cell, experiment: Experiment) -> tuple[str, ...]:
         parts = zip(joints, values, units, strict=True)
         return ", ".join(f"{robot.joints[joint].name} {value:g} {unit.name}" for joint, value, unit in parts)
 
-    return (
+    yield (
         f"Assembly pose, to compare with the robot: {listed(robot.passive_joints)} while the motors' joints are at "
-        f"{listed(robot.axis_joints)}.",
+        f"{listed(robot.axis_joints)}."
     )
 
 
@@ -126,7 +125,10 @@ def plan_text(
 ) -> str:
     """Describe a plan in lines for the operator, who looks at its preview, if there is one."""
     look = ", or look at it (--preview PAGE)" if preview is None else f": {preview} shows the moves"
-    width = max(len(name) for name in (*cell.axis_names, "axis"))
+    way = "`record` checks the way to its first target from where the robot stands."
+    if cell.clearance is None:
+        way = "The way to its first target is not checked: the cell file declares no `workspace` and no `clearance`."
+    width = max(map(len, (*cell.axis_names, "axis")))
     lines = [
         f"{out}: {len(made.moves)} moves in {made.duration_s:.0f} s, condition {made.condition:.0f}",
         f"  {'axis':{width}}  predicted σ  verdict",
@@ -135,16 +137,10 @@ def plan_text(
             for axis, gain in zip(cell.axes, judged.gains, strict=True)
         ),
         *(f"  {gain.words(axis.name)}" for axis, gain in zip(cell.axes, judged.gains, strict=True)),
-        *(judged.sentences(cell.axis_names) or _nothing_hidden(judged)),
-        *_to_get_good(cell, made, judged),
+        *_on_all_gains(cell, made, judged),
         *_assembly(cell, experiment),
         "Assumed:",
         *(f"  {remark}" for remark in experiment.remarks),
-        f"Read the plan before the robot executes it{look}. "
-        + (
-            "`record` checks the way to its first target from where the robot stands."
-            if cell.clearance is not None
-            else "The way to its first target is not checked: the cell file declares no `workspace` and no `clearance`."
-        ),
+        f"Read the plan before the robot executes it{look}. {way}",
     ]
     return "\n".join(lines)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -32,11 +31,10 @@ _AXES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B58900", "#3B9BD6", "#7F7
 _AXES_DARK = ("#4BA3E3", "#F08A4B", "#2FC298", "#E39BC4", "#E0B73C", "#9AD5FF", "#B5B5B5", "#D77AA8")
 _LIGHT = {"base": "#8a8a8a", "swept": "#b9cbe0", "swept-edge": "#33567f", "footprint": "#a3a3a3"}
 _DARK = {"base": "#8f8f8f", "swept": "#4d6e93", "swept-edge": "#bcd6f2", "footprint": "#6d6d6d"}
+_LIGHT |= {f"axis-{number}": colour for number, colour in enumerate(_AXES)}
+_DARK |= {f"axis-{number}": colour for number, colour in enumerate(_AXES_DARK)}
 _STYLE = (
-    palette(
-        {**_LIGHT, **{f"axis-{number}": colour for number, colour in enumerate(_AXES)}},
-        {**_DARK, **{f"axis-{number}": colour for number, colour in enumerate(_AXES_DARK)}},
-    )
+    palette(_LIGHT, _DARK)
     + """\
 body { font: 16px/1.45 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 64rem;
   margin: 1rem auto; padding: 0 1rem; overflow-wrap: anywhere; }
@@ -91,21 +89,25 @@ part comes; grey on the grid: its footprint. A square of the grid is {1000 * _GR
 def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> dict[str, Any]:
     """Compute what the page draws, in rows of equal time steps; lengths in m and mm."""
     time_s, position, speed, move = _rows(cell, moves)
-    at, capsules = poses(checker.robot, checker.joints(position)), checker.scene.capsules
-    frame = [capsule.link + 1 for capsule in capsules]
-    ends = np.array([(capsule.start_m, capsule.end_m) for capsule in capsules]).reshape(-1, 1, 2, 3)
+    scene = checker.scene
+    at = poses(checker.robot, checker.joints(position))
+    frame = [capsule.link + 1 for capsule in scene.capsules]
+    ends = np.array([(capsule.start_m, capsule.end_m) for capsule in scene.capsules]).reshape(-1, 1, 2, 3)
     placed = np.einsum("ckij,cxej->kcei", at.rotation[frame], ends) + at.origin_m[frame].swapaxes(0, 1)[:, :, None]
     origins = at.origin_m.swapaxes(0, 1)
-    reach = _reach(placed, checker)
-    clearance_mm = 1000.0 * (checker.margins(position) + checker.scene.minimum_m)
-    boxes = [*checker.scene.boxes, *([] if checker.scene.workspace is None else [checker.scene.workspace])]
-    seen = np.concatenate((origins.reshape(-1, 3), [reach.lower_m, reach.upper_m]))
+    least, most, radius_m = _reach(placed, checker)
+    clearance_mm = 1000.0 * (checker.margins(position) + scene.minimum_m)
+    boxes = list(scene.boxes)
+    if scene.workspace is not None:
+        boxes.append(scene.workspace)
+    seen = np.concatenate((origins.reshape(-1, 3), [least, most]))
     # A box that reaches far beyond the arm, such as a floor, must not make the arm small.
     span = float(np.linalg.norm(np.ptp(seen, axis=0)))
-    corners = [np.clip(end, seen.min(axis=0) - span / 2, seen.max(axis=0) + span / 2) for one in boxes
-               for end in (one.lower_m, one.upper_m)]  # fmt: skip
-    seen = np.concatenate((seen, np.array(corners).reshape(-1, 3)))
-    lower, upper = seen.min(axis=0), seen.max(axis=0)
+    corners = np.array([(box.lower_m, box.upper_m) for box in boxes]).reshape(-1, 3)
+    corners = np.clip(corners, seen.min(axis=0) - span / 2, seen.max(axis=0) + span / 2)
+    seen = np.concatenate((seen, corners))
+    lower = seen.min(axis=0)
+    upper = seen.max(axis=0)
     limits = np.array([axis.limits.velocity for axis in cell.axes])
     return {
         "time_s": _rounded(time_s, 3),
@@ -113,27 +115,29 @@ def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> 
         "moves": len(moves),
         "origins_m": _rounded(origins, 3),
         "ends_m": _rounded(placed, 3),
-        "capsules": [{"name": visible_text(one.name), "link": one.link, "radius_m": one.radius_m} for one in capsules],
+        "capsules": [
+            {"name": visible_text(one.name), "link": one.link, "radius_m": one.radius_m} for one in scene.capsules
+        ],
         "boxes": [
             {
                 "name": visible_text(one.name),
                 "lower_m": one.lower_m,
                 "upper_m": one.upper_m,
-                "obstacle": one is not checker.scene.workspace,
+                "obstacle": one is not scene.workspace,
             }
             for one in boxes
         ],
         "reach": {
-            "lower_m": _rounded(np.array(reach.lower_m), 3),
-            "upper_m": _rounded(np.array(reach.upper_m), 3),
-            "radius_m": round(reach.radius_m, 3),
+            "lower_m": _rounded(least, 3),
+            "upper_m": _rounded(most, 3),
+            "radius_m": round(radius_m, 3),
         },
         "grid_m": _GRID_M,
         "frame_m": [_rounded(lower, 3), _rounded(upper, 3)],
         "centre_m": _rounded(0.5 * (lower + upper), 3),
         "radius_m": round(0.5 * float(np.linalg.norm(upper - lower)) + 0.05, 3),
         "clearance_mm": [round(value, 1) if np.isfinite(value) else None for value in clearance_mm.tolist()],
-        "minimum_mm": 1000.0 * checker.scene.minimum_m,
+        "minimum_mm": 1000.0 * scene.minimum_m,
         "speeds": [
             {"name": visible_text(name), "values": _rounded(column, 1)}
             for name, column in zip(cell.axis_names, 100.0 * np.abs(speed / limits).T, strict=True)
@@ -141,25 +145,25 @@ def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> 
     }
 
 
-@dataclass(frozen=True, slots=True)
-class _Reach:
-    """Extent of the moving parts over the plan, in the base frame [m]."""
+def _reach(ends_m: FloatArray, checker: Checker) -> tuple[FloatArray, FloatArray, float]:
+    """Return where the moving parts come over the plan [m].
 
-    lower_m: tuple[float, ...]
-    upper_m: tuple[float, ...]
-    radius_m: float  #: from the z axis of the base
+    Args:
+        ends_m: ends of all capsules, shape (rows, capsules, 2, 3).
+        checker: distances of the arm.
 
-
-def _reach(ends_m: FloatArray, checker: Checker) -> _Reach:
-    """Reach of the capsules that move; `ends_m`, shape (rows, capsules, 2, 3), are the ends of all capsules."""
-    moving = [index for index, capsule in enumerate(checker.scene.capsules) if capsule.link != BASE]
-    if not moving:
-        return _Reach((0.0,) * 3, (0.0,) * 3, 0.0)
+    Returns:
+        lower and upper end in the base frame, shape (3,) each, and largest distance from its z axis.
+    """
+    capsules = checker.scene.capsules
+    moving = np.array([capsule.link != BASE for capsule in capsules], dtype=np.bool_)
+    if not moving.any():
+        return np.zeros(3), np.zeros(3), 0.0
     ends = ends_m[:, moving]
-    radius_m = np.array([checker.scene.capsules[index].radius_m for index in moving])[None, :, None]
-    lower, upper = (ends - radius_m[..., None]).min(axis=(0, 1, 2)), (ends + radius_m[..., None]).max(axis=(0, 1, 2))
-    across = float((np.hypot(ends[..., 0], ends[..., 1]) + radius_m).max())
-    return _Reach(tuple(lower.tolist()), tuple(upper.tolist()), across)
+    radius_m = np.array([capsule.radius_m for capsule in capsules])[moving, None]
+    lower = (ends - radius_m[..., None]).min(axis=(0, 1, 2))
+    upper = (ends + radius_m[..., None]).max(axis=(0, 1, 2))
+    return lower, upper, float((np.hypot(ends[..., 0], ends[..., 1]) + radius_m).max())
 
 
 def _facts(cell: Cell, checker: Checker, drawn: Mapping[str, Any]) -> Iterator[str]:

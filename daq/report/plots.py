@@ -24,7 +24,9 @@ from ident.discovery.evidence import Evidence
 from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect
 from ident.effects.signals import fitted_signals, session_began_s
+from ident.equations.observation import Observation
 from ident.equations.rows import decimate_rows
+from ident.estimators.estimate import relative_error
 
 
 def draw_fit(fitted: Fit, calibration: Calibration, truth: dict[str, float] | None, out: Path) -> None:
@@ -49,9 +51,14 @@ def draw_fit(fitted: Fit, calibration: Calibration, truth: dict[str, float] | No
         before = step.after
 
 
+def _shown_rows(evidence: Evidence) -> Observation:
+    """Held-out rows, or those of the fit where there are none."""
+    return evidence.training if evidence.holdout is None else evidence.holdout
+
+
 def draw_torques(final: Evidence, cell: Cell) -> tuple[str, ...]:
     """Draw measured and predicted torque of the first held-out run, or of the fit."""
-    rows = final.training if final.holdout is None else final.holdout
+    rows = _shown_rows(final)
     rows = rows.only(rows.run == rows.run[0])
     return plot_torques(
         rows.time_s,
@@ -71,7 +78,7 @@ def plot_torques(
     predicted_nm: FloatArray,
     axes: tuple[str, ...],
     *,
-    forces: tuple[str, ...] = (),
+    forces: tuple[str, ...],
 ) -> tuple[str, ...]:
     """Draw τ = V g with the identified gains (wide) and the model's τ (dashed), one panel an axis (paper Fig. 2).
 
@@ -82,21 +89,18 @@ def plot_torques(
         measured_nm: torque from current and identified gain, shape (k, n) [forces]; NaN where a row was left out.
         predicted_nm: torque from the model, same shape [forces].
         axes: names of the n axes.
-        forces: "Nm" or, along a prismatic joint, "N", for each axis; all are "Nm" when left out.
+        forces: "Nm" or, along a prismatic joint, "N", for each axis.
     """
     shown = time_s <= time_s[0] + SHOWN_S
     drawn = []
-    for index, (name, unit) in enumerate(zip(axes, forces or ("Nm",) * len(axes), strict=True)):
-        measured, predicted = measured_nm[:, index], predicted_nm[:, index]
-        both = np.isfinite(measured) & np.isfinite(predicted)
-        norm = float(np.linalg.norm(measured[both]))
-        # ‖ρ‖/‖Y‖ (paper, Table 6); unknown without samples.
-        error = 100.0 * float(np.linalg.norm((measured - predicted)[both])) / norm if norm else float("nan")
+    use = np.isfinite(measured_nm) & np.isfinite(predicted_nm)
+    errors = relative_error(measured_nm.T, predicted_nm.T, use.T)
+    for index, (name, unit) in enumerate(zip(axes, forces, strict=True)):
         lines = (
-            Line(time_s[shown], measured[shown], "wide", "current × gain"),
-            Line(time_s[shown], predicted[shown], "dashed", "model"),
+            Line(time_s[shown], measured_nm[shown, index], "wide", "current × gain"),
+            Line(time_s[shown], predicted_nm[shown, index], "dashed", "model"),
         )
-        label = f"{name}: {QUANTITY[unit]} [{unit}], error {error:.1f} %"
+        label = f"{name}: {QUANTITY[unit]} [{unit}], error {errors.axes[index]:.1f} %"
         drawn.append(chart(lines, f"Measured and predicted {QUANTITY[unit]} of {name}", ("time [s]", label)))
     return tuple(drawn)
 
@@ -119,9 +123,9 @@ def draw_effect(before: Evidence, after: Evidence, placed: PlacedEffect, cell: C
     It is that of `drawn_axis`, against the variable and the velocity of the joint that the effect acts on.
     """
     index = len(after.fit_runs) if after.held_out else 0
-    rows_before = before.holdout if before.holdout is not None else before.training
-    rows_after = after.holdout if after.holdout is not None else after.training
-    chosen, data = rows_after.run == index, after.datasets[index]
+    rows_after = _shown_rows(after)
+    chosen = rows_after.run == index
+    data = after.datasets[index]
     seen = fitted_signals(after.model, data, after.training, after.estimate, session_began_s(after.fit_runs))
     along = seen.variable(placed.effect.abscissa, placed.axis, other_axis(placed.effect))
     variable, velocity = (
@@ -131,8 +135,8 @@ def draw_effect(before: Evidence, after: Evidence, placed: PlacedEffect, cell: C
     drawn = drawn_axis(before, after, placed)
     use = rows_after.use[drawn, chosen]
     residuals = (
-        np.where(use, model.estimate.residual_torque(rows)[drawn, chosen], np.nan)
-        for model, rows in ((before, rows_before), (after, rows_after))
+        np.where(use, model.estimate.residual_torque(_shown_rows(model))[drawn, chosen], np.nan)
+        for model in (before, after)
     )
     return plot_residual(
         rows_after.time_s[chosen],
@@ -193,8 +197,7 @@ def _against(variable: FloatArray, residual_nm: FloatArray, velocity_rad_s: Floa
     for name, moving, cloud, line in directions:
         x, y = variable[known & moving], residual_nm[known & moving]
         # Stretches of the variable with equally many samples, so that no mean is of a handful of them.
-        order = np.argsort(x, kind="stable") if len(x) >= _BINS else np.array([], dtype=np.intp)
-        bins = np.array_split(order, _BINS) if len(order) else []
+        bins = np.array_split(np.argsort(x, kind="stable"), _BINS) if len(x) >= _BINS else []
         clouds.append(Line(x, y, cloud))
         centres, middle = (np.array([column[part].mean() for part in bins]) for column in (x, y))
         means.append(Line(centres, middle, line, f"mean {name}"))
@@ -207,12 +210,10 @@ def plot_ranking(findings: Sequence[Finding], rivals: Sequence[PlacedEffect], ax
     Rivals are those not distinguishable from the added one; they are pale. Those that fail a gate are hollow.
     """
     alike = {(rival.effect.name, rival.axis) for rival in rivals}
-    rows = [
-        (
-            f"{axes[one.axis]}: {effect_text(one.effect, axes)}",
-            one.held_out_fall,
-            "alike" if (one.effect.name, one.axis) in alike else "full" if one.passed else "empty",
-        )
-        for one in findings
-    ]
+    rows = []
+    for one in findings:
+        kind = "full" if one.passed else "empty"
+        if (one.effect.name, one.axis) in alike:
+            kind = "alike"
+        rows.append((f"{axes[one.axis]}: {effect_text(one.effect, axes)}", one.held_out_fall, kind))
     return ranking(rows, "Candidates", "fall of the squared error [noise variances]")

@@ -10,25 +10,112 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from daq.report.controller_schemas import (
-    DriveChange,
-    DriveGain,
-    DriveRollback,
-    FileChange,
-    FileGain,
-    FileRollback,
-    Refused,
-    RestoredObject,
-)
+from daq.report.document import Figure, Report
 from daq.report.gains import with_deviation
 from daq.report.text import plain_table, terminal_lines, terminal_text
 from daq.writeback.drive_target import DriveEdit
 from daq.writeback.file_target import FileEdit
-from daq.writeback.gates.gate import Refusal
-from daq.writeback.judgement import NOT_JUDGED, NOTHING, JudgedChange, Spread, judge, noise_note
+from daq.writeback.judgement import NOT_JUDGED, NOTHING, Spread, judge, noise_note
 from daq.writeback.request import Edit, GainChange
 from daq.writeback.target import E, Proposal, Written
-from drivers.canopen.parameters import ParameterValue, ParameterWrite
+
+
+class Refused(Report):
+    """A check that failed."""
+
+    gate: str
+    subject: str
+    found: str
+    expected: str
+    remedy: str
+
+
+class FileGain(Report):
+    """A gain in the controller's file and its planned value."""
+
+    axis: str
+    key: str
+    line: int
+    old: Figure
+    new: Figure
+    """as it is read back; null where there is none to write"""
+    change_percent: Figure
+    change_sigmas: Figure
+    """signed as change_percent"""
+    significant: bool
+    std_percent: Figure
+    nameplate: float
+    nameplate_percent: Figure
+    unit: str
+
+
+class FileChange(Report):
+    """`apply` to the controller's file."""
+
+    file: str
+    base_sha256: str
+    base: str
+    """BEFORE-AFTER of this change, for --base"""
+    applied: bool
+    backup: str | None
+    changes: list[FileGain]
+    refusals: list[Refused]
+    diff: str
+
+
+class RestoredObject(Report):
+    """An object in a drive before and after."""
+
+    axis: str
+    object: str
+    old: Figure
+    """null where the drive has no number"""
+    new: Figure
+
+
+class DriveGain(RestoredObject):
+    """An object in a drive and its planned value."""
+
+    std: float
+    nameplate: float
+    unit: str
+
+
+class DriveChange(Report):
+    """`apply --drives`; `record`, `source` and `saved` are there once the drives are written."""
+
+    cell: str | None
+    base_sha256: str
+    base: str
+    applied: bool
+    record: str = ""
+    source: str | None = None
+    saved: bool = False
+    changes: list[DriveGain]
+    refusals: list[Refused]
+
+
+class FileRollback(Report):
+    """`rollback` of the controller's file."""
+
+    file: str
+    restored: str
+    """backup that was restored"""
+    backup: str | None
+    """of the content before"""
+    diff: str
+    audit: str | None
+
+
+class DriveRollback(Report):
+    """`rollback --drives`; the last two are there once the drives are written."""
+
+    drives: str
+    source: str
+    restored: bool
+    changes: list[RestoredObject]
+    record: str = ""
+    saved: bool = False
 
 
 def show_proposal(proposal: Proposal[E], console: Console, known: Spread = NOTHING) -> None:
@@ -66,51 +153,24 @@ def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING, place
     return table
 
 
-def proposal_report(
-    proposal: Proposal[E], written: Written | None, known: Spread = NOTHING
-) -> FileChange | DriveChange:
+def proposal_report(proposal: Proposal[E], written: Written | None, known: Spread) -> FileChange | DriveChange:
     """Return a proposal and its outcome; `written` is None where nothing was written."""
     edit = proposal.edit
     if isinstance(edit, DriveEdit):
         return _drive_change(proposal, written)
-    judged, _ = judge(edit.changes, known)
-    return FileChange(
-        file=str(edit.place),
-        base_sha256=edit.base_sha256,
-        base=edit.base,
+    judgements, _ = judge(edit.changes, known)
+    changes = []
+    for change in edit.changes:
+        judged = judgements.get(change.axis, NOT_JUDGED)
+        changes.append(FileGain.of(change, judged, change_sigmas=judged.sigmas))
+    return FileChange.of(
+        edit,
+        proposal,
+        file=edit.place,
         applied=written is not None,
         backup=None if written is None else str(written.backup),
-        changes=[_file_gain(change, judged.get(change.axis, NOT_JUDGED)) for change in edit.changes],
-        refusals=[refused_of(refusal) for refusal in proposal.refusals],
+        changes=changes,
         diff=edit.diff if isinstance(edit, FileEdit) else "",
-    )
-
-
-def refused_of(refusal: Refusal) -> Refused:
-    """Return a failed check."""
-    return Refused(
-        gate=refusal.gate.value,
-        subject=refusal.subject,
-        found=refusal.found,
-        expected=refusal.expected,
-        remedy=refusal.remedy,
-    )
-
-
-def _file_gain(change: GainChange, judged: JudgedChange) -> FileGain:
-    return FileGain(
-        axis=change.axis,
-        key=change.key,
-        line=change.line,
-        old=change.old,
-        new=change.new,
-        change_percent=change.change_percent,
-        change_sigmas=judged.sigmas,
-        significant=judged.significant,
-        std_percent=change.std_percent,
-        nameplate=change.nameplate,
-        nameplate_percent=change.nameplate_percent,
-        unit=change.unit,
     )
 
 
@@ -118,26 +178,14 @@ def _drive_change(proposal: Proposal[E], written: Written | None) -> DriveChange
     edit, cell = proposal.edit, proposal.target.cell
     # A calibration restores no record.
     outcome = {} if written is None else {**_outcome(written), "source": None}
-    return DriveChange(
+    return DriveChange.of(
         cell=None if cell is None else cell.name,
         base_sha256=edit.base_sha256,
         base=edit.base,
         applied=written is not None,
-        changes=[_drive_gain(change) for change in edit.changes],
-        refusals=[refused_of(refusal) for refusal in proposal.refusals],
+        changes=[DriveGain.of(change, object=change.key) for change in edit.changes],
+        refusals=proposal.refusals,
         **outcome,
-    )
-
-
-def _drive_gain(change: GainChange) -> DriveGain:
-    return DriveGain(
-        axis=change.axis,
-        object=change.key,
-        old=change.old,
-        new=change.new,
-        std=change.std,
-        nameplate=change.nameplate,
-        unit=change.unit,
     )
 
 
@@ -159,21 +207,21 @@ def show_drive_rollback(edit: DriveEdit, console: Console) -> None:
 
 def drive_rollback_report(edit: DriveEdit, written: Written | None) -> DriveRollback:
     """Return a rollback of the drives; `written` is None where nothing was written."""
+    outcome = {} if written is None else _outcome(written)
     return DriveRollback(
         drives=edit.subject,
         source=str(edit.source),
         restored=written is not None,
-        changes=[_restored(value, write) for value, write in zip(edit.values, edit.writes, strict=True)],
-        **({} if written is None else _outcome(written)),
-    )
-
-
-def _restored(value: ParameterValue, write: ParameterWrite) -> RestoredObject:
-    return RestoredObject(
-        axis=value.axis.name,
-        object=str(value.parameter),
-        old=value.value,
-        new=value.parameter.value(write.word),
+        changes=[
+            RestoredObject(
+                axis=value.axis.name,
+                object=str(value.parameter),
+                old=value.value,
+                new=value.parameter.value(write.word),
+            )
+            for value, write in zip(edit.values, edit.writes, strict=True)
+        ],
+        **outcome,
     )
 
 
@@ -188,12 +236,12 @@ def show_file_rollback(written: Written, console: Console) -> None:
 
 def file_rollback_report(written: Written, audit: Path | None) -> FileRollback:
     """Return a rollback of the controller's file; `audit` is the log that has it."""
-    return FileRollback(
+    return FileRollback.of(
+        written,
         file=written.edit.subject,
         restored=str(written.edit.source),
-        backup=None if written.backup is None else str(written.backup),
         diff=_rollback_diff(written.edit),
-        audit=None if audit is None else str(audit),
+        audit=audit,
     )
 
 

@@ -12,43 +12,22 @@ from rich.console import RenderableType
 from rich.table import Table
 
 from daq.report.effect_names import effect_text, size_text, variable_text
-from daq.report.fit import coefficients, error_table, errors_of, errors_or_none, identifiability_notes, with_calibration
-from daq.report.fit_schemas import (
-    AsideEntry,
-    ChangedGain,
-    Coefficient,
-    DetectionLimit,
-    FindingEntry,
-    GearLossEntry,
-    LeftOutRun,
-    LeftOutRuns,
-    ModelErrors,
-    MotorNoise,
-    NoiseFloor,
-    PlacedEffectEntry,
-    ResidualReport,
-    Skew,
-    SkewByInstruments,
-    SplitNameEntry,
-    TurnEntry,
-    VerdictEntry,
-)
+from daq.report.fit import error_table, identifiability_notes
 from daq.report.gains import diagnosis_texts, gain_table, partial_note
-from daq.report.split_names import SplitName, names_by_split
+from daq.report.split_names import names_by_split, placed_by
 from daq.report.text import Sentence, plain_table
 from daq.workflow.fit import Fit
 from ident.calibration import AcceptedEffect, Calibration
-from ident.discovery.before_after import Account, BeforeAfter, GainShift, RelativeErrors, RunError, RunErrors
-from ident.discovery.effect_verdict import EffectVerdict, Judgement
+from ident.discovery.before_after import Account, BeforeAfter, RelativeErrors
+from ident.discovery.effect_verdict import Judgement
 from ident.discovery.gates import runs_to_leave_out
 from ident.discovery.gear_loss import CERTAIN, GearLoss, gear_losses, is_gear_loss
-from ident.discovery.joining import SetAside
 from ident.discovery.loop import MAX_EFFECTS, Step
-from ident.discovery.noise_floor import CONFIDENCE, FloorSource, MotorNoiseFloor
+from ident.discovery.noise_floor import FloorSource
 from ident.discovery.search import Finding
 from ident.discovery.time_skew import CurrentDelay
 from ident.drift.change import FALSE_ALARM
-from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import is_correction
 from ident.effects.signals import session_began_s
 from ident.effects.unnamed import is_unnamed
@@ -59,7 +38,6 @@ _SHOWN_RIVALS = 3
 MUCH = 0.2  #: Share of the squared residual; a candidate that would explain it, and failed a check, is named
 SLIGHT = 0.1  #: Share of an error; an effect that lowers it by less is said to be small
 
-ErrorRow = tuple[str, RelativeError]  #: Name of the error and of the data it is measured on, and the error [%]
 WHEN = ("before", "after")
 
 
@@ -67,8 +45,7 @@ def residual_view(
     fitted: Fit, account: Account, calibration: Calibration, *, verbose: bool = False
 ) -> Iterator[RenderableType]:
     """One screen: what was found, and the gains; if verbose, all that the report says of the search, too."""
-    if (note := partial_note(calibration)) is not None:
-        yield Sentence(note, "bold")
+    yield from (Sentence(note, "bold") for note in partial_note(calibration))
     if verbose:
         yield from turns_view(fitted)
         yield from map(Sentence, effect_sizes(calibration))
@@ -100,7 +77,7 @@ def effect_sizes(calibration: Calibration) -> Iterator[str]:
 
 def turns_view(fitted: Fit) -> Iterator[RenderableType]:
     """Candidates of each turn of the loop, and the one that was added."""
-    declared = declared_sentences(fitted)
+    declared = list(declared_sentences(fitted))
     yield from map(Sentence, declared)
     for number, step in enumerate(searched_steps(fitted), start=1):
         if number > 1 or declared:
@@ -138,34 +115,28 @@ def candidate_rows(fitted: Fit, step: Step, count: int) -> Iterator[tuple[str, .
         )
 
 
-def declared_sentences(fitted: Fit) -> list[str]:
+def declared_sentences(fitted: Fit) -> Iterator[str]:
     """Name the effects that the cell file declares."""
-    sentences: list[str] = []
     for step in fitted.steps:
         if step.declared and step.accepted is not None:
-            placed = PlacedEffect(step.accepted.effect, step.accepted.axis)
-            sentences.append(f"Declared in the cell file: {placed.name_among(fitted.cell.place_names)}.")
-    return sentences
+            name = placed_by(step.accepted).name_among(fitted.cell.place_names)
+            yield f"Declared in the cell file: {name}."
 
 
-def turn_sentences(fitted: Fit, step: Step) -> list[str]:
+def turn_sentences(fitted: Fit, step: Step) -> Iterator[str]:
     """Say what a turn of the search added, and what it refused and why."""
     places = fitted.cell.place_names
-    sentences: list[str] = []
     for aside in step.set_aside:
-        placed = PlacedEffect(aside.finding.effect, aside.finding.axis)
-        sentences.append(f"Not added: {placed.name_among(places)}: {aside.reason(places)}.")
+        yield f"Not added: {placed_by(aside.finding).name_among(places)}: {aside.reason(places)}."
     if step.accepted is None:
-        sentences.append("No candidate passes every gate; nothing is added.")
+        yield "No candidate passes every gate; nothing is added."
     else:
-        placed = PlacedEffect(step.accepted.effect, step.accepted.axis)
-        sentences.append(f"Added: {placed.name_among(places)}.")
-    return sentences
+        yield f"Added: {placed_by(step.accepted).name_among(places)}."
 
 
 def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
     """Relative error of each axis before and after, and what noise alone would leave."""
-    return error_table("Relative error ‖e‖/‖v‖ of the motor currents by ml [%]", axes, dict(error_rows(account)))
+    return error_table("Relative error ‖e‖/‖v‖ of the motor currents by ml [%]", axes, error_rows(account))
 
 
 def summary(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -> tuple[str, ...]:
@@ -185,15 +156,20 @@ def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -
     The arguments are those of `summary`. The diagnoses come first, a sentence each.
     """
     kept = fitted.steps[-1].after.effects
-    first = (*diagnosis_texts(fitted.diagnoses), *_correction_sentence(kept))
-    found = tuple(
-        _effect_sentence(fitted, account, turn, placed, step)
-        for step, turn in zip(fitted.steps, account.turns, strict=True)
-        if step.accepted is not None and turn is not None
-        for placed in turn.added
-        if placed in kept
-    )
-    (before, _), (after, where) = _strictest_error(account.total.before), _strictest_error(account.total.after)
+    first = list(diagnosis_texts(fitted.diagnoses))
+    if any(is_correction(placed) for placed in kept):
+        # Its gains are right, although the cell file is not yet.
+        first.append(
+            "The model corrects the description of the robot: gains and errors below are those of the corrected one. "
+            "Correct the cell file all the same, and fit again."
+        )
+    found: list[str] = []
+    for step, turn in zip(fitted.steps, account.turns, strict=True):
+        if step.accepted is not None and turn is not None:
+            added = [placed for placed in turn.added if placed in kept]
+            found += [_effect_sentence(fitted, account, turn, placed, step) for placed in added]
+    before, _ = _strictest_error(account.total.before)
+    after, where = _strictest_error(account.total.after)
     floor = _floor(account).total
     noise = f" ({_floor_text(floor)})" if math.isfinite(floor) else ""
     ending = (*_skew_sentence(account.skew), *_holdout_verdict(fitted, account))
@@ -203,17 +179,9 @@ def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -
         return (*first, f"{none}: the error {where} is {after.total:.1f} %{noise}.", *judged, *ending)
     change = error_change_text(before.total, after.total)
     whole = f"All axes together: the error {where} {change}{noise}{_unconfirmed(account)}."
-    gains = gains_sentence(fitted, account)
-    return (*first, *found, whole, *judged, *_to_be_refused(effects), *((gains,) if gains else ()), *ending)
-
-
-def _correction_sentence(kept: Sequence[PlacedEffect]) -> Iterator[str]:
-    """Say that the model corrects the description: its gains are right, although the cell file is not yet."""
-    if any(is_correction(placed) for placed in kept):
-        yield (
-            "The model corrects the description of the robot: gains and errors below are those of the corrected one. "
-            "Correct the cell file all the same, and fit again."
-        )
+    sentences = (*first, *found, whole, *judged, *_to_be_refused(effects), gains_sentence(fitted, account), *ending)
+    # Of gains that were held there is nothing to say.
+    return tuple(sentence for sentence in sentences if sentence)
 
 
 def verdict_sentences(fitted: Fit) -> Iterator[str]:
@@ -269,29 +237,22 @@ def _unconfirmed(account: Account) -> str:
 def _to_be_refused(effects: Sequence[AcceptedEffect]) -> Iterator[str]:
     """Name the effects with which `apply` refuses a calibration (`daq.writeback.gates.fit.effect`)."""
     refused = [one for one in effects if not one.is_confirmed]
-    if not refused:
-        return
-    first, *others = refused
-    more = "".join(
-        f"; {one.name} on {one.axis}: {one.error_after_percent:.2f} % with it, {one.error_before_percent:.2f} % without"
-        for one in others
-    )
-    yield (
-        f"`apply` refuses a calibration with {first.name} on {first.axis}: on data that the fit did not use, the "
-        f"torque error is {first.error_after_percent:.2f} % with it, {first.error_before_percent:.2f} % without{more}. "
-        "Record more runs for the fit, or take `drivegain fit`, which adds no effects."
-    )
+    errors = [f"{one.error_after_percent:.2f} % with it, {one.error_before_percent:.2f} % without" for one in refused]
+    names = [f"{one.name} on {one.axis}" for one in refused]
+    if refused:
+        more = "".join(f"; {name}: {error}" for name, error in zip(names[1:], errors[1:], strict=True))
+        yield (
+            f"`apply` refuses a calibration with {names[0]}: on data that the fit did not use, the torque error is "
+            f"{errors[0]}{more}. Record more runs for the fit, or take `drivegain fit`, which adds no effects."
+        )
 
 
 def gains_sentence(fitted: Fit, account: Account) -> str:
     """Say which gains the effects change by more than noise; empty where the gains were held."""
     if fitted.estimate.gains_fixed:
         return ""
-    changed = [
-        f"{axis} by {change.change_percent:+.1f} %"
-        for axis, change in zip(fitted.cell.axis_names, account.total.gains, strict=True)
-        if change.significant
-    ]
+    changes = zip(fitted.cell.axis_names, account.total.gains, strict=True)
+    changed = [f"{axis} by {change.change_percent:+.1f} %" for axis, change in changes if change.significant]
     if not changed:
         return "With and without the effects, the gains are the same within noise."
     return (
@@ -314,10 +275,11 @@ def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:
 
 def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
     """Sentences on findings that did not join the model, where the last model still lacks them."""
-    axes, last = fitted.cell.place_names, fitted.steps[-1]
+    axes = fitted.cell.place_names
+    last = fitted.steps[-1]
     for aside in step.set_aside:
         finding = aside.finding
-        axis = PlacedEffect(finding.effect, finding.axis).axis_name(axes)
+        axis = placed_by(finding).axis_name(axes)
         replaced = aside.rival is not None and aside.rival in last.after.effects
         if aside.rival is not None and aside.moved and step is last:
             yield (
@@ -337,18 +299,19 @@ def _refused(fitted: Fit) -> Iterator[str]:
     """Sentences on candidates that failed a check: of each axis the strongest, where it would explain much of the
     residual, and the first one, where physics alone does not allow it.
     """
-    axes, last = fitted.cell.place_names, fitted.steps[-1]
+    axes = fitted.cell.place_names
+    last = fitted.steps[-1]
     # Those are reported with the reason already.
-    reported = {(aside.finding.effect, aside.finding.axis) for aside in last.set_aside}
+    reported = [placed_by(aside.finding) for aside in last.set_aside]
     first: dict[int, Finding] = {}
     strongest: dict[int, Finding] = {}
     for finding in last.findings:
         first.setdefault(finding.axis, finding)
-        failed = finding.explained >= MUCH and finding.refusals and (finding.effect, finding.axis) not in reported
+        failed = finding.explained >= MUCH and finding.refusals and placed_by(finding) not in reported
         if failed and (finding.axis not in strongest or finding.explained > strongest[finding.axis].explained):
             strongest[finding.axis] = finding
     for axis, finding in first.items():
-        name = PlacedEffect(finding.effect, axis).axis_name(axes)
+        name = placed_by(finding).axis_name(axes)
         if finding.impossible and finding.refusals == (finding.impossible,):
             yield (
                 f"{name}: {effect_text(finding.effect, axes)} ranks first on this axis, but its sign or size is "
@@ -357,39 +320,44 @@ def _refused(fitted: Fit) -> Iterator[str]:
             if strongest.get(axis) is finding:
                 strongest.pop(axis)
     for finding in strongest.values():
-        name = PlacedEffect(finding.effect, finding.axis).axis_name(axes)
+        name = placed_by(finding).axis_name(axes)
         yield (
             f"{name}: {effect_text(finding.effect, axes)} would explain {100.0 * finding.explained:.0f} % of the "
             f"squared residual, but failed a check: {'; '.join(finding.refusals)}. The cause may be another one."
         )
 
 
-def floor_sentences(account: Account, axes: Sequence[str]) -> list[str]:
+_FLOOR_CAUSES = {
+    FloorSource.STANDSTILL: (
+        "at standstill",
+        "a brake that takes the load over, dither, an axis that hunts, or axes that move meanwhile",
+    ),
+    FloorSource.REPEATED_MOVES: ("between repeated moves", "warm-up, or moves that are not quite the same"),
+}
+"""When a noise was measured, and what else than noise may be in it."""
+
+
+def floor_sentences(account: Account, axes: Sequence[str]) -> Iterator[str]:
     """Name the axes whose noise estimate is far above what the model leaves, and possible causes."""
-    causes = {
-        FloorSource.STANDSTILL: (
-            "at standstill",
-            "a brake that takes the load over, dither, an axis that hunts, or axes that move meanwhile",
-        ),
-        FloorSource.REPEATED_MOVES: ("between repeated moves", "warm-up, or moves that are not quite the same"),
-    }
-    return [
-        f"{axis} has no noise floor: its current {causes[floor.source][0]} scatters {floor.noise_a / left_a:.1f} times "
-        f"as much as the model's error in motion; possible causes: {causes[floor.source][1]}."
-        for axis, floor, left_a in zip(axes, account.floors, account.left_a, strict=True)
-        if floor is not None and floor.is_refuted(left_a)
-    ]
+    for axis, floor, left_a in zip(axes, account.floors, account.left_a, strict=True):
+        if floor is not None and floor.is_refuted(left_a):
+            when, causes = _FLOOR_CAUSES[floor.source]
+            yield (
+                f"{axis} has no noise floor: its current {when} scatters {floor.noise_a / left_a:.1f} times "
+                f"as much as the model's error in motion; possible causes: {causes}."
+            )
 
 
-def _holdout_verdict(fitted: Fit, account: Account) -> list[str]:
+def _holdout_verdict(fitted: Fit, account: Account) -> Iterator[str]:
     if account.holdout_change is None or not account.holdout_change.is_rise:
-        return []
+        return
     if fitted.accept_worse_holdout:
-        return [
+        yield (
             "The effects raise the error of the held-out runs by more than its noise. They were accepted all the same, "
             "because --accept-worse-holdout was given."
-        ]
-    return ["The effects raise the error of the held-out runs by more than its noise: no calibration was written."]
+        )
+    else:
+        yield "The effects raise the error of the held-out runs by more than its noise: no calibration was written."
 
 
 def _skew_sentence(skew: CurrentDelay | None) -> Iterator[str]:
@@ -419,58 +387,55 @@ def _unconfirmed_skew(skew: CurrentDelay | None) -> Iterator[str]:
         )
 
 
-def gear_sentences(fitted: Fit) -> list[str]:
+def gear_sentences(fitted: Fit) -> Iterator[str]:
     """Say which gains carry the efficiency of their gear, and what a loss in the model means for its gain."""
     if fitted.estimate.gains_fixed:
-        return []
-    in_model = {placed.axis for placed in fitted.steps[-1].after.effects if is_gear_loss(placed.effect)}
-    judged = zip(fitted.cell.axis_names, gear_losses(fitted.steps[-1]), strict=True)
-    return [
-        sentence
-        for axis, (name, gear) in enumerate(judged)
-        if (sentence := _gear_sentence(name, gear, in_model=axis in in_model))
-    ]
+        return
+    last = fitted.steps[-1]
+    in_model = {placed.axis for placed in last.after.effects if is_gear_loss(placed.effect)}
+    for axis, (name, gear) in enumerate(zip(fitted.cell.axis_names, gear_losses(last), strict=True)):
+        yield from _gear_sentence(name, gear, in_model=axis in in_model)
 
 
-def _gear_sentence(name: str, gear: GearLoss, *, in_model: bool) -> str:
+def _gear_sentence(name: str, gear: GearLoss, *, in_model: bool) -> Iterator[str]:
     if in_model and gear.efficiency is not None and gear.gain_factor is not None:
-        return (
+        yield (
             f"The loss in the gear of {name} is an efficiency of {100.0 * gear.efficiency:.1f} % if motor and load "
             f"lose the same share; its motor's gain is then {100.0 * (gear.gain_factor - 1.0):.2f} % larger than the "
             "one found, which no residual can show."
         )
-    if not gear.gain_carries_it or gear.hidden_shift is None or gear.loss_std is None:
-        return ""
-    side, share = ("motor", gear.motoring_torque) if gear.lean > 0.0 else ("load", 1.0 - gear.motoring_torque)
-    return (
-        f"The gain of {name} carries the efficiency of its gear: the {side} drives in {100.0 * share:.0f} % of the "
-        f"squared load torque, and a loss of up to {100.0 * CERTAIN * gear.loss_std:.1f} % would not show; it would "
-        f"change the gain by {100.0 * gear.hidden_shift:.1f} %."
-    )
+    elif gear.gain_carries_it and gear.hidden_shift is not None and gear.loss_std is not None:
+        side, share = ("motor", gear.motoring_torque) if gear.lean > 0.0 else ("load", 1.0 - gear.motoring_torque)
+        yield (
+            f"The gain of {name} carries the efficiency of its gear: the {side} drives in {100.0 * share:.0f} % of the "
+            f"squared load torque, and a loss of up to {100.0 * CERTAIN * gear.loss_std:.1f} % would not show; it "
+            f"would change the gain by {100.0 * gear.hidden_shift:.1f} %."
+        )
 
 
-def error_rows(account: Account) -> tuple[ErrorRow, ...]:
-    """Rows of the table of errors; errors that were not computed or are unknown are left out."""
-    before, after = account.total.before, account.total.after
-    first, second = (
-        None if errors.left_out_runs is None else errors.left_out_runs.together for errors in (before, after)
-    )
-    pairs = (
-        ("fit", before.in_sample, after.in_sample),
-        ("moves left out", before.cross_validated, after.cross_validated),
-        ("runs left out", first, second),
-        ("held out", before.holdout, after.holdout),
-    )
-    floors = (
-        ("noise, estimate", account.floor),
-        ("noise, estimate, held out", account.holdout_floor),
-        ("noise, at least", account.least_floor),
-        ("noise, at least, held out", account.least_holdout_floor),
-    )
-    named = [(f"{name}, {when}", error) for name, *both in pairs for when, error in zip(WHEN, both, strict=True)]
-    return tuple(
-        (name, error) for name, error in (*named, *floors) if error is not None and any(map(math.isfinite, error.axes))
-    )
+def errors_by_data(errors: RelativeErrors) -> dict[str, RelativeError | None]:
+    """Return the errors of one model, by the data that they are measured on."""
+    left_out = errors.left_out_runs
+    return {
+        "fit": errors.in_sample,
+        "moves left out": errors.cross_validated,
+        "runs left out": None if left_out is None else left_out.together,
+        "held out": errors.holdout,
+    }
+
+
+def error_rows(account: Account) -> dict[str, RelativeError]:
+    """Return the errors [%] by their names and the data they are measured on; those that are not known are left out."""
+    after = errors_by_data(account.total.after)
+    rows: dict[str, RelativeError | None] = {}
+    for data, before in errors_by_data(account.total.before).items():
+        rows[f"{data}, before"] = before
+        rows[f"{data}, after"] = after[data]
+    rows["noise, estimate"] = account.floor
+    rows["noise, estimate, held out"] = account.holdout_floor
+    rows["noise, at least"] = account.least_floor
+    rows["noise, at least, held out"] = account.least_holdout_floor
+    return {name: error for name, error in rows.items() if error is not None and any(map(math.isfinite, error.axes))}
 
 
 def _strictest_error(errors: RelativeErrors, place: int | None = None) -> tuple[RelativeError, str]:
@@ -501,28 +466,23 @@ def error_change_text(before_percent: float, after_percent: float) -> str:
 def _effect_sentence(fitted: Fit, account: Account, turn: BeforeAfter, placed: PlacedEffect, step: Step) -> str:
     axes = fitted.cell.place_names
     name = axes[placed.axis]
-    share_of_excess = None if step.accepted is None else step.accepted.share_of_excess
     what = effect_text(placed.effect, axes)
     if doubt := doubted_name(step, placed, axes):
         what = f"a torque that depends on {variable_text(placed.effect, axes)} ({doubt})"
     place = placed.axis if placed.effect.has_axis else None
     before, where = _strictest_error(turn.before, place)
     after, _ = _strictest_error(turn.after, place)
-    floor = _floor(account).at(placed.axis)
-    floor_text = _floor_text(floor)
-    excess = ""
-    if is_unnamed(placed.effect) and share_of_excess is not None:
-        excess = f" (about {100.0 * share_of_excess:.0f} % of the residual beyond noise)"
     if not placed.effect.has_axis:
-        change = error_change_text(before.total, after.total)
-        return f"The recording has {what}: the error {where} {change}."
-    if before.at(placed.axis) * (1.0 - SLIGHT) < after.at(placed.axis) <= before.at(placed.axis):
-        excess += ", a small effect"
-    whose = f" of {name}" if placed.axis < len(fitted.cell.axes) else " of all axes"
-    return (
-        f"{name} has {what}{excess}: the error{whose} {where} "
-        f"{error_change_text(before.at(placed.axis), after.at(placed.axis))} ({floor_text})."
-    )
+        return f"The recording has {what}: the error {where} {error_change_text(before.total, after.total)}."
+    without = before.at(placed.axis)
+    with_it = after.at(placed.axis)
+    if is_unnamed(placed.effect) and step.accepted is not None and step.accepted.share_of_excess is not None:
+        what += f" (about {100.0 * step.accepted.share_of_excess:.0f} % of the residual beyond noise)"
+    if without * (1.0 - SLIGHT) < with_it <= without:
+        what += ", a small effect"
+    whose = name if placed.axis < len(fitted.cell.axes) else "all axes"
+    noise = _floor_text(_floor(account).at(placed.axis))
+    return f"{name} has {what}: the error of {whose} {where} {error_change_text(without, with_it)} ({noise})."
 
 
 def doubted_name(step: Step, placed: PlacedEffect, axes: Sequence[str]) -> str:
@@ -563,221 +523,3 @@ def _silence(fitted: Fit) -> str:
         f"{ended}An effect that the declared model cannot mimic would have been detected above this torque (root mean "
         f"square in motion): {limits}.{unseen}"
     )
-
-
-_METRIC = (
-    "‖e‖/‖v‖ of each motor's current over the rows that count; in total √(Σ w²‖e‖²/Σ w²‖v‖²), w the gains of the "
-    "declared model"
-)
-
-
-def residual_report(fitted: Fit, account: Account, calibration: Calibration) -> ResidualReport:
-    """Return the closed loop: the calibration, the errors before and after, and every turn of the search."""
-    axes, last = fitted.cell.axis_names, fitted.steps[-1]
-    return with_calibration(
-        ResidualReport,
-        calibration,
-        summary=list(summary(fitted, account, calibration.effects)),
-        axes=list(axes),
-        metric=_METRIC,
-        noise_floor=_noise_floor(account, axes),
-        time_skew=_stated_skew(account.skew),
-        time_skew_by_instruments=_skew_by_instruments(account.skew),
-        gear_loss=[_gear_loss(axis, gear) for axis, gear in zip(axes, gear_losses(last), strict=True)],
-        before=_model_errors(account.total.before),
-        after=_model_errors(account.total.after),
-        gain_changes=_changed_gains(fitted, account.total),
-        worse_holdout=None if account.holdout_change is None else account.holdout_change.is_rise,
-        verdicts=[_verdict(verdict, fitted.cell.place_names) for verdict in last.verdicts],
-        turns=[_turn(fitted, step, turn) for step, turn in zip(fitted.steps, account.turns, strict=True)],
-    )
-
-
-def _noise_floor(account: Account, axes: tuple[str, ...]) -> NoiseFloor:
-    floors = zip(axes, account.floors, account.left_a.tolist(), strict=True)
-    return NoiseFloor(
-        motors=[None if floor is None else _motor_noise(axis, floor, left_a) for axis, floor, left_a in floors],
-        relative_error_percent=errors_of(account.floor),
-        holdout_error_percent=errors_or_none(account.holdout_floor),
-        least_error_percent=errors_of(account.least_floor),
-        least_holdout_error_percent=errors_or_none(account.least_holdout_floor),
-        confidence=CONFIDENCE,
-    )
-
-
-def _motor_noise(axis: str, floor: MotorNoiseFloor, left_a: float) -> MotorNoise:
-    return MotorNoise(
-        axis=axis,
-        noise=floor.noise_a,
-        least=floor.least_a if floor.is_bound else None,
-        source=floor.source.value,
-        std_percent=floor.std_percent,
-        dwells=floor.parts if floor.source is FloorSource.STANDSTILL else None,
-        pairs=floor.parts if floor.source is FloorSource.REPEATED_MOVES else None,
-        degrees_of_freedom=floor.freedom,
-        left=left_a,
-        refuted=floor.is_refuted(left_a),
-    )
-
-
-def _stated_skew(skew: CurrentDelay | None) -> Skew | None:
-    """Return a time skew that instruments confirm; None for any other."""
-    if skew is None or not skew.confirmed:
-        return None
-    return Skew(seconds=skew.seconds, std=skew.std)
-
-
-def _skew_by_instruments(skew: CurrentDelay | None) -> SkewByInstruments | None:
-    if skew is None:
-        return None
-    return SkewByInstruments(
-        seconds=skew.seconds,
-        std=skew.std,
-        fit_seconds=skew.fit_seconds,
-        fit_std=skew.fit_std,
-        confirmed=skew.confirmed,
-        is_in_model=skew.is_in_model,
-    )
-
-
-def _gear_loss(axis: str, gear: GearLoss) -> GearLossEntry:
-    return GearLossEntry(
-        axis=axis,
-        motoring_rows=gear.motoring_rows,
-        motoring_torque=gear.motoring_torque,
-        loss=gear.loss,
-        loss_std=gear.loss_std,
-        efficiency=gear.efficiency,
-        gain_factor=gear.gain_factor,
-        hidden_shift=gear.hidden_shift,
-        gain_carries_it=gear.gain_carries_it,
-    )
-
-
-def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> TurnEntry:
-    axes = fitted.cell.place_names
-    limits = zip(fitted.cell.axes, step.limits_nm, strict=True)
-    return TurnEntry(
-        accepted=None if step.accepted is None else _finding(step.accepted, axes),
-        added=[] if turn is None else [_added(step, placed, axes) for placed in turn.added],
-        removed=[] if turn is None else [placed.name_among(axes) for placed in turn.removed],
-        names_by_split=[_split_name(name, axes) for name in names_by_split(step)],
-        before=None if turn is None else _model_errors(turn.before),
-        after=None if turn is None else _model_errors(turn.after),
-        gain_changes=None if turn is None else _changed_gains(fitted, turn),
-        findings=[_finding(finding, axes) for finding in step.findings],
-        structures=[_finding(finding, axes) for finding in step.structures],
-        set_aside=[_aside(aside, axes) for aside in step.set_aside],
-        detection_limits=[
-            DetectionLimit(axis=axis.name, rms=float(limit), unit=axis.unit.force) for axis, limit in limits
-        ],
-    )
-
-
-def _changed_gains(fitted: Fit, compared: BeforeAfter) -> list[ChangedGain]:
-    changes = zip(fitted.cell.axes, compared.gains, strict=True)
-    return [_changed_gain(axis.name, axis.gain_unit, change) for axis, change in changes]
-
-
-def _changed_gain(axis: str, unit: str, change: GainShift) -> ChangedGain:
-    return ChangedGain(
-        axis=axis,
-        unit=unit,
-        before=change.before,
-        before_std=change.before_std,
-        after=change.after,
-        after_std=change.after_std,
-        choice_std=change.choice_std,
-        change_percent=change.change_percent,
-        change_std_percent=change.change_std_percent,
-        significant=change.significant,
-    )
-
-
-def _model_errors(errors: RelativeErrors) -> ModelErrors:
-    return ModelErrors(
-        relative_error_percent=errors_of(errors.in_sample),
-        cross_validated_error_percent=errors_of(errors.cross_validated),
-        left_out_runs=None if errors.left_out_runs is None else _left_out_runs(errors.left_out_runs),
-        holdout_error_percent=errors_or_none(errors.holdout),
-    )
-
-
-def _left_out_runs(left_out: RunErrors) -> LeftOutRuns:
-    return LeftOutRuns(
-        error_percent=errors_or_none(left_out.together),
-        runs=[_left_out_run(run) for run in left_out.runs],
-    )
-
-
-def _left_out_run(run: RunError) -> LeftOutRun:
-    return LeftOutRun(run=run.run, error_percent=errors_or_none(run.error), reason=run.reason or None)
-
-
-def _verdict(verdict: EffectVerdict, axes: tuple[str, ...]) -> VerdictEntry:
-    return VerdictEntry(
-        effect=verdict.placed.effect.name,
-        axis=verdict.placed.axis_name(axes),
-        settings=_settings(verdict.placed.effect),
-        judgement=verdict.judgement.value,
-        reason=verdict.reason,
-        written=verdict.written,
-        blocks=verdict.change.total.moves,
-        error_before_percent=errors_of(verdict.before),
-        error_after_percent=errors_of(verdict.after),
-    )
-
-
-def _settings(effect: Effect) -> dict[str, float]:
-    return {name: float(value) for name, value in effect.settings.items()}
-
-
-def _added(step: Step, placed: PlacedEffect, axes: tuple[str, ...]) -> PlacedEffectEntry:
-    return PlacedEffectEntry(
-        effect=placed.effect.name,
-        axis=placed.axis_name(axes),
-        settings=_settings(placed.effect),
-        coefficients=[
-            Coefficient(name=one.name, value=one.value, std=one.std, unit=one.unit)
-            for one in coefficients(step.after, placed)
-        ],
-    )
-
-
-def _split_name(name: SplitName, axes: tuple[str, ...]) -> SplitNameEntry:
-    return SplitNameEntry(
-        effect=name.placed.effect.name,
-        axis=name.placed.axis_name(axes),
-        settings=_settings(name.placed.effect),
-        splits=name.splits,
-    )
-
-
-def _finding(finding: Finding, axes: tuple[str, ...]) -> FindingEntry:
-    sizes = zip(finding.effect.coefficients, finding.coefficients, finding.deviations, strict=True)
-    return FindingEntry(
-        effect=finding.effect.name,
-        axis=PlacedEffect(finding.effect, finding.axis).axis_name(axes),
-        settings=_settings(finding.effect),
-        variable=finding.effect.abscissa.value,
-        coefficients=[
-            Coefficient(name=column.name, value=float(value), std=float(std), unit=column.unit)
-            for column, value, std in sizes
-        ],
-        probability=finding.probability,
-        folds_better=finding.folds_better,
-        explained=finding.explained,
-        error_before_percent=finding.error_before_percent,
-        error_after_percent=finding.error_after_percent,
-        error_fall=finding.error_fall,
-        held_out_fall=finding.held_out_fall,
-        passed=finding.passed,
-        share_of_excess=finding.share_of_excess,
-        refusals=list(finding.refusals),
-        # For findings that failed a gate it would be most of the file and of no use.
-        ambiguity=[rival.name_among(axes) for rival in finding.ambiguity] if finding.passed else None,
-    )
-
-
-def _aside(aside: SetAside, axes: tuple[str, ...]) -> AsideEntry:
-    return AsideEntry(**dict(_finding(aside.finding, axes)), reason=aside.reason(axes))

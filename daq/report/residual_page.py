@@ -13,8 +13,7 @@ from daq.report.certificate_page import certificate_page
 from daq.report.document import json_text
 from daq.report.effect_names import effect_text, variable_text
 from daq.report.fit import coefficients, identifiability_notes, start_of
-from daq.report.fit_schemas import ResidualFile
-from daq.report.gains import with_deviation
+from daq.report.gains import value_rows, with_deviation
 from daq.report.html import MARK, figure, folded, html_list, pair, paragraph, table
 from daq.report.plots import draw_effect, draw_torques, drawn_axis, plot_ranking
 from daq.report.residual import (
@@ -26,19 +25,20 @@ from daq.report.residual import (
     doubted_name,
     effect_sizes,
     error_rows,
+    errors_by_data,
     gains_sentence,
-    residual_report,
     searched_steps,
     summary,
     turn_sentences,
 )
+from daq.report.residual_document import ResidualFile, residual_report
+from daq.report.split_names import placed_by
 from daq.report.svg import Interval, intervals
 from daq.report.text import percent_text
 from daq.workflow.fit import Fit
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account, BeforeAfter
 from ident.discovery.evidence import Evidence
-from ident.discovery.joining import SetAside
 from ident.discovery.loop import Step
 from ident.effects.effect import PlacedEffect
 from ident.effects.unnamed import is_unnamed
@@ -58,17 +58,13 @@ def save_report(
     Raises:
         OutputFailed: the file system refuses.
     """
-    document = _residual_file(fitted, account, calibration)
+    body = residual_report(fitted, account, calibration)
+    # Not strictly: a document that is made takes every sequence for a list, and a calibration has tuples.
+    document = ResidualFile.model_validate({"format": FORMAT, "version": VERSION, **dict(body)}, strict=False)
     content = {PAGE: residual_page(fitted, account, calibration, comparison), DOCUMENT: json_text(document)}
     with writing(folder):
         for name, text in content.items():
             replace_file(folder / name, text.encode())
-
-
-def _residual_file(fitted: Fit, account: Account, calibration: Calibration) -> ResidualFile:
-    body = residual_report(fitted, account, calibration)
-    # Not strictly: a document that is made takes every sequence for a list, and a calibration has tuples.
-    return ResidualFile.model_validate({"format": FORMAT, "version": VERSION, **dict(body)}, strict=False)
 
 
 def beside_nameplate(fitted: Fit, calibration: Calibration) -> Comparison:
@@ -81,8 +77,9 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration, compa
     """Build the certificate of a closed loop with the account of its turns folded below."""
     axes = fitted.cell.axis_names
     comparison = comparison or beside_nameplate(fitted, calibration)
-    errors = [(name, *map(percent_text, (*error.axes, error.total))) for name, error in error_rows(account)]
-    sections, before = [], start_of(fitted)
+    errors = [(name, *map(percent_text, (*error.axes, error.total))) for name, error in error_rows(account).items()]
+    sections = []
+    before = start_of(fitted)
     for step, turn in zip(fitted.steps, account.turns, strict=True):
         if turn is not None:
             sections += [_effect(fitted, before, step, turn, placed) for placed in turn.added]
@@ -122,32 +119,25 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
     shown_axis = axes[drawn_axis(before, step.after, placed)]
     of_joint = "" if has_motor else f" of {axis}"
     kept = placed in final.effects
-    doubts: list[str] = []
+    sentences = [f"Name in files and commands: `{placed.name_among(axes)}`."]
     if doubt := doubted_name(step, placed, axes):
-        doubts.append(f"Its name is not certain. Chosen without an eighth of the moves, each in turn, {doubt}.")
-    rivals = () if step.accepted is None else step.accepted.ambiguity
-    ambiguous = "; ".join(f"{axes[one.axis]}: {effect_text(one.effect, axes)}" for one in rivals)
-    sentences = (
-        f"Name in files and commands: `{placed.name_among(axes)}`.",
-        *doubts,
-        f"These data cannot distinguish it from: {ambiguous}."
-        if ambiguous
-        else "Every other candidate is clearly worse.",
-        *(() if kept else ("A later round removed it again, because it no longer reduced the error.",)),
-    )
-    pairs = (
-        ("fit", turn.before.in_sample, turn.after.in_sample),
-        ("moves left out", turn.before.cross_validated, turn.after.cross_validated),
-        ("held out", turn.before.holdout, turn.after.holdout),
-    )
-    errors = [
-        (name, percent_text(first.at(placed.axis)), percent_text(second.at(placed.axis)))
-        for name, first, second in pairs
-        if first is not None and second is not None
-    ]
+        sentences.append(f"Its name is not certain. Chosen without an eighth of the moves, each in turn, {doubt}.")
+    if step.accepted is not None and step.accepted.ambiguity:
+        rivals = "; ".join(f"{axes[one.axis]}: {effect_text(one.effect, axes)}" for one in step.accepted.ambiguity)
+        sentences.append(f"These data cannot distinguish it from: {rivals}.")
+    else:
+        sentences.append("Every other candidate is clearly worse.")
+    if not kept:
+        sentences.append("A later round removed it again, because it no longer reduced the error.")
+    before_by_data = errors_by_data(turn.before)
+    after_by_data = errors_by_data(turn.after)
+    errors = []
+    for data in ("fit", "moves left out", "held out"):
+        first, second = before_by_data[data], after_by_data[data]
+        if first is not None and second is not None:
+            errors.append((data, percent_text(first.at(placed.axis)), percent_text(second.at(placed.axis))))
     # The coefficients of a term without a name mean nothing one by one; the certificate draws its curve.
-    found = () if is_unnamed(placed.effect) else coefficients(final if kept else step.after, placed)
-    sizes = [(one.name, with_deviation(one.value, one.std), one.unit) for one in found]
+    sizes = [] if is_unnamed(placed.effect) else value_rows(coefficients(final if kept else step.after, placed))
     return folded(
         f"{axis}: {effect_text(placed.effect, axes)}",
         paragraph(" ".join(sentences)),
@@ -162,26 +152,23 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
 
 
 def _gains(fitted: Fit, account: Account) -> str:
-    axes, changes = fitted.cell.axis_names, account.total.gains
     if fitted.estimate.gains_fixed:
         return folded("Gains without and with the effects", paragraph("The gains were held at their nameplate values."))
-    rows = [
-        (
-            axis.name,
-            with_deviation(change.before, change.before_std),
-            f"{with_deviation(change.after, change.after_std)} {axis.gain_unit}",
-            f"{change.change_percent:+.2f} ± {change.change_std_percent:.2f}",
-            "more than noise" if change.significant else "within noise",
+    rows = []
+    shifts = []
+    for axis, change in zip(fitted.cell.axes, account.total.gains, strict=True):
+        percent = change.change_percent
+        std_percent = change.change_std_percent
+        rows.append(
+            (
+                axis.name,
+                with_deviation(change.before, change.before_std),
+                f"{with_deviation(change.after, change.after_std)} {axis.gain_unit}",
+                f"{percent:+.2f} ± {std_percent:.2f}",
+                "more than noise" if change.significant else "within noise",
+            )
         )
-        for axis, change in zip(fitted.cell.axes, changes, strict=True)
-    ]
-    shifts = [
-        Interval(
-            *(name, one.change_percent, 2.0 * one.change_std_percent, -math.inf, math.inf),
-            f"{one.change_percent:+.2f} %",
-        )
-        for name, one in zip(axes, changes, strict=True)
-    ]
+        shifts.append(Interval(axis.name, percent, 2.0 * std_percent, -math.inf, math.inf, f"{percent:+.2f} %"))
     return folded(
         "Gains without and with the effects",
         table("", ("axis", *WHEN, "change ± σ [%]", "verdict"), rows, "words"),
@@ -195,8 +182,9 @@ def _gains(fitted: Fit, account: Account) -> str:
 def _turn(fitted: Fit, number: int, step: Step) -> str:
     axes, added = fitted.cell.place_names, step.accepted
     named = step.ranked(_SHOWN)
-    own = [(one.effect, one.axis) for one in named]
-    shown = (*named, *(o for o in step.structures[:_SHOWN] if o.passed and (o.effect, o.axis) not in own))
+    own = [placed_by(one) for one in named]
+    structures = [one for one in step.structures[:_SHOWN] if one.passed and placed_by(one) not in own]
+    shown = (*named, *structures)
     ranking = paragraph("No candidate could be tried.")
     if shown:
         ranked = sorted(shown, key=lambda finding: -finding.held_out_fall)
@@ -205,7 +193,10 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
             "Candidates by how much they reduce the error of left-out moves. Full: passed every check. Pale: these "
             "data cannot distinguish it from the added one. Hollow: failed a check.",
         )
-    in_words = [_in_words(fitted, aside) for aside in step.set_aside]
+    in_words = [
+        f"Not added to {axes[aside.finding.axis]}: {effect_text(aside.finding.effect, axes)}: {aside.reason(axes)}."
+        for aside in step.set_aside
+    ]
     if added is not None:
         in_words.append(f"Added to {axes[added.axis]}: {effect_text(added.effect, axes)}.")
     return folded(
@@ -216,24 +207,20 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
     )
 
 
-def _in_words(fitted: Fit, aside: SetAside) -> str:
-    axes = fitted.cell.place_names
-    words = effect_text(aside.finding.effect, axes)
-    return f"Not added to {axes[aside.finding.axis]}: {words}: {aside.reason(axes)}."
-
-
 def _limits(fitted: Fit, calibration: Calibration) -> str:
-    held = fitted.estimate.gains_fixed
-    limits = (
+    limits = [
         *identifiability_notes(fitted, calibration.payload_mass),
         "A torque constant that is wrong by a constant factor is part of the gain, and an effect that is the same at "
         "every speed, load and position is part of the parameters: neither leaves a residual.",
-        *(("The gains were held: an error in them is hidden in the parameters.",) if held else ()),
+    ]
+    if fitted.estimate.gains_fixed:
+        limits.append("The gains were held: an error in them is hidden in the parameters.")
+    limits += [
         "Backlash or elasticity behind an encoder on the motor may leave no trace in these signals.",
         "An effect is named after the variable it depends on and the shape of that dependence; another cause with the "
         "same dependence would get the same name. Indistinguishable effects are listed with each effect.",
         "Noise that was measured at standstill alone bounds nothing: in motion it may be smaller or larger. Between "
         "repeated moves its lower limit bounds any model's error (95 % confidence), often loosely: an error above it "
         "need not be an effect.",
-    )
+    ]
     return folded("What these data can and cannot show", html_list(limits))

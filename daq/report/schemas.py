@@ -4,18 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from daq.report.bus_schemas import ErrorCodeReport, MonitorReport, ScanReport
-from daq.report.controller_schemas import (
-    CertificateReport,
-    DriveChange,
-    DriveRollback,
-    FileChange,
-    FileRollback,
-    HistoryReport,
-)
-from daq.report.demo_schemas import DemoReport
-from daq.report.fit_schemas import CasesReport, ContactReport, FitReport, ResidualReport, ValidateReport, WeighReport
+from daq.report.bus_views import ErrorCodeReport, MonitorReport, ScanReport
+from daq.report.certificate import CertificateReport
+from daq.report.fit import CasesReport, FitReport
+from daq.report.history import HistoryReport
 from daq.report.job_schemas import (
+    DemoReport,
     DryRunReport,
     FleetReport,
     JobReport,
@@ -24,9 +18,13 @@ from daq.report.job_schemas import (
     SignatureReport,
     SignersReport,
 )
-from daq.report.log_schemas import BagReport, ImportReport, InfoReport, RecordReport, SalvageReport, TableReport
+from daq.report.log import BagReport, ImportReport, InfoReport, RecordReport, SalvageReport, TableReport
 from daq.report.plan import PlanReport
+from daq.report.proposal import DriveChange, DriveRollback, FileChange, FileRollback
+from daq.report.residual_document import ResidualReport
 from daq.report.urdf_views import UrdfReport
+from daq.report.validation import ValidateReport
+from daq.report.weighing_views import ContactReport, WeighReport
 
 REPORTS: dict[str, Any] = {
     "demo": DemoReport,

@@ -25,6 +25,11 @@ class SplitName:
     of: int  #: number of splits
 
 
+def placed_by(finding: Finding) -> PlacedEffect:
+    """Return the effect that a finding tests, on its axis."""
+    return PlacedEffect(finding.effect, finding.axis)
+
+
 def names_by_split(step: Step) -> tuple[SplitName, ...]:
     """Names that splits of the data choose for what a turn added, the most frequent first.
 
@@ -50,21 +55,14 @@ def names_by_split(step: Step) -> tuple[SplitName, ...]:
             candidates.append(finding)
     squares = np.stack([finding.fold_errors for finding in candidates])
     folds = squares.shape[1]
-    best: list[int] = []
+    count = np.zeros(len(candidates), dtype=np.intp)
     for left_out in range(folds):
         split = np.delete(squares, left_out, axis=1)
-        is_clearly_better = is_better(split, split[0])
-        chosen = 0  # what was added
-        if is_clearly_better.any():
-            total = np.where(is_clearly_better, split.sum(axis=1), np.inf)
-            chosen = int(np.argmin(total))
-        best.append(chosen)
-    count = np.bincount(best, minlength=len(candidates))
+        total = np.where(is_better(split, split[0]), split.sum(axis=1), np.inf)
+        # Where none is clearly better, all are alike, and the first is what was added.
+        count[np.argmin(total)] += 1
     # Of equals, what was added comes first.
     order = np.argsort(-count, kind="stable")
-    names: list[SplitName] = []
-    for number in order:
-        if count[number] > 0:
-            finding = candidates[number]
-            names.append(SplitName(PlacedEffect(finding.effect, finding.axis), int(count[number]), folds))
-    return tuple(names)
+    return tuple(
+        SplitName(placed_by(candidates[number]), int(count[number]), folds) for number in order if count[number] > 0
+    )

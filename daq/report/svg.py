@@ -34,7 +34,6 @@ class Interval:
     lower: float  #: limits of the value; infinite without one
     upper: float
     label: str  #: the value in words, beside the row
-    earlier: float = math.nan  #: value to compare with, NaN for none
 
 
 def intervals(rows: Sequence[Interval], title: str, unit: str) -> str:
@@ -43,9 +42,8 @@ def intervals(rows: Sequence[Interval], title: str, unit: str) -> str:
     The scale shows the limits where the values need a tenth of it or more. Else it is the values' own, and arrows at
     both ends say that the limits are beyond.
     """
-    reach = _largest([abs(r.value) + r.half for r in rows] + [abs(r.earlier) for r in rows])
+    reach = _largest(abs(row.value) + row.half for row in rows)
     bounds = _largest([abs(bound) for r in rows for bound in (r.lower, r.upper)])
-    limited = bounds > 0.0
     to_scale = bounds == 0.0 or reach >= 0.1 * bounds
     # Below 0.1 a scale would only magnify noise.
     extent = _ROOM * max(reach, bounds if to_scale else 0.0, 0.1)
@@ -54,15 +52,13 @@ def intervals(rows: Sequence[Interval], title: str, unit: str) -> str:
     for number, row in enumerate(rows):
         y = scale.y(number)
         low, high = (scale.x(min(max(bound, -extent), extent)) for bound in (row.lower, row.upper))
-        if limited:
+        if bounds > 0.0:
             parts.insert(0, f'<rect class="range" x="{low:.1f}" y="{y - 9:.1f}" width="{high - low:.1f}" height="18"/>')
         parts += [
             _line(scale.x(bound), y - 9, scale.x(bound), y + 9, "limit")
             for bound in (row.lower, row.upper)
             if abs(bound) <= extent
         ]
-        if math.isfinite(row.earlier):
-            parts.append(_diamond(scale.x(row.earlier), y))
         if math.isfinite(row.value):
             parts.append(_line(scale.x(row.value - row.half), y, scale.x(row.value + row.half), y, "bar"))
             parts.append(_dot(scale.x(row.value), y, "dot"))
@@ -122,13 +118,12 @@ def chart(
         reach: the scale of y reaches from -reach to reach at least, so that charts can share it.
     """
     first = lines[0]
-    values = [line.y for line in lines] + ([] if half is None else [first.y - half, first.y + half])
-    known = np.concatenate([column[np.isfinite(column)] for column in values] + [np.array([0.0, reach, -reach])])
-    low, high = float(known.min()), float(known.max())
-    high = high if high > low else low + 1.0
-    along = np.concatenate([line.x[np.isfinite(line.x)] for line in lines])
-    begin, end = (float(along.min()), float(along.max())) if len(along) else (0.0, 1.0)
-    end = end if end > begin else begin + 1.0
+    values = [line.y for line in lines]
+    if half is not None:
+        values += [first.y - half, first.y + half]
+    values.append(np.array([0.0, reach, -reach]))
+    low, high = _ends(values)
+    begin, end = _ends([line.x for line in lines])
     across, left, top, height = _WIDTH - 8.0, 50.0, 22.0, 150.0
 
     def right(x: FloatArray) -> FloatArray:
@@ -137,33 +132,45 @@ def chart(
     def down(y: FloatArray) -> FloatArray:
         return top + (high - y) / (high - low) * (height - top)
 
-    ticks = np.array(list(_ticks(low, high)))
     parts = []
-    for tick, y in zip(ticks.tolist(), down(ticks).tolist(), strict=True):
-        parts += [_line(left, y, across, y, "zero" if tick == 0.0 else "grid")]
-        parts += [_text(left - 5, y + 4, f"{tick:g}", "soft end")]
-    ticks = np.array(list(_ticks(begin, end)))
-    for tick, x in zip(ticks.tolist(), right(ticks).tolist(), strict=True):
-        parts.append(_text(x, height + 17, f"{tick:g}", "soft mid"))
+    for tick in _ticks(low, high):
+        y = float(down(np.array(tick)))
+        parts.append(_line(left, y, across, y, "zero" if tick == 0.0 else "grid"))
+        parts.append(_text(left - 5, y + 4, f"{tick:g}", "soft end"))
+    parts.extend(
+        _text(float(right(np.array(tick))), height + 17, f"{tick:g}", "soft mid") for tick in _ticks(begin, end)
+    )
     if half is not None:
-        xs, ys = np.concatenate([first.x, first.x[::-1]]), np.concatenate([first.y + half, (first.y - half)[::-1]])
-        places = zip(right(xs).tolist(), down(ys).tolist(), strict=True)
-        parts.append(f'<polygon class="band" points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in places)}"/>')
+        xs = np.concatenate([first.x, first.x[::-1]])
+        ys = np.concatenate([first.y + half, (first.y - half)[::-1]])
+        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(right(xs).tolist(), down(ys).tolist(), strict=True))
+        parts.append(f'<polygon class="band" points="{points}"/>')
     for line in lines:
-        draw = _points if line.kind in {"cloud", "rest"} else _curve
+        draw = _points if line.kind in _CLOUDS else _curve
         parts.append(f'<path class="{line.kind}" d="{draw(right(line.x), down(line.y))}"/>')
     parts += [_text(0, 13, labels[1], "soft"), _text(across, height + 36, labels[0], "soft end")]
-    bottom = height + 42
-    named, at = [line for line in lines if line.name], left
-    if named:
-        bottom += 18
+    named = [line for line in lines if line.name]
+    bottom = height + (60 if named else 42)
+    at = left
     for line in named:
-        sample = f"M{at:.0f} {bottom - 10:.0f}h{0 if line.kind in {'cloud', 'rest'} else 22}"
+        length = 0 if line.kind in _CLOUDS else 22
+        sample = f"M{at:.0f} {bottom - 10:.0f}h{length}"
         parts += [f'<path class="{line.kind}" d="{sample}"/>', _text(at + 28, bottom - 6, line.name, "soft")]
         at += 40 + 7.5 * len(line.name)
     return _drawing(parts, title, bottom)
 
 
+def _ends(columns: Iterable[FloatArray]) -> tuple[float, float]:
+    """Least and largest of all known values, apart where they are one; 0 and 1 without any."""
+    values = np.concatenate([*columns])
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return 0.0, 1.0
+    low, high = float(known.min()), float(known.max())
+    return low, high if high > low else low + 1.0
+
+
+_CLOUDS = frozenset({"cloud", "rest"})  #: Kinds of lines that are points
 _STRETCHES = 2 * round(_WIDTH)  #: Two a unit of the drawing's width, the dots of a fine screen
 
 
@@ -230,18 +237,18 @@ _COLUMNS = 2  #: Drawings beside each other
 def sheet(drawings: Sequence[str], title: str) -> bytes:
     """Return a file of its own with several drawings under a title, in the colours of paper."""
     heights = [float(found[1]) for one in drawings if (found := re.search(r'viewBox="0 0 \S+ ([\d.]+)"', one))]
-    row, across, gap = max(heights), min(_COLUMNS, len(drawings)), 24.0
-    width, height = across * (_WIDTH + gap) + gap, -(-len(drawings) // across) * (row + gap) + 48.0
+    across = min(_COLUMNS, len(drawings))
+    gap = 24.0
+    column_width = _WIDTH + gap
+    row_height = max(heights) + gap
+    width = across * column_width + gap
+    height = math.ceil(len(drawings) / across) * row_height + 48.0
     style = re.sub(r"var\(--(\w+)\)", lambda found: LIGHT[found[1]], DRAWING)
-    placed = (
-        one.replace(
-            "<svg ",
-            f'<svg x="{gap + number % across * (_WIDTH + gap):g}" y="{48 + number // across * (row + gap):g}" '
-            f'width="{_WIDTH:g}" height="{height_of:g}" ',
-            1,
-        )
-        for number, (one, height_of) in enumerate(zip(drawings, heights, strict=True))
-    )
+    placed = []
+    for number, (drawing, own_height) in enumerate(zip(drawings, heights, strict=True)):
+        row, column = divmod(number, across)
+        place = f'x="{gap + column * column_width:g}" y="{48 + row * row_height:g}"'
+        placed.append(drawing.replace("<svg ", f'<svg {place} width="{_WIDTH:g}" height="{own_height:g}" ', 1))
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" width="{width:g}" '
         f'height="{height:g}"><style>{style}</style><rect width="100%" height="100%" fill="{LIGHT["paper"]}"/>'
@@ -321,10 +328,6 @@ def _line(x1: float, y1: float, x2: float, y2: float, kind: str) -> str:
 
 def _dot(x: float, y: float, kind: str) -> str:
     return f'<circle class="{kind}" cx="{x:.1f}" cy="{y:.1f}" r="4.5"/>'
-
-
-def _diamond(x: float, y: float) -> str:
-    return f'<path class="hollow" d="M{x:.1f} {y - 7:.1f}l6 7l-6 7l-6-7z"/>'
 
 
 def _text(x: float, y: float, text: str, kind: str = "") -> str:

@@ -20,7 +20,11 @@ SHOWN_SIGMAS = 2.0  #: Half width of the intervals and bands of reports and pict
 
 def printable(text: str) -> str:
     """Spell out control characters, which could command a terminal; line ends stay."""
-    return "".join(c if c.isprintable() or c == "\n" else _spelled(c) for c in text)
+    return _spelled_out(text, "\n")
+
+
+def _spelled_out(text: str, kept: str = "") -> str:
+    return "".join(c if c.isprintable() or c in kept else _spelled(c) for c in text)
 
 
 def _spelled(character: str) -> str:
@@ -31,13 +35,12 @@ def _spelled(character: str) -> str:
 
 def terminal_text(text: str) -> Text:
     """One line of text that rich does not read as markup; control characters and line ends are spelled out."""
-    return Text("".join(c if c.isprintable() else _spelled(c) for c in text))
+    return Text(_spelled_out(text))
 
 
 def terminal_lines(text: str) -> str:
     """Lines of a diff: control characters except tabs spelled out, line ends as \\n."""
-    lines = text.splitlines()
-    return "\n".join("".join(c if c.isprintable() or c == "\t" else _spelled(c) for c in line) for line in lines)
+    return "\n".join(_spelled_out(line, "\t") for line in text.splitlines())
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +112,8 @@ class WholeTable(Table):
 
     def _only(self, chosen: list[int]) -> Table:
         part = Table(box=self.box, show_edge=False, pad_edge=False, collapse_padding=self.collapse_padding)
-        for column in (self.columns[index] for index in chosen):
+        columns = [self.columns[index] for index in chosen]
+        for column in columns:
             part.add_column(
                 column.header,
                 justify=column.justify,
@@ -117,8 +121,8 @@ class WholeTable(Table):
                 overflow=column.overflow,
                 ratio=column.ratio,
             )
-        cells = [[*self.columns[index].cells] for index in chosen]
-        for row, values in zip(self.rows, zip(*cells, strict=True), strict=True):
+        cells = zip(*(column.cells for column in columns), strict=True)
+        for row, values in zip(self.rows, cells, strict=True):
             part.add_row(*values, style=row.style)
         return part
 
@@ -168,6 +172,11 @@ def plain_table(
     return table
 
 
+def known_text(value: float | None, form: str, unknown: str = "-") -> str:
+    """Format a number by a format specification; `unknown` for one that is not known."""
+    return unknown if value is None else format(value, form)
+
+
 def percent_text(percent: float) -> str:
     """Two decimals; a dash for an unknown value."""
     return f"{percent:.2f}" if math.isfinite(percent) else "-"
@@ -176,17 +185,6 @@ def percent_text(percent: float) -> str:
 def spelled_bytes(text: str) -> str:
     """Spell out the bytes of a file's name that are not UTF-8, which no document can hold, as `\\udcff`."""
     return text.encode(errors="backslashreplace").decode()
-
-
-def json_safe(value: Any) -> Any:
-    """Copy a document, with null for numbers that JSON lacks."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, dict):
-        return {str(key): json_safe(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [json_safe(item) for item in value]
-    return value
 
 
 _FORMULA = tuple("=+-@\t\n＝＋－＠")

@@ -9,10 +9,10 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from daq.report.document import Figure, Report
-from daq.report.fit_schemas import Errors
+from daq.report.fit import Errors
 from daq.report.text import plain_table, printable, terminal_text
 from daq.workflow.remaining_corrections import CORRECTIONS
-from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Shift, Updated
+from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
 from ident.calibration import Calibration
 from ident.physical.physical import MARGIN
 
@@ -80,13 +80,19 @@ def urdf_view(
     table = plain_table(("joint", "link", "mass kg", "centre of mass m", "damping", "friction"), left=(0, 1))
     for name, update in updates.items():
         centre = " ".join(f"{value:+.3f}" for value in update.body.centre_m)
-        figures = f"{update.body.mass_kg:.3g}", centre, f"{update.damping:.3g}", f"{update.friction:.3g}"
-        table.add_row(terminal_text(name), terminal_text(updated.links[name]), *figures)
+        table.add_row(
+            terminal_text(name),
+            terminal_text(updated.links[name]),
+            f"{update.body.mass_kg:.3g}",
+            centre,
+            f"{update.damping:.3g}",
+            f"{update.friction:.3g}",
+        )
     yield table
-    change, joints = robot.parameters.torque_change_percent, robot.parameters.model.robot.joints
     if robot.parameters.exact:
         yield "The torque of these bodies is exactly the identified one."
     else:
+        change = robot.parameters.torque_change_percent
         axes = ", ".join(f"{value:.2f}" for value in change.axes)
         shifts = ", ".join(f"{shift.name} by {shift.deviations:.1f} σ" for shift in robot.shifts[:_SHOWN_SHIFTS])
         yield (
@@ -94,6 +100,7 @@ def urdf_view(
             f"{change.total:.2g} % (axes: {axes} %). Largest shifts: {shifts}."
         )
     if robot.prior.assumed:
+        joints = robot.parameters.model.robot.joints
         names = ", ".join(joints[number].name for number in robot.prior.assumed)
         yield printable(
             f"The URDF has no possible inertia behind {names}; a ball was assumed where the data have none."
@@ -101,7 +108,8 @@ def urdf_view(
     if updated.merged:
         yield printable(f"Merged into the moving link that carries them: {', '.join(updated.merged)}.")
     left_out = ["rotor inertias", "offsets"]
-    left_out += ["friction of coupled motors"] if robot.parameters.model.drive_train.coupled else []
+    if robot.parameters.model.drive_train.coupled:
+        left_out.append("friction of coupled motors")
     corrected: list[str] = []
     for effect in calibration.effects:
         name = f"{effect.name} on {effect.axis}"
@@ -135,19 +143,19 @@ def urdf_report(
         out: the URDF.
     """
     parameters = robot.parameters
-    change = parameters.torque_change_percent
-    return UrdfReport(
-        urdf=str(out),
+    return UrdfReport.of(
+        parameters,
+        urdf=out,
         calibration=calibration.cell,
         same_configuration=same_configuration,
-        exact=parameters.exact,
-        torque_change_percent=Errors(axes=list(change.axes), total=change.total),
-        shifts=[_shifted(shift) for shift in robot.shifts],
+        shifts=[
+            ShiftedParameter.of(one, physical=one.realised, standard_deviations=one.deviations) for one in robot.shifts
+        ],
         margin=MARGIN,
         joints=[_joint(robot, number, update, updated) for number, update in enumerate(updates.values())],
-        merged_links=list(updated.merged),
+        merged_links=updated.merged,
         not_in_urdf=[
-            NotInUrdf(name=column.name, value=float(value), unit=column.unit)
+            NotInUrdf.of(column, value=value)
             for column, value in zip(parameters.model.columns, parameters.standard, strict=True)
             if column.name.startswith(("Ia", "off", "fvm", "fsm"))
         ],
@@ -155,25 +163,13 @@ def urdf_report(
     )
 
 
-def _shifted(shift: Shift) -> ShiftedParameter:
-    return ShiftedParameter(
-        name=shift.name,
-        identified=shift.identified,
-        physical=shift.realised,
-        standard_deviations=shift.deviations,
-    )
-
-
 def _joint(robot: PhysicalRobot, number: int, update: JointUpdate, updated: Updated) -> UrdfJoint:
     name = robot.parameters.model.robot.joints[number].name
-    return UrdfJoint(
+    return UrdfJoint.of(
+        update,
+        update.body,
         name=name,
         link=updated.links[name],
-        mass_kg=update.body.mass_kg,
-        centre_m=update.body.centre_m.tolist(),
-        inertia_kg_m2=update.body.inertia_kg_m2.tolist(),
-        damping=update.damping,
-        friction=update.friction,
-        smallest_eigenvalue=float(robot.parameters.eigenvalues[number]),
+        smallest_eigenvalue=robot.parameters.eigenvalues[number],
         prior_assumed=number in robot.prior.assumed,
     )

@@ -11,25 +11,95 @@ from rich.console import RenderableType
 
 from daq.files import replace_file
 from daq.report import paper_tables
-from daq.report.fit import errors_of
-from daq.report.fit_schemas import (
-    CheckedLog,
-    CheckedPayload,
-    DiagnosisEntry,
-    FoundMass,
-    Together,
-    ValidatedLog,
-    ValidateReport,
-)
+from daq.report.document import Figure, Report
+from daq.report.fit import Errors
 from daq.report.gains import diagnosis_texts
 from daq.report.plots import plot_torques
 from daq.report.svg import sheet
 from daq.report.text import Sentence, percent_text, plain_table, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
-from daq.workflow.validate import CheckedRun, CrossValidation, Mass, WeighedRun, conditioning_of, together
+from daq.workflow.validate import CrossValidation, Mass, WeighedRun, conditioning_of, together
 from daq.workflow.validation import DataUse, Validation
-from ident.calibration import Calibration
-from ident.errors import Diagnosis
+from ident.calibration import Calibration, PayloadMass
+
+
+class ValidatedLog(Report):
+    """Errors of one log."""
+
+    log: str
+    sha256: str
+    seen_by_fit: bool
+    partial: bool
+    held_out: bool
+    same_configuration: bool
+    rows: int
+    relative_error_percent: Errors
+    picture: str | None
+
+
+class Together(Report):
+    """Errors of all logs together."""
+
+    relative_error_percent: Errors
+
+
+class CheckedLog(Report):
+    """One log under every calibration."""
+
+    log: str
+    condition: Figure
+    relative_error_percent: dict[str, Errors | None]
+    left_out: str | None
+    seen_by: list[str]
+
+
+class FoundMass(Report):
+    """Mass of a payload by one calibration, or why it was not found."""
+
+    reason: str = ""
+    mass_kg: Figure = None
+    std_percent: Figure = None
+    std_with_gains_percent: Figure = None
+    error_percent: Figure = None
+
+
+class CheckedPayload(Report):
+    """A weighed payload."""
+
+    log: str
+    payload: str
+    mounting: str
+    weighed_kg: Figure
+    with_bare_runs: bool
+    masses: dict[str, FoundMass]
+
+
+# Not the `Diagnosis` of `ident`: the name of a run is that of its file, which only a `Report` makes fit for JSON.
+class DiagnosisEntry(Report):
+    """Something wrong with a recording or a fit, and where to look."""
+
+    name: str
+    runs: list[str]
+    axes: list[str]
+    found: str
+    expected: str
+    remedy: str
+
+
+class ValidateReport(Report):
+    """`validate`."""
+
+    cell: str
+    axes: list[str]
+    filter: dict[str, int | float | list[float]]
+    fit_relative_error_percent: Errors
+    payload_mass: list[PayloadMass]
+    logs: list[ValidatedLog]
+    together: Together | None
+    calibrations: list[str]
+    diagnoses: list[DiagnosisEntry]
+    runs: list[CheckedLog]
+    payloads: list[CheckedPayload]
 
 
 def validation_view(calibration: Calibration, found: CrossValidation) -> Iterator[RenderableType]:
@@ -38,8 +108,10 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
     headings = ("log", *(gain.axis for gain in calibration.gains), "total", "")
     table = plain_table(headings, title="Relative error ‖ρ‖/‖Y‖ [%]", left=(0, len(headings) - 1), wrap=(0,))
     errors = [(validation.run, validation.error, validation.data_use.value) for validation in validations]
-    errors += [("together", together(validations), "")] if len(validations) > 1 else []
-    for name, error, use in (*errors, ("fit", calibration.relative_error_percent, "")):
+    if len(validations) > 1:
+        errors.append(("together", together(validations), ""))
+    errors.append(("fit", calibration.relative_error_percent, ""))
+    for name, error, use in errors:
         table.add_row(terminal_text(name), *map(percent_text, (*error.axes, error.total)), use)
     yield table
     filter_ = conditioning_of(calibration)
@@ -47,37 +119,37 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
         f"Position filter {filter_.position_cutoff_hz:g} Hz, decimation {filter_.decimation_cutoff_hz:g} Hz, as in the "
         "fit. Compare relative errors only under the same filters."
     )
-    doubts: list[str] = []
-    names = {validation.run for validation in validations}
-    for diagnosis, text in zip(found.diagnoses, diagnosis_texts(found.diagnoses), strict=True):
-        # What these runs show again is theirs.
-        is_of_fit = diagnosis in calibration.diagnoses and names.isdisjoint(diagnosis.runs)
-        doubts.append(f"The fit of this calibration found: {text}" if is_of_fit else text)
-    doubts += [
-        f"{validation.log} carries another cell configuration than the logs of the fit; check the difference."
-        for validation in validations
-        if not validation.same_configuration
-    ]
-    doubts += [
-        f"{validation.run} contradicts the calibration: it leaves {validation.error.total:.3g} % of the torque. "
-        "Was the payload mounted as the log says, and is it the same robot?"
-        for validation in validations
-        if validation.error.total > DOUBTFUL_PERCENT
-    ]
-    doubts += [f"{run.run}: {run.left_out}" for run in found.runs if run.left_out]
-    yield from (Sentence(doubt, "bold") for doubt in doubts)
+    yield from (Sentence(doubt, "bold") for doubt in _doubts(calibration, found))
     for paper_table in validation_tables(found, complete=False):
         yield ""
         yield from paper_table.view(numbered=False)
 
 
+def _doubts(calibration: Calibration, found: CrossValidation) -> Iterator[str]:
+    validations = found.validations
+    names = {validation.run for validation in validations}
+    for diagnosis, text in zip(found.diagnoses, diagnosis_texts(found.diagnoses), strict=True):
+        # What these runs show again is theirs.
+        is_of_fit = diagnosis in calibration.diagnoses and names.isdisjoint(diagnosis.runs)
+        yield f"The fit of this calibration found: {text}" if is_of_fit else text
+    for validation in validations:
+        if not validation.same_configuration:
+            yield f"{validation.log} carries another cell configuration than the logs of the fit; check the difference."
+    for validation in validations:
+        if validation.error.total > DOUBTFUL_PERCENT:
+            yield (
+                f"{validation.run} contradicts the calibration: it leaves {validation.error.total:.3g} % of the torque."
+                " Was the payload mounted as the log says, and is it the same robot?"
+            )
+    yield from (f"{run.run}: {run.left_out}" for run in found.runs if run.left_out)
+
+
 def validation_tables(found: CrossValidation, *, complete: bool) -> list[paper_tables.PaperTable]:
     """Tables 5 to 8 of the paper; unless complete, Table 6 is left out where the table of errors shows the same."""
-    return [
-        paper_tables.condition_table(found),
-        *([paper_tables.paper_error_table(found)] if complete or len(found.calibrations) > 1 else []),
-        *paper_tables.mass_tables(found),
-    ]
+    tables = [paper_tables.condition_table(found)]
+    if complete or len(found.calibrations) > 1:
+        tables.append(paper_tables.paper_error_table(found))
+    return [*tables, *paper_tables.mass_tables(found)]
 
 
 def draw_validations(calibration: Calibration, validations: tuple[Validation, ...], folder: Path) -> dict[Path, Path]:
@@ -115,73 +187,40 @@ def validate_report(calibration: Calibration, found: CrossValidation, drawn: dic
         drawn: pictures by log.
     """
     validations = found.validations
-    return ValidateReport(
-        cell=calibration.cell,
+    return ValidateReport.of(
+        found,
+        calibration,
         axes=[gain.axis for gain in calibration.gains],
-        filter=calibration.filter,
-        fit_relative_error_percent=errors_of(calibration.relative_error_percent),
-        payload_mass=list(calibration.payload_mass),
-        logs=[_validated_log(validation, drawn.get(validation.log)) for validation in validations],
-        together=Together(relative_error_percent=errors_of(together(validations))) if validations else None,
+        fit_relative_error_percent=calibration.relative_error_percent,
+        logs=[
+            ValidatedLog.of(
+                validation,
+                sha256=validation.digest,
+                seen_by_fit=validation.data_use is DataUse.FIT,
+                held_out=validation.data_use is DataUse.HOLDOUT,
+                relative_error_percent=validation.error,
+                picture=drawn.get(validation.log),
+            )
+            for validation in validations
+        ],
+        together={"relative_error_percent": together(validations)} if validations else None,
         calibrations=list(found.calibrations),
-        diagnoses=[_diagnosis(one) for one in found.diagnoses],
-        runs=[_checked_log(run) for run in found.runs],
+        runs=[
+            CheckedLog.of(run, relative_error_percent=run.errors, left_out=run.left_out or None) for run in found.runs
+        ],
         payloads=[_checked_payload(run, with_bare_runs=found.with_bare_runs) for run in found.weighed],
     )
 
 
-def _validated_log(validation: Validation, picture: Path | None) -> ValidatedLog:
-    return ValidatedLog(
-        log=str(validation.log),
-        sha256=validation.digest,
-        seen_by_fit=validation.data_use is DataUse.FIT,
-        partial=validation.partial,
-        held_out=validation.data_use is DataUse.HOLDOUT,
-        same_configuration=validation.same_configuration,
-        rows=validation.rows,
-        relative_error_percent=errors_of(validation.error),
-        picture=None if picture is None else str(picture),
-    )
-
-
-def _diagnosis(one: Diagnosis) -> DiagnosisEntry:
-    return DiagnosisEntry(
-        name=one.name,
-        runs=list(one.runs),
-        axes=list(one.axes),
-        found=one.found,
-        expected=one.expected,
-        remedy=one.remedy,
-    )
-
-
-def _checked_log(run: CheckedRun) -> CheckedLog:
-    return CheckedLog(
-        log=str(run.log),
-        condition=run.condition,
-        relative_error_percent={label: errors_of(error) for label, error in run.errors.items()},
-        left_out=run.left_out or None,
-        seen_by=list(run.seen_by),
-    )
-
-
 def _checked_payload(run: WeighedRun, *, with_bare_runs: bool) -> CheckedPayload:
-    return CheckedPayload(
-        log=str(run.log),
+    return CheckedPayload.of(
+        run,
+        run.payload,
         payload=run.payload.name,
-        mounting=run.payload.mounting,
-        weighed_kg=run.weighed_kg,
         with_bare_runs=with_bare_runs,
         masses={label: _found_mass(mass) for label, mass in run.masses.items()},
     )
 
 
 def _found_mass(mass: Mass | str) -> FoundMass:
-    if isinstance(mass, str):
-        return FoundMass(reason=mass)
-    return FoundMass(
-        mass_kg=mass.mass_kg,
-        std_percent=mass.std_percent,
-        std_with_gains_percent=mass.std_with_gains_percent,
-        error_percent=mass.error_percent,
-    )
+    return FoundMass(reason=mass) if isinstance(mass, str) else FoundMass.of(mass)

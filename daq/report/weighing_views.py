@@ -12,29 +12,118 @@ from rich.text import Text
 
 from daq.config.cell import Cell, robot_of
 from daq.files import replace_file
-from daq.report.fit import errors_of
-from daq.report.fit_schemas import (
-    AddedMoves,
-    ContactAxis,
-    ContactEntry,
-    ContactReport,
-    NotJudged,
-    WeighedParameter,
-    WeighedValue,
-    WeighedValues,
-    WeighReport,
-)
+from daq.report.document import Figure, Report
+from daq.report.fit import Errors
 from daq.report.gains import with_deviation
 from daq.report.picture import BLACK, ORANGE, SKY, legend_below, panels, render, unformatted
-from daq.report.text import plain_table, terminal_text
+from daq.report.text import known_text, plain_table, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
 from daq.workflow.weigh import Weighed
 from ident.arrays import FloatArray
-from ident.contact import Contact, ExternalTorque
+from ident.contact import ExternalTorque
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, pseudo_inertia
 from ident.model.robot import Place
 from ident.model.urdf import read_urdf
-from ident.weighing import KNOWN, Help, WeighedBody
+from ident.weighing import KNOWN, WeighedBody
+
+
+class WeighedValue(Report):
+    """A number and its σ."""
+
+    value: Figure
+    std: Figure
+
+
+class WeighedValues(Report):
+    """Numbers and their σ."""
+
+    value: list[Figure]
+    std: list[Figure]
+
+
+class AddedMoves(Report):
+    """Moves that would show a parameter."""
+
+    words: str
+    seconds: float
+    std: Figure
+
+
+class WeighedParameter(Report):
+    """One of the ten parameters of a body."""
+
+    name: str
+    unit: str
+    value: Figure
+    std: Figure
+    std_of_moves: Figure
+    identifiable: bool
+    add: AddedMoves | None
+
+
+class WeighReport(Report):
+    """`weigh`."""
+
+    cell: str
+    logs: list[str]
+    bare: list[str]
+    part_of_the_fit: list[str]
+    declared_kg: Figure
+    mass_kg: WeighedValue
+    centre_m: WeighedValues
+    centre_in_platform_m: WeighedValues | None
+    inertia_about_centre_kg_m2: WeighedValues
+    parameters: list[WeighedParameter]
+    relative_error_percent: Errors
+    moves: int
+    complete: bool
+
+
+class ContactAxis(Report):
+    """Band and threshold of one axis; medians over the motion in `unit`."""
+
+    axis: str
+    unit: str
+    scale: list[Figure]
+    band_over_scale: Figure
+    threshold_over_scale: Figure
+    correlation_s: Figure
+    quiet_s: Figure
+    band: Figure
+    threshold: Figure
+    largest: Figure
+
+
+class ContactEntry(Report):
+    """A stretch beyond the threshold."""
+
+    axis: str
+    start_s: float
+    end_s: float
+    peak: float
+    peak_over_threshold: float
+
+
+class NotJudged(Report):
+    """An axis that cannot show a contact."""
+
+    axis: str
+    reason: str
+
+
+class ContactReport(Report):
+    """`contact`."""
+
+    cell: str
+    log: str
+    band_from_this_log: bool
+    stretches_left_out: int
+    alarms_per_hour: float
+    axes: list[ContactAxis]
+    contacts: list[ContactEntry]
+    not_judged: list[NotJudged]
+    picture: str | None
+
 
 LISTED = 20  #: Contacts shown in a terminal; `--json` has all
 NOISE_ROWS = 4.0
@@ -43,8 +132,10 @@ NOISE_ROWS = 4.0
 
 def weighed_view(found: Weighed) -> Iterator[RenderableType]:
     """Mass, centre and inertia, the ten parameters, and doubts."""
-    body, carrier = found.body, "flange" if found.cell.chain is None else "platform"
-    nothing, turns = _shows_nothing(body), not np.isnan(body.values[:-1]).all()
+    body = found.body
+    carrier = "flange" if found.cell.chain is None else "platform"
+    nothing = _shows_nothing(body)
+    turns = not np.isnan(body.values[:-1]).all()
     shown = turns and not nothing
     if nothing:
         yield Text("No body shows: the mass is within two σ of nothing.", style="bold")
@@ -89,15 +180,15 @@ def _shows_nothing(body: WeighedBody) -> bool:
 
 def _add_centre_and_inertia(table: Table, found: Weighed) -> None:
     body = found.body
-    (centre, centre_std), (inertia, inertia_std) = body.centre_m, body.inertia_kg_m2
-    for name, value, std in zip("xyz", 1000.0 * centre, 1000.0 * centre_std, strict=True):
-        table.add_row(f"centre {name}", with_deviation(value, std), "mm")
+    centres = {"": body.centre_m}
     platform = _platform(found.cell)
     if platform is not None:
-        link, (centre, centre_std) = platform[0], body.centre_in(platform[1])
-        for name, value, std in zip("xyz", 1000.0 * centre, 1000.0 * centre_std, strict=True):
-            table.add_row(terminal_text(f"centre {name} in {link}"), with_deviation(value, std), "mm")
-    for name, value, std in zip(LINK_PARAMETERS[:6], inertia, inertia_std, strict=True):
+        link, frame = platform
+        centres[f" in {link}"] = body.centre_in(frame)
+    for where, (centre_m, std_m) in centres.items():
+        for name, value, std in zip("xyz", 1000.0 * centre_m, 1000.0 * std_m, strict=True):
+            table.add_row(terminal_text(f"centre {name}{where}"), with_deviation(value, std), "mm")
+    for name, value, std in zip(LINK_PARAMETERS[:6], *body.inertia_kg_m2, strict=True):
         table.add_row(f"{name} about the centre", with_deviation(value, std), "kg m²")
 
 
@@ -139,60 +230,54 @@ def _platform(cell: Cell) -> tuple[str, Place] | None:
 def weigh_report(found: Weighed) -> WeighReport:
     """Return a body: mass, centre, inertia, and its ten parameters with the moves that would show them."""
     body, platform = found.body, _platform(found.cell)
-    return WeighReport(
+    return WeighReport.of(
+        found,
+        body,
         cell=found.cell.name,
-        logs=[str(log) for log in found.logs],
-        bare=[str(log) for log in found.bare],
-        part_of_the_fit=list(found.fitted),
-        declared_kg=found.declared_kg,
+        part_of_the_fit=found.fitted,
         mass_kg=WeighedValue(value=body.mass_kg, std=body.mass_std_kg),
         centre_m=_weighed_values(*body.centre_m),
         centre_in_platform_m=None if platform is None else _weighed_values(*body.centre_in(platform[1])),
         inertia_about_centre_kg_m2=_weighed_values(*body.inertia_kg_m2),
         parameters=_weighed_parameters(found),
-        relative_error_percent=errors_of(body.error),
-        moves=body.moves,
-        complete=body.complete,
+        relative_error_percent=body.error,
     )
 
 
 def _weighed_values(value: FloatArray, std: FloatArray) -> WeighedValues:
-    return WeighedValues(value=value.tolist(), std=std.tolist())
+    return WeighedValues.of(value=value, std=std)
 
 
 def _weighed_parameters(found: Weighed) -> list[WeighedParameter]:
     body = found.body
     moves_std = np.sqrt(np.diag(body.moves_covariance))
-    moves = {one.name: _added_moves(one) for one in found.help}
+    moves = {one.name: one for one in found.help}
     return [
-        WeighedParameter(
+        WeighedParameter.of(
             name=name,
             unit=unit,
-            value=float(body.values[index]),
-            std=float(body.std[index]),
-            std_of_moves=float(moves_std[index]),
-            identifiable=bool(body.identifiable[index]),
+            value=body.values[index],
+            std=body.std[index],
+            std_of_moves=moves_std[index],
+            identifiable=body.identifiable[index],
             add=moves.get(name),
         )
         for index, (name, unit) in enumerate(zip(LINK_PARAMETERS, LINK_UNITS, strict=True))
     ]
 
 
-def _added_moves(moves: Help) -> AddedMoves:
-    return AddedMoves(words=moves.words, seconds=moves.seconds, std=moves.std)
-
-
 def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
     """Band and threshold of each axis, and the contacts."""
     headings = ("axis", "quiet s", "band ±", "threshold", "largest", "unit")
     table = plain_table(headings, title="External torque (medians over the motion)", left=(0, 5))
-    for index, (axis, (band, threshold, largest)) in enumerate(zip(cell.axes, _figures(found), strict=True)):
-        seconds = f"{found.band.quiet_s[index]:.0f}"
-        table.add_row(axis.name, seconds, _digits(band), _digits(threshold), _digits(largest), axis.unit.force)
+    for shown, quiet_s in zip(_contact_axes(found, cell), found.band.quiet_s, strict=True):
+        figures = (known_text(figure, ".3g") for figure in (shown.band, shown.threshold, shown.largest))
+        table.add_row(shown.axis, f"{quiet_s:.0f}", *figures, shown.unit)
     yield table
-    stretches = "1 stretch that is" if found.left_out == 1 else f"{found.left_out} stretches that are"
-    itself = f"this log less {stretches} far out" if found.left_out else "this log"
-    source = itself if found.from_itself else "the quiet logs"
+    source = "this log" if found.from_itself else "the quiet logs"
+    if found.from_itself and found.left_out:
+        stretches = "1 stretch that is" if found.left_out == 1 else f"{found.left_out} stretches that are"
+        source = f"this log less {stretches} far out"
     yield (
         f"Band (95 %) and threshold from {source}; less than {found.band.alarms_per_hour:g} false alarm in an hour of "
         "motion like that, all axes together. Standstill is not judged."
@@ -208,8 +293,14 @@ def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
     listed = plain_table(("axis", "from s", "to s", "peak", "unit", "× threshold"), title="Contacts", left=(0, 4))
     for one in contacts[:LISTED]:
         axis = cell.axes[one.axis]
-        numbers = f"{one.start_s:.2f}", f"{one.end_s:.2f}", f"{one.peak_nm:+.3g}", axis.unit.force
-        listed.add_row(axis.name, *numbers, f"{one.peak_over_threshold:.2f}")
+        listed.add_row(
+            axis.name,
+            f"{one.start_s:.2f}",
+            f"{one.end_s:.2f}",
+            f"{one.peak_nm:+.3g}",
+            axis.unit.force,
+            f"{one.peak_over_threshold:.2f}",
+        )
     yield listed
     if len(contacts) > LISTED:
         yield f"… and {len(contacts) - LISTED} more; --json lists all."
@@ -238,59 +329,45 @@ def not_judged(found: ExternalTorque, cell: Cell) -> dict[str, str]:
 
 def contact_report(found: ExternalTorque, cell: Cell, log: Path, picture: Path | None) -> ContactReport:
     """Return band and threshold of each axis, and the contacts."""
-    return ContactReport(
+    return ContactReport.of(
         cell=cell.name,
-        log=str(log),
+        log=log,
         band_from_this_log=found.from_itself,
         stretches_left_out=found.left_out,
         alarms_per_hour=found.band.alarms_per_hour,
         axes=_contact_axes(found, cell),
-        contacts=[_contact_entry(cell.axes[one.axis].name, one) for one in found.contacts],
+        contacts=[ContactEntry.of(one, axis=cell.axis_names[one.axis], peak=one.peak_nm) for one in found.contacts],
         not_judged=[NotJudged(axis=axis, reason=reason) for axis, reason in not_judged(found, cell).items()],
-        picture=None if picture is None else str(picture),
+        picture=picture,
     )
 
 
 def _contact_axes(found: ExternalTorque, cell: Cell) -> list[ContactAxis]:
     learned = found.band
-    return [
-        ContactAxis(
-            axis=axis.name,
-            unit=axis.unit.force,
-            scale=learned.scale[index].tolist(),
-            band_over_scale=float(learned.factor[index]),
-            threshold_over_scale=float(learned.threshold[index]),
-            correlation_s=float(learned.correlation_s[index]),
-            quiet_s=float(learned.quiet_s[index]),
-            band=band,
-            threshold=threshold,
-            largest=largest,
-        )
-        for index, (axis, (band, threshold, largest)) in enumerate(zip(cell.axes, _figures(found), strict=True))
-    ]
-
-
-def _contact_entry(axis: str, contact: Contact) -> ContactEntry:
-    return ContactEntry(
-        axis=axis,
-        start_s=contact.start_s,
-        end_s=contact.end_s,
-        peak=contact.peak_nm,
-        peak_over_threshold=contact.peak_over_threshold,
-    )
-
-
-def _figures(found: ExternalTorque) -> Iterator[tuple[float, float, float]]:
-    """Median band and threshold and the largest torque of each joint over its motion; NaN where it did not move."""
-    for band, threshold, torque, use in zip(found.band_nm, found.threshold_nm, found.torque_nm, found.use, strict=True):
+    axes = []
+    for index, axis in enumerate(cell.axes):
+        use = found.use[index]
+        # None of these is known of an axis that did not move.
+        figures = dict.fromkeys(("band", "threshold", "largest"))
         if use.any():
-            yield float(np.median(band[use])), float(np.median(threshold[use])), float(np.abs(torque[use]).max())
-        else:
-            yield np.nan, np.nan, np.nan
-
-
-def _digits(value: float) -> str:
-    return f"{value:.3g}" if np.isfinite(value) else "-"
+            figures = {
+                "band": np.median(found.band_nm[index, use]),
+                "threshold": np.median(found.threshold_nm[index, use]),
+                "largest": np.abs(found.torque_nm[index, use]).max(),
+            }
+        axes.append(
+            ContactAxis.of(
+                axis=axis.name,
+                unit=axis.unit.force,
+                scale=learned.scale[index],
+                band_over_scale=learned.factor[index],
+                threshold_over_scale=learned.threshold[index],
+                correlation_s=learned.correlation_s[index],
+                quiet_s=learned.quiet_s[index],
+                **figures,
+            )
+        )
+    return axes
 
 
 def draw_contact(found: ExternalTorque, cell: Cell, log: Path, folder: Path) -> Path:

@@ -20,9 +20,8 @@ from daq.environment import shipped_configurations
 from daq.errors import UsageError
 from daq.files import replace_file
 from daq.report.certificate import Comparison
-from daq.report.demo_schemas import DemoGain, DemoLog, DemoPlan, DemoReport
 from daq.report.fit import start_of
-from daq.report.job_schemas import FleetEffect
+from daq.report.job_schemas import DemoGain, DemoLog, DemoPlan, DemoReport, FleetEffect
 from daq.report.plots import draw_fit
 from daq.report.residual_page import save_report
 from daq.simulation.simulation_file import load_simulation, require_simulator

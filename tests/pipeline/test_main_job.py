@@ -18,7 +18,7 @@ from daq.cli.app import main
 from daq.config.cell import model_of
 from daq.errors import ExitCode
 from daq.log.conversion import load_run
-from daq.report.demo_schemas import DemoReport
+from daq.report.job_schemas import DemoReport
 from ident.errors import RolesExchanged
 from ident.estimators.identify import identify
 from ident.estimators.refusals import require_roles

@@ -17,7 +17,7 @@ from daq.documents.calibration_file import encode_calibration
 from daq.errors import BusTaken, CalibrationRefused, UsageError
 from daq.ledger.audit import AuditAction, read
 from daq.ledger.ledger import Ledger, read_history
-from daq.report.controller_schemas import DriveChange, DriveRollback
+from daq.report.proposal import DriveChange, DriveRollback
 from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.parameters import Saving

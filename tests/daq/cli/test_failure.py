@@ -19,8 +19,7 @@ import pytest
 from daq.cli.app import main
 from daq.cli.failure import ADVICE, ErrorParts, show_failure
 from daq.errors import DataError, ExitCode, OutputFailed
-from daq.report.document import json_tree
-from daq.report.error_schema import ErrorReport
+from daq.report.document import ErrorReport, json_tree
 from drivers.canopen.bus import bus_errors
 from drivers.errors import BusError, DriveFault, DriverError
 from ident.errors import IdentificationError

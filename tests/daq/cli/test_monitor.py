@@ -26,8 +26,7 @@ from daq.config.cell_buses import answer_us, bus_loads_percent, drive_axes
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
 from daq.log.feed import Feed, RunFacts
-from daq.report.bus_schemas import MonitorReport, PredictionState
-from daq.report.bus_views import monitor_report, monitor_view, prediction_view
+from daq.report.bus_views import MonitorReport, PredictionState, monitor_report, monitor_view, prediction_view
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.bus_lock import bus_lock, bus_taken
 from daq.workflow.events import explain_error_code, notice_of

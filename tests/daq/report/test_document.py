@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -52,3 +54,33 @@ def test_a_number_that_json_lacks_is_null_wherever_it_is(number: float) -> None:
 def test_a_key_with_a_default_is_there_where_it_was_given() -> None:
     assert "remark" not in json_tree(Whole(parts=[], sizes=(), by_name={}))
     assert json_tree(Whole(parts=[], sizes=(), by_name={}, remark=""))["remark"] == ""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a document is made of."""
+
+    name: Path
+    sigma: float
+    other: str = "no field of the document"
+
+
+class Measurement(Report):
+    """A document with parts that are dataclasses."""
+
+    first: Part
+    parts: list[Part]
+    name: str
+    sigma: Figure
+
+
+def test_a_document_takes_the_attributes_of_its_sources_by_name_and_the_first_source_wins() -> None:
+    one = Measured(Path("a"), math.inf)
+    two = Measured(Path("b"), 2.0)
+    made = Measurement.of(one, two, first=two, parts=(one, two), sigma=two.sigma)
+    part = {"name": "b", "sigma": 2.0}
+    assert json_tree(made) == {"first": part, "parts": [{"name": "a", "sigma": None}, part], "name": "a", "sigma": 2.0}
+
+
+def test_a_source_that_is_none_gives_null_to_what_the_others_lack() -> None:
+    assert json_tree(Part.of(None, name="J1")) == {"name": "J1", "sigma": None}

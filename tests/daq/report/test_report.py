@@ -36,7 +36,7 @@ def _torques(samples: int = 3000) -> tuple[FloatArray, FloatArray, FloatArray]:
 def _drawings(kind: str) -> tuple[str, ...]:
     time_s, measured_nm, predicted_nm = _torques()
     if kind == "torque":
-        return plot_torques(time_s, measured_nm, predicted_nm, AXES)
+        return plot_torques(time_s, measured_nm, predicted_nm, AXES, forces=("Nm",) * len(AXES))
     return plot_residual(
         time_s,
         measured_nm[:, 2] - 0.5 * predicted_nm[:, 2],
@@ -73,14 +73,14 @@ def test_the_picture_of_the_gains_is_whole_and_the_same_twice() -> None:
 def test_any_number_of_axes_has_its_panels(axes: int) -> None:
     time_s = np.arange(50) / 10.0
     torque_nm = np.ones((50, axes))
-    drawn = plot_torques(time_s, torque_nm, torque_nm, tuple(f"J{i}" for i in range(axes)))
+    drawn = plot_torques(time_s, torque_nm, torque_nm, tuple(f"J{i}" for i in range(axes)), forces=("Nm",) * axes)
     assert len(drawn) == axes
     ElementTree.fromstring(sheet(drawn, "t"))
 
 
 def test_a_run_of_which_nothing_could_be_used_is_drawn_all_the_same() -> None:
     nothing = np.full((50, 2), np.nan)
-    for one in plot_torques(np.arange(50) / 10.0, nothing, nothing, ("J1", "J2")):
+    for one in plot_torques(np.arange(50) / 10.0, nothing, nothing, ("J1", "J2"), forces=("Nm", "Nm")):
         assert "nan" not in one.partition("error nan")[2]
 
 

@@ -15,10 +15,9 @@ from pydantic import TypeAdapter
 
 import daq.report
 from daq.cli.app import VERBS
-from daq.report.document import Report
-from daq.report.error_schema import ErrorReport
-from daq.report.fit_schemas import ResidualFile
+from daq.report.document import ErrorReport, Report
 from daq.report.job_schemas import ProposalReport
+from daq.report.residual_document import ResidualFile
 from daq.report.schemas import REPORTS
 from ident.calibration import Source
 from ident.errors import Diagnosis

@@ -37,7 +37,7 @@ from daq.report import (
     validation,
     weighing_views,
 )
-from daq.report.bus_schemas import ScannedNode
+from daq.report.bus_views import ScannedNode
 from daq.report.log import log_lines
 from daq.report.text import WholeTable
 from daq.workflow.live_prediction import RecentCurrent
@@ -187,6 +187,8 @@ def _contact(cell: Cell, _: Any) -> Iterator[RenderableType]:
     ones = np.ones((n, 9))
     band = SimpleNamespace(quiet_s=np.full(n, 12345.0), threshold=np.ones(n), alarms_per_hour=0.1)
     band.correlation_s = np.ones(n)
+    band.factor = np.ones(n)
+    band.scale = ones
     found: Any = SimpleNamespace(
         band=band,
         band_nm=1.234e4 * ones,

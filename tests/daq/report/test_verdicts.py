@@ -8,7 +8,8 @@ from typing import cast
 import numpy as np
 import pytest
 
-from daq.report.residual import _verdict, verdict_sentences
+from daq.report.residual import verdict_sentences
+from daq.report.residual_document import _verdict
 from daq.workflow.fit import Fit, Undecided
 from ident.calibration import AcceptedEffect
 from ident.discovery.effect_verdict import EffectVerdict, Judgement

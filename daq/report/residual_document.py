@@ -1,0 +1,375 @@
+"""`residual.json`, and what `residual` prints under `--json`; docs/reference/residual-json.md describes its keys."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, TypeVar
+
+from daq.documents.calibration_file import CalibrationBody
+from daq.report.document import Figure, Report
+from daq.report.fit import Errors, coefficients, with_calibration
+from daq.report.residual import summary
+from daq.report.split_names import names_by_split, placed_by
+from daq.workflow.fit import Fit
+from ident.calibration import Calibration
+from ident.discovery.before_after import Account, BeforeAfter, RelativeErrors
+from ident.discovery.effect_verdict import EffectVerdict
+from ident.discovery.gear_loss import gear_losses
+from ident.discovery.loop import Step
+from ident.discovery.noise_floor import CONFIDENCE, FloorSource, MotorNoiseFloor
+from ident.discovery.search import Finding
+from ident.effects.effect import PlacedEffect
+
+NamedT = TypeVar("NamedT", bound="NamedEffect")
+
+
+class MotorNoise(Report):
+    """Noise of one motor at rest or between repeated moves."""
+
+    axis: str
+    noise: float
+    """estimate, in the unit of the current reference"""
+    least: Figure
+    """its lower limit where that bounds any model's error: known from repeated moves"""
+    source: str
+    std_percent: Figure
+    dwells: int | None
+    pairs: int | None
+    degrees_of_freedom: Figure
+    left: Figure
+    """what the last model leaves in motion"""
+    refuted: bool
+
+
+class NoiseFloor(Report):
+    """Error that noise alone would leave: estimates, and their lower limits."""
+
+    motors: list[MotorNoise | None]
+    relative_error_percent: Errors
+    holdout_error_percent: Errors | None
+    least_error_percent: Errors
+    least_holdout_error_percent: Errors | None
+    confidence: float
+
+
+class Skew(Report):
+    """Delay of currents against positions that instruments confirm [s]."""
+
+    seconds: float
+    std: float
+
+
+class SkewByInstruments(Skew):
+    """The same whether or not they confirm it, beside the estimate of the fit [s]."""
+
+    fit_seconds: float
+    fit_std: float
+    confirmed: bool
+    is_in_model: bool
+
+
+class GearLossEntry(Report):
+    """Side that drives a gear, and its loss."""
+
+    axis: str
+    motoring_rows: Figure
+    motoring_torque: Figure
+    loss: Figure
+    loss_std: Figure
+    efficiency: Figure
+    gain_factor: Figure
+    hidden_shift: Figure
+    gain_carries_it: bool
+
+
+class LeftOutRun(Report):
+    """Error of one run by a fit of the others, or why there is none."""
+
+    run: str
+    error_percent: Errors | None
+    reason: str | None
+
+
+class LeftOutRuns(Report):
+    """Errors of runs left out in turn."""
+
+    error_percent: Errors | None
+    runs: list[LeftOutRun]
+
+
+class ModelErrors(Report):
+    """Errors of one model."""
+
+    relative_error_percent: Errors
+    cross_validated_error_percent: Errors
+    left_out_runs: LeftOutRuns | None
+    holdout_error_percent: Errors | None
+
+
+class ChangedGain(Report):
+    """A gain before and after effects."""
+
+    axis: str
+    unit: str
+    before: float
+    before_std: Figure
+    after: float
+    after_std: Figure
+    choice_std: Figure
+    change_percent: Figure
+    change_std_percent: Figure
+    significant: bool
+
+
+class Coefficient(Report):
+    """Linear parameter of an effect."""
+
+    name: str
+    value: float
+    std: Figure
+    unit: str
+
+
+class NamedEffect(Report):
+    """An effect, and the axis that it is on."""
+
+    effect: str
+    axis: str
+    settings: dict[str, float]
+
+
+class PlacedEffectEntry(NamedEffect):
+    """An effect on an axis, with its size."""
+
+    coefficients: list[Coefficient]
+
+
+class FindingEntry(NamedEffect):
+    """Result of testing one effect on one axis."""
+
+    variable: str
+    coefficients: list[Coefficient]
+    probability: Figure
+    """by noise alone; null where it rests on too few moves for a test"""
+    folds_better: float
+    explained: Figure
+    error_before_percent: Figure
+    error_after_percent: Figure
+    error_fall: Figure
+    held_out_fall: Figure
+    passed: bool
+    share_of_excess: Figure
+    refusals: list[str]
+    ambiguity: list[str] | None
+
+
+class AsideEntry(FindingEntry):
+    """Finding that passed and did not join the model."""
+
+    reason: str
+
+
+class DetectionLimit(Report):
+    """Torque that an effect needs to be detected, root mean square in motion."""
+
+    axis: str
+    rms: Figure
+    unit: str
+
+
+class SplitNameEntry(NamedEffect):
+    """Name that splits of the data choose for what a turn added."""
+
+    splits: int
+
+
+class TurnEntry(Report):
+    """One turn of the loop."""
+
+    accepted: FindingEntry | None
+    added: list[PlacedEffectEntry]
+    removed: list[str]
+    names_by_split: list[SplitNameEntry]
+    before: ModelErrors | None
+    after: ModelErrors | None
+    gain_changes: list[ChangedGain] | None
+    findings: list[FindingEntry]
+    structures: list[FindingEntry]
+    set_aside: list[AsideEntry]
+    detection_limits: list[DetectionLimit]
+
+
+class VerdictEntry(NamedEffect):
+    """What held-out runs say of one effect."""
+
+    judgement: str
+    reason: str
+    written: bool
+    blocks: int
+    error_before_percent: Errors | None
+    error_after_percent: Errors | None
+
+
+class ResidualReport(CalibrationBody, Report):
+    """`residual`, and the body of `residual.json`."""
+
+    summary: list[str]
+    axes: list[str]
+    metric: str
+    noise_floor: NoiseFloor
+    time_skew: Skew | None
+    time_skew_by_instruments: SkewByInstruments | None
+    gear_loss: list[GearLossEntry]
+    before: ModelErrors
+    after: ModelErrors
+    gain_changes: list[ChangedGain]
+    worse_holdout: bool | None
+    verdicts: list[VerdictEntry]
+    turns: list[TurnEntry]
+
+
+class ResidualFormat(Report):
+    """How `residual.json` begins."""
+
+    format: Literal["drivegain-residual"]
+    version: int
+
+
+# The keys of the last base come first.
+class ResidualFile(ResidualReport, ResidualFormat):
+    """`residual.json`."""
+
+
+_METRIC = (
+    "‖e‖/‖v‖ of each motor's current over the rows that count; in total √(Σ w²‖e‖²/Σ w²‖v‖²), w the gains of the "
+    "declared model"
+)
+
+
+def residual_report(fitted: Fit, account: Account, calibration: Calibration) -> ResidualReport:
+    """Return the closed loop: the calibration, the errors before and after, and every turn of the search."""
+    axes, last = fitted.cell.axis_names, fitted.steps[-1]
+    return with_calibration(
+        ResidualReport,
+        calibration,
+        summary=summary(fitted, account, calibration.effects),
+        axes=axes,
+        metric=_METRIC,
+        noise_floor=_noise_floor(account, axes),
+        time_skew=account.skew if account.skew is not None and account.skew.confirmed else None,
+        time_skew_by_instruments=account.skew,
+        gear_loss=[GearLossEntry.of(gear, axis=axis) for axis, gear in zip(axes, gear_losses(last), strict=True)],
+        before=_model_errors(account.total.before),
+        after=_model_errors(account.total.after),
+        gain_changes=_changed_gains(fitted, account.total),
+        worse_holdout=None if account.holdout_change is None else account.holdout_change.is_rise,
+        verdicts=[_verdict(verdict, fitted.cell.place_names) for verdict in last.verdicts],
+        turns=[_turn(fitted, step, turn) for step, turn in zip(fitted.steps, account.turns, strict=True)],
+    )
+
+
+def _noise_floor(account: Account, axes: tuple[str, ...]) -> NoiseFloor:
+    floors = zip(axes, account.floors, account.left_a.tolist(), strict=True)
+    return NoiseFloor.of(
+        motors=[None if floor is None else _motor_noise(axis, floor, left_a) for axis, floor, left_a in floors],
+        relative_error_percent=account.floor,
+        holdout_error_percent=account.holdout_floor,
+        least_error_percent=account.least_floor,
+        least_holdout_error_percent=account.least_holdout_floor,
+        confidence=CONFIDENCE,
+    )
+
+
+def _motor_noise(axis: str, floor: MotorNoiseFloor, left_a: float) -> MotorNoise:
+    return MotorNoise.of(
+        floor,
+        axis=axis,
+        noise=floor.noise_a,
+        least=floor.least_a if floor.is_bound else None,
+        dwells=floor.parts if floor.source is FloorSource.STANDSTILL else None,
+        pairs=floor.parts if floor.source is FloorSource.REPEATED_MOVES else None,
+        degrees_of_freedom=floor.freedom,
+        left=left_a,
+        refuted=floor.is_refuted(left_a),
+    )
+
+
+def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> TurnEntry:
+    axes = fitted.cell.place_names
+    limits = zip(fitted.cell.axes, step.limits_nm, strict=True)
+    changes: dict[str, Any] = {"added": [], "removed": []}
+    if turn is not None:
+        changes = {
+            "added": [
+                _named(PlacedEffectEntry, placed, axes, coefficients=coefficients(step.after, placed))
+                for placed in turn.added
+            ],
+            "removed": [placed.name_among(axes) for placed in turn.removed],
+            "before": _model_errors(turn.before),
+            "after": _model_errors(turn.after),
+            "gain_changes": _changed_gains(fitted, turn),
+        }
+    return TurnEntry.of(
+        None,
+        **changes,
+        accepted=None if step.accepted is None else _finding(step.accepted, axes),
+        names_by_split=[_named(SplitNameEntry, name.placed, axes, splits=name.splits) for name in names_by_split(step)],
+        findings=[_finding(finding, axes) for finding in step.findings],
+        structures=[_finding(finding, axes) for finding in step.structures],
+        set_aside=[AsideEntry.of(_finding(aside.finding, axes), reason=aside.reason(axes)) for aside in step.set_aside],
+        detection_limits=[DetectionLimit.of(axis=axis.name, rms=limit, unit=axis.unit.force) for axis, limit in limits],
+    )
+
+
+def _changed_gains(fitted: Fit, compared: BeforeAfter) -> list[ChangedGain]:
+    changes = zip(fitted.cell.axes, compared.gains, strict=True)
+    return [ChangedGain.of(change, axis=axis.name, unit=axis.gain_unit) for axis, change in changes]
+
+
+def _model_errors(errors: RelativeErrors) -> ModelErrors:
+    left_out = None
+    if errors.left_out_runs is not None:
+        runs = errors.left_out_runs.runs
+        left_out = LeftOutRuns.of(
+            error_percent=errors.left_out_runs.together,
+            runs=[LeftOutRun.of(run, error_percent=run.error, reason=run.reason or None) for run in runs],
+        )
+    return ModelErrors.of(
+        relative_error_percent=errors.in_sample,
+        cross_validated_error_percent=errors.cross_validated,
+        left_out_runs=left_out,
+        holdout_error_percent=errors.holdout,
+    )
+
+
+def _named(kind: type[NamedT], placed: PlacedEffect, axes: tuple[str, ...], *sources: object, **others: Any) -> NamedT:
+    """Return what a document says of an effect, with its name, axis and settings."""
+    settings = {name: float(value) for name, value in placed.effect.settings.items()}
+    return kind.of(*sources, effect=placed.effect.name, axis=placed.axis_name(axes), settings=settings, **others)
+
+
+def _verdict(verdict: EffectVerdict, axes: tuple[str, ...]) -> VerdictEntry:
+    return _named(
+        VerdictEntry,
+        verdict.placed,
+        axes,
+        verdict,
+        blocks=verdict.change.total.moves,
+        error_before_percent=verdict.before,
+        error_after_percent=verdict.after,
+    )
+
+
+def _finding(finding: Finding, axes: tuple[str, ...]) -> FindingEntry:
+    sizes = zip(finding.effect.coefficients, finding.coefficients, finding.deviations, strict=True)
+    return _named(
+        FindingEntry,
+        placed_by(finding),
+        axes,
+        finding,
+        variable=finding.effect.abscissa,
+        coefficients=[
+            Coefficient.of(name=column.name, value=value, std=std, unit=column.unit) for column, value, std in sizes
+        ],
+        # For findings that failed a gate it would be most of the file and of no use.
+        ambiguity=[rival.name_among(axes) for rival in finding.ambiguity] if finding.passed else None,
+    )
