@@ -1,7 +1,7 @@
 """`calibration.yaml`, the result of a fit: written whole, read strictly, and every edit by hand is detected.
 
 The file adds percentages for people and writes NaN as null. Sections without such a difference (`Source`, `Recording`,
-`Diagnosis`, `PayloadMass`) are read as the classes of `ident`.
+`Diagnosis`) are read as the classes of `ident`.
 """
 
 from __future__ import annotations
