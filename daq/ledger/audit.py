@@ -17,8 +17,8 @@ import os
 import stat
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import Enum
 from pathlib import Path
@@ -87,7 +87,16 @@ def entry(
     # As it will be read: with lists for tuples, so that what is returned is what is in the file.
     plain: dict[str, object] = json.loads(_canonical(dict(details)))
     unsigned = AuditEntry(number, at, who, action, subject, plain, previous, "")
-    return AuditEntry(number, at, who, action, subject, plain, previous, sha256(_canonical(_content(unsigned))))
+    return replace(unsigned, sha256=sha256(_canonical(_content(unsigned))))
+
+
+def entry_after(
+    before: AuditEntry | None, at: str, who: str, action: AuditAction, subject: str, details: Mapping[str, object]
+) -> AuditEntry:
+    """Make the entry that follows another one, or the first one; raises as `entry`."""
+    if before is None:
+        return entry(1, at, who, action, subject, details, FIRST)
+    return entry(before.number + 1, at, who, action, subject, details, before.sha256)
 
 
 def encode(one: AuditEntry) -> bytes:
@@ -116,7 +125,7 @@ def _decode(line: bytes) -> tuple[AuditEntry | None, bool]:
         # Encoding again costs four times as much as reading: it is only done to tell what a changed line is.
         if found.sha256 == _digest_of_line(line):
             return found, True
-        return (found, found.holds) if encode(found) == line else (None, False)
+        return (found if encode(found) == line else None), False
     except (ValueError, TypeError, RecursionError):
         return None, False
 
@@ -135,12 +144,11 @@ def _is_fragment(line: bytes) -> bool:
     begun = line.rstrip(b"\0")
     if not begun.startswith(_BEGINNING) and not _BEGINNING.startswith(begun):
         return False
-    try:
-        json.loads(line)
-    except ValueError:
-        return True
-    except RecursionError:
-        return False
+    with contextlib.suppress(RecursionError):
+        try:
+            json.loads(line)
+        except ValueError:
+            return True
     return False
 
 
@@ -175,26 +183,21 @@ def append(
             raise _no_file(path, f"more than {MAX_BYTES} bytes")
         with os.fdopen(descriptor, "rb", closefd=False) as stream:
             content = stream.read()
-        new: list[AuditEntry] = []
-
-        def add(kind: AuditAction, says: Mapping[str, object]) -> None:
-            before = new[-1] if new else last
-            number, previous = (1, FIRST) if before is None else (before.number + 1, before.sha256)
-            new.append(entry(number, at.isoformat(), who, kind, subject, says, previous))
-
         last, unfinished = _end_of(content, path)
+        line = b"" if not content or content.endswith(b"\n") else b"\n"
         if unfinished:
-            add(AuditAction.TORN_LINE, _torn_details(unfinished))
-        add(action, details)
-        begin = b"" if not content or content.endswith(b"\n") else b"\n"
-        line = begin + b"".join(encode(one) + b"\n" for one in new)
+            torn = _torn_details(unfinished)
+            last = entry_after(last, at.isoformat(), who, AuditAction.TORN_LINE, subject, torn)
+            line += encode(last) + b"\n"
+        new = entry_after(last, at.isoformat(), who, action, subject, details)
+        line += encode(new) + b"\n"
         if os.write(descriptor, line) != len(line):
             raise OSError(28, "No space left on device", str(path))
         os.fsync(descriptor)
         if not content:
             fsync_folder(Path(os.path.realpath(path)).parent)
-        _note_head(path, content, new[-1].sha256)
-        return new[-1]
+        _note_head(path, content, new.sha256)
+        return new
 
 
 def noted_heads(path: Path) -> tuple[str, ...]:
@@ -222,20 +225,16 @@ def _note_head(path: Path, content: bytes, head: str) -> None:
     The note is behind the log after a kill, which is harmless: an older entry is in the chain, too.
     """
     missing = [one for one in noted_heads(path) if one.encode() not in content]
-    with contextlib.suppress(OSError):  # the entry is on the disk, and a note can be missing
-        _write_heads(path, (*missing, head))
-
-
-def _write_heads(path: Path, heads: Sequence[str]) -> None:
+    noted = "".join(f"{one}\n" for one in (*missing, head)).encode()
     flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-    descriptor = os.open(head_file(path), flags, 0o666)
-    try:
-        # In one piece and in place: there are never fewer lines than before, but where a missing entry came back.
-        content = "".join(f"{head}\n" for head in heads).encode()
-        os.pwrite(descriptor, content, 0)
-        os.ftruncate(descriptor, len(content))
-    finally:
-        os.close(descriptor)
+    with contextlib.suppress(OSError):  # the entry is on the disk, and a note can be missing
+        descriptor = os.open(head_file(path), flags, 0o666)
+        try:
+            # In one piece and in place: there are never fewer lines than before, but where a missing entry came back.
+            os.pwrite(descriptor, noted, 0)
+            os.ftruncate(descriptor, len(noted))
+        finally:
+            os.close(descriptor)
 
 
 def read(path: Path) -> tuple[AuditEntry, ...]:
@@ -528,8 +527,7 @@ class _Chain:
 
 def open_writes(entries: Sequence[AuditEntry], digest_now: Callable[[str], str | None]) -> Iterator[OpenWrite]:
     """Find writes that were begun and never ended. Args as of `judge_chain`."""
-    # A forged chain can hold: a value that is no number names no entry.
-    ended = {begun for one in entries if one.action in _ENDS and isinstance(begun := one.details.get("begun"), int)}
+    ended = {begun_by(one) for one in entries if one.action in _ENDS}
     begins = [one for one in entries if one.action in _BEGUN]
     for place, one in enumerate(begins):
         if one.number in ended:
@@ -544,7 +542,25 @@ def open_writes(entries: Sequence[AuditEntry], digest_now: Callable[[str], str |
             yield OpenWrite(one, {before: Content.BEFORE, after: Content.AFTER}.get(found, Content.OTHER))
 
 
+def begun_by(entry: AuditEntry) -> int:
+    """Return the number of the entry that began the write, 0 where there is none."""
+    found = entry.details.get("begun")
+    return found if isinstance(found, int) else 0
+
+
+def made_writes(opened: Iterable[OpenWrite]) -> list[OpenWrite]:
+    """Return the writes without an end whose content was found afterwards."""
+    return [one for one in opened if one.content is Content.AFTER]
+
+
+def witnessed_writes(entries: Sequence[AuditEntry]) -> list[OpenWrite]:
+    """Return the writes without an end of which a later entry shows that they were made."""
+    return made_writes(open_writes(entries, lambda _: None))
+
+
 def _digest_before(begun: AuditEntry) -> str | None:
     """Return the digest of the file when the write began, `GONE` without a file, None for an entry without one."""
     recorded = begun.details.get("sha256_before", 0)
-    return GONE if recorded is None else recorded if isinstance(recorded, str) else None
+    if recorded is None:
+        return GONE
+    return recorded if isinstance(recorded, str) else None

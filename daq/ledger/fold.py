@@ -11,7 +11,7 @@ from typing import Any
 from daq.config.cell import Cell
 from daq.documents.calibration_file import decode_calibration
 from daq.errors import DaqError
-from daq.ledger.audit import AuditAction, AuditEntry, Content, OpenWrite, open_writes
+from daq.ledger.audit import AuditAction, AuditEntry, OpenWrite, begun_by, made_writes, witnessed_writes
 from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, drives_of, entry_of, figures_of, utc
 
 _ENDS = {AuditAction.APPLIED: WriteAction.APPLIED, AuditAction.ROLLED_BACK: WriteAction.ROLLED_BACK}
@@ -82,8 +82,7 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
     A write without an end counts where a later entry shows that it was made: the next write found its content, or a
     process did (`write found`). What the controller's file is by now is not asked: a history does not change by itself.
     """
-    witnessed = [one for one in open_writes(entries, lambda _: None) if one.content is Content.AFTER]
-    events = _events(writes_to(cell, entries, witnessed, everywhere=True))
+    events = _events(writes_to(cell, entries, witnessed_writes(entries), everywhere=True))
     by_digest: dict[str | None, list[Event]] = {}
     for event in events:
         by_digest.setdefault(event.digest, []).append(event)
@@ -265,7 +264,7 @@ def _place(found: Sequence[AuditedWrite], one: AuditEntry) -> int:
 
 
 def unknown_writes(
-    cell: Cell, entries: Sequence[AuditEntry], opened: Iterable[OpenWrite], calibrations: Collection[str]
+    cell: Cell, entries: Sequence[AuditEntry], opened: Sequence[OpenWrite], calibrations: Collection[str]
 ) -> tuple[AuditedWrite, ...]:
     """Return the writes to this cell's controller that its history lacks.
 
@@ -279,15 +278,20 @@ def unknown_writes(
         writes whose content the controller has now, though no later entry shows it; writes of calibrations that were
         never entered.
     """
-    witnessed = {one.begun.number for one in open_writes(entries, lambda _: None) if one.content is Content.AFTER}
-    made = [one for one in opened if one.content is Content.AFTER]
-    shown = {one.begun.number for one in made} - witnessed
+    shown = shown_writes(cell, entries, opened)
     return tuple(
         write
-        for write in writes_to(cell, entries, made)
-        if write.ended.number in shown
-        or (write.action is WriteAction.APPLIED and write.calibration not in calibrations)
+        for write in writes_to(cell, entries, made_writes(opened))
+        if write in shown or (write.action is WriteAction.APPLIED and write.calibration not in calibrations)
     )
+
+
+def shown_writes(cell: Cell, entries: Sequence[AuditEntry], opened: Sequence[OpenWrite]) -> list[AuditedWrite]:
+    """Return the writes without an end that only the content of their target shows, not a later entry."""
+    witnessed = {one.begun.number for one in witnessed_writes(entries)}
+    made = made_writes(opened)
+    shown = {one.begun.number for one in made} - witnessed
+    return [one for one in writes_to(cell, entries, made, everywhere=True) if one.ended.number in shown]
 
 
 def at_of(entry: AuditEntry) -> datetime | None:
@@ -300,12 +304,6 @@ def text_field(entry: AuditEntry, key: str) -> str | None:
     """Return a text of an entry's details, None where there is none."""
     found = entry.details.get(key)
     return found if isinstance(found, str) else None
-
-
-def begun_by(entry: AuditEntry) -> int:
-    """Return the number of the entry that began the write, 0 where there is none."""
-    found = entry.details.get("begun")
-    return found if isinstance(found, int) else 0
 
 
 def calibration_field(begun: AuditEntry, key: str) -> str | None:

@@ -18,18 +18,14 @@ from daq.documents.calibration_file import encode_calibration
 from daq.errors import DataError, HistoryInaccessible, HistoryUnreadable, OutputFailed, evidence, writing
 from daq.files import fsync_folder
 from daq.ledger.audit import (
-    FIRST,
     AuditAction,
     AuditEntry,
     AuditVerdict,
-    Content,
     Flaw,
-    OpenWrite,
     append,
-    entry,
+    entry_after,
     head_file,
     noted_heads,
-    open_writes,
     verify,
 )
 from daq.ledger.entry import Entry, figures_of, iso
@@ -39,8 +35,8 @@ from daq.ledger.fold import (
     at_of,
     entered_calibrations,
     fold,
+    shown_writes,
     unknown_writes,
-    writes_to,
 )
 from daq.ledger.migration import (
     EMPTY,
@@ -388,10 +384,9 @@ def _with_stored(entries: Sequence[AuditEntry], stored: StoredHistory, cell: Cel
     chain = list(entries)
     never = datetime.min.replace(tzinfo=UTC)  # these entries are only folded
     for draft in drafts_of(stored, entries, cell.name, "", never):
-        number = chain[-1].number + 1 if chain else 1
-        previous = chain[-1].sha256 if chain else FIRST
+        last = chain[-1] if chain else None
         at = draft.at.isoformat()
-        chain.append(entry(number, at, draft.who, draft.action, draft.subject, draft.details, previous))
+        chain.append(entry_after(last, at, draft.who, draft.action, draft.subject, draft.details))
     return tuple(chain)
 
 
@@ -410,13 +405,10 @@ def _end_found_writes(ledger: Ledger) -> None:
     verdict = verify(ledger.audit)
     if not verdict.holds:
         return
-    witnessed = {one.begun.number for one in open_writes(verdict.entries, lambda _: None) if _is_made(one)}
-    made = [one for one in verdict.open_writes if _is_made(one)]
-    found = {one.begun.number for one in made} - witnessed
-    for write in writes_to(ledger.cell, verdict.entries, made, everywhere=True):
+    for write in shown_writes(ledger.cell, verdict.entries, verdict.open_writes):
         begun = write.ended
         at = at_of(begun)
-        if begun.number not in found or at is None:
+        if at is None:
             continue
         details = {
             "action": write.action.value,
@@ -425,10 +417,6 @@ def _end_found_writes(ledger: Ledger) -> None:
             "sha256_after": write.sha256_after,
         }
         _append(ledger, EntryDraft(AuditAction.WRITE_FOUND, at, begun.who, begun.subject, details))
-
-
-def _is_made(one: OpenWrite) -> bool:
-    return one.content is Content.AFTER
 
 
 def _check_like(ledger: Ledger, calibration: Calibration, entries: Collection[Entry]) -> None:

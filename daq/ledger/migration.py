@@ -11,20 +11,19 @@ import os
 import re
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields, replace
 from datetime import datetime
 from pathlib import Path
 from urllib.parse import quote
 
 from daq.documents.calibration_file import decode_calibration
 from daq.errors import DaqError, HistoryInaccessible, HistoryUnreadable
-from daq.ledger.audit import AuditAction, AuditEntry
+from daq.ledger.audit import AuditAction, AuditEntry, begun_by
 from daq.ledger.entry import Acknowledgement, Event, WriteAction, figures_of, iso, zoned
 from daq.ledger.fold import (
     AuditedWrite,
     acknowledgement_of,
     at_of,
-    begun_by,
     calibration_field,
     entered_calibrations,
     is_end,
@@ -176,7 +175,8 @@ def stored_contradictions(stored: StoredHistory, entries: Sequence[AuditEntry], 
     for number, event in enumerate(stored.events, start=1):
         entry = by_digest.get(event.audit or "")
         if entry is not None:
-            yield from _event_flaws(f"event {number}", event, entry, begun.get(begun_by(entry)))
+            expected = _audited_event(event, entry, begun.get(begun_by(entry), entry))
+            yield from _differences(f"event {number}", event, expected, entry)
     for noted in stored.acknowledgements:
         if noted.since > noted.at:  # until then it would silence the axis
             yield f"acknowledgement of {noted.axis} at {iso(noted.at)}: found a baseline since {iso(noted.since)}"
@@ -193,22 +193,20 @@ def stored_contradictions(stored: StoredHistory, entries: Sequence[AuditEntry], 
         said = f"as entry {known.number} of the audit says"
         if calibration.document != known.document:
             yield f"document of {name}: found another one, expected it {said}"
-        yield from _differences(name, {"entered": calibration.entered}, {"entered": known.entered}, said)
+        if calibration.entered != known.entered:
+            yield f"{name}: found entered {_shown(calibration.entered)}, expected {_shown(known.entered)} {said}"
 
 
-def _event_flaws(name: str, event: Event, entry: AuditEntry, begun: AuditEntry | None) -> Iterator[str]:
-    first = begun if begun is not None else entry
-    expected: dict[str, object] = {"target": entry.subject}
-    if is_end(entry):
-        # One that names the begin was entered later: its writer was killed, and another process may have done it.
-        expected |= {"who": entry.who, "at": at_of(entry), "action": AuditedWrite(first, entry).action}
-    after = text_field(first, "sha256_after")
-    if after is not None:
-        expected["sha256_after"] = after
-    digest = calibration_field(first, "sha256")
+def _audited_event(event: Event, entry: AuditEntry, begun: AuditEntry) -> Event:
+    """Return an event as the audit log says it; what the log leaves open stays as it is."""
+    after = text_field(begun, "sha256_after") or event.sha256_after
+    audited = replace(event, target=entry.subject, sha256_after=after)
+    digest = calibration_field(begun, "sha256")
     if digest is not None and entry.action is not AuditAction.ROLLED_BACK:
-        expected["digest"] = digest
-    yield from _differences(name, asdict(event), expected, _as_said_by(entry))
+        audited = replace(audited, digest=digest)
+    if not is_end(entry):  # it was entered later: its writer was killed, and another process may have done it
+        return audited
+    return replace(audited, who=entry.who, at=at_of(entry) or event.at, action=AuditedWrite(begun, entry).action)
 
 
 def _acknowledgement_flaws(noted: Acknowledgement, entry: AuditEntry) -> Iterator[str]:
@@ -217,7 +215,7 @@ def _acknowledgement_flaws(noted: Acknowledgement, entry: AuditEntry) -> Iterato
     if expected is None:
         yield f"{name}: found entry {entry.number} of the audit, {entry.action.value}, expected an acknowledgement"
     else:
-        yield from _differences(name, asdict(noted), asdict(expected), _as_said_by(entry))
+        yield from _differences(name, noted, expected, entry)
 
 
 def _document_flaws(calibration: StoredCalibration) -> Iterator[str]:
@@ -228,14 +226,15 @@ def _document_flaws(calibration: StoredCalibration) -> Iterator[str]:
         yield f"{name}: its document is {error.found}, expected {error.expected}"
 
 
-def _as_said_by(entry: AuditEntry) -> str:
-    return f"as entry {entry.number} of the audit, which it names"
-
-
-def _differences(name: str, found: Mapping[str, object], expected: Mapping[str, object], source: str) -> Iterator[str]:
-    for key, wanted in expected.items():
-        if found[key] != wanted:
-            yield f"{name}: found {key} {_shown(found[key])}, expected {_shown(wanted)} {source}"
+def _differences(
+    name: str, found: Event | Acknowledgement, expected: Event | Acknowledgement, entry: AuditEntry
+) -> Iterator[str]:
+    for field in fields(found):
+        said = getattr(found, field.name)
+        wanted = getattr(expected, field.name)
+        if said != wanted:
+            source = f"as entry {entry.number} of the audit, which it names"
+            yield f"{name}: found {field.name} {_shown(said)}, expected {_shown(wanted)} {source}"
 
 
 def _shown(value: object) -> str:
