@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import hypot
+from math import hypot, sqrt
 from xml.etree import ElementTree
 
 import numpy as np
 
-from daq.config.bus_checks import bus_faults, producer_faults
 from daq.config.cell import DEGREE, MILLIMETRE, joint_unit
+from daq.config.cell_buses import bus_faults, producer_faults
 from daq.config.cell_closures import chain_faults, chain_of, mechanism_faults, platform_frame, robot_with
 from daq.config.cell_schema import AxisModel, CellModel, gain_joints, ratio_of
 from daq.config.controller import controller_faults
 from daq.config.hold import mimic_faults
-from daq.config.impossible_bodies import centre_faults, gyration_faults, moment_faults
 from daq.config.policy import max_change_faults
 from daq.config.signers import signer_faults
 from daq.config.workspace import clearance_faults
@@ -27,11 +26,13 @@ from ident.errors import ModelError
 from ident.model.robot import Joint, JointKind, Robot
 from ident.plausible import (
     ACCELERATION,
+    FARTHEST_CENTRE_M,
     FARTHEST_DEG,
     FARTHEST_MM,
     GAIN,
     GRAVITY_M_S2,
     HEAVIEST_PAYLOAD_KG,
+    LARGEST_GYRATION_M,
     LIGHTEST_PAYLOAD_KG,
     PAYLOAD_RATIO,
     RATIO,
@@ -267,6 +268,45 @@ def _size_faults(model: CellModel) -> Iterator[Fault]:
                 yield from gyration_faults((*path, "known", name), (value,), mass_kg)
             else:
                 yield from centre_faults((*path, "known", name), (value / mass_kg,))
+
+
+_OVERFLOWS = 1e100  #: Moments of inertia whose eigenvalues may overflow
+
+
+def centre_faults(path: Location, centre_m: Sequence[float]) -> Iterator[Fault]:
+    """Find a centre of mass in mm."""
+    far_m = hypot(*centre_m)
+    if not within(far_m, (0.0, FARTHEST_CENTRE_M)):
+        found = f"a centre of mass {far_m:.4g} m from the origin"
+        yield Fault(path, found, f"at most {FARTHEST_CENTRE_M:g} m; is this in mm?")
+
+
+def gyration_faults(path: Location, inertia_kg_m2: Sequence[float], mass_kg: float) -> Iterator[Fault]:
+    """Find an inertia in kg mm², by its radius of gyration √(I/m)."""
+    radius_m = sqrt(max(map(abs, inertia_kg_m2)) / mass_kg)
+    if not within(radius_m, (0.0, LARGEST_GYRATION_M)):
+        found = f"a radius of gyration √(I/m) of {radius_m:.4g} m"
+        yield Fault(path, found, f"at most {LARGEST_GYRATION_M:g} m; is this in kg mm²?")
+
+
+def moment_faults(path: Location, inertia_kg_m2: Sequence[float]) -> Iterator[Fault]:
+    """Find inertias of no body: a principal moment below zero, or above the sum of the other two.
+
+    Args:
+        path: of the inertia.
+        inertia_kg_m2: xx, xy, xz, yy, yz, zz about the centre of mass.
+    """
+    if not max(map(abs, inertia_kg_m2)) < _OVERFLOWS:
+        return  # `gyration_faults` refuses it
+    xx, xy, xz, yy, yz, zz = inertia_kg_m2
+    least, middle, largest = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+    margin = 1e-9 * abs(largest)
+    if least < -margin or largest > least + middle + margin:
+        yield Fault(
+            path,
+            f"principal moments {least:.4g}, {middle:.4g}, {largest:.4g} kg m²",
+            "those of a body about its centre of mass: none below 0, none above the sum of the other two",
+        )
 
 
 @dataclass(frozen=True, slots=True)

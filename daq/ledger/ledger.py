@@ -28,13 +28,15 @@ from daq.ledger.audit import (
     noted_heads,
     verify,
 )
-from daq.ledger.entry import Entry, figures_of, iso
 from daq.ledger.fold import (
     AuditedWrite,
+    Entry,
     History,
     at_of,
     entered_calibrations,
+    figures_of,
     fold,
+    iso,
     shown_writes,
     unknown_writes,
 )

@@ -19,15 +19,20 @@ from urllib.parse import quote
 from daq.documents.calibration_file import decode_calibration
 from daq.errors import DaqError, HistoryInaccessible, HistoryUnreadable
 from daq.ledger.audit import AuditAction, AuditEntry, begun_by
-from daq.ledger.entry import Acknowledgement, Event, WriteAction, figures_of, iso, zoned
 from daq.ledger.fold import (
+    Acknowledgement,
     AuditedWrite,
+    Event,
+    WriteAction,
     acknowledgement_of,
     at_of,
     calibration_field,
     entered_calibrations,
+    figures_of,
     is_end,
+    iso,
     text_field,
+    zoned,
 )
 
 BUSY_S = 5.0  #: How long to wait for another process' transaction

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from daq.ledger.entry import Acknowledgement, Entry
+from daq.ledger.fold import Acknowledgement, Entry
 from ident.calibration import Gain
 from ident.drift.change import (
     Alarm,

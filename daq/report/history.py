@@ -18,8 +18,7 @@ from daq.errors import ControllerUnfit
 from daq.formats.document import decode_document, read_controller_file
 from daq.formats.scalar import Scalar, rewrite_gain
 from daq.ledger.audit import OpenWrite, head_file
-from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, drives_of
-from daq.ledger.fold import AuditedWrite, History
+from daq.ledger.fold import Acknowledgement, AuditedWrite, Entry, Event, History, WriteAction, drives_of
 from daq.ledger.ledger import Verification
 from daq.ledger.watch import Series, alarm_text, pattern_of, questions
 from daq.report.controller_schemas import (

@@ -23,7 +23,7 @@ from daq.config.controller import GainObject
 from daq.config.yaml_file import StrictModel
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
 from daq.files import read_regular, replace_file, sha256
-from daq.ledger.entry import drives_of
+from daq.ledger.fold import drives_of
 from daq.writeback.file_access import exclusive_writer, next_order
 from daq.writeback.request import Edit, GainChange, GateFinding, is_writable, require_axes
 from daq.writeback.target import Written

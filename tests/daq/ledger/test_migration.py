@@ -28,7 +28,7 @@ from daq.errors import ExitCode, HistoryUnreadable
 from daq.ledger import ledger as ledger_module
 from daq.ledger import migration as migration_module
 from daq.ledger.audit import AuditAction, read
-from daq.ledger.entry import WriteAction
+from daq.ledger.fold import WriteAction
 from daq.ledger.ledger import Ledger, migrate, read_history
 from daq.ledger.migration import VERSION, read_stored
 from tests.daq.calibrations import calibration_for
