@@ -255,8 +255,8 @@ def producer_faults(model: CellModel) -> Iterator[Fault]:
         if set(interfaces) != {KERNEL_INTERFACE}:
             expected = f"a bus of interface {KERNEL_INTERFACE}, whose broadcast manager sends it"
             yield Fault(path, f"{KERNEL} on {' + '.join(interfaces) or 'no bus'}", expected)
-    elif producer not in (names := [axis.name for axis in model.axes]):
-        yield Fault(path, producer, f"{RECORDER}, {KERNEL}, or an axis ({', '.join(names)})")
+    elif producer not in model.axis_names:
+        yield Fault(path, producer, f"{RECORDER}, {KERNEL}, or an axis ({', '.join(model.axis_names)})")
 
 
 def cell_address(cell: Cell) -> CellAddress:

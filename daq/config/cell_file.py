@@ -78,7 +78,8 @@ def cell_from_bundle(
     check(document, model, urdf, profiles, logged=file is None)
     controller = None if model.controller is None else model.controller.file
     chain = chain_of(model.robot, model.closures, urdf)
-    places = [axis.name for axis in model.axes] + [joint.name for joint in (chain.passive_joints if chain else ())]
+    passive = () if chain is None else chain.passive_joints
+    places = model.axis_names + [joint.name for joint in passive]
     mounted = platform_frame(model.robot, urdf)
     used = (CELL, URDF, *(f"{DRIVES}{drive}.yaml" for drive in model.drives))
     return Cell(
@@ -224,12 +225,11 @@ def _conditioning(model: ConditioningModel) -> Conditioning:
 
 def _joints(model: CellModel, chain: ClosedChain | None, urdf: str) -> dict[str, int]:
     """Return the index of the joint behind each axis, and behind each joint of a closed chain without a motor."""
-    names = [axis.name for axis in model.axes]
     if chain is None:
-        return {name: index for index, name in enumerate(names)}
+        return {name: index for index, name in enumerate(model.axis_names)}
     index = {joint.name: number for number, joint in enumerate(read_urdf(urdf).joints)}
     passive = {joint.name: index[joint.name] for joint in chain.passive_joints}
-    return passive | {name: index[motor] for name, motor in zip(names, chain.motors, strict=True)}
+    return passive | {name: index[motor] for name, motor in zip(model.axis_names, chain.motors, strict=True)}
 
 
 def _effect(effect: EffectModel, places: Sequence[str]) -> DeclaredEffect:

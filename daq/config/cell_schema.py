@@ -254,6 +254,11 @@ class CellModel(StrictModel):
     recalibration: RecalibrationSection | None = None
 
     @property
+    def axis_names(self) -> list[str]:
+        """Names in the order of the axes."""
+        return [axis.name for axis in self.axes]
+
+    @property
     def buses(self) -> tuple[Bus, ...]:
         """All buses, with names; empty in a cell that only imports recordings."""
         if self.bus is None or isinstance(self.bus, tuple):

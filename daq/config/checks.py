@@ -65,10 +65,13 @@ def check(
     Raises:
         ConfigurationInconsistent: with every contradiction and its line.
     """
-    beforehand = [] if logged else [*mechanism_faults(model.closures, urdf)]
-    robot, faults = (None, beforehand) if beforehand else _robot(model, urdf)
+    robot = None
+    faults = [] if logged else [*mechanism_faults(model.closures, urdf)]
+    if not faults:
+        robot, faults = _robot(model, urdf)
     joints = () if robot is None else robot.axes
-    names = [axis.name for axis in model.axes]
+    passive = () if robot is None else robot.passive_names
+    names = model.axis_names
     faults += [
         *_ratio_faults(model),
         *bus_faults(model, profiles),
@@ -77,7 +80,7 @@ def check(
         *_list_faults(model),
         *_effect_faults(model, robot, logged=logged),
         *signer_faults(model.policy.apply.signers),
-        *clearance_faults(model.workspace, model.clearance, [*names, *(() if robot is None else robot.passive_names)]),
+        *clearance_faults(model.workspace, model.clearance, [*names, *passive]),
         *max_change_faults(model.policy.apply, names),
     ]
     if not logged:
@@ -96,33 +99,28 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
     if not GRAVITY_M_S2[0] < gravity < GRAVITY_M_S2[1]:
         found = f"{gravity:.4g} m/s² in all"
         faults.append(Fault(("robot", "gravity_m_s2"), found, f"{range_text(GRAVITY_M_S2)} m/s², as anywhere on Earth"))
-    if not urdf.strip():
-        return None, [*faults, Fault(("robot", "urdf"), "an empty file", "a URDF of an arm")]
+    axes = model.axis_names
     try:
-        following = [*mimic_faults([axis.name for axis in model.axes], urdf)]
-        if following:
-            return None, [*faults, *following]
-        of_chain = [*chain_faults(model.robot, model.closures, urdf)]
-        if of_chain:
-            return None, [*faults, *of_chain]
+        of_urdf = _urdf_faults(model, urdf)
+        if of_urdf:
+            return None, faults + of_urdf
         chain = chain_of(model.robot, model.closures, urdf)
         robot = robot_with(chain, urdf, model.robot.gravity_m_s2)
     except ModelError as error:
         expected = "a URDF of an arm; `hold: {JOINT: POSITION}` fixes a joint that is no axis"
         return None, [*faults, Fault(("robot", "urdf"), str(error), expected)]
-    joints = robot.axes
-    if chain is not None and len(joints) != len(model.axes):
-        found, named = f"{len(joints)} joints for {len(model.axes)} axes", ", ".join(axis.name for axis in model.axes)
-        faults.append(Fault(("robot", "motors"), found, f"the joint of each axis, in their order ({named})"))
-    elif len(joints) != len(model.axes):
-        names = [joint.name for joint in joints]
+    names = [joint.name for joint in robot.axes]
+    more = len(names) - len(axes)
+    if more and chain is not None:
+        found = f"{len(names)} joints for {len(axes)} axes"
+        faults.append(Fault(("robot", "motors"), found, f"the joint of each axis, in their order ({', '.join(axes)})"))
+    elif more:
         expected = f"one for each moving joint of the URDF ({', '.join(names)})"
-        if len(joints) > len(model.axes):
-            others = [name for name in names if name not in {axis.name for axis in model.axes}]
-            held = ", ".join(f"{name}: 0.0" for name in others[len(model.axes) - len(joints) :])
+        if more > 0:
+            others = [name for name in names if name not in axes]
+            held = ", ".join(f"{name}: 0.0" for name in others[-more:])
             expected += f"; joints that are no axes are held at a position [deg; m if prismatic]: `hold: {{{held}}}`"
-        faults.append(Fault(("axes",), f"{len(model.axes)} axes", expected))
-    axes = [axis.name for axis in model.axes]
+        faults.append(Fault(("axes",), f"{len(axes)} axes", expected))
     for index, name in enumerate(axes[: len(model.robot.motors)]):
         # Either the list has the wrong joint or the axis the wrong name; both cannot stay: an effect may name either.
         if name in robot.passive_names:
@@ -130,6 +128,13 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
             expected = f"{name}, or another name of that axis (`axes[{index}].name`)"
             faults.append(Fault(("robot", "motors", index), found, expected))
     return robot, faults
+
+
+def _urdf_faults(model: CellModel, urdf: str) -> list[Fault]:
+    """Find what keeps a URDF from being read as the robot of the axes; the first kind of fault alone."""
+    if not urdf.strip():
+        return [Fault(("robot", "urdf"), "an empty file", "a URDF of an arm")]
+    return [*mimic_faults(model.axis_names, urdf)] or [*chain_faults(model.robot, model.closures, urdf)]
 
 
 def _order_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
@@ -174,7 +179,7 @@ def _ratio_faults(model: CellModel) -> Iterator[Fault]:
 
 def _list_faults(model: CellModel) -> Iterator[Fault]:
     n = len(model.axes)
-    names = Counter(axis.name for axis in model.axes)
+    names = Counter(model.axis_names)
     for index, axis in enumerate(model.axes):
         if names[axis.name] > 1:
             yield Fault(("axes", index, "name"), f"{axis.name}, used {names[axis.name]} times", "each name once")
@@ -187,9 +192,8 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
             yield Fault(("payloads", index, "mass_kg"), f"{payload.mass_kg:g}", "a positive mass [kg]")
         elif payload.mass_tolerance_kg > TOLERANCE_SHARE * payload.mass_kg:
             found = f"{payload.mass_tolerance_kg:g} kg for {payload.mass_kg:g} kg"
-            yield Fault(
-                ("payloads", index, "mass_tolerance_kg"), found, "at most a tenth of the mass: it is in every gain"
-            )
+            expected = "at most a tenth of the mass: it is in every gain"
+            yield Fault(("payloads", index, "mass_tolerance_kg"), found, expected)
         if mountings[payload.mounting] > 1:
             yield Fault(
                 ("payloads", index, "mounting"),
@@ -210,7 +214,7 @@ def _effect_faults(model: CellModel, robot: Robot | None, *, logged: bool) -> It
     from daq.config.effects import place_effect  # noqa: PLC0415 - loads scipy, which cells without effects do not need
 
     passive = () if robot is None else robot.passive_names
-    names = [*(axis.name for axis in model.axes), *passive]
+    names = [*model.axis_names, *passive]
     placed = [(effect.name, effect.axis) for effect in model.effects]
     for index, effect in enumerate(model.effects):
         if effect.axis not in names and not (model.closures and not passive):
