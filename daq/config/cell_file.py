@@ -184,10 +184,10 @@ def _member(files: Mapping[str, bytes], member: str, names: Mapping[str, str]) -
 
 
 def _axis(model: AxisModel, bus: str | None, profiles: Mapping[str, DriveProfile]) -> CellAxis:
-    limits, unit = model.limits, model.limits.unit
-    # The schema requires exactly one of the three, the checks that it matches the kind of joint.
-    gains = (model.nameplate_gain_nm_per_a, model.nameplate_gain_n_per_a, model.nameplate_gain)
-    per_newton = model.nameplate_gain_n_per_a is not None
+    limits = model.limits
+    unit = limits.unit
+    ((key, gain),) = model.nameplate_gains.items()  # the checks require that it matches the kind of joint
+    force = "N" if key == "nameplate_gain_n_per_a" else "Nm"
     profile = None if model.drive is None else profiles[model.drive]
     # A gain by the actual current is another quantity, so its unit must show it.
     ampere = "A(actual)" if profile is not None and profile.tap is TapPoint.ACTUAL else "A"
@@ -200,9 +200,9 @@ def _axis(model: AxisModel, bus: str | None, profiles: Mapping[str, DriveProfile
         bus=bus,
         counts_per_revolution=model.counts_per_revolution,
         unit=unit,
-        zero_offset_rad=unit.si * (model.zero_offset_deg or model.zero_offset_mm or 0.0),
-        nameplate_gain=next(gain for gain in gains if gain is not None),
-        gain_unit=model.gain_unit or f"{'N' if per_newton else 'Nm'}/{ampere}",
+        zero_offset_rad=unit.si * model.zero_offsets.get(unit, 0.0),
+        nameplate_gain=gain,
+        gain_unit=model.gain_unit or f"{force}/{ampere}",
         limits=Limits(
             position=(unit.si * limits.position[0], unit.si * limits.position[1]),
             velocity=unit.si * limits.velocity,

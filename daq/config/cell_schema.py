@@ -104,6 +104,9 @@ class LimitsModel(StrictModel):
         return self.acceleration_mm_s2 or self.acceleration_deg_s2 or 0.0
 
 
+_GAIN_KEYS = ("nameplate_gain_nm_per_a", "nameplate_gain_n_per_a", "nameplate_gain")
+
+
 class AxisModel(StrictModel):
     """One motor and its joint."""
 
@@ -131,10 +134,21 @@ class AxisModel(StrictModel):
             )
         return self
 
+    @property
+    def zero_offsets(self) -> dict[JointUnit, float]:
+        """Stated zero offsets, by their units."""
+        offsets = {DEGREE: self.zero_offset_deg, MILLIMETRE: self.zero_offset_mm}
+        return {unit: offset for unit, offset in offsets.items() if offset is not None}
+
+    @property
+    def nameplate_gains(self) -> dict[str, float]:
+        """Stated gains by their keys; the schema requires one."""
+        gains = {key: getattr(self, key) for key in _GAIN_KEYS}
+        return {key: gain for key, gain in gains.items() if gain is not None}
+
     @model_validator(mode="after")
     def _check_gain(self) -> AxisModel:
-        gains = (self.nameplate_gain_nm_per_a, self.nameplate_gain_n_per_a, self.nameplate_gain)
-        if gains.count(None) != 2 or (self.nameplate_gain is None) != (self.gain_unit is None):
+        if len(self.nameplate_gains) != 1 or (self.nameplate_gain is None) != (self.gain_unit is None):
             raise ValueError(
                 "nameplate_gain_nm_per_a, nameplate_gain_n_per_a (prismatic), or nameplate_gain together with gain_unit"
             )

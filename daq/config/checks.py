@@ -344,9 +344,9 @@ def _axis_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
         if index < len(joints):
             yield from _kind_faults(path, axis, joints[index])
         yield from _limit_faults((*path, "limits", f"position_{axis.limits.unit.name}"), axis)
-        for unit, offset in ((DEGREE, axis.zero_offset_deg), (MILLIMETRE, axis.zero_offset_mm)):
+        for unit, offset in axis.zero_offsets.items():
             farthest = _PLAUSIBLE[unit].farthest
-            if offset is not None and abs(offset) > farthest:
+            if abs(offset) > farthest:
                 yield Fault((*path, f"zero_offset_{unit.name}"), f"{offset:g}", f"at most ±{farthest:g} {unit.name}")
     yield from _gain_faults(model, joints)
     yield from _standstill_faults(model, joints)
@@ -363,17 +363,11 @@ def _kind_faults(path: Location, axis: AxisModel, joint: Joint) -> Iterator[Faul
             f"limits in {written.name}, and {what}",
             f"position_{name}, velocity_{name}_s and acceleration_{name}_s2",
         )
-    for other, offset in ((DEGREE, axis.zero_offset_deg), (MILLIMETRE, axis.zero_offset_mm)):
-        if offset is not None and other is not unit:
+    for other in axis.zero_offsets:
+        if other is not unit:
             yield Fault((*path, f"zero_offset_{other.name}"), f"{other.name}, and {what}", f"zero_offset_{unit.name}")
     if axis.lead_mm is not None and joint.kind is not JointKind.PRISMATIC:
         yield Fault((*path, "lead_mm"), f"a lead, and {what}", "nothing: only a prismatic joint has a lead")
-
-
-def _gain_key(axis: AxisModel) -> str:
-    """Return the key by which an axis states its gain; the schema requires one."""
-    keys = ("nameplate_gain", "nameplate_gain_nm_per_a", "nameplate_gain_n_per_a")
-    return next(key for key in keys if getattr(axis, key) is not None)
 
 
 def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
@@ -382,8 +376,8 @@ def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
     except ValueError:
         gained = ()  # _ratio_faults refuses the drive train
     for index, axis in enumerate(model.axes):
-        key = _gain_key(axis)
-        if not getattr(axis, key):
+        ((key, gain),) = axis.nameplate_gains.items()
+        if not gain:
             yield Fault(("axes", index, key), "0", "the manufacturer's gain, signed, not zero")
         if index >= len(gained) or gained[index] >= len(joints):
             continue
@@ -417,11 +411,12 @@ def _limit_faults(path: Location, axis: AxisModel) -> Iterator[Fault]:
 def _range_faults(model: CellModel) -> Iterator[Fault]:
     """Find speeds, accelerations and gains that no axis has."""
     for index, axis in enumerate(model.axes):
-        unit, key = axis.limits.unit.name, _gain_key(axis)
+        unit = axis.limits.unit.name
+        ((key, gain),) = axis.nameplate_gains.items()
         for where, value, bounds, shown in (
             (("limits", f"velocity_{unit}_s"), axis.limits.velocity, SPEED, f" {unit}/s"),
             (("limits", f"acceleration_{unit}_s2"), axis.limits.acceleration, ACCELERATION, f" {unit}/s²"),
-            ((key,), abs(getattr(axis, key)), RAW_GAIN if key == "nameplate_gain" else GAIN, " in size"),
+            ((key,), abs(gain), RAW_GAIN if key == "nameplate_gain" else GAIN, " in size"),
         ):
             if value != 0.0 and not within(value, bounds):
                 found = f"{value:g}{shown}"

@@ -19,9 +19,9 @@ import yaml
 from pydantic import AfterValidator, Field, model_validator
 
 from daq.config.cell_schema import CUTOFF_HZ, FILTER_ORDER
-from daq.config.yaml_file import MAX_BYTES, StrictModel, parse_yaml, read_model
+from daq.config.yaml_file import StrictModel, parse_yaml, read_file, read_model
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, SchemaMismatch, YamlInvalid
-from daq.files import read_regular, replace_file
+from daq.files import replace_file
 from ident.calibration import (
     AcceptedEffect,
     Calibration,
@@ -318,12 +318,8 @@ def read_calibration_bytes(path: Path) -> bytes:
     Raises:
         CalibrationMissing: see `load_calibration`.
     """
-    try:
-        return read_regular(path, MAX_BYTES)
-    except OSError as error:
-        found = (error.strerror or type(error).__name__).lower()
-        wanted = "the file that `drivegain fit` wrote"
-        raise CalibrationMissing(str(path), found=found, expected=wanted, remedy="check the name") from error
+    wanted = "the file that `drivegain fit` wrote"
+    return read_file(path, CalibrationMissing, expected=wanted, remedy="check the name")
 
 
 def decode_calibration(content: bytes, name: str) -> Calibration:

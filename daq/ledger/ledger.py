@@ -136,7 +136,7 @@ def read_history(ledger: Ledger) -> History:
     """
     stored = _read_stored(ledger)
     verdict = verify(ledger.audit, stored.noted.union(noted_heads(ledger.audit)))
-    flaws = _flaws(ledger, stored, verdict.intact)
+    flaws = _flaws(ledger, stored, verdict)
     if flaws:
         raise stored_error(ledger, flaws)
     history = fold(_with_stored(verdict.intact, stored, ledger.cell), ledger.cell)
@@ -165,7 +165,7 @@ def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
     stored = _read_stored(ledger)
     noted = noted_heads(ledger.audit)
     verdict = verify(ledger.audit, stored.noted.union(heads, noted))
-    broken = _flaws(ledger, stored, verdict.intact)
+    broken = _flaws(ledger, stored, verdict)
     entries = _with_stored(verdict.intact, EMPTY if broken else stored, ledger.cell)
     history = fold(entries, ledger.cell)
     broken += history.unreadable
@@ -303,7 +303,7 @@ def _take_over(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) 
     verdict = verify(ledger.audit, stored.noted.union(noted_heads(ledger.audit)))
     if not verdict.holds:
         raise audit_error(ledger.audit, verdict)
-    flaws += _flaws(ledger, stored, verdict.entries)
+    flaws += _flaws(ledger, stored, verdict)
     if flaws and not forced:
         raise stored_error(ledger, flaws)
     drafts = drafts_of(EMPTY if flaws else stored, verdict.entries, ledger.cell.name, who, at)
@@ -377,8 +377,8 @@ def _read_stored(ledger: Ledger) -> StoredHistory:
     return read_stored(ledger.stored)
 
 
-def _flaws(ledger: Ledger, stored: StoredHistory, entries: Sequence[AuditEntry]) -> tuple[str, ...]:
-    return (*stored.flaws, *stored_contradictions(stored, entries, ledger.cell.name))
+def _flaws(ledger: Ledger, stored: StoredHistory, verdict: AuditVerdict) -> tuple[str, ...]:
+    return (*stored.flaws, *stored_contradictions(stored, verdict.intact, ledger.cell.name))
 
 
 def _with_stored(entries: Sequence[AuditEntry], stored: StoredHistory, cell: Cell) -> tuple[AuditEntry, ...]:
@@ -423,8 +423,6 @@ def _end_found_writes(ledger: Ledger) -> None:
 
 def _check_like(ledger: Ledger, calibration: Calibration, entries: Collection[Entry]) -> None:
     """Refuse a calibration that cannot be compared with those of the history."""
-    found: str
-    expected: str
     units = {gain.axis: gain.unit for gain in calibration.gains}
     known = {gain.axis: gain.unit for one in entries for gain in one.gains}
     other = [axis for axis in units if axis in known and units[axis] != known[axis]]

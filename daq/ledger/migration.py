@@ -100,12 +100,7 @@ def read_stored(path: Path) -> StoredHistory:
         damaged = [str(row[0]) for row in connection.execute("PRAGMA integrity_check") if row[0] != "ok"]
         if damaged:  # rows of a broken file prove nothing
             return StoredHistory((), (), (), tuple(damaged))
-        return StoredHistory(
-            calibrations=tuple(_calibrations(connection)),
-            events=tuple(_events(connection)),
-            acknowledgements=tuple(_acknowledgements(connection)),
-            flaws=(*_gaps(connection, "event"), *_gaps(connection, "acknowledgement")),
-        )
+        return _content(connection)
 
 
 @contextlib.contextmanager
@@ -142,21 +137,20 @@ def _unreadable(path: Path, found: str) -> HistoryUnreadable:
     )
 
 
-def _calibrations(connection: sqlite3.Connection) -> Iterator[StoredCalibration]:
-    for row in connection.execute("SELECT digest, entered, document FROM calibration ORDER BY created, digest"):
-        yield StoredCalibration(str(row[0]), zoned(row[1]), str(row[2]))
-
-
-def _events(connection: sqlite3.Connection) -> Iterator[Event]:
+def _content(connection: sqlite3.Connection) -> StoredHistory:
+    """Read all rows; raises ValueError for one that drivegain did not write."""
+    rows = connection.execute("SELECT digest, entered, document FROM calibration ORDER BY created, digest")
+    calibrations = [StoredCalibration(str(row[0]), zoned(row[1]), str(row[2])) for row in rows]
+    events = []
     query = "SELECT digest, deed, at, who, target, audit, sha256_after FROM event ORDER BY number"
     for digest, deed, at, who, target, audit, after in connection.execute(query):
-        yield Event(digest, WriteAction(deed), zoned(at), _raw(who), _raw(target), audit, after)
-
-
-def _acknowledgements(connection: sqlite3.Connection) -> Iterator[Acknowledgement]:
+        events.append(Event(digest, WriteAction(deed), zoned(at), _raw(who), _raw(target), audit, after))
+    acknowledgements = []
     query = "SELECT axis, since, at, who, why, audit FROM acknowledgement ORDER BY number"
     for axis, since, at, who, why, audit in connection.execute(query):
-        yield Acknowledgement(axis, zoned(since), zoned(at), _raw(who), _raw(why), audit)
+        acknowledgements.append(Acknowledgement(axis, zoned(since), zoned(at), _raw(who), _raw(why), audit))
+    flaws = (*_gaps(connection, "event"), *_gaps(connection, "acknowledgement"))
+    return StoredHistory(tuple(calibrations), tuple(events), tuple(acknowledgements), flaws)
 
 
 def _raw(text: str) -> str:
