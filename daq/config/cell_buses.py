@@ -190,7 +190,8 @@ def _wiring_faults(model: CellModel) -> Iterator[Fault]:
             for key in ("node_id", "drive", "identity", "counts_per_revolution"):
                 if getattr(axis, key) is None:
                     yield Fault(("axes", index, key), "nothing", "a value, because the cell has a bus")
-        where, known = ("axes", index, "bus"), ", ".join(names)
+        where = ("axes", index, "bus")
+        known = ", ".join(names)
         if model.bus_of(axis) is None and len(names) > 1:
             yield Fault(where, "nothing", f"the bus of its amplifier, because the cell has several: {known}")
         elif axis.bus is not None and axis.bus not in names:
@@ -243,7 +244,8 @@ def producer_faults(model: CellModel) -> Iterator[Fault]:
     """Find a SYNC producer that does not exist, or cannot pace this bus."""
     if model.sync is None or model.sync.producer == RECORDER:
         return
-    path, producer = ("sync", "producer"), model.sync.producer
+    path = ("sync", "producer")
+    producer = model.sync.producer
     interfaces = [bus.interface for bus in model.buses]
     if len(interfaces) > 1:
         expected = f"{RECORDER}: no other producer sends SYNC on several buses at once"

@@ -23,7 +23,8 @@ from daq.config.yaml_file import FileName, Name, Positive, StrictModel, not_in_f
 from ident.arrays import FloatArray
 from ident.plausible import LEAD_MM, SPEED, within
 
-ONE_BUS, SEVERAL_BUSES = not_in_file("one bus"), not_in_file("several buses")
+ONE_BUS = not_in_file("one bus")
+SEVERAL_BUSES = not_in_file("several buses")
 U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 

@@ -151,7 +151,8 @@ def _order_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
 
 def _ratio_faults(model: CellModel) -> Iterator[Fault]:
     path = ("drive_train", "ratio")
-    ratio, n = model.drive_train.ratio, len(model.axes)
+    ratio = model.drive_train.ratio
+    n = len(model.axes)
     if len(ratio) != n or any(len(row) != n for row in ratio):
         shape = f"{len(ratio)} rows of {', '.join(map(str, sorted({len(row) for row in ratio})))} numbers"
         yield Fault(path, shape, f"{n} × {n}, a row for each motor")
@@ -245,7 +246,8 @@ def _mass_faults(model: CellModel) -> Iterator[Fault]:
     rated_kg = model.robot.rated_payload_kg
     lightest_kg = min((payload.mass_kg for payload in model.payloads if payload.mass_kg > 0), default=0.0)
     for index, payload in enumerate(model.payloads):
-        path, found = ("payloads", index, "mass_kg"), f"{payload.mass_kg:g} kg"
+        path = ("payloads", index, "mass_kg")
+        found = f"{payload.mass_kg:g} kg"
         if rated_kg is not None and payload.mass_kg > rated_kg:
             yield Fault(path, found, f"at most the {rated_kg:g} kg of `robot.rated_payload_kg`")
         elif rated_kg is None and payload.mass_kg > HEAVIEST_PAYLOAD_KG:
@@ -354,7 +356,8 @@ def _axis_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
 
 def _kind_faults(path: Location, axis: AxisModel, joint: Joint) -> Iterator[Fault]:
     """Find degrees for a prismatic joint, and mm for a revolute one."""
-    unit, written = joint_unit(joint.kind), axis.limits.unit
+    unit = joint_unit(joint.kind)
+    written = axis.limits.unit
     what = f"joint {joint.name} of the URDF is {joint.kind.value}"
     if written is not unit:
         name = unit.name
@@ -385,7 +388,8 @@ def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
         force = joint_unit(joint.kind).force
         written = {"nameplate_gain_nm_per_a": "Nm", "nameplate_gain_n_per_a": "N"}.get(key)
         if written is None:
-            key, written = "gain_unit", (axis.gain_unit or "").partition("/")[0].strip()
+            key = "gain_unit"
+            written = (axis.gain_unit or "").partition("/")[0].strip()
         if written in {"Nm", "N"} and written != force:
             yield Fault(
                 ("axes", index, key),
@@ -395,7 +399,8 @@ def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
 
 
 def _limit_faults(path: Location, axis: AxisModel) -> Iterator[Fault]:
-    (lower, upper), unit = axis.limits.position, axis.limits.unit
+    lower, upper = axis.limits.position
+    unit = axis.limits.unit
     plausible = _PLAUSIBLE[unit]
     found = f"[{lower:g}, {upper:g}] {unit.name}"
     if lower >= upper:
@@ -430,10 +435,14 @@ def _si_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
     ranges = [axis.limits.position for axis in model.axes if axis.limits.unit is DEGREE]
     narrow = all(SHORTEST_DEG < upper - lower < SHORTEST_OF_ALL_DEG for lower, upper in ranges)
     for index, axis in enumerate(model.axes):
-        (lower, upper), velocity, unit = axis.limits.position, axis.limits.velocity, axis.limits.unit
-        path, in_si = ("axes", index, "limits"), of_urdf.get(index)
+        lower, upper = axis.limits.position
+        velocity = axis.limits.velocity
+        unit = axis.limits.unit
+        path = ("axes", index, "limits")
+        in_si = of_urdf.get(index)
         remedy = f"{unit.name}; multiply by {1.0 / unit.si:.3g}"
-        where, found = (*path, f"position_{unit.name}"), f"[{lower:g}, {upper:g}] {unit.name}"
+        where = (*path, f"position_{unit.name}")
+        found = f"[{lower:g}, {upper:g}] {unit.name}"
         if in_si is not None and _within_urdf((lower, upper), in_si.position, _PLAUSIBLE[unit].farthest * unit.si):
             yield Fault(where, f"{found}, the numbers of the URDF in {unit.si_name}", remedy)
         elif narrow and unit is DEGREE:
@@ -494,7 +503,8 @@ def _urdf_limits(urdf: str) -> dict[str, _UrdfLimits | None]:
         for joint in joints:
             if joint.get("type") not in {"revolute", "continuous", "prismatic"}:
                 continue
-            limit, name = joint.find("limit"), joint.get("name", "")
+            limit = joint.find("limit")
+            name = joint.get("name", "")
             limits[name] = None
             if limit is None:
                 continue

@@ -98,7 +98,8 @@ class ScaleModel(SectionModel):
 
     @model_validator(mode="after")
     def _form_and_keys(self) -> ScaleModel:
-        given, wanted = self.model_fields_set - {"form"}, SCALE_KEYS[self.form]
+        given = self.model_fields_set - {"form"}
+        wanted = SCALE_KEYS[self.form]
         empty = {key for key in given if getattr(self, key) is None and key != "peak_current_a"}
         if empty or given - wanted or wanted - given - {"objects"}:
             raise ValueError(f"{' and '.join(sorted(wanted))} of a scale of form {self.form.value}, and nothing else")
@@ -106,11 +107,14 @@ class ScaleModel(SectionModel):
 
     def built(self) -> CurrentScale | None:
         """Convert to the class of `drivers`; None until the peak current is entered."""
-        factor, objects = self.factor, self.objects
+        factor = self.factor
+        objects = self.objects
         if self.rated_current is not None:
-            factor, objects = 1e-6, (self.rated_current,)  # a thousandth of so many mA
+            factor = 1e-6  # a thousandth of so many mA
+            objects = (self.rated_current,)
         elif self.digits is not None and self.peak_current is not None:
-            factor, objects = 1e-3 / self.digits, (self.peak_current,)  # [mA]
+            factor = 1e-3 / self.digits  # [mA]
+            objects = (self.peak_current,)
         elif self.digits is not None and self.peak_current_a is not None:
             factor = self.peak_current_a / self.digits
         elif self.ampere_per_unit is not None:

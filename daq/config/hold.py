@@ -43,7 +43,8 @@ def _faults(model: CellModel, held: dict[str, float], joints: dict[str, ElementT
     for name, position in held.items():
         if name in model.axis_names:
             yield Fault(("hold", name), "a joint that is also one of `axes`", "an axis or a held joint, not both")
-        limit, kind = joints[name].find("{*}limit"), joints[name].get("type")
+        limit = joints[name].find("{*}limit")
+        kind = joints[name].get("type")
         if limit is None or kind == "continuous":
             continue
         try:

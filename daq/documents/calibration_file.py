@@ -284,9 +284,12 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
     def check(content: bytes) -> None:
         # Compared as documents: NaN, for an axis that did not move, is not equal to itself.
         if as_document(decode_calibration(content, str(path))) != as_document(calibration):
-            found, expected = "another content on reading back", "what was written"
-            remedy = "check the disk; the file was not replaced"
-            raise CalibrationUnreadable(str(path), found=found, expected=expected, remedy=remedy)
+            raise CalibrationUnreadable(
+                str(path),
+                found="another content on reading back",
+                expected="what was written",
+                remedy="check the disk; the file was not replaced",
+            )
 
     replace_file(path, encode_calibration(calibration), check=check)
 

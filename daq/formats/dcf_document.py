@@ -24,7 +24,9 @@ _KEY = re.compile(r"(?:0x)?([0-9a-f]{4})h?(?:(?:sub|:)(?:0x)?([0-9a-f]{1,2})h?)?
 _TITLE = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]+))?")
 _CODE = re.compile(r"0|[1-9][0-9]{0,9}|0x[0-9a-f]{1,8}", re.IGNORECASE)
 """The number of a type: Python's int(…, 0) takes underscores, signs and 0b too."""
-_VALUE, _TYPE, _OBJECT_TYPE = "parametervalue", "datatype", "objecttype"
+_VALUE = "parametervalue"
+_TYPE = "datatype"
+_OBJECT_TYPE = "objecttype"
 _VARIABLE = 7
 _BYTE_ORDER_MARK = "ï»¿"  #: That of UTF-8, each byte a character
 _INTEGERS = {
@@ -77,7 +79,8 @@ class DcfDocument(ControllerDocument):
         match = _KEY.fullmatch(key)
         if match is None:
             raise self.unfit(key, "a key that names no object", f"{CORRECT_KEY}: 6076, 2003:01 or 2003sub1")
-        index, subindex = int(match[1], 16), int(match[2] or "0", 16)
+        index = int(match[1], 16)
+        subindex = int(match[2] or "0", 16)
         found = [
             section
             for section in sections
@@ -199,7 +202,8 @@ def _sections(text: str) -> list[_Section]:
         written = line[1].removeprefix(_BYTE_ORDER_MARK) if number == 1 else line[1]
         if written.lstrip().startswith(";"):
             continue
-        title, entry = _SECTION.fullmatch(written), _ENTRY.fullmatch(written)
+        title = _SECTION.fullmatch(written)
+        entry = _ENTRY.fullmatch(written)
         if title is not None:
             sections.append(_Section(title[1].strip().lower(), number))
         elif entry is not None and sections:

@@ -43,8 +43,10 @@ def parse(content: bytes, name: str) -> tuple[Element, str]:
     Raises:
         ControllerUnfit: it is no XML, or has a document type.
     """
-    around, encodings = Element("", {}, "", 0, 0), ["utf-8"]
-    opened, count = [around], itertools.count(1)
+    around = Element("", {}, "", 0, 0)
+    encodings = ["utf-8"]
+    opened = [around]
+    count = itertools.count(1)
     parser = expat.ParserCreate()
     parser.buffer_text = True
 
@@ -160,7 +162,8 @@ class XmlDocument(ControllerDocument):
     def _find(self, around: Element, key: str) -> tuple[Element, str | None]:
         """Return the element that a path names, and its attribute where it names one."""
         steps, attribute = self._steps(key)
-        element, walked = around, ""
+        element = around
+        walked = ""
         for step in steps:
             found = [one for one in element.children if one.name == step.name and step.having <= one.attributes.items()]
             found = found if step.number is None else found[step.number - 1 : step.number]
@@ -172,7 +175,8 @@ class XmlDocument(ControllerDocument):
                 lines = ", ".join(str(one.line) for one in found[:12])
                 remedy = f"choose one by an attribute ({step.name}[@name='…']) or its number ({step.name}[1])"
                 raise self.unfit(key, f"{len(found)} of {step.written} in {place}, on lines {lines}", remedy)
-            element, walked = found[0], f"{walked}/{step.written}".lstrip("/")
+            element = found[0]
+            walked = f"{walked}/{step.written}".lstrip("/")
         if attribute is not None and attribute not in element.attributes:
             has = ", ".join(f"@{name}" for name in list(element.attributes)[:12]) or "none"
             raise self.unfit(key, f"no attribute @{attribute} in {walked} (it has {has})", CORRECT_KEY)

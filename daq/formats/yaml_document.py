@@ -130,7 +130,8 @@ def _composed(text: str, name: str, version: str) -> Any:
             root = yaml.compose(text, Loader=yaml.SafeLoader)
         found = "nothing in it"
     except (YAMLError, yaml.YAMLError, ValueError, RecursionError) as error:
-        root, found = None, " ".join(str(error).split())[:200]
+        root = None
+        found = " ".join(str(error).split())[:200]
     if root is None:
         raise ControllerUnfit(
             name,

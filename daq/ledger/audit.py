@@ -485,7 +485,9 @@ class _Chain:
         place = index + 1
         if not holds:
             self._add_flaw(place, Flaw.EDITED, f"the digest of entry {one.number} is not that of its content")
-            self.number, self.previous, self.place = self.number + 1, None, place
+            self.number += 1
+            self.previous = None
+            self.place = place
             return
         if one.number < self.number:
             twice = self.numbers[one.number] > 1
@@ -503,7 +505,9 @@ class _Chain:
         elif self.previous is not None and one.previous != self.previous:
             says = f"entry {one.number} follows another entry than the one before it, which was put in its place"
             self._add_flaw(self.place, Flaw.EDITED, says)
-        self.number, self.previous, self.place = one.number + 1, one.sha256, place
+        self.number = one.number + 1
+        self.previous = one.sha256
+        self.place = place
 
     def settle(self, follower: AuditEntry | None) -> None:
         """Judge lines that are no entries: left by a killed writer, or changed."""
@@ -518,7 +522,8 @@ class _Chain:
             for index in self.unfinished:
                 self._add_flaw(index + 1, Flaw.EDITED, "no entry as drivegain writes them")
             if fragments:
-                self.number, self.previous = self.number + len(fragments), None
+                self.number += len(fragments)
+                self.previous = None
         self.unfinished = []
 
     def _add_flaw(self, line: int, flaw: Flaw, says: str) -> None:
@@ -535,7 +540,8 @@ def open_writes(entries: Sequence[AuditEntry], digest_now: Callable[[str], str |
         # The next write read the file under its lock, before it changed anything: that is nearer than the file now.
         witness = next((later for later in begins[place + 1 :] if later.subject == one.subject), None)
         found = digest_now(one.subject) if witness is None else _digest_before(witness)
-        before, after = _digest_before(one), one.details.get("sha256_after")
+        before = _digest_before(one)
+        after = one.details.get("sha256_after")
         if found is None or before is None or not isinstance(after, str):
             yield OpenWrite(one, Content.UNKNOWN)
         else:

@@ -98,7 +98,8 @@ def watch(entries: Sequence[Entry], acknowledgements: Sequence[Acknowledgement])
     axes = {gain.axis: gain.unit for gain in entries[-1].gains}
     found = []
     for axis, dispersion in dispersions_of(entries, tuple(axes)).items():
-        known, acknowledged = _known(entries, axis), tuple(noted for noted in acknowledgements if noted.axis == axis)
+        known = _known(entries, axis)
+        acknowledged = tuple(noted for noted in acknowledgements if noted.axis == axis)
         starts = {sum(entry.recorded < a.since for entry, _ in known) for a in acknowledged}
         stretches = []
         for began, ended in pairwise(sorted({0, *starts, len(known)})):
@@ -191,11 +192,14 @@ _SEVERAL = (
 
 def alarm_text(series: Series) -> str | None:
     """`gain of J4 fell 6.0 % since 2026-03-02, 5.1 σ`; None where the newest calibration raises no alarm."""
-    drift, onset = series.drift, series.onset
+    drift = series.drift
+    onset = series.onset
     if drift is None or drift.alarm is None or onset is None:
         return None
-    rose, since = drift.change_percent > 0, f"since {onset:%Y-%m-%d}"
-    percent, sigmas = f"{abs(drift.change_percent):.1f} %", f"{abs(drift.change_sigmas):.1f} σ"
+    rose = drift.change_percent > 0
+    since = f"since {onset:%Y-%m-%d}"
+    percent = f"{abs(drift.change_percent):.1f} %"
+    sigmas = f"{abs(drift.change_sigmas):.1f} σ"
     moved = "rose" if rose else "fell"
     match drift.alarm.kind:
         case AlarmKind.DRIFT:

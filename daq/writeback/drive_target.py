@@ -341,11 +341,14 @@ def content_of(base: tuple[ParameterValue, ...], writes: tuple[ParameterWrite, .
 
 def _change(gain: Gain, value: ParameterValue, gain_object: GainObject) -> tuple[GainChange, ParameterWrite]:
     """Plan one drive; a gain that is no number leaves the present bits, and a gate refuses it."""
-    parameter, factor = gain_object.parameter, gain_object.factor
-    key, word = f"{value.axis.name}, {parameter}", value.word
+    parameter = gain_object.parameter
+    factor = gain_object.factor
+    key = f"{value.axis.name}, {parameter}"
+    word = value.word
     planned = None
     if is_writable(gain):
-        wanted, std = factor * gain.value, abs(factor) * gain.std
+        wanted = factor * gain.value
+        std = abs(factor) * gain.std
         try:
             word = parameter.word(wanted)
         except ValueError as error:
@@ -385,7 +388,8 @@ def _changed_since_record(base: tuple[ParameterValue, ...], folder: Path) -> tup
     for value in base:
         note = notes.get((value.axis.name, value.parameter))
         if note is not None and value.word not in {note.old, note.new}:
-            new, old = value.parameter.value(note.new), value.parameter.value(note.old)
+            new = value.parameter.value(note.new)
+            old = value.parameter.value(note.old)
             expected = f"{new:.9g}, as written according to {records[-1].name}, or {old:.9g} as before"
             remedy = f"the gain was changed since, or the drive exchanged: {_REVIEW}"
             found.append((f"{value.axis.name}, {value.parameter}", f"{value.value:.9g}", expected, remedy))

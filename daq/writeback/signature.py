@@ -32,7 +32,8 @@ def generate(folder: Path, name: str, password: str = "") -> tuple[Path, PublicK
         UsageError: there is a key of this name; it is never replaced.
         OutputFailed: from the file system.
     """
-    secret, public = folder / f"{_checked(name)}.key", folder / f"{name}.pub"
+    secret = folder / f"{_checked(name)}.key"
+    public = folder / f"{name}.pub"
     for path in (secret, public):
         if path.exists() or path.is_symlink():
             raise UsageError(

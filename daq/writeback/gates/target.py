@@ -123,7 +123,8 @@ def _axes_of_cell(context: GateContext) -> Iterator[tuple[Gain, CellAxis]]:
 
 def base(context: GateContext) -> Iterator[GateFinding]:
     """Require the content that the target had at the recording, or after the last write; or that of `--base`."""
-    edit, base = context.edit, context.request.base
+    edit = context.edit
+    base = context.request.base
     reviewed, after_digest = (None, None) if base is None else parse_base(base, edit.before or b"")
     if edit.keeps_all:
         return
@@ -154,7 +155,8 @@ def signature(context: GateContext) -> Iterator[GateFinding]:
     Raises:
         ConfigurationInconsistent: a public key of the policy is none.
     """
-    policy, request = context.policy, context.request
+    policy = context.policy
+    request = context.request
     if not policy.signatures:
         return
     subject = "calibration" if request.file is None else str(request.file)
