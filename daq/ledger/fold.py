@@ -264,7 +264,7 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
     return History(
         entries=tuple(sorted(comparable, key=lambda one: (one.created, one.entered, one.digest))),
         events=tuple(events),
-        acknowledgements=tuple(_acknowledgements(entries, cell.name)),
+        acknowledgements=tuple(acknowledgements_of(entries, cell.name)),
         unreadable=tuple(unreadable),
     )
 
@@ -332,14 +332,15 @@ def _entered_calibration(entry: AuditEntry, cell: str) -> EnteredCalibration | N
     return EnteredCalibration(entry.number, digest, entered, document, known)
 
 
-def _acknowledgements(entries: Iterable[AuditEntry], cell: str) -> Iterator[Acknowledgement]:
+def acknowledgements_of(entries: Iterable[AuditEntry], cell: str) -> Iterator[Acknowledgement]:
+    """Yield the changes that were explained in a cell, oldest first."""
     for entry in entries:
-        found = acknowledgement_of(entry)
+        found = _acknowledgement_of(entry)
         if found is not None and text_field(entry, "cell") == cell:
             yield found
 
 
-def acknowledgement_of(entry: AuditEntry) -> Acknowledgement | None:
+def _acknowledgement_of(entry: AuditEntry) -> Acknowledgement | None:
     """Return the acknowledgement of an entry, None where it lacks a part or would silence an axis beforehand."""
     axis = text_field(entry, "axis")
     why = text_field(entry, "why")

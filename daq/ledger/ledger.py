@@ -48,7 +48,6 @@ from daq.ledger.migration import (
     history_subject,
     read_stored,
     set_aside,
-    stored_contradictions,
 )
 from ident.calibration import Calibration
 
@@ -132,13 +131,12 @@ def read_history(ledger: Ledger) -> History:
 
     Raises:
         AuditUnusable: the audit log is no regular file, or it cannot be read.
-        HistoryUnreadable: there is a history of an earlier version that cannot be read, or contradicts the audit log.
+        HistoryUnreadable: there is a history of an earlier version that cannot be read.
     """
     stored = _read_stored(ledger)
     verdict = verify(ledger.audit, stored.noted.union(noted_heads(ledger.audit)))
-    flaws = _flaws(ledger, stored, verdict)
-    if flaws:
-        raise stored_error(ledger, flaws)
+    if stored.flaws:
+        raise stored_error(ledger, stored.flaws)
     history = fold(_with_stored(verdict.intact, stored, ledger.cell), ledger.cell)
     return replace(history, may_lack=not verdict.holds)
 
@@ -165,10 +163,9 @@ def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
     stored = _read_stored(ledger)
     noted = noted_heads(ledger.audit)
     verdict = verify(ledger.audit, stored.noted.union(heads, noted))
-    broken = _flaws(ledger, stored, verdict)
-    entries = _with_stored(verdict.intact, EMPTY if broken else stored, ledger.cell)
+    entries = _with_stored(verdict.intact, EMPTY if stored.flaws else stored, ledger.cell)
     history = fold(entries, ledger.cell)
-    broken += history.unreadable
+    broken = stored.flaws + history.unreadable
     if not verdict.holds:  # its entries do not prove that anything is missing
         return Verification(ledger.audit, verdict, replace(history, may_lack=True), broken)
     known = {one.digest for one in history.entries}
@@ -274,12 +271,12 @@ def migrate(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) -> 
         ledger: of the cell.
         who: the person or the job.
         at: time, with zone.
-        forced: also rename a file that is broken or contradicts the audit log, from which nothing is taken over; and
+        forced: also rename a file that is broken, from which nothing is taken over; and
             add figures where there is no such file.
 
     Raises:
         HistoryInaccessible: the file is locked, or its rights do not let it be read; nothing was changed.
-        HistoryUnreadable: the file is broken or contradicts the audit log, without `forced`; nothing was changed.
+        HistoryUnreadable: the file is broken, without `forced`; nothing was changed.
         DataError: the audit log is not what was written; nothing was changed.
         AuditUnusable, OutputFailed: a file cannot be written; the next call goes on.
     """
@@ -303,7 +300,7 @@ def _take_over(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) 
     verdict = verify(ledger.audit, stored.noted.union(noted_heads(ledger.audit)))
     if not verdict.holds:
         raise audit_error(ledger.audit, verdict)
-    flaws += _flaws(ledger, stored, verdict)
+    flaws += stored.flaws
     if flaws and not forced:
         raise stored_error(ledger, flaws)
     drafts = drafts_of(EMPTY if flaws else stored, verdict.entries, ledger.cell.name, who, at)
@@ -359,13 +356,13 @@ def audit_error(audit: Path, verdict: AuditVerdict) -> DataError:
 
 
 def stored_error(ledger: Ledger, flaws: Collection[str]) -> HistoryUnreadable:
-    """Return the error for a history of an earlier version that is broken, or contradicts the audit log."""
+    """Return the error for a history of an earlier version that is broken."""
     listed = list(flaws)
     more = len(listed) - _SHOWN
     return HistoryUnreadable(
         str(ledger.stored),
         found="; ".join(listed[:_SHOWN]) + (f"; and {more} more" if more > 0 else ""),
-        expected="a sound SQLite file with what the audit log says",
+        expected="a sound SQLite file whose calibrations can be read",
         remedy="ask who can write to it, and restore the last good one from a backup, or go on without it: "
         "`drivegain history CELL --migrate` keeps it under another name, and takes nothing over from it",
     )
@@ -375,10 +372,6 @@ def _read_stored(ledger: Ledger) -> StoredHistory:
     if ledger.stored is None or not ledger.outdated:
         return EMPTY
     return read_stored(ledger.stored)
-
-
-def _flaws(ledger: Ledger, stored: StoredHistory, verdict: AuditVerdict) -> tuple[str, ...]:
-    return (*stored.flaws, *stored_contradictions(stored, verdict.intact, ledger.cell.name))
 
 
 def _with_stored(entries: Sequence[AuditEntry], stored: StoredHistory, cell: Cell) -> tuple[AuditEntry, ...]:

@@ -1,7 +1,7 @@
 """The SQLite file in which earlier versions kept the history: what only it has goes into the audit log, once.
 
-Those versions wrote each calibration and each write to a controller twice. Where the two differ, the audit log is
-right, and nothing is taken over from the file (docs/decisions/0036).
+Those versions wrote each calibration and each write to a controller twice. What the audit log has is right, whatever
+the file says of it; from a file that is broken nothing is taken over (docs/decisions/0036).
 """
 
 from __future__ import annotations
@@ -11,27 +11,23 @@ import os
 import re
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from urllib.parse import quote
 
 from daq.documents.calibration_file import decode_calibration
 from daq.errors import DaqError, HistoryInaccessible, HistoryUnreadable
-from daq.ledger.audit import AuditAction, AuditEntry, begun_by
+from daq.ledger.audit import AuditAction, AuditEntry
 from daq.ledger.fold import (
     Acknowledgement,
-    AuditedWrite,
     Event,
     WriteAction,
-    acknowledgement_of,
-    at_of,
-    calibration_field,
+    acknowledgements_of,
     entered_calibrations,
     figures_of,
     is_end,
     iso,
-    text_field,
     zoned,
 )
 
@@ -149,7 +145,7 @@ def _content(connection: sqlite3.Connection) -> StoredHistory:
     query = "SELECT axis, since, at, who, why, audit FROM acknowledgement ORDER BY number"
     for axis, since, at, who, why, audit in connection.execute(query):
         acknowledgements.append(Acknowledgement(axis, zoned(since), zoned(at), _raw(who), _raw(why), audit))
-    flaws = (*_gaps(connection, "event"), *_gaps(connection, "acknowledgement"))
+    flaws = tuple(_unreadable_documents(calibrations))
     return StoredHistory(tuple(calibrations), tuple(events), tuple(acknowledgements), flaws)
 
 
@@ -158,88 +154,13 @@ def _raw(text: str) -> str:
     return re.sub(r"\\u(d[89a-f][0-9a-f]{2})", lambda found: chr(int(found[1], 16)), text)
 
 
-def _gaps(connection: sqlite3.Connection, table: str) -> Iterator[str]:
-    """Report missing rows of a table: their numbers go from 1 to the last that SQLite gave, without gaps."""
-    there = {int(row[0]) for row in connection.execute(f"SELECT number FROM {table}")}
-    given = connection.execute("SELECT seq FROM sqlite_sequence WHERE name = ?", (table,)).fetchone()
-    last = max([*there, 0 if given is None else int(given[0])], default=0)
-    if len(there) != last:
-        yield f"{table}: found {len(there)} rows, expected all from 1 to {last}"
-
-
-def stored_contradictions(stored: StoredHistory, entries: Sequence[AuditEntry], cell: str) -> Iterator[str]:
-    """Report what the file says otherwise than the audit log, as sentences."""
-    by_digest = {one.sha256: one for one in entries}
-    begun = {one.number: one for one in entries}
-    for number, event in enumerate(stored.events, start=1):
-        entry = by_digest.get(event.audit or "")
-        if entry is not None:
-            expected = _audited_event(event, entry, begun.get(begun_by(entry), entry))
-            yield from _differences(f"event {number}", event, expected, entry)
-    for noted in stored.acknowledgements:
-        if noted.since > noted.at:  # until then it would silence the axis
-            yield f"acknowledgement of {noted.axis} at {iso(noted.at)}: found a baseline since {iso(noted.since)}"
-        entry = by_digest.get(noted.audit)
-        if entry is not None:
-            yield from _acknowledgement_flaws(noted, entry)
-    entered = {one.digest: one for one in entered_calibrations(entries, cell)}
-    for calibration in stored.calibrations:
-        yield from _document_flaws(calibration)
-        known = entered.get(calibration.digest)
-        if known is None or known.document is None:
-            continue
-        name = f"calibration {calibration.digest[:12]}…"
-        said = f"as entry {known.number} of the audit says"
-        if calibration.document != known.document:
-            yield f"document of {name}: found another one, expected it {said}"
-        if calibration.entered != known.entered:
-            yield f"{name}: found entered {_shown(calibration.entered)}, expected {_shown(known.entered)} {said}"
-
-
-def _audited_event(event: Event, entry: AuditEntry, begun: AuditEntry) -> Event:
-    """Return an event as the audit log says it; what the log leaves open stays as it is."""
-    after = text_field(begun, "sha256_after") or event.sha256_after
-    audited = replace(event, target=entry.subject, sha256_after=after)
-    digest = calibration_field(begun, "sha256")
-    if digest is not None and entry.action is not AuditAction.ROLLED_BACK:
-        audited = replace(audited, digest=digest)
-    if not is_end(entry):  # it was entered later: its writer was killed, and another process may have done it
-        return audited
-    return replace(audited, who=entry.who, at=at_of(entry) or event.at, action=AuditedWrite(begun, entry).action)
-
-
-def _acknowledgement_flaws(noted: Acknowledgement, entry: AuditEntry) -> Iterator[str]:
-    name = f"acknowledgement of {noted.axis} at {iso(noted.at)}"
-    expected = acknowledgement_of(entry)
-    if expected is None:
-        yield f"{name}: found entry {entry.number} of the audit, {entry.action.value}, expected an acknowledgement"
-    else:
-        yield from _differences(name, noted, expected, entry)
-
-
-def _document_flaws(calibration: StoredCalibration) -> Iterator[str]:
-    name = f"calibration {calibration.digest[:12]}…"
-    try:
-        decode_calibration(calibration.document.encode(), f"document of {name}")
-    except DaqError as error:
-        yield f"{name}: its document is {error.found}, expected {error.expected}"
-
-
-def _differences(
-    name: str, found: Event | Acknowledgement, expected: Event | Acknowledgement, entry: AuditEntry
-) -> Iterator[str]:
-    for field in fields(found):
-        said = getattr(found, field.name)
-        wanted = getattr(expected, field.name)
-        if said != wanted:
-            source = f"as entry {entry.number} of the audit, which it names"
-            yield f"{name}: found {field.name} {_shown(said)}, expected {_shown(wanted)} {source}"
-
-
-def _shown(value: object) -> str:
-    if isinstance(value, datetime):
-        return repr(iso(value))
-    return repr(value.value if isinstance(value, WriteAction) else value)
+def _unreadable_documents(calibrations: Iterable[StoredCalibration]) -> Iterator[str]:
+    for one in calibrations:
+        name = f"calibration {one.digest[:12]}…"
+        try:
+            decode_calibration(one.document.encode(), f"document of {name}")
+        except DaqError as error:
+            yield f"{name}: its document is {error.found}, expected {error.expected}"
 
 
 def drafts_of(
@@ -248,7 +169,7 @@ def drafts_of(
     """Return what the audit log lacks of a stored history: nothing where it was migrated before.
 
     Args:
-        stored: without flaws and contradictions.
+        stored: without flaws.
         entries: of the audit log.
         cell: name of the cell.
         who: the person or the job that migrates.
@@ -315,14 +236,12 @@ def _event_drafts(stored: Iterable[Event], entries: Sequence[AuditEntry], cell: 
 def _acknowledgement_drafts(
     stored: Iterable[Acknowledgement], entries: Sequence[AuditEntry], cell: str
 ) -> Iterator[EntryDraft]:
-    known = set()
-    for entry in entries:
-        found = acknowledgement_of(entry)
-        if found is not None and text_field(entry, "cell") == cell:
-            known.add((found.axis, found.since, found.at, found.who, found.why))
+    entered = list(acknowledgements_of(entries, cell))
+    named = {one.audit for one in entered}
+    known = {replace(one, audit="") for one in entered}  # migrated before, under an entry of its own
     for noted in stored:
         # The first versions did not enter the name of the cell.
-        if (noted.axis, noted.since, noted.at, noted.who, noted.why) not in known:
+        if noted.audit not in named and replace(noted, audit="") not in known:
             details = {
                 "axis": noted.axis,
                 "cell": cell,
