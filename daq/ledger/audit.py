@@ -70,11 +70,6 @@ class AuditEntry:
     previous: str  #: `sha256` of the entry before, `FIRST` for the first
     sha256: str  #: of the canonical JSON of all of the above, hexadecimal
 
-    @property
-    def holds(self) -> bool:
-        """Whether the entry is what its digest was computed from."""
-        return self.sha256 == sha256(_canonical(_content(self)))
-
 
 def entry(
     number: int, at: str, who: str, action: AuditAction, subject: str, details: Mapping[str, object], previous: str

@@ -168,7 +168,7 @@ def signature(context: GateContext) -> Iterator[GateFinding]:
     *given, login = request.appliers or ("",)
     for name in given:
         known = {_as_read(other) for other in (*policy.signers, login)}
-        if not _is_legible(name) or _as_read(name) not in known:
+        if not name or _as_read(name) not in known:
             yield (
                 "operator",
                 ascii(name),
@@ -193,12 +193,9 @@ def _as_read(name: str) -> str:
     return " ".join(folded.split())
 
 
-def _is_legible(name: str) -> bool:
-    """Whether every character shows: no control, format, private or unassigned one."""
-    return bool(name) and not any(unicodedata.category(character).startswith("C") for character in name)
-
-
 def _others(names: tuple[str, ...], applying: set[str]) -> list[str]:
     """Persons other than the operator, each once however often a name is spelled."""
-    persons = {_as_read(name): name for name in reversed(names) if _is_legible(name)}
-    return [name for name in names if persons.get(_as_read(name)) == name and _as_read(name) not in applying]
+    persons: dict[str, str] = {}
+    for name in names:
+        persons.setdefault(_as_read(name), name)
+    return [name for person, name in persons.items() if person not in applying]
