@@ -237,7 +237,7 @@ def _effect(effect: EffectModel, places: Sequence[str]) -> DeclaredEffect:
 
 
 def _payload(model: PayloadModel, mounted: Place) -> WeighedPayload:
-    known = {} if model.known is None else model.known.model_dump(exclude_none=True)
+    known = model.known_parameters
     if model.centre_m is not None:
         centre_m, inertia = _in_joint_frame(mounted, model.centre_m, model.inertia_kg_m2)
         known = drawn_parameters(model.mass_kg, centre_m, inertia)

@@ -185,6 +185,11 @@ class PayloadModel(StrictModel):
     inertia_kg_m2: tuple[float, float, float, float, float, float] | None = None
     known: KnownModel | None = None
 
+    @property
+    def known_parameters(self) -> dict[str, float]:
+        """Stated single parameters, by their names."""
+        return {} if self.known is None else self.known.model_dump(exclude_none=True)
+
     @model_validator(mode="after")
     def _check_form(self) -> PayloadModel:
         if self.inertia_kg_m2 is not None and self.centre_m is None:

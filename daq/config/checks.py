@@ -170,11 +170,14 @@ def _ratio_faults(model: CellModel) -> Iterator[Fault]:
     if not np.isfinite(condition) or condition > LARGEST_CONDITION:
         yield Fault(path, f"a singular matrix (condition {condition:.3g})", "one that can be inverted")
     free = model.robot.mobility
-    for motor, row in enumerate(ratio if free is not None and len(model.robot.motors) > free else ()):
-        if others := [model.axes[joint].name for joint in range(n) if joint != motor and row[joint] != 0.0]:
-            # The rule of ident.model.model.Model.
+    motors = len(model.robot.motors)
+    if free is None or motors <= free:
+        return
+    for motor, row in enumerate(ratio):
+        others = [model.axes[joint].name for joint in range(n) if joint != motor and row[joint] != 0.0]
+        if others:  # the rule of ident.model.model.Model
             found = f"the motor of {model.axes[motor].name} also turns with {', '.join(others)}"
-            expected = f"zeros off the diagonal: {len(model.robot.motors)} motors for {free} degrees of freedom"
+            expected = f"zeros off the diagonal: {motors} motors for {free} degrees of freedom"
             yield Fault((*path, motor), found, expected)
 
 
@@ -236,9 +239,8 @@ def _frame_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
     for index, payload in enumerate(model.payloads):
         if payload.known is not None:
             found = f"single parameters, and the link {model.robot.platform} is not at the origin of its joint"
-            yield Fault(
-                ("payloads", index, "known"), found, "`centre_m` and `inertia_kg_m2`, in the frame of that link"
-            )
+            expected = "`centre_m` and `inertia_kg_m2`, in the frame of that link"
+            yield Fault(("payloads", index, "known"), found, expected)
 
 
 def _mass_faults(model: CellModel) -> Iterator[Fault]:
@@ -269,7 +271,7 @@ def _size_faults(model: CellModel) -> Iterator[Fault]:
             yield from centre_faults((*path, "centre_m"), payload.centre_m)
         if payload.inertia_kg_m2 is not None:
             yield from gyration_faults((*path, "inertia_kg_m2"), payload.inertia_kg_m2, mass_kg)
-        for name, value in ({} if payload.known is None else payload.known.model_dump(exclude_none=True)).items():
+        for name, value in payload.known_parameters.items():
             if name.startswith("I"):
                 yield from gyration_faults((*path, "known", name), (value,), mass_kg)
             else:
@@ -469,30 +471,23 @@ def _standstill_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fa
         "standstill_rad_s": model.conditioning.standstill_rad_s,
         "standstill_mm_s": model.conditioning.standstill_mm_s,
     }
-    prismatic = [joint.kind is JointKind.PRISMATIC for joint in joints] or [
-        axis.limits.unit is MILLIMETRE for axis in model.axes
-    ]
-    needed = {"standstill_rad_s": not all(prismatic), "standstill_mm_s": any(prismatic)}
+    units = [joint_unit(joint.kind) for joint in joints] or [axis.limits.unit for axis in model.axes]
     if not any(lists.values()):
         return
-    complete = True
-    for key, speeds in lists.items():
-        if len(speeds) != n and (speeds or needed[key]):
-            complete = False
-            yield Fault(
-                ("conditioning", key), f"{len(speeds)} speeds", f"{n}, one for each axis (null in the other list)"
-            )
-    if not complete:
+    keys = ["standstill_mm_s" if unit is MILLIMETRE else "standstill_rad_s" for unit in units]
+    short = [key for key, speeds in lists.items() if len(speeds) != n and (speeds or key in keys)]
+    for key in short:
+        expected = f"{n}, one for each axis (null in the other list)"
+        yield Fault(("conditioning", key), f"{len(lists[key])} speeds", expected)
+    if short:
         return
-    for index, along in enumerate(prismatic[:n]):
+    for index, own in enumerate(keys[:n]):
+        kind = JointKind.PRISMATIC if own == "standstill_mm_s" else JointKind.REVOLUTE
         for key, speeds in lists.items():
-            wanted = along == (key == "standstill_mm_s")
-            if speeds and (speeds[index] is not None) != wanted:
-                kind = JointKind.PRISMATIC if along else JointKind.REVOLUTE
+            if speeds and (speeds[index] is None) == (key == own):
                 found = f"{speeds[index]} for {model.axes[index].name}, which is {kind.value}"
-                yield Fault(
-                    ("conditioning", key, index), found, "a speed" if wanted else "null, it is in the other list"
-                )
+                expected = "a speed" if key == own else "null, it is in the other list"
+                yield Fault(("conditioning", key, index), found, expected)
 
 
 def _urdf_limits(urdf: str) -> dict[str, _UrdfLimits | None]:

@@ -57,6 +57,10 @@ class Entry:
     gains: tuple[Gain, ...]  #: one an axis, in the order of the axes
     events: tuple[Event, ...]  #: writes after which a controller had its gains, oldest first
 
+    def gain_of(self, axis: str) -> Gain | None:
+        """Return the gain of an axis, None for an axis that it does not have."""
+        return next((gain for gain in self.gains if gain.axis == axis), None)
+
     @property
     def applied(self) -> bool:
         """Whether a controller ever had its gains."""

@@ -417,7 +417,9 @@ def _end_found_writes(ledger: Ledger) -> None:
 def _check_like(ledger: Ledger, calibration: Calibration, entries: Collection[Entry]) -> None:
     """Refuse a calibration that cannot be compared with those of the history."""
     units = {gain.axis: gain.unit for gain in calibration.gains}
-    known = {gain.axis: gain.unit for one in entries for gain in one.gains}
+    known: dict[str, str] = {}
+    for one in entries:
+        known |= {gain.axis: gain.unit for gain in one.gains}
     other = [axis for axis in units if axis in known and units[axis] != known[axis]]
     if calibration.cell != ledger.cell.name:
         found = f"a calibration of cell {calibration.cell!r}"

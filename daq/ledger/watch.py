@@ -144,12 +144,11 @@ def dispersions_of(entries: Sequence[Entry], axes: Sequence[str]) -> dict[str, f
 
 def _known(entries: Sequence[Entry], axis: str) -> list[tuple[Entry, Gain]]:
     """Return the calibrations that identified the gain of an axis, with it."""
-    known = {
-        entry.digest: gain
-        for entry in entries
-        for gain in entry.gains
-        if gain.axis == axis and gain.std > 0 and gain.value
-    }
+    known: dict[str, Gain] = {}
+    for entry in entries:
+        gain = entry.gain_of(axis)
+        if gain is not None and gain.std > 0 and gain.value:
+            known[entry.digest] = gain
     identified = [entry for entry in entries if entry.digest in known]
     return [(entry, known[entry.digest]) for entry in of_each_recording(identified)]
 
