@@ -105,13 +105,8 @@ _TYPES = {
 }
 
 
-def decode_entry(line: bytes) -> AuditEntry | None:
-    """Return the entry of a line, its digest unchecked; None for a line that `encode` could not write."""
-    return _decode(line)[0]
-
-
 def _decode(line: bytes) -> tuple[AuditEntry | None, bool]:
-    """Return the entry of a line, and whether its digest is that of its content."""
+    """Return the entry of a line, None for one that `encode` could not write, and whether its digest is right."""
     try:
         tree = json.loads(line)
         if not isinstance(tree, dict) or {name: type(value) for name, value in tree.items()} != _TYPES:
@@ -238,7 +233,8 @@ def read(path: Path) -> tuple[AuditEntry, ...]:
     Raises:
         AuditUnusable: no regular file, or it cannot be read.
     """
-    return tuple(one for one in map(decode_entry, _lines_of(_content_of(path))) if one is not None)
+    decoded = [_decode(line) for line in _lines_of(_content_of(path))]
+    return tuple(one for one, _ in decoded if one is not None)
 
 
 def verify(path: Path, heads: Collection[str] = ()) -> AuditVerdict:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from enum import Enum
 from typing import Any
@@ -257,7 +257,7 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
     unreadable: list[str] = []
     for one in entered_calibrations(entries, cell.name):
         try:
-            figures = one.figures or _figures_of_document(one)
+            figures = one.figures or figures_of_document(one)
             found.append(entry_of(one.digest, cell.name, one.entered, figures, by_digest.get(one.digest, ())))
         except DaqError as error:
             unreadable.append(f"{_named(one)}: its document is {error.found}, expected {error.expected}")
@@ -273,8 +273,12 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
     )
 
 
-def _figures_of_document(one: EnteredCalibration) -> dict[str, object]:
-    """Return the figures of a calibration that an earlier version entered; parsing its document takes 7 ms."""
+def figures_of_document(one: EnteredCalibration) -> dict[str, object]:
+    """Return the figures of a calibration that an earlier version entered; parsing its document takes 7 ms.
+
+    Raises:
+        DaqError: the document cannot be read.
+    """
     calibration = decode_calibration((one.document or "").encode(), f"entry {one.number}")
     return figures_of(calibration, one.digest, one.entered)
 
@@ -313,13 +317,8 @@ def entered_calibrations(entries: Iterable[AuditEntry], cell: str) -> list[Enter
             continue
         first = found.setdefault(one.digest, one)
         # A later entry gives the figures of one that an earlier version has entered.
-        found[one.digest] = EnteredCalibration(
-            number=first.number,
-            digest=first.digest,
-            entered=first.entered,
-            document=first.document or one.document,
-            figures=first.figures or one.figures,
-        )
+        document = first.document or one.document
+        found[one.digest] = replace(first, document=document, figures=first.figures or one.figures)
     return list(found.values())
 
 

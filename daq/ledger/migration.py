@@ -16,16 +16,16 @@ from datetime import datetime
 from pathlib import Path
 from urllib.parse import quote
 
-from daq.documents.calibration_file import decode_calibration
 from daq.errors import DaqError, HistoryInaccessible, HistoryUnreadable
 from daq.ledger.audit import AuditAction, AuditEntry
 from daq.ledger.fold import (
     Acknowledgement,
+    EnteredCalibration,
     Event,
     WriteAction,
     acknowledgements_of,
     entered_calibrations,
-    figures_of,
+    figures_of_document,
     is_end,
     iso,
     zoned,
@@ -37,19 +37,10 @@ VERSION = 1  #: Of its tables; there was no other
 
 
 @dataclass(frozen=True, slots=True)
-class StoredCalibration:
-    """A calibration as the file has it."""
-
-    digest: str  #: SHA-256 of its file
-    entered: datetime  #: when it was entered, UTC
-    document: str  #: the whole calibration
-
-
-@dataclass(frozen=True, slots=True)
 class StoredHistory:
     """Content of the file."""
 
-    calibrations: tuple[StoredCalibration, ...]  #: oldest first
+    calibrations: tuple[EnteredCalibration, ...]  #: oldest first; of no entry (0), and without figures
     events: tuple[Event, ...]  #: writes to controllers, oldest first
     acknowledgements: tuple[Acknowledgement, ...]  #: oldest first
     flaws: tuple[str, ...]  #: what is broken in it, as sentences
@@ -136,7 +127,7 @@ def _unreadable(path: Path, found: str) -> HistoryUnreadable:
 def _content(connection: sqlite3.Connection) -> StoredHistory:
     """Read all rows; raises ValueError for one that drivegain did not write."""
     rows = connection.execute("SELECT digest, entered, document FROM calibration ORDER BY created, digest")
-    calibrations = [StoredCalibration(str(row[0]), zoned(row[1]), str(row[2])) for row in rows]
+    calibrations = [EnteredCalibration(0, str(row[0]), zoned(row[1]), str(row[2]), None) for row in rows]
     events = []
     query = "SELECT digest, deed, at, who, target, audit, sha256_after FROM event ORDER BY number"
     for digest, deed, at, who, target, audit, after in connection.execute(query):
@@ -154,13 +145,12 @@ def _raw(text: str) -> str:
     return re.sub(r"\\u(d[89a-f][0-9a-f]{2})", lambda found: chr(int(found[1], 16)), text)
 
 
-def _unreadable_documents(calibrations: Iterable[StoredCalibration]) -> Iterator[str]:
+def _unreadable_documents(calibrations: Iterable[EnteredCalibration]) -> Iterator[str]:
     for one in calibrations:
-        name = f"calibration {one.digest[:12]}…"
         try:
-            decode_calibration(one.document.encode(), f"document of {name}")
+            figures_of_document(one)
         except DaqError as error:
-            yield f"{name}: its document is {error.found}, expected {error.expected}"
+            yield f"calibration {one.digest[:12]}…: its document is {error.found}, expected {error.expected}"
 
 
 def drafts_of(
@@ -183,26 +173,22 @@ def drafts_of(
 
 
 def _calibration_drafts(
-    stored: Iterable[StoredCalibration], entries: Sequence[AuditEntry], cell: str, who: str, at: datetime
+    stored: Iterable[EnteredCalibration], entries: Sequence[AuditEntry], cell: str, who: str, at: datetime
 ) -> Iterator[EntryDraft]:
     """Enter calibrations that only the file has, and the figures of those that an earlier version entered."""
     known = {one.digest: one for one in entered_calibrations(entries, cell)}
     lacking = [one for one in stored if one.digest not in known]
-    without_figures = [
-        StoredCalibration(one.digest, one.entered, one.document)
-        for one in known.values()
-        if one.figures is None and one.document is not None
-    ]
+    without_figures = [one for one in known.values() if one.figures is None and one.document is not None]
     for one in (*without_figures, *lacking):
         try:
-            calibration = decode_calibration(one.document.encode(), f"document of calibration {one.digest[:12]}…")
+            figures = figures_of_document(one)
         except DaqError:
             continue  # reported wherever the history is read
-        details = {
+        details: dict[str, object] = {
             "sha256": one.digest,
             "cell": cell,
             "entered": iso(one.entered),
-            "figures": figures_of(calibration, one.digest, one.entered),
+            "figures": figures,
         }
         if one.digest not in known:
             details["document"] = one.document
