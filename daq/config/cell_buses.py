@@ -291,11 +291,11 @@ def bus_loads(cell: Cell) -> tuple[tuple[Bus, BusLoad], ...]:
     """Compute the load of a recording on each bus; in lockstep, the load of a real bus."""
     if cell.sync is None:
         return ()
-    profiles = [[axis.profile for axis in axes if axis.profile is not None] for _, axes in cell.wiring]
-    return tuple(
-        (bus, bus_load(used, bus.bitrate_bit_s, cell.sync.period_us))
-        for bus, used in zip(cell.buses, profiles, strict=True)
-    )
+    loads = []
+    for bus, axes in cell.wiring:
+        used = [axis.profile for axis in axes if axis.profile is not None]
+        loads.append((bus, bus_load(used, bus.bitrate_bit_s, cell.sync.period_us)))
+    return tuple(loads)
 
 
 def load_warnings(cell: Cell) -> tuple[str, ...]:
@@ -384,9 +384,8 @@ def _no_bus(cell: Cell, found: str) -> ConfigurationInconsistent:
 
 def bus_loads_percent(cell: Cell, reading: CellReading) -> tuple[float, ...]:
     """Load of each bus, with every frame as long as bit stuffing can make it [%]."""
-    return tuple(
-        100.0
-        * sum(count * frame_bits(length) for length, count in enumerate(frames))
-        / (bus.bitrate_bit_s * reading.seconds)
-        for bus, frames in zip(cell.buses, reading.frames, strict=True)
-    )
+    loads = []
+    for bus, frames in zip(cell.buses, reading.frames, strict=True):
+        bits = sum(count * frame_bits(length) for length, count in enumerate(frames))
+        loads.append(100.0 * bits / (bus.bitrate_bit_s * reading.seconds))
+    return tuple(loads)

@@ -69,11 +69,10 @@ def cell_from_bundle(
     document = parse_yaml(_member(files, CELL, names), names.get(CELL, CELL))
     model = read_model(document, CellModel, None if file is None else file.parent)
     urdf = _member(files, URDF, names).decode("utf-8", errors="replace")
-    profiles = {
-        drive: drive_from_text(_member(files, member, names), names.get(member, member))
-        for drive in model.drives
-        for member in (f"{DRIVES}{drive}.yaml",)
-    }
+    members = {drive: f"{DRIVES}{drive}.yaml" for drive in model.drives}
+    profiles: dict[str, DriveProfile] = {}
+    for drive, member in members.items():
+        profiles[drive] = drive_from_text(_member(files, member, names), names.get(member, member))
     urdf = held_urdf(document, model, urdf)
     check(document, model, urdf, profiles, logged=file is None)
     controller = None if model.controller is None else model.controller.file
@@ -81,7 +80,7 @@ def cell_from_bundle(
     passive = () if chain is None else chain.passive_joints
     places = model.axis_names + [joint.name for joint in passive]
     mounted = platform_frame(model.robot, urdf)
-    used = (CELL, URDF, *(f"{DRIVES}{drive}.yaml" for drive in model.drives))
+    used = (CELL, URDF, *members.values())
     return Cell(
         name=model.name,
         urdf=urdf,

@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from daq.ledger.fold import Acknowledgement, Entry
+from ident.arrays import FloatArray
 from ident.calibration import Gain
 from ident.drift.change import (
     Alarm,
@@ -128,16 +129,14 @@ def dispersions_of(entries: Sequence[Entry], axes: Sequence[str]) -> dict[str, f
     Returns:
         at least 1 each, `ident.drift.change.DISPERSION` before there are five recordings of the axis.
     """
-    alike: dict[tuple[str, ...], dict[str, list[Gain]]] = {}
+    alike: dict[tuple[str, ...], dict[str, FloatArray]] = {}  #: for each axis its gains and their σ, shape (2, n)
     for axis in axes:
         known = _known(entries, axis)
-        alike.setdefault(tuple(entry.logs for entry, _ in known), {})[axis] = [gain for _, gain in known]
+        numbers = np.array([(gain.value, gain.std) for _, gain in known]).reshape(-1, 2)
+        alike.setdefault(tuple(entry.logs for entry, _ in known), {})[axis] = numbers.T
     factors: dict[str, float] = {}
     for together in alike.values():
-        values, stds = (
-            np.array([[getattr(gain, part) for gain in gains] for gains in together.values()])
-            for part in ("value", "std")
-        )
+        values, stds = np.stack(list(together.values()), axis=1)
         factors |= zip(together, map(float, dispersions(values, stds)), strict=True)
     return {axis: factors[axis] for axis in axes}
 
