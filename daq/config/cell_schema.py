@@ -207,14 +207,16 @@ class EffectModel(StrictModel):
     settings: dict[str, float] = Field(default_factory=dict)
 
 
-_CutOff = Annotated[float, Field(ge=0.01, le=100_000.0)]  #: Of a filter [Hz]; below, its window is minutes long
+CUTOFF_HZ = (0.01, 100_000.0)  #: Least and largest cut-off of a filter; below, its window is minutes long
+FILTER_ORDER = (1, 10)  #: Least and largest order
+_CutOff = Annotated[float, Field(ge=CUTOFF_HZ[0], le=CUTOFF_HZ[1])]
 
 
 class ConditioningModel(StrictModel):
     """The filters."""
 
     position_cutoff_hz: _CutOff = 40.0
-    position_order: Annotated[int, Field(ge=1, le=10)] = 4
+    position_order: Annotated[int, Field(ge=FILTER_ORDER[0], le=FILTER_ORDER[1])] = 4
     decimation_cutoff_hz: _CutOff = 20.0
     standstill_rad_s: tuple[Annotated[float, Field(ge=0, le=1e3)] | None, ...] = ()
     standstill_mm_s: tuple[Annotated[float, Field(ge=0, le=SPEED[1])] | None, ...] = ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
@@ -106,5 +107,5 @@ def controller_faults(section: Controller, axes: int, *, on_a_bus: bool) -> Iter
     factors = {"gains": section.factors, "objects": tuple(entry.factor for entry in section.objects)}
     for kind, values in factors.items():
         for index, factor in enumerate(values):
-            if factor == 0.0:
+            if factor == 0.0 or not math.isfinite(factor):
                 yield Fault(("controller", kind, index, "factor"), f"{factor:g}", "a factor that is not zero")

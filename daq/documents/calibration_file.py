@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import yaml
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
+from daq.config.cell_schema import CUTOFF_HZ, FILTER_ORDER
 from daq.config.yaml_file import StrictModel, parse_yaml, read_file, read_model
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, SchemaMismatch, YamlInvalid
 from daq.files import replace_file
@@ -38,6 +39,21 @@ from ident.estimators.estimate import RelativeError
 _LARGEST = 1e30  #: Size of a number, in any unit: products of three of them are still finite
 _Number = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST)]
 _Positive = Annotated[float, Field(ge=0.0, le=_LARGEST)]
+_FILTER_BOUNDS = {
+    **dict.fromkeys(("position_cutoff_hz", "decimation_cutoff_hz"), CUTOFF_HZ),
+    "position_order": FILTER_ORDER,
+    "standstill_rad_s": (0.0, 1e6),
+    "standstill_share": (1e-6, 1.0),
+}
+
+
+def _check_filter(found: dict[str, int | float | list[float]]) -> dict[str, int | float | list[float]]:
+    """Check the settings that a filter is made of: one of order 10⁹, or of 10⁻³⁰⁰ Hz, takes all memory."""
+    for name, (least, most) in _FILTER_BOUNDS.items():
+        values = found.get(name, [])
+        if not all(least <= value <= most for value in (values if isinstance(values, list) else [values])):
+            raise ValueError(f"{name} from {least:g} to {most:g}")
+    return found
 
 
 class GainEntry(StrictModel):
@@ -138,7 +154,7 @@ class CalibrationBody(StrictModel):
     holdout_error_percent: RelativeErrorEntry | None
     condition: _Positive
     rows: Annotated[int, Field(ge=0, le=10**15)]
-    filter: dict[str, int | float | list[float]]
+    filter: Annotated[dict[str, int | float | list[float]], AfterValidator(_check_filter)]
     sources: tuple[Source, ...]
     configuration_sha256: str
     created: str

@@ -21,6 +21,14 @@ from tests.daq.calibrations import demo_calibration
 FILTER = Conditioning().document()
 _demo = demo_calibration()
 NONSENSE: dict[str, dict[str, Any]] = {
+    "filter of zero": {"filter": {**FILTER, "position_cutoff_hz": 0.0}},
+    "negative filter": {"filter": {**FILTER, "decimation_cutoff_hz": -20.0}},
+    "tiny filter": {"filter": {**FILTER, "decimation_cutoff_hz": 1e-300}},
+    "huge filter": {"filter": {**FILTER, "position_cutoff_hz": 1e300}},
+    "filter of order 1e9": {"filter": {**FILTER, "position_order": 10**9}},
+    "filter of order 0": {"filter": {**FILTER, "position_order": 0}},
+    "negative standstill": {"filter": {**FILTER, "standstill_rad_s": [0.1, -1.0]}},
+    "no share": {"filter": {**FILTER, "standstill_share": 0.0}},
     "rows beyond SQLite": {"rows": 2**63},
     "negative rows": {"rows": -1},
     "huge gain": {"gains": (replace(_demo.gains[0], value=1e300), *_demo.gains[1:])},
