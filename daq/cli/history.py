@@ -255,7 +255,7 @@ def _add(ledger: Ledger, file: Path, who: str, now: datetime) -> None:
 
 
 def _day(text: str, now: datetime) -> datetime:
-    from daq.ledger.entry import utc
+    from daq.ledger.fold import utc
 
     never = datetime.min.replace(tzinfo=UTC)
     found = utc(text, never)

@@ -126,8 +126,8 @@ def record_verb(options: RecordOptions) -> None:
 
 def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:
     """Say in notes of an error what became of the samples, and what helps a cell that is too slow for its clock."""
-    from daq.config.bus_checks import SIMULATED_INTERFACES
     from daq.config.cell import PacingMode
+    from daq.config.cell_buses import SIMULATED_INTERFACES
 
     if part.exists():
         error.add_note(

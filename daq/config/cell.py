@@ -73,7 +73,8 @@ class Bus(UnnamedBus):
     name: FileName
 
 
-RECORDER, KERNEL = "recorder", "kernel"
+RECORDER = "recorder"
+KERNEL = "kernel"
 """SYNC producers other than an axis: the recording program, or this machine's kernel (SocketCAN's BCM).
 
 On one SocketCAN bus that can do it, the kernel sends SYNC for the recording program too.
@@ -194,9 +195,11 @@ class Cell:
         """
         if self.controller is None or self.controller.file is None or self.folder is None:
             return None
-        place, parts = Path(os.path.realpath(self.folder)), Path(self.controller.file).parts
+        place = Path(os.path.realpath(self.folder))
+        parts = Path(self.controller.file).parts
         while parts and parts[0] == "..":  # exact, because the folder's own links are resolved
-            place, parts = place.parent, parts[1:]
+            place = place.parent
+            parts = parts[1:]
         return place.joinpath(*parts)
 
     @property

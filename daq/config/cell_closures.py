@@ -170,10 +170,8 @@ def _repeated(closures: tuple[ClosureModel, ...]) -> Iterator[Fault]:
 def _unknown_names(robot: ChainModel, closures: tuple[ClosureModel, ...], tree: UrdfRobot) -> Iterator[Fault]:
     """Find names of joints and links that the URDF lacks."""
     joints = [joint.name for joint in tree.joints]
-    a_joint, a_link = (
-        f"a joint of the URDF that moves: {', '.join(joints)}",
-        f"a link of the URDF: {', '.join(tree.links)}",
-    )
+    a_joint = f"a joint of the URDF that moves: {', '.join(joints)}"
+    a_link = f"a link of the URDF: {', '.join(tree.links)}"
     for index, name in enumerate(robot.motors):
         if name not in joints:
             yield Fault(("robot", "motors", index), f"{name!r}", a_joint)

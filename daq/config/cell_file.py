@@ -69,18 +69,18 @@ def cell_from_bundle(
     document = parse_yaml(_member(files, CELL, names), names.get(CELL, CELL))
     model = read_model(document, CellModel, None if file is None else file.parent)
     urdf = _member(files, URDF, names).decode("utf-8", errors="replace")
-    profiles = {
-        drive: drive_from_text(_member(files, member, names), names.get(member, member))
-        for drive in model.drives
-        for member in (f"{DRIVES}{drive}.yaml",)
-    }
+    members = {drive: f"{DRIVES}{drive}.yaml" for drive in model.drives}
+    profiles: dict[str, DriveProfile] = {}
+    for drive, member in members.items():
+        profiles[drive] = drive_from_text(_member(files, member, names), names.get(member, member))
     urdf = held_urdf(document, model, urdf)
     check(document, model, urdf, profiles, logged=file is None)
     controller = None if model.controller is None else model.controller.file
     chain = chain_of(model.robot, model.closures, urdf)
-    places = [axis.name for axis in model.axes] + [joint.name for joint in (chain.passive_joints if chain else ())]
+    passive = () if chain is None else chain.passive_joints
+    places = model.axis_names + [joint.name for joint in passive]
     mounted = platform_frame(model.robot, urdf)
-    used = (CELL, URDF, *(f"{DRIVES}{drive}.yaml" for drive in model.drives))
+    used = (CELL, URDF, *members.values())
     return Cell(
         name=model.name,
         urdf=urdf,
@@ -183,10 +183,10 @@ def _member(files: Mapping[str, bytes], member: str, names: Mapping[str, str]) -
 
 
 def _axis(model: AxisModel, bus: str | None, profiles: Mapping[str, DriveProfile]) -> CellAxis:
-    limits, unit = model.limits, model.limits.unit
-    # The schema requires exactly one of the three, the checks that it matches the kind of joint.
-    gains = (model.nameplate_gain_nm_per_a, model.nameplate_gain_n_per_a, model.nameplate_gain)
-    per_newton = model.nameplate_gain_n_per_a is not None
+    limits = model.limits
+    unit = limits.unit
+    ((key, gain),) = model.nameplate_gains.items()  # the checks require that it matches the kind of joint
+    force = "N" if key == "nameplate_gain_n_per_a" else "Nm"
     profile = None if model.drive is None else profiles[model.drive]
     # A gain by the actual current is another quantity, so its unit must show it.
     ampere = "A(actual)" if profile is not None and profile.tap is TapPoint.ACTUAL else "A"
@@ -199,9 +199,9 @@ def _axis(model: AxisModel, bus: str | None, profiles: Mapping[str, DriveProfile
         bus=bus,
         counts_per_revolution=model.counts_per_revolution,
         unit=unit,
-        zero_offset_rad=unit.si * (model.zero_offset_deg or model.zero_offset_mm or 0.0),
-        nameplate_gain=next(gain for gain in gains if gain is not None),
-        gain_unit=model.gain_unit or f"{'N' if per_newton else 'Nm'}/{ampere}",
+        zero_offset_rad=unit.si * model.zero_offsets.get(unit, 0.0),
+        nameplate_gain=gain,
+        gain_unit=model.gain_unit or f"{force}/{ampere}",
         limits=Limits(
             position=(unit.si * limits.position[0], unit.si * limits.position[1]),
             velocity=unit.si * limits.velocity,
@@ -224,12 +224,11 @@ def _conditioning(model: ConditioningModel) -> Conditioning:
 
 def _joints(model: CellModel, chain: ClosedChain | None, urdf: str) -> dict[str, int]:
     """Return the index of the joint behind each axis, and behind each joint of a closed chain without a motor."""
-    names = [axis.name for axis in model.axes]
     if chain is None:
-        return {name: index for index, name in enumerate(names)}
+        return {name: index for index, name in enumerate(model.axis_names)}
     index = {joint.name: number for number, joint in enumerate(read_urdf(urdf).joints)}
     passive = {joint.name: index[joint.name] for joint in chain.passive_joints}
-    return passive | {name: index[motor] for name, motor in zip(names, chain.motors, strict=True)}
+    return passive | {name: index[motor] for name, motor in zip(model.axis_names, chain.motors, strict=True)}
 
 
 def _effect(effect: EffectModel, places: Sequence[str]) -> DeclaredEffect:
@@ -237,7 +236,7 @@ def _effect(effect: EffectModel, places: Sequence[str]) -> DeclaredEffect:
 
 
 def _payload(model: PayloadModel, mounted: Place) -> WeighedPayload:
-    known = {} if model.known is None else model.known.model_dump(exclude_none=True)
+    known = model.known_parameters
     if model.centre_m is not None:
         centre_m, inertia = _in_joint_frame(mounted, model.centre_m, model.inertia_kg_m2)
         known = drawn_parameters(model.mass_kg, centre_m, inertia)

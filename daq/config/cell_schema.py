@@ -23,7 +23,8 @@ from daq.config.yaml_file import FileName, Name, Positive, StrictModel, not_in_f
 from ident.arrays import FloatArray
 from ident.plausible import LEAD_MM, SPEED, within
 
-ONE_BUS, SEVERAL_BUSES = not_in_file("one bus"), not_in_file("several buses")
+ONE_BUS = not_in_file("one bus")
+SEVERAL_BUSES = not_in_file("several buses")
 U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 
@@ -104,6 +105,9 @@ class LimitsModel(StrictModel):
         return self.acceleration_mm_s2 or self.acceleration_deg_s2 or 0.0
 
 
+_GAIN_KEYS = ("nameplate_gain_nm_per_a", "nameplate_gain_n_per_a", "nameplate_gain")
+
+
 class AxisModel(StrictModel):
     """One motor and its joint."""
 
@@ -131,10 +135,21 @@ class AxisModel(StrictModel):
             )
         return self
 
+    @property
+    def zero_offsets(self) -> dict[JointUnit, float]:
+        """Stated zero offsets, by their units."""
+        offsets = {DEGREE: self.zero_offset_deg, MILLIMETRE: self.zero_offset_mm}
+        return {unit: offset for unit, offset in offsets.items() if offset is not None}
+
+    @property
+    def nameplate_gains(self) -> dict[str, float]:
+        """Stated gains by their keys; the schema requires one."""
+        gains = {key: getattr(self, key) for key in _GAIN_KEYS}
+        return {key: gain for key, gain in gains.items() if gain is not None}
+
     @model_validator(mode="after")
     def _check_gain(self) -> AxisModel:
-        gains = (self.nameplate_gain_nm_per_a, self.nameplate_gain_n_per_a, self.nameplate_gain)
-        if gains.count(None) != 2 or (self.nameplate_gain is None) != (self.gain_unit is None):
+        if len(self.nameplate_gains) != 1 or (self.nameplate_gain is None) != (self.gain_unit is None):
             raise ValueError(
                 "nameplate_gain_nm_per_a, nameplate_gain_n_per_a (prismatic), or nameplate_gain together with gain_unit"
             )
@@ -169,6 +184,11 @@ class PayloadModel(StrictModel):
     centre_m: tuple[float, float, float] | None = None
     inertia_kg_m2: tuple[float, float, float, float, float, float] | None = None
     known: KnownModel | None = None
+
+    @property
+    def known_parameters(self) -> dict[str, float]:
+        """Stated single parameters, by their names."""
+        return {} if self.known is None else self.known.model_dump(exclude_none=True)
 
     @model_validator(mode="after")
     def _check_form(self) -> PayloadModel:
@@ -252,6 +272,11 @@ class CellModel(StrictModel):
     policy: PolicyModel = PolicyModel()
     history: HistorySection = HistorySection()
     recalibration: RecalibrationSection | None = None
+
+    @property
+    def axis_names(self) -> list[str]:
+        """Names in the order of the axes."""
+        return [axis.name for axis in self.axes]
 
     @property
     def buses(self) -> tuple[Bus, ...]:

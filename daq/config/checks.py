@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import hypot
+from math import hypot, sqrt
 from xml.etree import ElementTree
 
 import numpy as np
 
-from daq.config.bus_checks import bus_faults, producer_faults
 from daq.config.cell import DEGREE, MILLIMETRE, joint_unit
+from daq.config.cell_buses import bus_faults, producer_faults
 from daq.config.cell_closures import chain_faults, chain_of, mechanism_faults, platform_frame, robot_with
 from daq.config.cell_schema import AxisModel, CellModel, gain_joints, ratio_of
 from daq.config.controller import controller_faults
 from daq.config.hold import mimic_faults
-from daq.config.impossible_bodies import centre_faults, gyration_faults, moment_faults
 from daq.config.policy import max_change_faults
 from daq.config.signers import signer_faults
 from daq.config.workspace import clearance_faults
@@ -27,11 +26,13 @@ from ident.errors import ModelError
 from ident.model.robot import Joint, JointKind, Robot
 from ident.plausible import (
     ACCELERATION,
+    FARTHEST_CENTRE_M,
     FARTHEST_DEG,
     FARTHEST_MM,
     GAIN,
     GRAVITY_M_S2,
     HEAVIEST_PAYLOAD_KG,
+    LARGEST_GYRATION_M,
     LIGHTEST_PAYLOAD_KG,
     PAYLOAD_RATIO,
     RATIO,
@@ -64,10 +65,13 @@ def check(
     Raises:
         ConfigurationInconsistent: with every contradiction and its line.
     """
-    beforehand = [] if logged else [*mechanism_faults(model.closures, urdf)]
-    robot, faults = (None, beforehand) if beforehand else _robot(model, urdf)
+    robot = None
+    faults = [] if logged else [*mechanism_faults(model.closures, urdf)]
+    if not faults:
+        robot, faults = _robot(model, urdf)
     joints = () if robot is None else robot.axes
-    names = [axis.name for axis in model.axes]
+    passive = () if robot is None else robot.passive_names
+    names = model.axis_names
     faults += [
         *_ratio_faults(model),
         *bus_faults(model, profiles),
@@ -76,7 +80,7 @@ def check(
         *_list_faults(model),
         *_effect_faults(model, robot, logged=logged),
         *signer_faults(model.policy.apply.signers),
-        *clearance_faults(model.workspace, model.clearance, [*names, *(() if robot is None else robot.passive_names)]),
+        *clearance_faults(model.workspace, model.clearance, [*names, *passive]),
         *max_change_faults(model.policy.apply, names),
     ]
     if not logged:
@@ -95,33 +99,28 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
     if not GRAVITY_M_S2[0] < gravity < GRAVITY_M_S2[1]:
         found = f"{gravity:.4g} m/s² in all"
         faults.append(Fault(("robot", "gravity_m_s2"), found, f"{range_text(GRAVITY_M_S2)} m/s², as anywhere on Earth"))
-    if not urdf.strip():
-        return None, [*faults, Fault(("robot", "urdf"), "an empty file", "a URDF of an arm")]
+    axes = model.axis_names
     try:
-        following = [*mimic_faults([axis.name for axis in model.axes], urdf)]
-        if following:
-            return None, [*faults, *following]
-        of_chain = [*chain_faults(model.robot, model.closures, urdf)]
-        if of_chain:
-            return None, [*faults, *of_chain]
+        of_urdf = _urdf_faults(model, urdf)
+        if of_urdf:
+            return None, faults + of_urdf
         chain = chain_of(model.robot, model.closures, urdf)
         robot = robot_with(chain, urdf, model.robot.gravity_m_s2)
     except ModelError as error:
         expected = "a URDF of an arm; `hold: {JOINT: POSITION}` fixes a joint that is no axis"
         return None, [*faults, Fault(("robot", "urdf"), str(error), expected)]
-    joints = robot.axes
-    if chain is not None and len(joints) != len(model.axes):
-        found, named = f"{len(joints)} joints for {len(model.axes)} axes", ", ".join(axis.name for axis in model.axes)
-        faults.append(Fault(("robot", "motors"), found, f"the joint of each axis, in their order ({named})"))
-    elif len(joints) != len(model.axes):
-        names = [joint.name for joint in joints]
+    names = [joint.name for joint in robot.axes]
+    more = len(names) - len(axes)
+    if more and chain is not None:
+        found = f"{len(names)} joints for {len(axes)} axes"
+        faults.append(Fault(("robot", "motors"), found, f"the joint of each axis, in their order ({', '.join(axes)})"))
+    elif more:
         expected = f"one for each moving joint of the URDF ({', '.join(names)})"
-        if len(joints) > len(model.axes):
-            others = [name for name in names if name not in {axis.name for axis in model.axes}]
-            held = ", ".join(f"{name}: 0.0" for name in others[len(model.axes) - len(joints) :])
+        if more > 0:
+            others = [name for name in names if name not in axes]
+            held = ", ".join(f"{name}: 0.0" for name in others[-more:])
             expected += f"; joints that are no axes are held at a position [deg; m if prismatic]: `hold: {{{held}}}`"
-        faults.append(Fault(("axes",), f"{len(model.axes)} axes", expected))
-    axes = [axis.name for axis in model.axes]
+        faults.append(Fault(("axes",), f"{len(axes)} axes", expected))
     for index, name in enumerate(axes[: len(model.robot.motors)]):
         # Either the list has the wrong joint or the axis the wrong name; both cannot stay: an effect may name either.
         if name in robot.passive_names:
@@ -129,6 +128,13 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
             expected = f"{name}, or another name of that axis (`axes[{index}].name`)"
             faults.append(Fault(("robot", "motors", index), found, expected))
     return robot, faults
+
+
+def _urdf_faults(model: CellModel, urdf: str) -> list[Fault]:
+    """Find what keeps a URDF from being read as the robot of the axes; the first kind of fault alone."""
+    if not urdf.strip():
+        return [Fault(("robot", "urdf"), "an empty file", "a URDF of an arm")]
+    return [*mimic_faults(model.axis_names, urdf)] or [*chain_faults(model.robot, model.closures, urdf)]
 
 
 def _order_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
@@ -145,7 +151,8 @@ def _order_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
 
 def _ratio_faults(model: CellModel) -> Iterator[Fault]:
     path = ("drive_train", "ratio")
-    ratio, n = model.drive_train.ratio, len(model.axes)
+    ratio = model.drive_train.ratio
+    n = len(model.axes)
     if len(ratio) != n or any(len(row) != n for row in ratio):
         shape = f"{len(ratio)} rows of {', '.join(map(str, sorted({len(row) for row in ratio})))} numbers"
         yield Fault(path, shape, f"{n} × {n}, a row for each motor")
@@ -163,17 +170,20 @@ def _ratio_faults(model: CellModel) -> Iterator[Fault]:
     if not np.isfinite(condition) or condition > LARGEST_CONDITION:
         yield Fault(path, f"a singular matrix (condition {condition:.3g})", "one that can be inverted")
     free = model.robot.mobility
-    for motor, row in enumerate(ratio if free is not None and len(model.robot.motors) > free else ()):
-        if others := [model.axes[joint].name for joint in range(n) if joint != motor and row[joint] != 0.0]:
-            # The rule of ident.model.model.Model.
+    motors = len(model.robot.motors)
+    if free is None or motors <= free:
+        return
+    for motor, row in enumerate(ratio):
+        others = [model.axes[joint].name for joint in range(n) if joint != motor and row[joint] != 0.0]
+        if others:  # the rule of ident.model.model.Model
             found = f"the motor of {model.axes[motor].name} also turns with {', '.join(others)}"
-            expected = f"zeros off the diagonal: {len(model.robot.motors)} motors for {free} degrees of freedom"
+            expected = f"zeros off the diagonal: {motors} motors for {free} degrees of freedom"
             yield Fault((*path, motor), found, expected)
 
 
 def _list_faults(model: CellModel) -> Iterator[Fault]:
     n = len(model.axes)
-    names = Counter(axis.name for axis in model.axes)
+    names = Counter(model.axis_names)
     for index, axis in enumerate(model.axes):
         if names[axis.name] > 1:
             yield Fault(("axes", index, "name"), f"{axis.name}, used {names[axis.name]} times", "each name once")
@@ -186,9 +196,8 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
             yield Fault(("payloads", index, "mass_kg"), f"{payload.mass_kg:g}", "a positive mass [kg]")
         elif payload.mass_tolerance_kg > TOLERANCE_SHARE * payload.mass_kg:
             found = f"{payload.mass_tolerance_kg:g} kg for {payload.mass_kg:g} kg"
-            yield Fault(
-                ("payloads", index, "mass_tolerance_kg"), found, "at most a tenth of the mass: it is in every gain"
-            )
+            expected = "at most a tenth of the mass: it is in every gain"
+            yield Fault(("payloads", index, "mass_tolerance_kg"), found, expected)
         if mountings[payload.mounting] > 1:
             yield Fault(
                 ("payloads", index, "mounting"),
@@ -209,7 +218,7 @@ def _effect_faults(model: CellModel, robot: Robot | None, *, logged: bool) -> It
     from daq.config.effects import place_effect  # noqa: PLC0415 - loads scipy, which cells without effects do not need
 
     passive = () if robot is None else robot.passive_names
-    names = [*(axis.name for axis in model.axes), *passive]
+    names = [*model.axis_names, *passive]
     placed = [(effect.name, effect.axis) for effect in model.effects]
     for index, effect in enumerate(model.effects):
         if effect.axis not in names and not (model.closures and not passive):
@@ -230,9 +239,8 @@ def _frame_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
     for index, payload in enumerate(model.payloads):
         if payload.known is not None:
             found = f"single parameters, and the link {model.robot.platform} is not at the origin of its joint"
-            yield Fault(
-                ("payloads", index, "known"), found, "`centre_m` and `inertia_kg_m2`, in the frame of that link"
-            )
+            expected = "`centre_m` and `inertia_kg_m2`, in the frame of that link"
+            yield Fault(("payloads", index, "known"), found, expected)
 
 
 def _mass_faults(model: CellModel) -> Iterator[Fault]:
@@ -240,7 +248,8 @@ def _mass_faults(model: CellModel) -> Iterator[Fault]:
     rated_kg = model.robot.rated_payload_kg
     lightest_kg = min((payload.mass_kg for payload in model.payloads if payload.mass_kg > 0), default=0.0)
     for index, payload in enumerate(model.payloads):
-        path, found = ("payloads", index, "mass_kg"), f"{payload.mass_kg:g} kg"
+        path = ("payloads", index, "mass_kg")
+        found = f"{payload.mass_kg:g} kg"
         if rated_kg is not None and payload.mass_kg > rated_kg:
             yield Fault(path, found, f"at most the {rated_kg:g} kg of `robot.rated_payload_kg`")
         elif rated_kg is None and payload.mass_kg > HEAVIEST_PAYLOAD_KG:
@@ -262,11 +271,50 @@ def _size_faults(model: CellModel) -> Iterator[Fault]:
             yield from centre_faults((*path, "centre_m"), payload.centre_m)
         if payload.inertia_kg_m2 is not None:
             yield from gyration_faults((*path, "inertia_kg_m2"), payload.inertia_kg_m2, mass_kg)
-        for name, value in ({} if payload.known is None else payload.known.model_dump(exclude_none=True)).items():
+        for name, value in payload.known_parameters.items():
             if name.startswith("I"):
                 yield from gyration_faults((*path, "known", name), (value,), mass_kg)
             else:
                 yield from centre_faults((*path, "known", name), (value / mass_kg,))
+
+
+_OVERFLOWS = 1e100  #: Moments of inertia whose eigenvalues may overflow
+
+
+def centre_faults(path: Location, centre_m: Sequence[float]) -> Iterator[Fault]:
+    """Find a centre of mass in mm."""
+    far_m = hypot(*centre_m)
+    if not within(far_m, (0.0, FARTHEST_CENTRE_M)):
+        found = f"a centre of mass {far_m:.4g} m from the origin"
+        yield Fault(path, found, f"at most {FARTHEST_CENTRE_M:g} m; is this in mm?")
+
+
+def gyration_faults(path: Location, inertia_kg_m2: Sequence[float], mass_kg: float) -> Iterator[Fault]:
+    """Find an inertia in kg mm², by its radius of gyration √(I/m)."""
+    radius_m = sqrt(max(map(abs, inertia_kg_m2)) / mass_kg)
+    if not within(radius_m, (0.0, LARGEST_GYRATION_M)):
+        found = f"a radius of gyration √(I/m) of {radius_m:.4g} m"
+        yield Fault(path, found, f"at most {LARGEST_GYRATION_M:g} m; is this in kg mm²?")
+
+
+def moment_faults(path: Location, inertia_kg_m2: Sequence[float]) -> Iterator[Fault]:
+    """Find inertias of no body: a principal moment below zero, or above the sum of the other two.
+
+    Args:
+        path: of the inertia.
+        inertia_kg_m2: xx, xy, xz, yy, yz, zz about the centre of mass.
+    """
+    if not max(map(abs, inertia_kg_m2)) < _OVERFLOWS:
+        return  # `gyration_faults` refuses it
+    xx, xy, xz, yy, yz, zz = inertia_kg_m2
+    least, middle, largest = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+    margin = 1e-9 * abs(largest)
+    if least < -margin or largest > least + middle + margin:
+        yield Fault(
+            path,
+            f"principal moments {least:.4g}, {middle:.4g}, {largest:.4g} kg m²",
+            "those of a body about its centre of mass: none below 0, none above the sum of the other two",
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,9 +348,9 @@ def _axis_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
         if index < len(joints):
             yield from _kind_faults(path, axis, joints[index])
         yield from _limit_faults((*path, "limits", f"position_{axis.limits.unit.name}"), axis)
-        for unit, offset in ((DEGREE, axis.zero_offset_deg), (MILLIMETRE, axis.zero_offset_mm)):
+        for unit, offset in axis.zero_offsets.items():
             farthest = _PLAUSIBLE[unit].farthest
-            if offset is not None and abs(offset) > farthest:
+            if abs(offset) > farthest:
                 yield Fault((*path, f"zero_offset_{unit.name}"), f"{offset:g}", f"at most ±{farthest:g} {unit.name}")
     yield from _gain_faults(model, joints)
     yield from _standstill_faults(model, joints)
@@ -310,7 +358,8 @@ def _axis_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
 
 def _kind_faults(path: Location, axis: AxisModel, joint: Joint) -> Iterator[Fault]:
     """Find degrees for a prismatic joint, and mm for a revolute one."""
-    unit, written = joint_unit(joint.kind), axis.limits.unit
+    unit = joint_unit(joint.kind)
+    written = axis.limits.unit
     what = f"joint {joint.name} of the URDF is {joint.kind.value}"
     if written is not unit:
         name = unit.name
@@ -319,17 +368,11 @@ def _kind_faults(path: Location, axis: AxisModel, joint: Joint) -> Iterator[Faul
             f"limits in {written.name}, and {what}",
             f"position_{name}, velocity_{name}_s and acceleration_{name}_s2",
         )
-    for other, offset in ((DEGREE, axis.zero_offset_deg), (MILLIMETRE, axis.zero_offset_mm)):
-        if offset is not None and other is not unit:
+    for other in axis.zero_offsets:
+        if other is not unit:
             yield Fault((*path, f"zero_offset_{other.name}"), f"{other.name}, and {what}", f"zero_offset_{unit.name}")
     if axis.lead_mm is not None and joint.kind is not JointKind.PRISMATIC:
         yield Fault((*path, "lead_mm"), f"a lead, and {what}", "nothing: only a prismatic joint has a lead")
-
-
-def _gain_key(axis: AxisModel) -> str:
-    """Return the key by which an axis states its gain; the schema requires one."""
-    keys = ("nameplate_gain", "nameplate_gain_nm_per_a", "nameplate_gain_n_per_a")
-    return next(key for key in keys if getattr(axis, key) is not None)
 
 
 def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
@@ -338,8 +381,8 @@ def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
     except ValueError:
         gained = ()  # _ratio_faults refuses the drive train
     for index, axis in enumerate(model.axes):
-        key = _gain_key(axis)
-        if not getattr(axis, key):
+        ((key, gain),) = axis.nameplate_gains.items()
+        if not gain:
             yield Fault(("axes", index, key), "0", "the manufacturer's gain, signed, not zero")
         if index >= len(gained) or gained[index] >= len(joints):
             continue
@@ -347,7 +390,8 @@ def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
         force = joint_unit(joint.kind).force
         written = {"nameplate_gain_nm_per_a": "Nm", "nameplate_gain_n_per_a": "N"}.get(key)
         if written is None:
-            key, written = "gain_unit", (axis.gain_unit or "").partition("/")[0].strip()
+            key = "gain_unit"
+            written = (axis.gain_unit or "").partition("/")[0].strip()
         if written in {"Nm", "N"} and written != force:
             yield Fault(
                 ("axes", index, key),
@@ -357,7 +401,8 @@ def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
 
 
 def _limit_faults(path: Location, axis: AxisModel) -> Iterator[Fault]:
-    (lower, upper), unit = axis.limits.position, axis.limits.unit
+    lower, upper = axis.limits.position
+    unit = axis.limits.unit
     plausible = _PLAUSIBLE[unit]
     found = f"[{lower:g}, {upper:g}] {unit.name}"
     if lower >= upper:
@@ -373,11 +418,12 @@ def _limit_faults(path: Location, axis: AxisModel) -> Iterator[Fault]:
 def _range_faults(model: CellModel) -> Iterator[Fault]:
     """Find speeds, accelerations and gains that no axis has."""
     for index, axis in enumerate(model.axes):
-        unit, key = axis.limits.unit.name, _gain_key(axis)
+        unit = axis.limits.unit.name
+        ((key, gain),) = axis.nameplate_gains.items()
         for where, value, bounds, shown in (
             (("limits", f"velocity_{unit}_s"), axis.limits.velocity, SPEED, f" {unit}/s"),
             (("limits", f"acceleration_{unit}_s2"), axis.limits.acceleration, ACCELERATION, f" {unit}/s²"),
-            ((key,), abs(getattr(axis, key)), RAW_GAIN if key == "nameplate_gain" else GAIN, " in size"),
+            ((key,), abs(gain), RAW_GAIN if key == "nameplate_gain" else GAIN, " in size"),
         ):
             if value != 0.0 and not within(value, bounds):
                 found = f"{value:g}{shown}"
@@ -391,10 +437,14 @@ def _si_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
     ranges = [axis.limits.position for axis in model.axes if axis.limits.unit is DEGREE]
     narrow = all(SHORTEST_DEG < upper - lower < SHORTEST_OF_ALL_DEG for lower, upper in ranges)
     for index, axis in enumerate(model.axes):
-        (lower, upper), velocity, unit = axis.limits.position, axis.limits.velocity, axis.limits.unit
-        path, in_si = ("axes", index, "limits"), of_urdf.get(index)
+        lower, upper = axis.limits.position
+        velocity = axis.limits.velocity
+        unit = axis.limits.unit
+        path = ("axes", index, "limits")
+        in_si = of_urdf.get(index)
         remedy = f"{unit.name}; multiply by {1.0 / unit.si:.3g}"
-        where, found = (*path, f"position_{unit.name}"), f"[{lower:g}, {upper:g}] {unit.name}"
+        where = (*path, f"position_{unit.name}")
+        found = f"[{lower:g}, {upper:g}] {unit.name}"
         if in_si is not None and _within_urdf((lower, upper), in_si.position, _PLAUSIBLE[unit].farthest * unit.si):
             yield Fault(where, f"{found}, the numbers of the URDF in {unit.si_name}", remedy)
         elif narrow and unit is DEGREE:
@@ -421,30 +471,23 @@ def _standstill_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fa
         "standstill_rad_s": model.conditioning.standstill_rad_s,
         "standstill_mm_s": model.conditioning.standstill_mm_s,
     }
-    prismatic = [joint.kind is JointKind.PRISMATIC for joint in joints] or [
-        axis.limits.unit is MILLIMETRE for axis in model.axes
-    ]
-    needed = {"standstill_rad_s": not all(prismatic), "standstill_mm_s": any(prismatic)}
+    units = [joint_unit(joint.kind) for joint in joints] or [axis.limits.unit for axis in model.axes]
     if not any(lists.values()):
         return
-    complete = True
-    for key, speeds in lists.items():
-        if len(speeds) != n and (speeds or needed[key]):
-            complete = False
-            yield Fault(
-                ("conditioning", key), f"{len(speeds)} speeds", f"{n}, one for each axis (null in the other list)"
-            )
-    if not complete:
+    keys = ["standstill_mm_s" if unit is MILLIMETRE else "standstill_rad_s" for unit in units]
+    short = [key for key, speeds in lists.items() if len(speeds) != n and (speeds or key in keys)]
+    for key in short:
+        expected = f"{n}, one for each axis (null in the other list)"
+        yield Fault(("conditioning", key), f"{len(lists[key])} speeds", expected)
+    if short:
         return
-    for index, along in enumerate(prismatic[:n]):
+    for index, own in enumerate(keys[:n]):
+        kind = JointKind.PRISMATIC if own == "standstill_mm_s" else JointKind.REVOLUTE
         for key, speeds in lists.items():
-            wanted = along == (key == "standstill_mm_s")
-            if speeds and (speeds[index] is not None) != wanted:
-                kind = JointKind.PRISMATIC if along else JointKind.REVOLUTE
+            if speeds and (speeds[index] is None) == (key == own):
                 found = f"{speeds[index]} for {model.axes[index].name}, which is {kind.value}"
-                yield Fault(
-                    ("conditioning", key, index), found, "a speed" if wanted else "null, it is in the other list"
-                )
+                expected = "a speed" if key == own else "null, it is in the other list"
+                yield Fault(("conditioning", key, index), found, expected)
 
 
 def _urdf_limits(urdf: str) -> dict[str, _UrdfLimits | None]:
@@ -455,7 +498,8 @@ def _urdf_limits(urdf: str) -> dict[str, _UrdfLimits | None]:
         for joint in joints:
             if joint.get("type") not in {"revolute", "continuous", "prismatic"}:
                 continue
-            limit, name = joint.find("limit"), joint.get("name", "")
+            limit = joint.find("limit")
+            name = joint.get("name", "")
             limits[name] = None
             if limit is None:
                 continue

@@ -48,7 +48,8 @@ class GainObject:
         return DriveParameter(self.index, self.subindex, self.type)
 
 
-_KEY, _KEY_AND_FACTOR = not_in_file("key"), not_in_file("key and factor")
+_KEY = not_in_file("key")
+_KEY_AND_FACTOR = not_in_file("key and factor")
 
 
 def _entry_kind(value: object) -> str:

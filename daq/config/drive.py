@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -35,15 +35,31 @@ Subindex = Annotated[int, Field(ge=0, le=0xFF)]
 Text = Annotated[str, Field(min_length=1, max_length=400)]
 
 
-class EntryModel(StrictModel):
+class SectionModel(StrictModel):
+    """A section that `drivers` has as a class of its own."""
+
+    def built(self) -> Any:
+        """Convert to the class of `drivers`."""
+        raise NotImplementedError
+
+
+def _parts(model: StrictModel) -> dict[str, Any]:
+    """Return the values of a section by their keys, with every section in it as the class of `drivers`."""
+    parts: dict[str, Any] = {}
+    for key, value in model:
+        parts[key] = value.built() if isinstance(value, SectionModel) else value
+    return parts
+
+
+class EntryModel(SectionModel):
     """One object dictionary entry."""
 
     index: Index
     subindex: Subindex = 0
     type: Literal["i8", "i16", "i32", "i64", "u8", "u16", "u32", "u64"]
 
-    def entry(self) -> ObjectEntry:
-        """Convert to the class of `drivers`."""
+    def built(self) -> Any:
+        """Convert to `ObjectEntry`; a temperature is a `Thermometer`."""
         return ObjectEntry(self.index, self.subindex, int(self.type[1:]), signed=self.type[0] == "i")
 
 
@@ -64,7 +80,7 @@ SCALE_KEYS: dict[ScaleForm, frozenset[str]] = {
 """Keys of each form, all of them required (but `objects` of a product)."""
 
 
-class ScaleModel(StrictModel):
+class ScaleModel(SectionModel):
     """Ampere per raw unit, in one of the known forms (drivers.profile.ScaleForm).
 
     A file without `form` is a product: logs of the first version carry such profiles.
@@ -82,32 +98,36 @@ class ScaleModel(StrictModel):
 
     @model_validator(mode="after")
     def _form_and_keys(self) -> ScaleModel:
-        given, wanted = self.model_fields_set - {"form"}, SCALE_KEYS[self.form]
+        given = self.model_fields_set - {"form"}
+        wanted = SCALE_KEYS[self.form]
         empty = {key for key in given if getattr(self, key) is None and key != "peak_current_a"}
         if empty or given - wanted or wanted - given - {"objects"}:
             raise ValueError(f"{' and '.join(sorted(wanted))} of a scale of form {self.form.value}, and nothing else")
         return self
 
-    def scale(self) -> CurrentScale | None:
+    def built(self) -> CurrentScale | None:
         """Convert to the class of `drivers`; None until the peak current is entered."""
-        factor, objects = self.factor, self.objects
+        factor = self.factor
+        objects = self.objects
         if self.rated_current is not None:
-            factor, objects = 1e-6, (self.rated_current,)  # a thousandth of so many mA
+            factor = 1e-6  # a thousandth of so many mA
+            objects = (self.rated_current,)
         elif self.digits is not None and self.peak_current is not None:
-            factor, objects = 1e-3 / self.digits, (self.peak_current,)  # [mA]
+            factor = 1e-3 / self.digits  # [mA]
+            objects = (self.peak_current,)
         elif self.digits is not None and self.peak_current_a is not None:
             factor = self.peak_current_a / self.digits
         elif self.ampere_per_unit is not None:
             factor = self.ampere_per_unit
         if factor is None:
             return None
-        entries = tuple(entry.entry() for entry in objects)
+        entries = tuple(entry.built() for entry in objects)
         if self.switch is None:
             return CurrentScale(factor, entries, self.form)
-        return CurrentScale(factor, entries, self.form, self.switch.entry(), (math.sqrt(0.5), 1.0))
+        return CurrentScale(factor, entries, self.form, self.switch.built(), (math.sqrt(0.5), 1.0))
 
 
-class RatedModel(StrictModel):
+class RatedModel(SectionModel):
     """Objects with the motor's rated values."""
 
     current: EntryModel
@@ -115,10 +135,9 @@ class RatedModel(StrictModel):
     torque: EntryModel | None = None
     newton_metre_per_unit: Positive = 1e-3
 
-    def rated(self) -> RatedMotor:
+    def built(self) -> RatedMotor:
         """Convert to the class of `drivers`."""
-        torque = None if self.torque is None else self.torque.entry()
-        return RatedMotor(self.current.entry(), self.ampere_per_unit, torque, self.newton_metre_per_unit)
+        return RatedMotor(**_parts(self))
 
 
 class TemperatureModel(SignalModel):
@@ -126,12 +145,12 @@ class TemperatureModel(SignalModel):
 
     kelvin_per_unit: Positive
 
-    def thermometer(self) -> Thermometer:
+    def built(self) -> Thermometer:
         """Convert to the class of `drivers`."""
-        return Thermometer(self.entry(), self.kelvin_per_unit)
+        return Thermometer(super().built(), self.kelvin_per_unit)
 
 
-class SaveModel(StrictModel):
+class SaveModel(SectionModel):
     """Command with which the drive stores its parameters."""
 
     index: Index = 0x1010
@@ -139,7 +158,7 @@ class SaveModel(StrictModel):
     signature: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
     mapping: Mapping
 
-    def save(self) -> Save:
+    def built(self) -> Save:
         """Convert to the class of `drivers`."""
         return Save(ObjectEntry(self.index, self.subindex, 32, signed=False), self.signature, self.mapping)
 
@@ -151,7 +170,7 @@ class FactModel(StrictModel):
     where: Text
 
 
-class FactsModel(StrictModel):
+class FactsModel(SectionModel):
     """Evidence for each line of a profile."""
 
     position: FactModel
@@ -167,10 +186,9 @@ class FactsModel(StrictModel):
     torque: FactModel | None = None
     temperature: FactModel | None = None
 
-    def facts(self) -> tuple[Fact, ...]:
+    def built(self) -> tuple[Fact, ...]:
         """Convert to the class of `drivers`."""
-        stated: dict[str, FactModel | None] = {name: getattr(self, name) for name in type(self).model_fields}
-        return tuple(Fact(name, fact.basis, fact.where) for name, fact in stated.items() if fact is not None)
+        return tuple(Fact(name, fact.basis, fact.where) for name, fact in self if fact is not None)
 
 
 class DriveModel(StrictModel):
@@ -229,30 +247,14 @@ def drive_from_text(text: bytes, name: str) -> DriveProfile:
         ConfigurationError: it is not a drive profile, or the peak current of the drive is missing.
     """
     document = parse_yaml(text, name)
-    model = read_model(document, DriveModel)
-    scale = model.current_scale.scale()
-    if scale is None:
+    parts = _parts(read_model(document, DriveModel))
+    if parts["current_scale"] is None:
         place = ("current_scale", "peak_current_a")
         expected = "the peak current of this size of drive [A]; no object of the drive reports it"
         raise ConfigurationInconsistent(
             **fault_texts(document, [Fault(place, "nothing", expected)]),
             remedy="copy the profile to drives/ beside your cell file and enter it from the drive's data sheet",
         )
-    return DriveProfile(
-        name=model.name,
-        position=model.position.entry(),
-        current=model.current.entry(),
-        current_scale=scale,
-        amplitude=model.amplitude,
-        tap=model.tap,
-        saturation_bit=model.saturation_bit,
-        update_period_us=model.update_period_us,
-        save_semantics=model.save_semantics,
-        source=model.source,
-        facts=() if model.facts is None else model.facts.facts(),
-        rated=None if model.rated is None else model.rated.rated(),
-        save=None if model.save is None else model.save.save(),
-        toggle_bit=model.toggle_bit,
-        torque=None if model.torque is None else model.torque.entry(),
-        temperature=None if model.temperature is None else model.temperature.thermometer(),
-    )
+    del parts["eds"]  # a log carries it for people; no reader of a profile needs it
+    parts["facts"] = parts["facts"] or ()
+    return DriveProfile(**parts)

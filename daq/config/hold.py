@@ -41,9 +41,10 @@ def held_urdf(document: Document, model: CellModel, urdf: str) -> str:
 def _faults(model: CellModel, held: dict[str, float], joints: dict[str, ElementTree.Element]) -> Iterator[Fault]:
     """Find held joints that are axes, and positions that the URDF excludes."""
     for name, position in held.items():
-        if name in {axis.name for axis in model.axes}:
+        if name in model.axis_names:
             yield Fault(("hold", name), "a joint that is also one of `axes`", "an axis or a held joint, not both")
-        limit, kind = joints[name].find("{*}limit"), joints[name].get("type")
+        limit = joints[name].find("{*}limit")
+        kind = joints[name].get("type")
         if limit is None or kind == "continuous":
             continue
         try:

@@ -65,7 +65,7 @@ class TimeUnit(Enum):
     @property
     def seconds(self) -> float:
         """The unit in seconds."""
-        return {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "iso8601": 1.0}[self.value]
+        return 10.0**-self.digits
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,23 +85,34 @@ class CsvLayout:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PositionColumns:
-    """Position columns, one for each axis."""
+class Section:
+    """Columns of a quantity, one for each axis."""
 
     file: FileName
     columns: SomeColumns
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PositionColumns(Section):
+    """Position columns, one for each axis."""
+
     unit: PositionUnit
     side: Side
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ScaledColumns:
+class ScaledColumns(Section):
     """Columns of a quantity, one for each axis, and the factor to its unit."""
 
-    file: FileName
-    columns: SomeColumns
     #: One for all axes, a list in their order, or a mapping from their names.
     factor: Factor | Annotated[tuple[Factor, ...], Field(min_length=1)] | dict[Name, Factor] = 1.0
+
+    @property
+    def stated_factors(self) -> tuple[float, ...]:
+        """The factors as they are written, one of all axes alone."""
+        if isinstance(self.factor, float):
+            return (self.factor,)
+        return tuple(self.factor.values()) if isinstance(self.factor, dict) else self.factor
 
     def factors(self, axes: Sequence[str]) -> tuple[float, ...] | None:
         """Return the factor of each axis; None if other axes have one."""
@@ -127,11 +138,8 @@ class TorqueColumns(ScaledColumns):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TemperatureColumns:
+class TemperatureColumns(Section):
     """Columns of the temperature of each motor or its drive [°C]."""
-
-    file: FileName
-    columns: SomeColumns
 
 
 class VelocityUnit(Enum):
@@ -144,11 +152,9 @@ class VelocityUnit(Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VelocityColumns:
+class VelocityColumns(Section):
     """Velocity columns, one for each axis: a check of the positions and the time; not imported."""
 
-    file: FileName
-    columns: SomeColumns
     unit: VelocityUnit
     side: Side
     #: Largest difference between the way by the velocities and by the positions, as a share of the latter.
@@ -165,9 +171,6 @@ class TimeColumn:
     rate_hz: Rate | None = None  #: rate to resample to [Hz]; that of the stamps by default
     #: Longest step that is interpolated, in usual steps; a longer one is a gap, and refused.
     largest_gap_periods: Annotated[float, Field(ge=1.5, le=100.0)] = 3.0
-
-
-Section = PositionColumns | ScaledColumns | VelocityColumns | TemperatureColumns
 
 
 class ImportDescription(StrictModel):
@@ -223,8 +226,7 @@ def load_import(path: Path) -> ImportDescription:
         faults.append(Fault(("position", "side"), "joint, with encoder counts", expected))
     axes = len(wanted.position.columns)
     for name, section in wanted.sections():
-        factor = section.factor if isinstance(section, ScaledColumns) else 1.0
-        factors = (factor,) if isinstance(factor, float) else factor.values() if isinstance(factor, dict) else factor
+        factors = section.stated_factors if isinstance(section, ScaledColumns) else ()
         if any(abs(one) < SMALLEST_FACTOR for one in factors):
             expected = f"the unit of the log for each unit in the file, at least {SMALLEST_FACTOR:g}"
             faults.append(Fault((name, "factor"), f"{min(factors, key=abs):g}", expected))

@@ -114,13 +114,17 @@ class HistorySection:
         Raises:
             ConfigurationInconsistent: it would, or a link in one of the names must not be followed.
         """
-        folder, stem = cell_file.parent, cell_file.stem
+        folder = cell_file.parent
+        stem = cell_file.stem
         store = policy_judged(cell_file, "history.store", folder / (self.store or f"{stem}.history.sqlite"))
         for other in (cell_file, folder / (controller or cell_file.name)):
             if str(store) == os.path.realpath(other) or (store.exists() and other.exists() and store.samefile(other)):
-                where, found = f"{cell_file}: history.store", f"the same file as {other}"
-                expected, remedy = "a file of the history's own", "give it another name"
-                raise ConfigurationInconsistent(where, found=found, expected=expected, remedy=remedy)
+                raise ConfigurationInconsistent(
+                    f"{cell_file}: history.store",
+                    found=f"the same file as {other}",
+                    expected="a file of the history's own",
+                    remedy="give it another name",
+                )
         audit = policy_judged(cell_file, "history.audit", folder / (self.audit or f"{stem}.audit.jsonl"))
         return HistoryPlace(store, audit)
 

@@ -77,8 +77,8 @@ class PlannedRun:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Bounds:
-    """Keys that mean the same in the file and in the program."""
+class RecalibrationSection:
+    """`recalibration`; docs/how-to/schedule-recalibration.md has an example."""
 
     runs: Annotated[tuple[PlannedRun, ...], Field(min_length=3, max_length=100)]  #: in the order of their recording
     interlock: Interlock  #: checked before each run
@@ -93,21 +93,7 @@ class _Bounds:
     keep_sessions: Annotated[int, Field(ge=1)] = 20  #: number of ended sessions whose logs are kept
     seed: Annotated[int, Field(ge=0)] = 0  #: seed of the significance test
     metrics: FilePath | None = None  #: folder of Prometheus' textfile collector, None without one
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Recalibration(_Bounds):
-    """A scheduled recalibration."""
-
-    folder: Path  #: parent of its sessions, each with logs, state and report; absolute
-    working_folder: Path  #: folder in which commands run: that of the cell file
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecalibrationSection(_Bounds):
-    """`recalibration`; docs/how-to/schedule-recalibration.md has an example."""
-
-    folder: FilePath | None = None
+    folder: FilePath | None = None  #: parent of its sessions; None for the one named after the cell file
 
     @model_validator(mode="after")
     def _check_runs(self) -> RecalibrationSection:
@@ -123,10 +109,16 @@ class RecalibrationSection(_Bounds):
 
     def recalibration(self, cell_file: Path) -> Recalibration:
         """Add the folders that follow from the cell file's own."""
-        return Recalibration(
-            **{bound.name: getattr(self, bound.name) for bound in fields(_Bounds)},
-            # Named after the cell file, as its history: two cells in one folder have separate sessions.
-            folder=self.folder
-            or policy_judged(cell_file, "recalibration.folder", cell_file.with_suffix(".recalibration")),
-            working_folder=Path(os.path.realpath(cell_file.parent)),
-        )
+        # Named after the cell file, as its history: two cells in one folder have separate sessions.
+        named = cell_file.with_suffix(".recalibration")
+        keys = {key.name: getattr(self, key.name) for key in fields(RecalibrationSection)}
+        keys["folder"] = self.folder or policy_judged(cell_file, "recalibration.folder", named)
+        return Recalibration(**keys, working_folder=Path(os.path.realpath(cell_file.parent)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recalibration(RecalibrationSection):
+    """A scheduled recalibration."""
+
+    folder: Path  #: parent of its sessions, each with logs, state and report; absolute
+    working_folder: Path  #: folder in which commands run: that of the cell file

@@ -8,9 +8,7 @@ two robots of one make have the same axes and joints, and a copied cell file eve
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-
-import numpy as np
+from dataclasses import dataclass, fields, replace
 
 from daq.config.cell import Cell, CellAxis
 from daq.config.cell_file import CELL, cell_from_bundle
@@ -76,7 +74,7 @@ def correction_of(
 
 def mismatch(own: Cell, given: Cell) -> Mismatch | None:
     """Return what shows that a description is of another cell than that of a log; None for the same cell."""
-    found = _mismatch_of_axes((own.name, own.axis_names), (given.name, given.axis_names))
+    found = _mismatch_of_axes(own.name, own.axis_names, given)
     if found is not None:
         return found
     joints = _joints(own)
@@ -107,30 +105,32 @@ def differing_sections(own: Cell, given: Cell) -> tuple[str, ...]:
 
     Both have the same axes (`mismatch`).
     """
-    of_robot = (
-        ("robot.urdf", own.urdf == given.urdf),
-        ("robot.gravity_m_s2", own.gravity_m_s2 == given.gravity_m_s2),
-        ("closures", _closing(own) == _closing(given)),
-        ("drive_train.ratio", np.array_equal(own.ratio, given.ratio)),
-        ("bus", own.buses == given.buses),
-        ("sync", own.sync == given.sync),
-    )
-    of_fit = (
-        ("payloads", own.payloads == given.payloads),
-        ("effects", own.effects == given.effects),
-        ("conditioning", own.conditioning == given.conditioning),
-    )
-    return (
-        *(name for name, same in of_robot if not same),
-        *_differing_axes(own.axes, given.axes),
-        *(name for name, same in of_fit if not same),
-    )
+    found = _sections(own)
+    expected = _sections(given)
+    sections = []
+    for name in found:
+        if name == "axes":
+            sections += _differing_axes(own.axes, given.axes)
+        elif found[name] != expected[name]:
+            sections.append(name)
+    return tuple(sections)
 
 
-def _closing(cell: Cell) -> tuple[object, ...]:
-    """How the loops of a closed chain close; empty for a serial robot."""
+def _sections(cell: Cell) -> dict[str, object]:
+    """Return what a recording or its fit needs of a description, by the keys of the cell file."""
     chain = cell.chain
-    return () if chain is None else (chain.closures, chain.motors, chain.platform, chain.assembly_rad)
+    return {
+        "robot.urdf": cell.urdf,
+        "robot.gravity_m_s2": cell.gravity_m_s2,
+        "closures": None if chain is None else replace(chain, passive_joints=()),  # these follow from the URDF
+        "drive_train.ratio": cell.ratio.tolist(),
+        "bus": cell.buses,
+        "sync": cell.sync,
+        "axes": cell.axes,
+        "payloads": cell.payloads,
+        "effects": cell.effects,
+        "conditioning": cell.conditioning,
+    }
 
 
 def _differing_axes(own: Sequence[CellAxis], given: Sequence[CellAxis]) -> list[str]:
@@ -170,22 +170,22 @@ def _drive_of(own: CellAxis, given: CellAxis) -> tuple[tuple[str, int | None, in
     )
 
 
-def _mismatch_of_axes(own: tuple[str, tuple[str, ...]], given: tuple[str, tuple[str, ...]]) -> Mismatch | None:
-    if own[0] != given[0]:
-        return Mismatch(f"a log of cell {own[0]!r}", f"one of cell {given[0]!r}, as in the given description")
-    if own[1] != given[1]:
-        return Mismatch(f"axes {', '.join(own[1])}", f"{', '.join(given[1])}, as in the given description")
+def _mismatch_of_axes(name: str, axes: tuple[str, ...], given: Cell) -> Mismatch | None:
+    if name != given.name:
+        return Mismatch(f"a log of cell {name!r}", f"one of cell {given.name!r}, as in the given description")
+    if axes != given.axis_names:
+        return Mismatch(f"axes {', '.join(axes)}", f"{', '.join(given.axis_names)}, as in the given description")
     return None
 
 
 def _mismatch_of_names(files: Mapping[str, bytes], given: Cell, name: str) -> Mismatch | None:
     """Compare name and axes with those of a description that this version refuses otherwise."""
     tree = parse_yaml(files[CELL], name).tree
-    own = tree.get("name") if isinstance(tree, dict) else None
-    axes = tree.get("axes") if isinstance(tree, dict) else None
+    cell = tree if isinstance(tree, dict) else {}
+    axes = cell.get("axes")
     entries = axes if isinstance(axes, list) else []
     names = tuple(str(entry.get("name")) for entry in entries if isinstance(entry, dict))
-    return _mismatch_of_axes((str(own), names or given.axis_names), (given.name, given.axis_names))
+    return _mismatch_of_axes(str(cell.get("name")), names or given.axis_names, given)
 
 
 def _mismatch_of_drives(own: Cell | None, given: Cell, serials: Sequence[int | None]) -> Mismatch | None:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, get_args, g
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
 
-from daq.errors import ConfigurationMissing, SchemaMismatch, YamlInvalid
+from daq.errors import ConfigurationMissing, DaqError, SchemaMismatch, YamlInvalid
 from daq.files import follow_links, read_regular
 
 Location = tuple[str | int, ...]
@@ -224,15 +224,25 @@ def read_yaml_bytes(path: Path) -> bytes:
     Raises:
         ConfigurationMissing: the file does not exist, is not a regular file, is too large, or cannot be read.
     """
+    return read_file(
+        path,
+        ConfigurationMissing,
+        expected=f"a readable, regular file of at most {MAX_BYTES} bytes",
+        remedy="check the name; it is relative to the file that names it, on a command line to the current folder",
+    )
+
+
+def read_file(path: Path, missing: type[DaqError], *, expected: str, remedy: str) -> bytes:
+    """Read a file of at most MAX_BYTES that a person named; a pipe or device is not waited for.
+
+    Raises:
+        DaqError: of the class `missing`, where it does not exist, is no regular file, is too large, or cannot be read.
+    """
     try:
         return read_regular(path, MAX_BYTES)
     except OSError as error:
-        raise ConfigurationMissing(
-            str(path),
-            found=(error.strerror or type(error).__name__).lower(),
-            expected=f"a readable, regular file of at most {MAX_BYTES} bytes",
-            remedy="check the name; it is relative to the file that names it, on a command line to the current folder",
-        ) from error
+        found = (error.strerror or type(error).__name__).lower()
+        raise missing(str(path), found=found, expected=expected, remedy=remedy) from error
 
 
 def read_model(document: Document, model: type[Model], folder: Path | None = None) -> Model:

@@ -1,7 +1,7 @@
 """`calibration.yaml`, the result of a fit: written whole, read strictly, and every edit by hand is detected.
 
 The file adds percentages for people and writes NaN as null. Sections without such a difference (`Source`, `Recording`,
-`Diagnosis`, `PayloadMass`) are read as the classes of `ident`.
+`Diagnosis`) are read as the classes of `ident`.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ import yaml
 from pydantic import AfterValidator, Field, model_validator
 
 from daq.config.cell_schema import CUTOFF_HZ, FILTER_ORDER
-from daq.config.yaml_file import MAX_BYTES, StrictModel, parse_yaml, read_model
+from daq.config.yaml_file import StrictModel, parse_yaml, read_file, read_model
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, SchemaMismatch, YamlInvalid
-from daq.files import read_regular, replace_file
+from daq.files import replace_file
 from ident.calibration import (
     AcceptedEffect,
     Calibration,
@@ -284,9 +284,12 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
     def check(content: bytes) -> None:
         # Compared as documents: NaN, for an axis that did not move, is not equal to itself.
         if as_document(decode_calibration(content, str(path))) != as_document(calibration):
-            found, expected = "another content on reading back", "what was written"
-            remedy = "check the disk; the file was not replaced"
-            raise CalibrationUnreadable(str(path), found=found, expected=expected, remedy=remedy)
+            raise CalibrationUnreadable(
+                str(path),
+                found="another content on reading back",
+                expected="what was written",
+                remedy="check the disk; the file was not replaced",
+            )
 
     replace_file(path, encode_calibration(calibration), check=check)
 
@@ -318,12 +321,8 @@ def read_calibration_bytes(path: Path) -> bytes:
     Raises:
         CalibrationMissing: see `load_calibration`.
     """
-    try:
-        return read_regular(path, MAX_BYTES)
-    except OSError as error:
-        found = (error.strerror or type(error).__name__).lower()
-        wanted = "the file that `drivegain fit` wrote"
-        raise CalibrationMissing(str(path), found=found, expected=wanted, remedy="check the name") from error
+    wanted = "the file that `drivegain fit` wrote"
+    return read_file(path, CalibrationMissing, expected=wanted, remedy="check the name")
 
 
 def decode_calibration(content: bytes, name: str) -> Calibration:

@@ -11,21 +11,22 @@ from __future__ import annotations
 
 import configparser
 import re
+from collections import Counter
 from dataclasses import dataclass, field
 
 from daq.errors import ControllerUnfit
-from daq.formats.scalar import CORRECT_KEY, ControllerDocument, IntegerStyle, KeyPath, Leaves, Scalar, unfit
+from daq.formats.scalar import CORRECT_KEY, DECIMAL, OCTAL, ControllerDocument, IntegerStyle, KeyPath, Leaves, Scalar
 
 _LINE = re.compile(r"([^\r\n]*)(?:\r\n|\r|\n|\Z)")
 _SECTION = re.compile(r"\s*\[([^\]]*)\]\s*")
 _ENTRY = re.compile(r"\s*([^=]*?)\s*=\s*(.*?)\s*")
 _KEY = re.compile(r"(?:0x)?([0-9a-f]{4})h?(?:(?:sub|:)(?:0x)?([0-9a-f]{1,2})h?)?", re.IGNORECASE)
 _TITLE = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]+))?")
-_DECIMAL = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 _CODE = re.compile(r"0|[1-9][0-9]{0,9}|0x[0-9a-f]{1,8}", re.IGNORECASE)
 """The number of a type: Python's int(…, 0) takes underscores, signs and 0b too."""
-_OCTAL = re.compile(r"[-+]?0[0-9]+")
-_VALUE, _TYPE, _OBJECT_TYPE = "parametervalue", "datatype", "objecttype"
+_VALUE = "parametervalue"
+_TYPE = "datatype"
+_OBJECT_TYPE = "objecttype"
 _VARIABLE = 7
 _BYTE_ORDER_MARK = "ï»¿"  #: That of UTF-8, each byte a character
 _INTEGERS = {
@@ -61,13 +62,13 @@ class DcfDocument(ControllerDocument):
     def readings(self) -> tuple[Leaves, Leaves]:
         """Read with our parser and with configparser."""
         leaves: dict[KeyPath, str] = {}
+        seen = Counter[KeyPath]()
         for section in _sections(self.text):
             for entry in section.entries:
-                path, again = (section.title, entry.name), 1
-                while path in leaves:
-                    again += 1
-                    path = (section.title, f"{entry.name} ({again})")
-                leaves[path] = entry.value
+                seen[section.title, entry.name] += 1
+                again = seen[section.title, entry.name]
+                name = entry.name if again == 1 else f"{entry.name} ({again})"
+                leaves[section.title, name] = entry.value
         return leaves, _parsed(self)
 
     def leaf(self, key: str) -> KeyPath:
@@ -77,8 +78,9 @@ class DcfDocument(ControllerDocument):
     def _section(self, sections: list[_Section], key: str) -> _Section:
         match = _KEY.fullmatch(key)
         if match is None:
-            raise unfit(self.name, key, "a key that names no object", f"{CORRECT_KEY}: 6076, 2003:01 or 2003sub1")
-        index, subindex = int(match[1], 16), int(match[2] or "0", 16)
+            raise self.unfit(key, "a key that names no object", f"{CORRECT_KEY}: 6076, 2003:01 or 2003sub1")
+        index = int(match[1], 16)
+        subindex = int(match[2] or "0", 16)
         found = [
             section
             for section in sections
@@ -87,56 +89,51 @@ class DcfDocument(ControllerDocument):
         ]
         if len(found) > 1:
             lines = " and ".join(str(section.line) for section in found)
-            raise unfit(self.name, key, f"it {len(found)} times, on lines {lines}", "remove all but one")
+            raise self.unfit(key, f"it {len(found)} times, on lines {lines}", "remove all but one")
         if not found:
             subs = [s.title for s in sections if s.title.startswith(f"{index:04x}")]
             has = f"it has {', '.join(subs[:12])}" if subs else "it does not have this index at all"
             titles = ([f"{index:04x}"] if subindex == 0 else []) + [f"{index:04x}sub{subindex:x}"]
-            raise unfit(self.name, key, f"no section [{'] or ['.join(titles)}] ({has})", CORRECT_KEY)
+            raise self.unfit(key, f"no section [{'] or ['.join(titles)}] ({has})", CORRECT_KEY)
         return found[0]
 
     def _locate(self, sections: list[_Section], key: str) -> Scalar:
         section = self._section(sections, key)
-        doubled = sorted({e.name for e in section.entries if [o.name for o in section.entries].count(e.name) > 1})
+        names = Counter(entry.name for entry in section.entries)
+        doubled = sorted(name for name, count in names.items() if count > 1)
         if doubled:
-            raise unfit(self.name, key, f"{', '.join(doubled)} twice in [{section.title}]", "remove one of them")
+            raise self.unfit(key, f"{', '.join(doubled)} twice in [{section.title}]", "remove one of them")
         entries = {entry.name: entry for entry in section.entries}
         if self._number(entries, key, _OBJECT_TYPE, _VARIABLE) != _VARIABLE:
-            raise unfit(self.name, key, f"[{section.title}], an array or record", "name one of its subindices")
+            raise self.unfit(key, f"[{section.title}], an array or record", "name one of its subindices")
         entry = entries.get(_VALUE)
         if entry is None:
-            raise unfit(
-                self.name,
+            raise self.unfit(
                 key,
                 f"[{section.title}] without ParameterValue",
                 "a data sheet (EDS) has none: give the device's DCF, or add the line with the value of now",
             )
         kind = self._number(entries, key, _TYPE, 0)
         where = f"line {entry.line}: {entry.value!r:.60}"
-        if kind in (*_REALS, *_INTEGERS) and _OCTAL.fullmatch(entry.value):
-            raise unfit(
-                self.name,
+        if kind in (*_REALS, *_INTEGERS) and OCTAL.fullmatch(entry.value):
+            raise self.unfit(
                 key,
                 f"{where}, octal by its leading zero",
                 "write the value that is meant without a zero before it",
                 "a plain decimal number, or an integer after 0x",
             )
         if kind in _REALS:
-            if not _DECIMAL.fullmatch(entry.value):
-                raise unfit(self.name, key, f"{where} in a real object", "write a plain decimal number")
-            return Scalar(key, float(entry.value), entry.value, entry.start, entry.end, entry.line)
+            if not DECIMAL.fullmatch(entry.value):
+                raise self.unfit(key, f"{where} in a real object", "write a plain decimal number")
+            return Scalar(key, float(entry.value), entry.value, entry.start, entry.line)
         if kind not in _INTEGERS:
-            raise unfit(
-                self.name, key, f"DataType {kind:#06x} in [{section.title}]", "name an integer or a real object"
-            )
+            raise self.unfit(key, f"DataType {kind:#06x} in [{section.title}]", "name an integer or a real object")
         style = self._style(entries, key, kind)
         try:
             value = style.read(entry.value)
         except ValueError as error:
-            raise unfit(
-                self.name, key, where, "write a plain integer, decimal or 0x", "an integer of its type"
-            ) from error
-        return Scalar(key, float(value), entry.value, entry.start, entry.end, entry.line, style)
+            raise self.unfit(key, where, "write a plain integer, decimal or 0x", "an integer of its type") from error
+        return Scalar(key, float(value), entry.value, entry.start, entry.line, style)
 
     def _style(self, entries: dict[str, _Entry], key: str, kind: int) -> IntegerStyle:
         """Return the integers of a type within the limits of the file."""
@@ -150,7 +147,7 @@ class DcfDocument(ControllerDocument):
                 bounds.append(given if entry is None or not entry.value else whole.read(entry.value))
             except ValueError as error:
                 found = f"line {entry.line if entry else 0}: {entry.value if entry else '':.60} as {name}"
-                raise unfit(self.name, key, found, "correct the limit", "an integer, or nothing") from error
+                raise self.unfit(key, found, "correct the limit", "an integer, or nothing") from error
         return IntegerStyle(bits, max(lowest, bounds[0]), min(highest, bounds[1]))
 
     def _number(self, entries: dict[str, _Entry], key: str, name: str, default: int) -> int:
@@ -159,7 +156,7 @@ class DcfDocument(ControllerDocument):
             return default
         if not _CODE.fullmatch(entry.value):
             expected = f"{name} in decimal digits without a leading zero, or in hexadecimal digits after 0x"
-            raise unfit(self.name, key, f"line {entry.line}: {entry.value!r:.60}", "correct it", expected)
+            raise self.unfit(key, f"line {entry.line}: {entry.value!r:.60}", "correct it", expected)
         return int(entry.value, 0)
 
 
@@ -170,7 +167,6 @@ class _Entry:
     name: str
     value: str
     start: int
-    end: int
     line: int
 
 
@@ -206,12 +202,13 @@ def _sections(text: str) -> list[_Section]:
         written = line[1].removeprefix(_BYTE_ORDER_MARK) if number == 1 else line[1]
         if written.lstrip().startswith(";"):
             continue
-        title, entry = _SECTION.fullmatch(written), _ENTRY.fullmatch(written)
+        title = _SECTION.fullmatch(written)
+        entry = _ENTRY.fullmatch(written)
         if title is not None:
             sections.append(_Section(title[1].strip().lower(), number))
         elif entry is not None and sections:
             start = line.end(1) - len(written) + entry.start(2)
-            sections[-1].entries.append(_Entry(entry[1].lower(), entry[2], start, start + len(entry[2]), number))
+            sections[-1].entries.append(_Entry(entry[1].lower(), entry[2], start, number))
     return sections
 
 

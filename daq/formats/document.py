@@ -21,15 +21,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from daq.config.controller import ControllerFormat
+from daq.config.yaml_file import MAX_BYTES, read_file
 from daq.errors import ControllerUnfit
-from daq.files import read_regular
 from daq.formats.dcf_document import dcf_document
 from daq.formats.json_document import json_document
 from daq.formats.scalar import ControllerDocument
 from daq.formats.xml_document import xml_document
 from daq.formats.yaml_document import yaml_document
-
-MAX_BYTES = 4 * 2**20  #: No controller's parameter file is larger; a file that is must be something else
 
 FORMATS: dict[ControllerFormat, tuple[Callable[[bytes, str], ControllerDocument], tuple[str, ...]]] = {
     ControllerFormat.YAML: (yaml_document, (".yaml", ".yml")),
@@ -65,12 +63,9 @@ def read_controller_file(path: Path) -> bytes:
     Raises:
         ControllerUnfit: there is none, it is no regular file, is too large, or cannot be read.
     """
-    try:
-        return read_regular(path, MAX_BYTES)
-    except OSError as error:
-        raise ControllerUnfit(
-            str(path),
-            found=(error.strerror or type(error).__name__).lower(),
-            expected=f"the controller's file, at most {MAX_BYTES >> 20} MiB",
-            remedy="correct `controller.file` of the cell configuration, or give --to FILE",
-        ) from error
+    return read_file(
+        path,
+        ControllerUnfit,
+        expected=f"the controller's file, at most {MAX_BYTES >> 20} MiB",
+        remedy="correct `controller.file` of the cell configuration, or give --to FILE",
+    )

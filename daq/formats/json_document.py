@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from daq.errors import ControllerUnfit
-from daq.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPath, Leaves, Scalar, unfit, utf8
+from daq.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPath, Leaves, Scalar, utf8
 
 MAX_DEPTH = 100
 _BYTE_ORDER_MARK = "\ufeff"
@@ -90,11 +90,11 @@ class JsonDocument(ControllerDocument):
         leaf = leaves.get(path)
         if leaf is not None and leaf.kind == "number":
             line = self.text.count("\n", 0, leaf.start) + 1
-            return Scalar(key, float(leaf.text), leaf.text, leaf.start, leaf.start + len(leaf.text), line)
+            return Scalar(key, float(leaf.text), leaf.text, leaf.start, line)
         if leaf is not None:
-            raise unfit(self.name, key, f"{leaf.text:.60}", "write a plain number, without quotes")
+            raise self.unfit(key, f"{leaf.text:.60}", "write a plain number, without quotes")
         if (*path, "{}") in leaves or (*path, "[]") in leaves:
-            raise unfit(self.name, key, "a list or mapping", "name the key of a number")
+            raise self.unfit(key, "a list or mapping", "name the key of a number")
         for length in range(len(path), 0, -1):
             parent = path[: length - 1]
             if (*parent, "{}") in leaves or (*parent, "[]") in leaves:
@@ -103,10 +103,10 @@ class JsonDocument(ControllerDocument):
                     other[length - 1] for other in leaves if len(other) >= length and other[: length - 1] == parent
                 }
                 has = ", ".join(sorted(inside - {"{}", "[]"})[:12]) or "nothing"
-                raise unfit(self.name, key, f"no key {path[length - 1]!r} in {place} (it has {has})", CORRECT_KEY)
+                raise self.unfit(key, f"no key {path[length - 1]!r} in {place} (it has {has})", CORRECT_KEY)
             if parent in leaves:
                 break
-        raise unfit(self.name, key, f"no key {path[-1]!r} in {'.'.join(path[:-1]) or 'the file'}", CORRECT_KEY)
+        raise self.unfit(key, f"no key {path[-1]!r} in {'.'.join(path[:-1]) or 'the file'}", CORRECT_KEY)
 
 
 @dataclass(frozen=True, slots=True)

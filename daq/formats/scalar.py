@@ -17,6 +17,8 @@ from daq.errors import ControllerUnfit
 
 _EXPONENT = re.compile(r"([eE])[-+]?([0-9]+)$")
 _INTEGER = re.compile(r"-?(?:0|[1-9][0-9]*)|0[xX][0-9a-fA-F]+")
+DECIMAL = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
+OCTAL = re.compile(r"[-+]?0[0-9]+")  #: To CiA 306 and YAML 1.1; a decimal number to YAML 1.2 and many a tool
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,10 +93,14 @@ class Scalar:
     value: float  #: the number
     text: str  #: the number as it is written
     start: int  #: its first character in the text, inside any quotes
-    end: int  #: the character behind its last one
     line: int  #: from 1
     #: Style of the integers that are allowed there; None where any decimal number is.
     integer: IntegerStyle | None = None
+
+    @property
+    def end(self) -> int:
+        """The character behind its last one."""
+        return self.start + len(self.text)
 
     def read(self, text: str) -> float:
         """Return the number that another text would mean in this place."""
@@ -177,6 +183,14 @@ class ControllerDocument(ABC):
             ControllerUnfit: a parser cannot read the text.
         """
 
+    def unfit(
+        self, key: str, found: str, remedy: str, expected: str = "one decimal number of its own"
+    ) -> ControllerUnfit:
+        """Make the error for a place that holds no number that can be changed on its own."""
+        return ControllerUnfit(
+            f"{self.name}: {key}", found=found, expected=expected, remedy=f"{remedy}; nothing was written"
+        )
+
     def leaf(self, key: str) -> KeyPath:
         """Return the path of a key's number among the leaves; here a dotted one (`drives.J1.gain`, `gains.0`)."""
         return tuple(key.split("."))
@@ -215,13 +229,12 @@ class ControllerDocument(ABC):
         # Comments, order and spacing are compared here alone.
         expected = _spliced(before.text, before.locate(tuple(spelling)), spelling)
         if self.text != expected:
-            same = next(
-                (i for i, (a, b) in enumerate(zip(self.text, expected, strict=False)) if a != b),
-                min(len(self.text), len(expected)),
-            )
+            same = 0
+            while self.text[same : same + 1] == expected[same : same + 1]:
+                same += 1
             raise ControllerUnfit(
                 self.name,
-                found=f"other characters on line {self.text.count(chr(10), 0, same) + 1} than planned",
+                found=f"other characters on line {expected.count(chr(10), 0, same) + 1} than planned",
                 expected="the new gains and nothing else changed",
                 remedy="nothing was written; take a new dry run",
             )
@@ -235,13 +248,6 @@ def _spliced(text: str, scalars: Sequence[Scalar], spelling: Mapping[str, str]) 
 
 
 CORRECT_KEY = "is this the controller's file? then correct `controller.gains` of the cell configuration"
-
-
-def unfit(
-    name: str, key: str, found: str, remedy: str, expected: str = "one decimal number of its own"
-) -> ControllerUnfit:
-    """Make the error for a place that holds no number that can be changed on its own."""
-    return ControllerUnfit(f"{name}: {key}", found=found, expected=expected, remedy=f"{remedy}; nothing was written")
 
 
 def utf8(content: bytes, name: str, kind: str) -> str:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from xml.parsers import expat
 
 from daq.errors import ControllerUnfit
-from daq.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPath, Leaves, Scalar, unfit
+from daq.formats.scalar import CORRECT_KEY, DECIMAL, ControllerDocument, KeyPath, Leaves, Scalar
 
 TEXT = "text()"
 
@@ -43,8 +43,10 @@ def parse(content: bytes, name: str) -> tuple[Element, str]:
     Raises:
         ControllerUnfit: it is no XML, or has a document type.
     """
-    around, encodings = Element("", {}, "", 0, 0), ["utf-8"]
-    opened, count = [around], itertools.count(1)
+    around = Element("", {}, "", 0, 0)
+    encodings = ["utf-8"]
+    opened = [around]
+    count = itertools.count(1)
     parser = expat.ParserCreate()
     parser.buffer_text = True
 
@@ -86,11 +88,10 @@ def parse(content: bytes, name: str) -> tuple[Element, str]:
 
 
 _SPACE = " \t\r\n"
-_NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 _NAME = r"[^\s/\[\]@='\"<>&]+"
 _CONDITION = rf"\[(?:@({_NAME})=(?:'([^']*)'|\"([^\"]*)\")|([1-9][0-9]*))\]"
 _STEP = re.compile(rf"({_NAME})((?:{_CONDITION})*)")
-_ATTRIBUTE = re.compile(r"\s+([^\s=/>]+)\s*=\s*(?:'([^']*)'|\"([^\"]*)\")")
+_ATTRIBUTE = re.compile(r"\s+([^\s=/>]+)\s*=\s*(['\"])(.*?)\2", re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,8 +140,7 @@ class XmlDocument(ControllerDocument):
         at = tag + 1 + len(element.name)
         attributes: dict[str, tuple[int, str]] = {}
         while (match := _ATTRIBUTE.match(self.text, at)) is not None:
-            group = 2 if match[2] is not None else 3
-            attributes[match[1]] = (match.start(group), match[group])
+            attributes[match[1]] = (match.start(3), match[3])
             at = match.end()
         if attribute is not None:
             start, written = attributes[attribute]
@@ -150,35 +150,36 @@ class XmlDocument(ControllerDocument):
             end = max(start, len(content[: element.end].decode(self.encoding)))
             written = self.text[start:end]
         number = written.strip(_SPACE)
-        if not _NUMBER.fullmatch(number):
-            raise unfit(
-                self.name,
+        if not DECIMAL.fullmatch(number):
+            raise self.unfit(
                 key,
                 f"line {element.line}: {written!r:.60}",
                 "write a plain decimal number there, without entities, CDATA, comments or other elements beside it",
             )
         start += written.index(number)
-        return Scalar(key, float(number), number, start, start + len(number), self.text.count("\n", 0, start) + 1)
+        return Scalar(key, float(number), number, start, self.text.count("\n", 0, start) + 1)
 
     def _find(self, around: Element, key: str) -> tuple[Element, str | None]:
         """Return the element that a path names, and its attribute where it names one."""
         steps, attribute = self._steps(key)
-        element, walked = around, ""
+        element = around
+        walked = ""
         for step in steps:
             found = [one for one in element.children if one.name == step.name and step.having <= one.attributes.items()]
             found = found if step.number is None else found[step.number - 1 : step.number]
             place = walked or "the file"
             if not found:
                 has = ", ".join(dict.fromkeys(one.name for one in element.children)) or "no elements"
-                raise unfit(self.name, key, f"no {step.written} in {place} (it has {has:.200})", CORRECT_KEY)
+                raise self.unfit(key, f"no {step.written} in {place} (it has {has:.200})", CORRECT_KEY)
             if len(found) > 1:
                 lines = ", ".join(str(one.line) for one in found[:12])
                 remedy = f"choose one by an attribute ({step.name}[@name='…']) or its number ({step.name}[1])"
-                raise unfit(self.name, key, f"{len(found)} of {step.written} in {place}, on lines {lines}", remedy)
-            element, walked = found[0], f"{walked}/{step.written}".lstrip("/")
+                raise self.unfit(key, f"{len(found)} of {step.written} in {place}, on lines {lines}", remedy)
+            element = found[0]
+            walked = f"{walked}/{step.written}".lstrip("/")
         if attribute is not None and attribute not in element.attributes:
             has = ", ".join(f"@{name}" for name in list(element.attributes)[:12]) or "none"
-            raise unfit(self.name, key, f"no attribute @{attribute} in {walked} (it has {has})", CORRECT_KEY)
+            raise self.unfit(key, f"no attribute @{attribute} in {walked} (it has {has})", CORRECT_KEY)
         return element, attribute
 
     def _steps(self, key: str) -> tuple[list[_Step], str | None]:
@@ -199,8 +200,7 @@ class XmlDocument(ControllerDocument):
             if last is not None:
                 return steps, last[1]
             at += 1
-        raise unfit(
-            self.name,
+        raise self.unfit(
             key,
             "a path that cannot be read" + (f" from {key[at:]!r} on" if at else ""),
             f"{CORRECT_KEY}: Robot/Axis[@name='J1']/Gain, or Robot/Axis[1]/@gain",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import re
 from collections import Counter
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,11 +15,9 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from daq.config.yaml_file import yaml_events
 from daq.errors import ControllerUnfit
-from daq.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPath, Leaves, Scalar, unfit, utf8
+from daq.formats.scalar import CORRECT_KEY, DECIMAL, OCTAL, ControllerDocument, KeyPath, Leaves, Scalar, utf8
 
 MAX_BYTES, MAX_VALUES, MAX_DEPTH = 2**19, 15_000, 100  #: Of a file: two parsers in Python read it before and after
-_NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
-_OCTAL = re.compile(r"[-+]?0[0-9]+")  #: To YAML 1.1; a decimal number to YAML 1.2
 _MERGE = "<<"
 _FLOAT = "tag:yaml.org,2002:float"
 
@@ -51,27 +48,25 @@ class YamlDocument(ControllerDocument):
             walked = (*walked, step)
             # A value that another place refers to by an alias cannot be changed without changing that place too.
             if references[id(node)] > 1:
-                raise unfit(
-                    self.name, key, f"{'.'.join(walked)} shared by an anchor (&) and its alias (*)", "write it out"
-                )
+                raise self.unfit(key, f"{'.'.join(walked)} shared by an anchor (&) and its alias (*)", "write it out")
         if not isinstance(node, ScalarNode):
-            raise unfit(self.name, key, "a list or mapping", "name the key of a number")
+            raise self.unfit(key, "a list or mapping", "name the key of a number")
         quote = node.style or ""
         end = node.end_mark.index - len(quote)
         start = end - len(node.value)
         # An anchor or a tag may precede the number; an escape within quotes makes its text another than its value.
         begins = start == node.start_mark.index or self.text[start - 1].isspace()
         opened = self.text[start - 1 : start] == quote if quote else begins
-        if not opened or self.text[start:end] != node.value or not _NUMBER.fullmatch(node.value):
-            raise unfit(self.name, key, f"{node.value!r:.60}", "write a plain decimal number")
-        if _OCTAL.fullmatch(node.value):
+        if not opened or self.text[start:end] != node.value or not DECIMAL.fullmatch(node.value):
+            raise self.unfit(key, f"{node.value!r:.60}", "write a plain decimal number")
+        if OCTAL.fullmatch(node.value):
             found = f"{node.value!r:.60}, which is octal to readers of YAML 1.1 and decimal to those of 1.2"
-            raise unfit(self.name, key, found, "write it without leading zeros")
+            raise self.unfit(key, found, "write it without leading zeros")
         # Anchor and tag precede the number. A new gain has a point, and is no integer even where this one is.
         tags = [part for part in self.text[node.start_mark.index : start].split() if part.startswith("!")]
         if tags and (tags[0] == "!" or node.tag != _FLOAT):
-            raise unfit(self.name, key, f"the tag {tags[0]:.60} before it", "remove the tag, or make it !!float")
-        return Scalar(key, float(node.value), node.value, start, end, node.start_mark.line + 1)
+            raise self.unfit(key, f"the tag {tags[0]:.60} before it", "remove the tag, or make it !!float")
+        return Scalar(key, float(node.value), node.value, start, node.start_mark.line + 1)
 
     def _child(self, node: Node, step: str, key: str, walked: KeyPath) -> Node:
         place = ".".join(walked) or "the file"
@@ -79,18 +74,16 @@ class YamlDocument(ControllerDocument):
             child: Node = node.value[int(step)]
             return child
         if not isinstance(node, MappingNode):
-            raise unfit(self.name, key, f"no key {step!r} in {place}", CORRECT_KEY)
+            raise self.unfit(key, f"no key {step!r} in {place}", CORRECT_KEY)
         found: list[Node] = [value for name, value in node.value if isinstance(name, ScalarNode) and name.value == step]
         if len(found) > 1:
-            raise unfit(self.name, key, f"{step!r} {len(found)} times in {place}", "remove all but one")
+            raise self.unfit(key, f"{step!r} {len(found)} times in {place}", "remove all but one")
         if not found:
             names = [str(name.value) for name, _ in node.value if isinstance(name, ScalarNode)]
             if _MERGE in names:
-                raise unfit(
-                    self.name, key, f"no {step!r} of its own in {place}, which merges (<<) another", "write it out"
-                )
+                raise self.unfit(key, f"no {step!r} of its own in {place}, which merges (<<) another", "write it out")
             has = ", ".join(names[:12]) or "nothing"
-            raise unfit(self.name, key, f"no key {step!r} in {place} (it has {has})", CORRECT_KEY)
+            raise self.unfit(key, f"no key {step!r} in {place} (it has {has})", CORRECT_KEY)
         return found[0]
 
 
@@ -137,7 +130,8 @@ def _composed(text: str, name: str, version: str) -> Any:
             root = yaml.compose(text, Loader=yaml.SafeLoader)
         found = "nothing in it"
     except (YAMLError, yaml.YAMLError, ValueError, RecursionError) as error:
-        root, found = None, " ".join(str(error).split())[:200]
+        root = None
+        found = " ".join(str(error).split())[:200]
     if root is None:
         raise ControllerUnfit(
             name,

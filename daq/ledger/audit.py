@@ -17,8 +17,8 @@ import os
 import stat
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import Enum
 from pathlib import Path
@@ -70,11 +70,6 @@ class AuditEntry:
     previous: str  #: `sha256` of the entry before, `FIRST` for the first
     sha256: str  #: of the canonical JSON of all of the above, hexadecimal
 
-    @property
-    def holds(self) -> bool:
-        """Whether the entry is what its digest was computed from."""
-        return self.sha256 == sha256(_canonical(_content(self)))
-
 
 def entry(
     number: int, at: str, who: str, action: AuditAction, subject: str, details: Mapping[str, object], previous: str
@@ -87,7 +82,16 @@ def entry(
     # As it will be read: with lists for tuples, so that what is returned is what is in the file.
     plain: dict[str, object] = json.loads(_canonical(dict(details)))
     unsigned = AuditEntry(number, at, who, action, subject, plain, previous, "")
-    return AuditEntry(number, at, who, action, subject, plain, previous, sha256(_canonical(_content(unsigned))))
+    return replace(unsigned, sha256=sha256(_canonical(_content(unsigned))))
+
+
+def entry_after(
+    before: AuditEntry | None, at: str, who: str, action: AuditAction, subject: str, details: Mapping[str, object]
+) -> AuditEntry:
+    """Make the entry that follows another one, or the first one; raises as `entry`."""
+    if before is None:
+        return entry(1, at, who, action, subject, details, FIRST)
+    return entry(before.number + 1, at, who, action, subject, details, before.sha256)
 
 
 def encode(one: AuditEntry) -> bytes:
@@ -101,13 +105,8 @@ _TYPES = {
 }
 
 
-def decode_entry(line: bytes) -> AuditEntry | None:
-    """Return the entry of a line, its digest unchecked; None for a line that `encode` could not write."""
-    return _decode(line)[0]
-
-
 def _decode(line: bytes) -> tuple[AuditEntry | None, bool]:
-    """Return the entry of a line, and whether its digest is that of its content."""
+    """Return the entry of a line, None for one that `encode` could not write, and whether its digest is right."""
     try:
         tree = json.loads(line)
         if not isinstance(tree, dict) or {name: type(value) for name, value in tree.items()} != _TYPES:
@@ -116,7 +115,7 @@ def _decode(line: bytes) -> tuple[AuditEntry | None, bool]:
         # Encoding again costs four times as much as reading: it is only done to tell what a changed line is.
         if found.sha256 == _digest_of_line(line):
             return found, True
-        return (found, found.holds) if encode(found) == line else (None, False)
+        return (found if encode(found) == line else None), False
     except (ValueError, TypeError, RecursionError):
         return None, False
 
@@ -135,12 +134,11 @@ def _is_fragment(line: bytes) -> bool:
     begun = line.rstrip(b"\0")
     if not begun.startswith(_BEGINNING) and not _BEGINNING.startswith(begun):
         return False
-    try:
-        json.loads(line)
-    except ValueError:
-        return True
-    except RecursionError:
-        return False
+    with contextlib.suppress(RecursionError):
+        try:
+            json.loads(line)
+        except ValueError:
+            return True
     return False
 
 
@@ -175,26 +173,21 @@ def append(
             raise _no_file(path, f"more than {MAX_BYTES} bytes")
         with os.fdopen(descriptor, "rb", closefd=False) as stream:
             content = stream.read()
-        new: list[AuditEntry] = []
-
-        def add(kind: AuditAction, says: Mapping[str, object]) -> None:
-            before = new[-1] if new else last
-            number, previous = (1, FIRST) if before is None else (before.number + 1, before.sha256)
-            new.append(entry(number, at.isoformat(), who, kind, subject, says, previous))
-
         last, unfinished = _end_of(content, path)
+        line = b"" if not content or content.endswith(b"\n") else b"\n"
         if unfinished:
-            add(AuditAction.TORN_LINE, _torn_details(unfinished))
-        add(action, details)
-        begin = b"" if not content or content.endswith(b"\n") else b"\n"
-        line = begin + b"".join(encode(one) + b"\n" for one in new)
+            torn = _torn_details(unfinished)
+            last = entry_after(last, at.isoformat(), who, AuditAction.TORN_LINE, subject, torn)
+            line += encode(last) + b"\n"
+        new = entry_after(last, at.isoformat(), who, action, subject, details)
+        line += encode(new) + b"\n"
         if os.write(descriptor, line) != len(line):
             raise OSError(28, "No space left on device", str(path))
         os.fsync(descriptor)
         if not content:
             fsync_folder(Path(os.path.realpath(path)).parent)
-        _note_head(path, content, new[-1].sha256)
-        return new[-1]
+        _note_head(path, content, new.sha256)
+        return new
 
 
 def noted_heads(path: Path) -> tuple[str, ...]:
@@ -222,20 +215,16 @@ def _note_head(path: Path, content: bytes, head: str) -> None:
     The note is behind the log after a kill, which is harmless: an older entry is in the chain, too.
     """
     missing = [one for one in noted_heads(path) if one.encode() not in content]
-    with contextlib.suppress(OSError):  # the entry is on the disk, and a note can be missing
-        _write_heads(path, (*missing, head))
-
-
-def _write_heads(path: Path, heads: Sequence[str]) -> None:
+    noted = "".join(f"{one}\n" for one in (*missing, head)).encode()
     flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-    descriptor = os.open(head_file(path), flags, 0o666)
-    try:
-        # In one piece and in place: there are never fewer lines than before, but where a missing entry came back.
-        content = "".join(f"{head}\n" for head in heads).encode()
-        os.pwrite(descriptor, content, 0)
-        os.ftruncate(descriptor, len(content))
-    finally:
-        os.close(descriptor)
+    with contextlib.suppress(OSError):  # the entry is on the disk, and a note can be missing
+        descriptor = os.open(head_file(path), flags, 0o666)
+        try:
+            # In one piece and in place: there are never fewer lines than before, but where a missing entry came back.
+            os.pwrite(descriptor, noted, 0)
+            os.ftruncate(descriptor, len(noted))
+        finally:
+            os.close(descriptor)
 
 
 def read(path: Path) -> tuple[AuditEntry, ...]:
@@ -244,7 +233,8 @@ def read(path: Path) -> tuple[AuditEntry, ...]:
     Raises:
         AuditUnusable: no regular file, or it cannot be read.
     """
-    return tuple(one for one in map(decode_entry, _lines_of(_content_of(path))) if one is not None)
+    decoded = [_decode(line) for line in _lines_of(_content_of(path))]
+    return tuple(one for one, _ in decoded if one is not None)
 
 
 def verify(path: Path, heads: Collection[str] = ()) -> AuditVerdict:
@@ -486,7 +476,9 @@ class _Chain:
         place = index + 1
         if not holds:
             self._add_flaw(place, Flaw.EDITED, f"the digest of entry {one.number} is not that of its content")
-            self.number, self.previous, self.place = self.number + 1, None, place
+            self.number += 1
+            self.previous = None
+            self.place = place
             return
         if one.number < self.number:
             twice = self.numbers[one.number] > 1
@@ -504,7 +496,9 @@ class _Chain:
         elif self.previous is not None and one.previous != self.previous:
             says = f"entry {one.number} follows another entry than the one before it, which was put in its place"
             self._add_flaw(self.place, Flaw.EDITED, says)
-        self.number, self.previous, self.place = one.number + 1, one.sha256, place
+        self.number = one.number + 1
+        self.previous = one.sha256
+        self.place = place
 
     def settle(self, follower: AuditEntry | None) -> None:
         """Judge lines that are no entries: left by a killed writer, or changed."""
@@ -519,7 +513,8 @@ class _Chain:
             for index in self.unfinished:
                 self._add_flaw(index + 1, Flaw.EDITED, "no entry as drivegain writes them")
             if fragments:
-                self.number, self.previous = self.number + len(fragments), None
+                self.number += len(fragments)
+                self.previous = None
         self.unfinished = []
 
     def _add_flaw(self, line: int, flaw: Flaw, says: str) -> None:
@@ -528,8 +523,7 @@ class _Chain:
 
 def open_writes(entries: Sequence[AuditEntry], digest_now: Callable[[str], str | None]) -> Iterator[OpenWrite]:
     """Find writes that were begun and never ended. Args as of `judge_chain`."""
-    # A forged chain can hold: a value that is no number names no entry.
-    ended = {begun for one in entries if one.action in _ENDS and isinstance(begun := one.details.get("begun"), int)}
+    ended = {begun_by(one) for one in entries if one.action in _ENDS}
     begins = [one for one in entries if one.action in _BEGUN]
     for place, one in enumerate(begins):
         if one.number in ended:
@@ -537,14 +531,33 @@ def open_writes(entries: Sequence[AuditEntry], digest_now: Callable[[str], str |
         # The next write read the file under its lock, before it changed anything: that is nearer than the file now.
         witness = next((later for later in begins[place + 1 :] if later.subject == one.subject), None)
         found = digest_now(one.subject) if witness is None else _digest_before(witness)
-        before, after = _digest_before(one), one.details.get("sha256_after")
+        before = _digest_before(one)
+        after = one.details.get("sha256_after")
         if found is None or before is None or not isinstance(after, str):
             yield OpenWrite(one, Content.UNKNOWN)
         else:
             yield OpenWrite(one, {before: Content.BEFORE, after: Content.AFTER}.get(found, Content.OTHER))
 
 
+def begun_by(entry: AuditEntry) -> int:
+    """Return the number of the entry that began the write, 0 where there is none."""
+    found = entry.details.get("begun")
+    return found if isinstance(found, int) else 0
+
+
+def made_writes(opened: Iterable[OpenWrite]) -> list[OpenWrite]:
+    """Return the writes without an end whose content was found afterwards."""
+    return [one for one in opened if one.content is Content.AFTER]
+
+
+def witnessed_writes(entries: Sequence[AuditEntry]) -> list[OpenWrite]:
+    """Return the writes without an end of which a later entry shows that they were made."""
+    return made_writes(open_writes(entries, lambda _: None))
+
+
 def _digest_before(begun: AuditEntry) -> str | None:
     """Return the digest of the file when the write began, `GONE` without a file, None for an entry without one."""
     recorded = begun.details.get("sha256_before", 0)
-    return GONE if recorded is None else recorded if isinstance(recorded, str) else None
+    if recorded is None:
+        return GONE
+    return recorded if isinstance(recorded, str) else None

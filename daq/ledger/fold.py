@@ -2,17 +2,184 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from enum import Enum
 from typing import Any
 
 from daq.config.cell import Cell
 from daq.documents.calibration_file import decode_calibration
 from daq.errors import DaqError
-from daq.ledger.audit import AuditAction, AuditEntry, Content, OpenWrite, open_writes
-from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, drives_of, entry_of, figures_of, utc
+from daq.ledger.audit import AuditAction, AuditEntry, OpenWrite, begun_by, made_writes, witnessed_writes
+from ident.calibration import Calibration, Gain, Source
+
+
+class WriteAction(Enum):
+    """Kinds of writes to a controller."""
+
+    APPLIED = "applied"
+    ROLLED_BACK = "rolled back"
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """A write to a controller."""
+
+    #: Of the calibration whose gains the controller had afterwards; None for a rollback to gains of no calibration.
+    digest: str | None
+    action: WriteAction  #: its kind
+    at: datetime  #: when, UTC
+    who: str  #: the person or the job
+    target: str  #: the controller's file, or the drives
+    audit: str | None = None  #: SHA-256 of its entry in the audit log, None where none was given
+    sha256_after: str | None = None  #: of the target's content afterwards, None where none was given
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One calibration."""
+
+    digest: str  #: SHA-256 of its file
+    created: datetime  #: when it was fitted, UTC; when it was entered where its own time cannot be read
+    recorded: datetime  #: when the newest log of its fit was recorded, UTC; as `created` where no log has a time
+    logs: str  #: digest of the logs of its fit, as a set; calibrations with the same one rest on the same recordings
+    entered: datetime  #: when it was entered, UTC
+    cell: str  #: name of the cell
+    configuration_sha256: str  #: of the cell configuration that its logs carry
+    method: str  #: of the fit
+    software: str  #: that made it
+    error_percent: float  #: relative error of the fit [%]
+    holdout_percent: float | None  #: relative error on held-out data [%], None without any
+    rows: int  #: of the observation
+    gains: tuple[Gain, ...]  #: one an axis, in the order of the axes
+    events: tuple[Event, ...]  #: writes after which a controller had its gains, oldest first
+
+    def gain_of(self, axis: str) -> Gain | None:
+        """Return the gain of an axis, None for an axis that it does not have."""
+        return next((gain for gain in self.gains if gain.axis == axis), None)
+
+    @property
+    def applied(self) -> bool:
+        """Whether a controller ever had its gains."""
+        return bool(self.events)
+
+
+@dataclass(frozen=True, slots=True)
+class Acknowledgement:
+    """A change that a person has explained; a new baseline begins."""
+
+    axis: str  #: whose gain changed
+    since: datetime  #: calibrations from this time on make the new baseline, UTC
+    at: datetime  #: when it was acknowledged, UTC
+    who: str  #: the person
+    why: str  #: what had happened
+    audit: str  #: SHA-256 of its entry in the audit log
+
+
+def drives_of(cell: str) -> str:
+    """Return the name of a cell's drives in audit and history."""
+    return f"drives of cell {cell}"
+
+
+def recorded_at(calibration: Calibration, otherwise: datetime) -> datetime:
+    """Return when the newest log of a fit was recorded, UTC; `otherwise` where no log has a time."""
+    times_s = [one.recording.recorded_s for one in _fitted(calibration) if one.recording is not None]
+    try:
+        return datetime.fromtimestamp(max(seconds for seconds in times_s if seconds is not None), UTC)
+    except (ValueError, OverflowError, OSError):
+        return otherwise.astimezone(UTC)
+
+
+def logs_of(calibration: Calibration, digest: str) -> str:
+    """Return the digest of the set of logs of a fit; that of the calibration itself without logs."""
+    logs = sorted({one.sha256 for one in _fitted(calibration)})
+    return hashlib.sha256("\n".join(logs).encode()).hexdigest() if logs else digest
+
+
+def _fitted(calibration: Calibration) -> list[Source]:
+    return [one for one in calibration.sources if one.role == "fit"]
+
+
+def utc(text: str, otherwise: datetime) -> datetime:
+    """Parse an ISO 8601 time as UTC, one without a zone as UTC; `otherwise` where the text is no time."""
+    try:
+        read = datetime.fromisoformat(text)
+        return (read.replace(tzinfo=UTC) if read.tzinfo is None else read).astimezone(UTC)
+    except (ValueError, OverflowError):
+        return otherwise.astimezone(UTC)
+
+
+def iso(at: datetime) -> str:
+    """Format a time: UTC, of one length, so that times sort as text.
+
+    Raises:
+        ValueError: a time without its zone.
+    """
+    if at.tzinfo is None:
+        raise ValueError(f"expected a time with its zone, found {at}")
+    return at.astimezone(UTC).isoformat(timespec="microseconds")
+
+
+def zoned(text: str) -> datetime:
+    """Parse a time with its zone.
+
+    Raises:
+        ValueError: no time, or without a zone.
+    """
+    found = datetime.fromisoformat(text)
+    if found.tzinfo is None:
+        raise ValueError(f"{text!r} is a time without its zone")
+    return found
+
+
+def figures_of(calibration: Calibration, digest: str, entered: datetime) -> dict[str, object]:
+    """Return what a history shows of a calibration, as plain JSON: parsing its document takes a hundred times as long.
+
+    Args:
+        calibration: of the document.
+        digest: SHA-256 of its file.
+        entered: when it was entered.
+    """
+    created = utc(calibration.created, entered)
+    holdout = calibration.holdout_error_percent
+    return {
+        "created": iso(created),
+        "recorded": iso(recorded_at(calibration, created)),
+        "logs": logs_of(calibration, digest),
+        "configuration_sha256": calibration.configuration_sha256,
+        "method": calibration.method,
+        "software": calibration.software,
+        "error_percent": calibration.relative_error_percent.total,
+        "holdout_percent": None if holdout is None else holdout.total,
+        "rows": calibration.rows,
+        "gains": [asdict(gain) for gain in calibration.gains],
+    }
+
+
+def entry_of(digest: str, cell: str, entered: datetime, figures: Mapping[str, Any], events: Sequence[Event]) -> Entry:
+    """Return a calibration by its `figures_of`; `events` are the writes of its gains, oldest first.
+
+    Raises:
+        KeyError, TypeError, ValueError: the figures are others than those of `figures_of`.
+    """
+    others = dict(figures)
+    gains = tuple(Gain(**gain) for gain in others.pop("gains"))
+    created = zoned(others.pop("created"))
+    recorded = zoned(others.pop("recorded"))
+    return Entry(
+        digest=digest,
+        cell=cell,
+        entered=entered,
+        created=created,
+        recorded=recorded,
+        gains=gains,
+        events=tuple(events),
+        **others,
+    )
+
 
 _ENDS = {AuditAction.APPLIED: WriteAction.APPLIED, AuditAction.ROLLED_BACK: WriteAction.ROLLED_BACK}
 _BEGINS = {AuditAction.APPLY_BEGUN: WriteAction.APPLIED, AuditAction.ROLLBACK_BEGUN: WriteAction.ROLLED_BACK}
@@ -82,8 +249,7 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
     A write without an end counts where a later entry shows that it was made: the next write found its content, or a
     process did (`write found`). What the controller's file is by now is not asked: a history does not change by itself.
     """
-    witnessed = [one for one in open_writes(entries, lambda _: None) if one.content is Content.AFTER]
-    events = _events(writes_to(cell, entries, witnessed, everywhere=True))
+    events = _events(writes_to(cell, entries, witnessed_writes(entries), everywhere=True))
     by_digest: dict[str | None, list[Event]] = {}
     for event in events:
         by_digest.setdefault(event.digest, []).append(event)
@@ -91,7 +257,7 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
     unreadable: list[str] = []
     for one in entered_calibrations(entries, cell.name):
         try:
-            figures = one.figures or _figures_of_document(one)
+            figures = one.figures or figures_of_document(one)
             found.append(entry_of(one.digest, cell.name, one.entered, figures, by_digest.get(one.digest, ())))
         except DaqError as error:
             unreadable.append(f"{_named(one)}: its document is {error.found}, expected {error.expected}")
@@ -102,13 +268,17 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
     return History(
         entries=tuple(sorted(comparable, key=lambda one: (one.created, one.entered, one.digest))),
         events=tuple(events),
-        acknowledgements=tuple(_acknowledgements(entries, cell.name)),
+        acknowledgements=tuple(acknowledgements_of(entries, cell.name)),
         unreadable=tuple(unreadable),
     )
 
 
-def _figures_of_document(one: EnteredCalibration) -> dict[str, object]:
-    """Return the figures of a calibration that an earlier version entered; parsing its document takes 7 ms."""
+def figures_of_document(one: EnteredCalibration) -> dict[str, object]:
+    """Return the figures of a calibration that an earlier version entered; parsing its document takes 7 ms.
+
+    Raises:
+        DaqError: the document cannot be read.
+    """
     calibration = decode_calibration((one.document or "").encode(), f"entry {one.number}")
     return figures_of(calibration, one.digest, one.entered)
 
@@ -147,13 +317,8 @@ def entered_calibrations(entries: Iterable[AuditEntry], cell: str) -> list[Enter
             continue
         first = found.setdefault(one.digest, one)
         # A later entry gives the figures of one that an earlier version has entered.
-        found[one.digest] = EnteredCalibration(
-            number=first.number,
-            digest=first.digest,
-            entered=first.entered,
-            document=first.document or one.document,
-            figures=first.figures or one.figures,
-        )
+        document = first.document or one.document
+        found[one.digest] = replace(first, document=document, figures=first.figures or one.figures)
     return list(found.values())
 
 
@@ -170,14 +335,15 @@ def _entered_calibration(entry: AuditEntry, cell: str) -> EnteredCalibration | N
     return EnteredCalibration(entry.number, digest, entered, document, known)
 
 
-def _acknowledgements(entries: Iterable[AuditEntry], cell: str) -> Iterator[Acknowledgement]:
+def acknowledgements_of(entries: Iterable[AuditEntry], cell: str) -> Iterator[Acknowledgement]:
+    """Yield the changes that were explained in a cell, oldest first."""
     for entry in entries:
-        found = acknowledgement_of(entry)
+        found = _acknowledgement_of(entry)
         if found is not None and text_field(entry, "cell") == cell:
             yield found
 
 
-def acknowledgement_of(entry: AuditEntry) -> Acknowledgement | None:
+def _acknowledgement_of(entry: AuditEntry) -> Acknowledgement | None:
     """Return the acknowledgement of an entry, None where it lacks a part or would silence an axis beforehand."""
     axis = text_field(entry, "axis")
     why = text_field(entry, "why")
@@ -265,7 +431,7 @@ def _place(found: Sequence[AuditedWrite], one: AuditEntry) -> int:
 
 
 def unknown_writes(
-    cell: Cell, entries: Sequence[AuditEntry], opened: Iterable[OpenWrite], calibrations: Collection[str]
+    cell: Cell, entries: Sequence[AuditEntry], opened: Sequence[OpenWrite], calibrations: Collection[str]
 ) -> tuple[AuditedWrite, ...]:
     """Return the writes to this cell's controller that its history lacks.
 
@@ -279,15 +445,20 @@ def unknown_writes(
         writes whose content the controller has now, though no later entry shows it; writes of calibrations that were
         never entered.
     """
-    witnessed = {one.begun.number for one in open_writes(entries, lambda _: None) if one.content is Content.AFTER}
-    made = [one for one in opened if one.content is Content.AFTER]
-    shown = {one.begun.number for one in made} - witnessed
+    shown = shown_writes(cell, entries, opened)
     return tuple(
         write
-        for write in writes_to(cell, entries, made)
-        if write.ended.number in shown
-        or (write.action is WriteAction.APPLIED and write.calibration not in calibrations)
+        for write in writes_to(cell, entries, made_writes(opened))
+        if write in shown or (write.action is WriteAction.APPLIED and write.calibration not in calibrations)
     )
+
+
+def shown_writes(cell: Cell, entries: Sequence[AuditEntry], opened: Sequence[OpenWrite]) -> list[AuditedWrite]:
+    """Return the writes without an end that only the content of their target shows, not a later entry."""
+    witnessed = {one.begun.number for one in witnessed_writes(entries)}
+    made = made_writes(opened)
+    shown = {one.begun.number for one in made} - witnessed
+    return [one for one in writes_to(cell, entries, made, everywhere=True) if one.ended.number in shown]
 
 
 def at_of(entry: AuditEntry) -> datetime | None:
@@ -300,12 +471,6 @@ def text_field(entry: AuditEntry, key: str) -> str | None:
     """Return a text of an entry's details, None where there is none."""
     found = entry.details.get(key)
     return found if isinstance(found, str) else None
-
-
-def begun_by(entry: AuditEntry) -> int:
-    """Return the number of the entry that began the write, 0 where there is none."""
-    found = entry.details.get("begun")
-    return found if isinstance(found, int) else 0
 
 
 def calibration_field(begun: AuditEntry, key: str) -> str | None:

@@ -18,29 +18,27 @@ from daq.documents.calibration_file import encode_calibration
 from daq.errors import DataError, HistoryInaccessible, HistoryUnreadable, OutputFailed, evidence, writing
 from daq.files import fsync_folder
 from daq.ledger.audit import (
-    FIRST,
     AuditAction,
     AuditEntry,
     AuditVerdict,
-    Content,
     Flaw,
-    OpenWrite,
     append,
-    entry,
+    entry_after,
     head_file,
     noted_heads,
-    open_writes,
     verify,
 )
-from daq.ledger.entry import Entry, figures_of, iso
 from daq.ledger.fold import (
     AuditedWrite,
+    Entry,
     History,
     at_of,
     entered_calibrations,
+    figures_of,
     fold,
+    iso,
+    shown_writes,
     unknown_writes,
-    writes_to,
 )
 from daq.ledger.migration import (
     EMPTY,
@@ -50,7 +48,6 @@ from daq.ledger.migration import (
     history_subject,
     read_stored,
     set_aside,
-    stored_contradictions,
 )
 from ident.calibration import Calibration
 
@@ -134,13 +131,12 @@ def read_history(ledger: Ledger) -> History:
 
     Raises:
         AuditUnusable: the audit log is no regular file, or it cannot be read.
-        HistoryUnreadable: there is a history of an earlier version that cannot be read, or contradicts the audit log.
+        HistoryUnreadable: there is a history of an earlier version that cannot be read.
     """
     stored = _read_stored(ledger)
     verdict = verify(ledger.audit, stored.noted.union(noted_heads(ledger.audit)))
-    flaws = _flaws(ledger, stored, verdict.intact)
-    if flaws:
-        raise stored_error(ledger, flaws)
+    if stored.flaws:
+        raise stored_error(ledger, stored.flaws)
     history = fold(_with_stored(verdict.intact, stored, ledger.cell), ledger.cell)
     return replace(history, may_lack=not verdict.holds)
 
@@ -167,10 +163,9 @@ def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
     stored = _read_stored(ledger)
     noted = noted_heads(ledger.audit)
     verdict = verify(ledger.audit, stored.noted.union(heads, noted))
-    broken = _flaws(ledger, stored, verdict.intact)
-    entries = _with_stored(verdict.intact, EMPTY if broken else stored, ledger.cell)
+    entries = _with_stored(verdict.intact, EMPTY if stored.flaws else stored, ledger.cell)
     history = fold(entries, ledger.cell)
-    broken += history.unreadable
+    broken = stored.flaws + history.unreadable
     if not verdict.holds:  # its entries do not prove that anything is missing
         return Verification(ledger.audit, verdict, replace(history, may_lack=True), broken)
     known = {one.digest for one in history.entries}
@@ -276,12 +271,12 @@ def migrate(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) -> 
         ledger: of the cell.
         who: the person or the job.
         at: time, with zone.
-        forced: also rename a file that is broken or contradicts the audit log, from which nothing is taken over; and
+        forced: also rename a file that is broken, from which nothing is taken over; and
             add figures where there is no such file.
 
     Raises:
         HistoryInaccessible: the file is locked, or its rights do not let it be read; nothing was changed.
-        HistoryUnreadable: the file is broken or contradicts the audit log, without `forced`; nothing was changed.
+        HistoryUnreadable: the file is broken, without `forced`; nothing was changed.
         DataError: the audit log is not what was written; nothing was changed.
         AuditUnusable, OutputFailed: a file cannot be written; the next call goes on.
     """
@@ -305,7 +300,7 @@ def _take_over(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) 
     verdict = verify(ledger.audit, stored.noted.union(noted_heads(ledger.audit)))
     if not verdict.holds:
         raise audit_error(ledger.audit, verdict)
-    flaws += _flaws(ledger, stored, verdict.entries)
+    flaws += stored.flaws
     if flaws and not forced:
         raise stored_error(ledger, flaws)
     drafts = drafts_of(EMPTY if flaws else stored, verdict.entries, ledger.cell.name, who, at)
@@ -361,13 +356,13 @@ def audit_error(audit: Path, verdict: AuditVerdict) -> DataError:
 
 
 def stored_error(ledger: Ledger, flaws: Collection[str]) -> HistoryUnreadable:
-    """Return the error for a history of an earlier version that is broken, or contradicts the audit log."""
+    """Return the error for a history of an earlier version that is broken."""
     listed = list(flaws)
     more = len(listed) - _SHOWN
     return HistoryUnreadable(
         str(ledger.stored),
         found="; ".join(listed[:_SHOWN]) + (f"; and {more} more" if more > 0 else ""),
-        expected="a sound SQLite file with what the audit log says",
+        expected="a sound SQLite file whose calibrations can be read",
         remedy="ask who can write to it, and restore the last good one from a backup, or go on without it: "
         "`drivegain history CELL --migrate` keeps it under another name, and takes nothing over from it",
     )
@@ -379,19 +374,14 @@ def _read_stored(ledger: Ledger) -> StoredHistory:
     return read_stored(ledger.stored)
 
 
-def _flaws(ledger: Ledger, stored: StoredHistory, entries: Sequence[AuditEntry]) -> tuple[str, ...]:
-    return (*stored.flaws, *stored_contradictions(stored, entries, ledger.cell.name))
-
-
 def _with_stored(entries: Sequence[AuditEntry], stored: StoredHistory, cell: Cell) -> tuple[AuditEntry, ...]:
     """Return the entries as they will be once a history of an earlier version is migrated."""
     chain = list(entries)
     never = datetime.min.replace(tzinfo=UTC)  # these entries are only folded
     for draft in drafts_of(stored, entries, cell.name, "", never):
-        number = chain[-1].number + 1 if chain else 1
-        previous = chain[-1].sha256 if chain else FIRST
+        last = chain[-1] if chain else None
         at = draft.at.isoformat()
-        chain.append(entry(number, at, draft.who, draft.action, draft.subject, draft.details, previous))
+        chain.append(entry_after(last, at, draft.who, draft.action, draft.subject, draft.details))
     return tuple(chain)
 
 
@@ -410,13 +400,10 @@ def _end_found_writes(ledger: Ledger) -> None:
     verdict = verify(ledger.audit)
     if not verdict.holds:
         return
-    witnessed = {one.begun.number for one in open_writes(verdict.entries, lambda _: None) if _is_made(one)}
-    made = [one for one in verdict.open_writes if _is_made(one)]
-    found = {one.begun.number for one in made} - witnessed
-    for write in writes_to(ledger.cell, verdict.entries, made, everywhere=True):
+    for write in shown_writes(ledger.cell, verdict.entries, verdict.open_writes):
         begun = write.ended
         at = at_of(begun)
-        if begun.number not in found or at is None:
+        if at is None:
             continue
         details = {
             "action": write.action.value,
@@ -427,16 +414,12 @@ def _end_found_writes(ledger: Ledger) -> None:
         _append(ledger, EntryDraft(AuditAction.WRITE_FOUND, at, begun.who, begun.subject, details))
 
 
-def _is_made(one: OpenWrite) -> bool:
-    return one.content is Content.AFTER
-
-
 def _check_like(ledger: Ledger, calibration: Calibration, entries: Collection[Entry]) -> None:
     """Refuse a calibration that cannot be compared with those of the history."""
-    found: str
-    expected: str
     units = {gain.axis: gain.unit for gain in calibration.gains}
-    known = {gain.axis: gain.unit for one in entries for gain in one.gains}
+    known: dict[str, str] = {}
+    for one in entries:
+        known |= {gain.axis: gain.unit for gain in one.gains}
     other = [axis for axis in units if axis in known and units[axis] != known[axis]]
     if calibration.cell != ledger.cell.name:
         found = f"a calibration of cell {calibration.cell!r}"

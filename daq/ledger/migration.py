@@ -1,7 +1,7 @@
 """The SQLite file in which earlier versions kept the history: what only it has goes into the audit log, once.
 
-Those versions wrote each calibration and each write to a controller twice. Where the two differ, the audit log is
-right, and nothing is taken over from the file (docs/decisions/0036).
+Those versions wrote each calibration and each write to a controller twice. What the audit log has is right, whatever
+the file says of it; from a file that is broken nothing is taken over (docs/decisions/0036).
 """
 
 from __future__ import annotations
@@ -11,24 +11,24 @@ import os
 import re
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from urllib.parse import quote
 
-from daq.documents.calibration_file import decode_calibration
 from daq.errors import DaqError, HistoryInaccessible, HistoryUnreadable
 from daq.ledger.audit import AuditAction, AuditEntry
-from daq.ledger.entry import Acknowledgement, Event, WriteAction, figures_of, iso, zoned
 from daq.ledger.fold import (
-    AuditedWrite,
-    acknowledgement_of,
-    at_of,
-    begun_by,
-    calibration_field,
+    Acknowledgement,
+    EnteredCalibration,
+    Event,
+    WriteAction,
+    acknowledgements_of,
     entered_calibrations,
+    figures_of_document,
     is_end,
-    text_field,
+    iso,
+    zoned,
 )
 
 BUSY_S = 5.0  #: How long to wait for another process' transaction
@@ -37,19 +37,10 @@ VERSION = 1  #: Of its tables; there was no other
 
 
 @dataclass(frozen=True, slots=True)
-class StoredCalibration:
-    """A calibration as the file has it."""
-
-    digest: str  #: SHA-256 of its file
-    entered: datetime  #: when it was entered, UTC
-    document: str  #: the whole calibration
-
-
-@dataclass(frozen=True, slots=True)
 class StoredHistory:
     """Content of the file."""
 
-    calibrations: tuple[StoredCalibration, ...]  #: oldest first
+    calibrations: tuple[EnteredCalibration, ...]  #: oldest first; of no entry (0), and without figures
     events: tuple[Event, ...]  #: writes to controllers, oldest first
     acknowledgements: tuple[Acknowledgement, ...]  #: oldest first
     flaws: tuple[str, ...]  #: what is broken in it, as sentences
@@ -96,12 +87,7 @@ def read_stored(path: Path) -> StoredHistory:
         damaged = [str(row[0]) for row in connection.execute("PRAGMA integrity_check") if row[0] != "ok"]
         if damaged:  # rows of a broken file prove nothing
             return StoredHistory((), (), (), tuple(damaged))
-        return StoredHistory(
-            calibrations=tuple(_calibrations(connection)),
-            events=tuple(_events(connection)),
-            acknowledgements=tuple(_acknowledgements(connection)),
-            flaws=(*_gaps(connection, "event"), *_gaps(connection, "acknowledgement")),
-        )
+        return _content(connection)
 
 
 @contextlib.contextmanager
@@ -138,21 +124,20 @@ def _unreadable(path: Path, found: str) -> HistoryUnreadable:
     )
 
 
-def _calibrations(connection: sqlite3.Connection) -> Iterator[StoredCalibration]:
-    for row in connection.execute("SELECT digest, entered, document FROM calibration ORDER BY created, digest"):
-        yield StoredCalibration(str(row[0]), zoned(row[1]), str(row[2]))
-
-
-def _events(connection: sqlite3.Connection) -> Iterator[Event]:
+def _content(connection: sqlite3.Connection) -> StoredHistory:
+    """Read all rows; raises ValueError for one that drivegain did not write."""
+    rows = connection.execute("SELECT digest, entered, document FROM calibration ORDER BY created, digest")
+    calibrations = [EnteredCalibration(0, str(row[0]), zoned(row[1]), str(row[2]), None) for row in rows]
+    events = []
     query = "SELECT digest, deed, at, who, target, audit, sha256_after FROM event ORDER BY number"
     for digest, deed, at, who, target, audit, after in connection.execute(query):
-        yield Event(digest, WriteAction(deed), zoned(at), _raw(who), _raw(target), audit, after)
-
-
-def _acknowledgements(connection: sqlite3.Connection) -> Iterator[Acknowledgement]:
+        events.append(Event(digest, WriteAction(deed), zoned(at), _raw(who), _raw(target), audit, after))
+    acknowledgements = []
     query = "SELECT axis, since, at, who, why, audit FROM acknowledgement ORDER BY number"
     for axis, since, at, who, why, audit in connection.execute(query):
-        yield Acknowledgement(axis, zoned(since), zoned(at), _raw(who), _raw(why), audit)
+        acknowledgements.append(Acknowledgement(axis, zoned(since), zoned(at), _raw(who), _raw(why), audit))
+    flaws = tuple(_unreadable_documents(calibrations))
+    return StoredHistory(tuple(calibrations), tuple(events), tuple(acknowledgements), flaws)
 
 
 def _raw(text: str) -> str:
@@ -160,88 +145,12 @@ def _raw(text: str) -> str:
     return re.sub(r"\\u(d[89a-f][0-9a-f]{2})", lambda found: chr(int(found[1], 16)), text)
 
 
-def _gaps(connection: sqlite3.Connection, table: str) -> Iterator[str]:
-    """Report missing rows of a table: their numbers go from 1 to the last that SQLite gave, without gaps."""
-    there = {int(row[0]) for row in connection.execute(f"SELECT number FROM {table}")}
-    given = connection.execute("SELECT seq FROM sqlite_sequence WHERE name = ?", (table,)).fetchone()
-    last = max([*there, 0 if given is None else int(given[0])], default=0)
-    if len(there) != last:
-        yield f"{table}: found {len(there)} rows, expected all from 1 to {last}"
-
-
-def stored_contradictions(stored: StoredHistory, entries: Sequence[AuditEntry], cell: str) -> Iterator[str]:
-    """Report what the file says otherwise than the audit log, as sentences."""
-    by_digest = {one.sha256: one for one in entries}
-    begun = {one.number: one for one in entries}
-    for number, event in enumerate(stored.events, start=1):
-        entry = by_digest.get(event.audit or "")
-        if entry is not None:
-            yield from _event_flaws(f"event {number}", event, entry, begun.get(begun_by(entry)))
-    for noted in stored.acknowledgements:
-        if noted.since > noted.at:  # until then it would silence the axis
-            yield f"acknowledgement of {noted.axis} at {iso(noted.at)}: found a baseline since {iso(noted.since)}"
-        entry = by_digest.get(noted.audit)
-        if entry is not None:
-            yield from _acknowledgement_flaws(noted, entry)
-    entered = {one.digest: one for one in entered_calibrations(entries, cell)}
-    for calibration in stored.calibrations:
-        yield from _document_flaws(calibration)
-        known = entered.get(calibration.digest)
-        if known is None or known.document is None:
-            continue
-        name = f"calibration {calibration.digest[:12]}…"
-        said = f"as entry {known.number} of the audit says"
-        if calibration.document != known.document:
-            yield f"document of {name}: found another one, expected it {said}"
-        yield from _differences(name, {"entered": calibration.entered}, {"entered": known.entered}, said)
-
-
-def _event_flaws(name: str, event: Event, entry: AuditEntry, begun: AuditEntry | None) -> Iterator[str]:
-    first = begun if begun is not None else entry
-    expected: dict[str, object] = {"target": entry.subject}
-    if is_end(entry):
-        # One that names the begin was entered later: its writer was killed, and another process may have done it.
-        expected |= {"who": entry.who, "at": at_of(entry), "action": AuditedWrite(first, entry).action}
-    after = text_field(first, "sha256_after")
-    if after is not None:
-        expected["sha256_after"] = after
-    digest = calibration_field(first, "sha256")
-    if digest is not None and entry.action is not AuditAction.ROLLED_BACK:
-        expected["digest"] = digest
-    yield from _differences(name, asdict(event), expected, _as_said_by(entry))
-
-
-def _acknowledgement_flaws(noted: Acknowledgement, entry: AuditEntry) -> Iterator[str]:
-    name = f"acknowledgement of {noted.axis} at {iso(noted.at)}"
-    expected = acknowledgement_of(entry)
-    if expected is None:
-        yield f"{name}: found entry {entry.number} of the audit, {entry.action.value}, expected an acknowledgement"
-    else:
-        yield from _differences(name, asdict(noted), asdict(expected), _as_said_by(entry))
-
-
-def _document_flaws(calibration: StoredCalibration) -> Iterator[str]:
-    name = f"calibration {calibration.digest[:12]}…"
-    try:
-        decode_calibration(calibration.document.encode(), f"document of {name}")
-    except DaqError as error:
-        yield f"{name}: its document is {error.found}, expected {error.expected}"
-
-
-def _as_said_by(entry: AuditEntry) -> str:
-    return f"as entry {entry.number} of the audit, which it names"
-
-
-def _differences(name: str, found: Mapping[str, object], expected: Mapping[str, object], source: str) -> Iterator[str]:
-    for key, wanted in expected.items():
-        if found[key] != wanted:
-            yield f"{name}: found {key} {_shown(found[key])}, expected {_shown(wanted)} {source}"
-
-
-def _shown(value: object) -> str:
-    if isinstance(value, datetime):
-        return repr(iso(value))
-    return repr(value.value if isinstance(value, WriteAction) else value)
+def _unreadable_documents(calibrations: Iterable[EnteredCalibration]) -> Iterator[str]:
+    for one in calibrations:
+        try:
+            figures_of_document(one)
+        except DaqError as error:
+            yield f"calibration {one.digest[:12]}…: its document is {error.found}, expected {error.expected}"
 
 
 def drafts_of(
@@ -250,7 +159,7 @@ def drafts_of(
     """Return what the audit log lacks of a stored history: nothing where it was migrated before.
 
     Args:
-        stored: without flaws and contradictions.
+        stored: without flaws.
         entries: of the audit log.
         cell: name of the cell.
         who: the person or the job that migrates.
@@ -264,26 +173,22 @@ def drafts_of(
 
 
 def _calibration_drafts(
-    stored: Iterable[StoredCalibration], entries: Sequence[AuditEntry], cell: str, who: str, at: datetime
+    stored: Iterable[EnteredCalibration], entries: Sequence[AuditEntry], cell: str, who: str, at: datetime
 ) -> Iterator[EntryDraft]:
     """Enter calibrations that only the file has, and the figures of those that an earlier version entered."""
     known = {one.digest: one for one in entered_calibrations(entries, cell)}
     lacking = [one for one in stored if one.digest not in known]
-    without_figures = [
-        StoredCalibration(one.digest, one.entered, one.document)
-        for one in known.values()
-        if one.figures is None and one.document is not None
-    ]
+    without_figures = [one for one in known.values() if one.figures is None and one.document is not None]
     for one in (*without_figures, *lacking):
         try:
-            calibration = decode_calibration(one.document.encode(), f"document of calibration {one.digest[:12]}…")
+            figures = figures_of_document(one)
         except DaqError:
             continue  # reported wherever the history is read
-        details = {
+        details: dict[str, object] = {
             "sha256": one.digest,
             "cell": cell,
             "entered": iso(one.entered),
-            "figures": figures_of(calibration, one.digest, one.entered),
+            "figures": figures,
         }
         if one.digest not in known:
             details["document"] = one.document
@@ -317,14 +222,12 @@ def _event_drafts(stored: Iterable[Event], entries: Sequence[AuditEntry], cell: 
 def _acknowledgement_drafts(
     stored: Iterable[Acknowledgement], entries: Sequence[AuditEntry], cell: str
 ) -> Iterator[EntryDraft]:
-    known = set()
-    for entry in entries:
-        found = acknowledgement_of(entry)
-        if found is not None and text_field(entry, "cell") == cell:
-            known.add((found.axis, found.since, found.at, found.who, found.why))
+    entered = list(acknowledgements_of(entries, cell))
+    named = {one.audit for one in entered}
+    known = {replace(one, audit="") for one in entered}  # migrated before, under an entry of its own
     for noted in stored:
         # The first versions did not enter the name of the cell.
-        if (noted.axis, noted.since, noted.at, noted.who, noted.why) not in known:
+        if noted.audit not in named and replace(noted, audit="") not in known:
             details = {
                 "axis": noted.axis,
                 "cell": cell,

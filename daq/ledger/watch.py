@@ -9,7 +9,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from daq.ledger.entry import Acknowledgement, Entry
+from daq.ledger.fold import Acknowledgement, Entry
+from ident.arrays import FloatArray
 from ident.calibration import Gain
 from ident.drift.change import (
     Alarm,
@@ -98,7 +99,8 @@ def watch(entries: Sequence[Entry], acknowledgements: Sequence[Acknowledgement])
     axes = {gain.axis: gain.unit for gain in entries[-1].gains}
     found = []
     for axis, dispersion in dispersions_of(entries, tuple(axes)).items():
-        known, acknowledged = _known(entries, axis), tuple(noted for noted in acknowledgements if noted.axis == axis)
+        known = _known(entries, axis)
+        acknowledged = tuple(noted for noted in acknowledgements if noted.axis == axis)
         starts = {sum(entry.recorded < a.since for entry, _ in known) for a in acknowledged}
         stretches = []
         for began, ended in pairwise(sorted({0, *starts, len(known)})):
@@ -127,28 +129,25 @@ def dispersions_of(entries: Sequence[Entry], axes: Sequence[str]) -> dict[str, f
     Returns:
         at least 1 each, `ident.drift.change.DISPERSION` before there are five recordings of the axis.
     """
-    alike: dict[tuple[str, ...], dict[str, list[Gain]]] = {}
+    alike: dict[tuple[str, ...], dict[str, FloatArray]] = {}  #: for each axis its gains and their σ, shape (2, n)
     for axis in axes:
         known = _known(entries, axis)
-        alike.setdefault(tuple(entry.logs for entry, _ in known), {})[axis] = [gain for _, gain in known]
+        numbers = np.array([(gain.value, gain.std) for _, gain in known]).reshape(-1, 2)
+        alike.setdefault(tuple(entry.logs for entry, _ in known), {})[axis] = numbers.T
     factors: dict[str, float] = {}
     for together in alike.values():
-        values, stds = (
-            np.array([[getattr(gain, part) for gain in gains] for gains in together.values()])
-            for part in ("value", "std")
-        )
+        values, stds = np.stack(list(together.values()), axis=1)
         factors |= zip(together, map(float, dispersions(values, stds)), strict=True)
     return {axis: factors[axis] for axis in axes}
 
 
 def _known(entries: Sequence[Entry], axis: str) -> list[tuple[Entry, Gain]]:
     """Return the calibrations that identified the gain of an axis, with it."""
-    known = {
-        entry.digest: gain
-        for entry in entries
-        for gain in entry.gains
-        if gain.axis == axis and gain.std > 0 and gain.value
-    }
+    known: dict[str, Gain] = {}
+    for entry in entries:
+        gain = entry.gain_of(axis)
+        if gain is not None and gain.std > 0 and gain.value:
+            known[entry.digest] = gain
     identified = [entry for entry in entries if entry.digest in known]
     return [(entry, known[entry.digest]) for entry in of_each_recording(identified)]
 
@@ -191,11 +190,14 @@ _SEVERAL = (
 
 def alarm_text(series: Series) -> str | None:
     """`gain of J4 fell 6.0 % since 2026-03-02, 5.1 σ`; None where the newest calibration raises no alarm."""
-    drift, onset = series.drift, series.onset
+    drift = series.drift
+    onset = series.onset
     if drift is None or drift.alarm is None or onset is None:
         return None
-    rose, since = drift.change_percent > 0, f"since {onset:%Y-%m-%d}"
-    percent, sigmas = f"{abs(drift.change_percent):.1f} %", f"{abs(drift.change_sigmas):.1f} σ"
+    rose = drift.change_percent > 0
+    since = f"since {onset:%Y-%m-%d}"
+    percent = f"{abs(drift.change_percent):.1f} %"
+    sigmas = f"{abs(drift.change_sigmas):.1f} σ"
     moved = "rose" if rose else "fell"
     match drift.alarm.kind:
         case AlarmKind.DRIFT:

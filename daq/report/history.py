@@ -19,8 +19,7 @@ from daq.errors import ControllerUnfit
 from daq.formats.document import decode_document, read_controller_file
 from daq.formats.scalar import Scalar, rewrite_gain
 from daq.ledger.audit import head_file
-from daq.ledger.entry import Entry, Event, WriteAction, drives_of
-from daq.ledger.fold import History
+from daq.ledger.fold import Entry, Event, History, WriteAction, drives_of
 from daq.ledger.ledger import Verification
 from daq.ledger.watch import Series, alarm_text, pattern_of, questions
 from daq.report.document import Figure, Report

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from daq.config.cell import DEGREE, MILLIMETRE
-from daq.config.impossible_bodies import centre_faults, gyration_faults, moment_faults
+from daq.config.checks import centre_faults, gyration_faults, moment_faults
 from daq.config.yaml_file import (
     Document,
     Fault,

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -23,7 +23,7 @@ from daq.config.controller import GainObject
 from daq.config.yaml_file import StrictModel
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
 from daq.files import read_regular, replace_file, sha256
-from daq.ledger.entry import drives_of
+from daq.ledger.fold import drives_of
 from daq.writeback.file_access import exclusive_writer, next_order
 from daq.writeback.request import Edit, GainChange, GateFinding, is_writable, require_axes
 from daq.writeback.target import Written
@@ -92,27 +92,28 @@ def write_record(folder: Path, cell: str, now: datetime, who: str, drives: tuple
         OSError: from the file system.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    taken = [_order(path.name) for path in read_records(folder)]
-    path = folder / f"{next_order([one for one in taken if one is not None], now)}.json"
-    body: dict[str, Any] = {"format": "drivegain drive record 1", "cell": cell, "at": now.isoformat(), "who": who}
-    body["drives"] = [note.model_dump(mode="json") for note in drives]
-    text = json.dumps({**body, "sha256": _digest(body)}, indent=1, ensure_ascii=False)
-    replace_file(path, (text + "\n").encode())
+    path = folder / f"{next_order(list(_records(folder)), now)}.json"
+    record = DriveRecord(
+        format="drivegain drive record 1", cell=cell, at=now.isoformat(), who=who, drives=drives, sha256=""
+    )
+    body = {**_body(record), "sha256": _digest(record)}
+    replace_file(path, (json.dumps(body, indent=1, ensure_ascii=False) + "\n").encode())
     return path
 
 
 def read_records(folder: Path) -> tuple[Path, ...]:
     """List the records of a folder, oldest first; none where there is no folder."""
-    if not folder.is_dir():
-        return ()
-    found = [(order, path) for path in folder.iterdir() if (order := _order(path.name)) is not None]
-    return tuple(path for _, path in sorted(found))
+    return tuple(_records(folder).values())
 
 
-def _order(name: str) -> tuple[str, int] | None:
-    """Return time and count of a record's name; None for another file."""
-    match = _NAME.fullmatch(name)
-    return None if match is None else (match[1], int(match[2] or 0))
+def _records(folder: Path) -> dict[tuple[str, int], Path]:
+    """Return the records of a folder by time and count in their names, in that order."""
+    found: dict[tuple[str, int], Path] = {}
+    for path in folder.iterdir() if folder.is_dir() else ():
+        match = _NAME.fullmatch(path.name)
+        if match is not None:
+            found[match[1], int(match[2] or 0)] = path
+    return dict(sorted(found.items()))
 
 
 def read_record(path: Path) -> DriveRecord:
@@ -122,19 +123,20 @@ def read_record(path: Path) -> DriveRecord:
         ControllerUnfit: it cannot be read, is no record, or was changed.
     """
     try:
-        content = read_regular(path, _MAX_BYTES)
-        record = DriveRecord.model_validate_json(content)
-        body: dict[str, Any] = json.loads(content)
+        record = DriveRecord.model_validate_json(read_regular(path, _MAX_BYTES))
     except (OSError, ValueError) as error:
         raise _unfit(path, str(error).splitlines()[0][:200]) from error
-    del body["sha256"]
-    if record.sha256 != _digest(body):
-        raise _unfit(path, f"content with SHA-256 {_digest(body)[:12]}…, not {record.sha256[:12]}… as it says")
+    if record.sha256 != _digest(record):
+        raise _unfit(path, f"content with SHA-256 {_digest(record)[:12]}…, not {record.sha256[:12]}… as it says")
     return record
 
 
-def _digest(body: dict[str, Any]) -> str:
-    return sha256(json.dumps(body, sort_keys=True).encode())
+def _body(record: DriveRecord) -> dict[str, object]:
+    return record.model_dump(mode="json", exclude={"sha256"})
+
+
+def _digest(record: DriveRecord) -> str:
+    return sha256(json.dumps(_body(record), sort_keys=True).encode())
 
 
 def _unfit(path: Path, found: str) -> ControllerUnfit:
@@ -205,16 +207,17 @@ class DriveTarget:
         pairs = [(axis, one.parameter) for axis, one in zip(self.network.axes, objects, strict=True)]
         base = read_parameters(self.network, pairs)
         planned = [_change(gains[value.axis.name], value, one) for value, one in zip(base, objects, strict=True)]
+        writes = tuple(write for _, write in planned)
         folder = record_folder(self.cell)
         return DriveEdit(
             subject=self.subject,
             before=content_of(base),
-            after=content_of(base, tuple(write for _, write in planned)),
+            after=content_of(base, writes),
             changes=tuple(change for change, _ in planned),
             unexpected=_changed_since_record(base, folder),
             folder=folder,
             values=base,
-            writes=tuple(write for _, write in planned),
+            writes=writes,
         )
 
     def plan_rollback(self) -> DriveEdit:
@@ -338,11 +341,14 @@ def content_of(base: tuple[ParameterValue, ...], writes: tuple[ParameterWrite, .
 
 def _change(gain: Gain, value: ParameterValue, gain_object: GainObject) -> tuple[GainChange, ParameterWrite]:
     """Plan one drive; a gain that is no number leaves the present bits, and a gate refuses it."""
-    parameter, factor = gain_object.parameter, gain_object.factor
-    key, word = f"{value.axis.name}, {parameter}", value.word
+    parameter = gain_object.parameter
+    factor = gain_object.factor
+    key = f"{value.axis.name}, {parameter}"
+    word = value.word
     planned = None
     if is_writable(gain):
-        wanted, std = factor * gain.value, abs(factor) * gain.std
+        wanted = factor * gain.value
+        std = abs(factor) * gain.std
         try:
             word = parameter.word(wanted)
         except ValueError as error:
@@ -382,7 +388,8 @@ def _changed_since_record(base: tuple[ParameterValue, ...], folder: Path) -> tup
     for value in base:
         note = notes.get((value.axis.name, value.parameter))
         if note is not None and value.word not in {note.old, note.new}:
-            new, old = value.parameter.value(note.new), value.parameter.value(note.old)
+            new = value.parameter.value(note.new)
+            old = value.parameter.value(note.old)
             expected = f"{new:.9g}, as written according to {records[-1].name}, or {old:.9g} as before"
             remedy = f"the gain was changed since, or the drive exchanged: {_REVIEW}"
             found.append((f"{value.axis.name}, {value.parameter}", f"{value.value:.9g}", expected, remedy))

@@ -172,7 +172,9 @@ def next_order(taken: Sequence[tuple[str, int]], now: datetime) -> str:
     A clock that was set back, or two writes in one second, must not make an older one look newer. `taken` has time and
     count of the others, in order.
     """
-    stamp, count = now.astimezone(UTC).strftime("%Y%m%dT%H%M%SZ"), 0
+    stamp = now.astimezone(UTC).strftime("%Y%m%dT%H%M%SZ")
+    count = 0
     if taken and taken[-1] >= (stamp, count):
-        stamp, count = taken[-1][0], taken[-1][1] + 1
+        stamp = taken[-1][0]
+        count = taken[-1][1] + 1
     return f"{stamp}-{count}" if count else stamp

@@ -82,7 +82,8 @@ class FileTarget:
         Raises:
             ConfigurationInconsistent: the cell names no controller file, or no keys in it.
         """
-        controller, chosen = cell.controller, file or cell.controller_path
+        controller = cell.controller
+        chosen = file or cell.controller_path
         if controller is None or not controller.gains or chosen is None:
             raise ConfigurationInconsistent(
                 f"cell {cell.name!r}: controller",
@@ -161,7 +162,8 @@ class FileTarget:
         backup = others[-1]
         after = backup.content()
         if before is not None and short_digest(before) != backup.after_digest:
-            one, other = shlex.quote(str(backup.path)), shlex.quote(str(self.file))
+            one = shlex.quote(str(backup.path))
+            other = shlex.quote(str(self.file))
             raise ControllerChanged(
                 str(self.file),
                 found=f"content {short_digest(before)}…",

@@ -26,16 +26,20 @@ from cryptography.hazmat.primitives.kdf.scrypt import Scrypt
 from daq.config.signers import KEY_ALGORITHM, UNTRUSTED, PublicKey, decode_line, shown_id
 
 TRUSTED = "trusted comment: "
-_PREHASHED, _CHECK = b"ED", b"B2"
-_SCRYPT, _PLAIN = b"Sc", b"\0\0"
+_PREHASHED = b"ED"
+_CHECK = b"B2"
+_SCRYPT = b"Sc"
+_PLAIN = b"\0\0"
 _SECRET = struct.Struct("<2s2s2s32sQQ104s")
 _BODY = struct.Struct("<8s32s32s32s")
 _SIGNATURE = struct.Struct("<2s8s64s")
 _SIGNATURE_LINES = 4
 
 # scrypt with N = 2¹⁷, r = 8, p = 1: 128 MB and half a second, which the PC of a cell can spare (minisign's own: 1 GB).
-_OPSLIMIT, _MEMLIMIT = 2**22, 2**27
-_MEMLIMIT_ALLOWED, _OPSLIMIT_ALLOWED = 2**30, 2**26
+_OPSLIMIT = 2**22
+_MEMLIMIT = 2**27
+_MEMLIMIT_ALLOWED = 2**30
+_OPSLIMIT_ALLOWED = 2**26
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from datetime import datetime
 from pathlib import Path
 
 from daq.config.signers import SIGNER_NAME, UNTRUSTED, PublicKey, public_keys
-from daq.config.yaml_file import MAX_BYTES
+from daq.config.yaml_file import read_file
 from daq.errors import CalibrationMissing, OutputFailed, SignatureInvalid, UsageError
 from daq.files import read_regular, replace_file
 from daq.writeback.minisign import SecretKey, check_signature, is_encrypted, parse_secret_key, parse_signature
@@ -32,7 +32,8 @@ def generate(folder: Path, name: str, password: str = "") -> tuple[Path, PublicK
         UsageError: there is a key of this name; it is never replaced.
         OutputFailed: from the file system.
     """
-    secret, public = folder / f"{_checked(name)}.key", folder / f"{name}.pub"
+    secret = folder / f"{_checked(name)}.key"
+    public = folder / f"{name}.pub"
     for path in (secret, public):
         if path.exists() or path.is_symlink():
             raise UsageError(
@@ -185,15 +186,8 @@ def _text_of(path: Path) -> str:
 
 
 def _read_signed(file: Path) -> bytes:
-    try:
-        return read_regular(file, MAX_BYTES)
-    except OSError as error:
-        raise CalibrationMissing(
-            str(file),
-            found=(error.strerror or type(error).__name__).lower(),
-            expected="the calibration to be signed or checked",
-            remedy="check the name",
-        ) from error
+    wanted = "the calibration to be signed or checked"
+    return read_file(file, CalibrationMissing, expected=wanted, remedy="check the name")
 
 
 def _write_new(path: Path, text: str, mode: int) -> None:

@@ -19,7 +19,7 @@ from daq.config.cell import Cell
 from daq.errors import AuditUnusable, CalibrationRefused, OutputFailed, evidence
 from daq.files import sha256
 from daq.ledger.audit import GONE, AuditAction, AuditEntry, digest_now
-from daq.ledger.entry import WriteAction
+from daq.ledger.fold import WriteAction
 from daq.ledger.ledger import Ledger, enter_calibration, read_history, record_write
 from daq.writeback.gates.gate import GateContext, Refusal
 from daq.writeback.gates.table import check_gates

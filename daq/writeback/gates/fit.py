@@ -13,7 +13,8 @@ from daq.writeback.request import GateFinding
 from ident.calibration import Calibration
 from ident.errors import Diagnosis
 
-NOISE, AXIS_NOISE = 1.01, 1.02
+NOISE = 1.01
+AXIS_NOISE = 1.02
 """Share of the nameplate's error that a calibration may have, in total and on an axis: where the nameplate is true, the
 two differ by 0.1 % and 0.3 % (`tests.studies.holdout_study`)."""
 CORRECTED_BY = {"zero-off": "zero-offset", "gravity-tilted": "gravity-direction", "position-late": "late-position"}
@@ -35,10 +36,12 @@ def configuration(context: GateContext) -> Iterator[GateFinding]:
     """Refuse after a change of URDF, drive profile or cell file since the recording, in what a recording depends on."""
     if context.cell is None or context.request.accepts_changed_configuration:
         return
-    found, expected = context.calibration.recording_configuration_sha256, context.cell.recording_digest
+    found = context.calibration.recording_configuration_sha256
+    expected = context.cell.recording_digest
     # A calibration of an earlier version has the digest of the whole configuration alone.
     if found is None:
-        found, expected = context.calibration.configuration_sha256, context.cell.digest
+        found = context.calibration.configuration_sha256
+        expected = context.cell.digest
     if found != expected:
         yield (
             "calibration",
@@ -100,10 +103,12 @@ def finite_errors(context: GateContext) -> Iterator[GateFinding]:
 
 def error(context: GateContext) -> Iterator[GateFinding]:
     """Bound the relative error of the torques, on the held-out run if there is one; in total, and on each axis."""
-    calibration, policy = context.calibration, context.policy
+    calibration = context.calibration
+    policy = context.policy
     if not _errors_are_finite(calibration):
         return
-    trained, held = calibration.relative_error_percent, calibration.holdout_error_percent
+    trained = calibration.relative_error_percent
+    held = calibration.holdout_error_percent
     judged = trained if held is None else held
     if not judged.total <= policy.max_error_percent:
         yield (
@@ -136,7 +141,8 @@ def holdout(context: GateContext) -> Iterator[GateFinding]:
     calibration = context.calibration
     if not _errors_are_finite(calibration):
         return
-    held, nameplate = calibration.holdout_error_percent, calibration.nameplate_holdout_error_percent
+    held = calibration.holdout_error_percent
+    nameplate = calibration.nameplate_holdout_error_percent
     if held is None:
         if context.policy.requires_holdout:
             yield (
@@ -212,7 +218,8 @@ def effect(context: GateContext) -> Iterator[GateFinding]:
 
 
 def _errors_are_finite(calibration: Calibration) -> bool:
-    trained, held = calibration.relative_error_percent, calibration.holdout_error_percent
+    trained = calibration.relative_error_percent
+    held = calibration.holdout_error_percent
     numbers = [*trained.axes, trained.total]
     if held is not None:
         numbers += [*(number for number in held.axes if not math.isnan(number)), held.total]

@@ -12,7 +12,8 @@ from daq.writeback.request import GateFinding
 from ident.calibration import Source
 from ident.data.run import Recording
 
-_FIT, _HOLDOUT = "fit", "holdout"
+_FIT = "fit"
+_HOLDOUT = "holdout"
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _UNFINISHED = ".part"
 _DAY_S = 86_400.0
@@ -137,9 +138,11 @@ def age(context: GateContext) -> Iterator[GateFinding]:
         if -_CLOCKS_DAYS <= days <= longest:
             continue
         if not abs(days) < _LONGEST_DAYS:
-            found, remedy = f"an impossible date, {recording.recorded_s:g} s of Unix time", "fit the logs again"
+            found = f"an impossible date, {recording.recorded_s:g} s of Unix time"
+            remedy = "fit the logs again"
         elif days > 0:
-            found, remedy = f"recorded {_span(days)} ago", "record again and fit"
+            found = f"recorded {_span(days)} ago"
+            remedy = "record again and fit"
         else:
             found = f"recorded {_span(-days)} from now"
             remedy = "set the clocks of this computer and of the recorder"

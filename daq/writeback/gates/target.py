@@ -123,7 +123,8 @@ def _axes_of_cell(context: GateContext) -> Iterator[tuple[Gain, CellAxis]]:
 
 def base(context: GateContext) -> Iterator[GateFinding]:
     """Require the content that the target had at the recording, or after the last write; or that of `--base`."""
-    edit, base = context.edit, context.request.base
+    edit = context.edit
+    base = context.request.base
     reviewed, after_digest = (None, None) if base is None else parse_base(base, edit.before or b"")
     if edit.keeps_all:
         return
@@ -154,7 +155,8 @@ def signature(context: GateContext) -> Iterator[GateFinding]:
     Raises:
         ConfigurationInconsistent: a public key of the policy is none.
     """
-    policy, request = context.policy, context.request
+    policy = context.policy
+    request = context.request
     if not policy.signatures:
         return
     subject = "calibration" if request.file is None else str(request.file)
@@ -166,7 +168,7 @@ def signature(context: GateContext) -> Iterator[GateFinding]:
     *given, login = request.appliers or ("",)
     for name in given:
         known = {_as_read(other) for other in (*policy.signers, login)}
-        if not _is_legible(name) or _as_read(name) not in known:
+        if not name or _as_read(name) not in known:
             yield (
                 "operator",
                 ascii(name),
@@ -191,12 +193,9 @@ def _as_read(name: str) -> str:
     return " ".join(folded.split())
 
 
-def _is_legible(name: str) -> bool:
-    """Whether every character shows: no control, format, private or unassigned one."""
-    return bool(name) and not any(unicodedata.category(character).startswith("C") for character in name)
-
-
 def _others(names: tuple[str, ...], applying: set[str]) -> list[str]:
     """Persons other than the operator, each once however often a name is spelled."""
-    persons = {_as_read(name): name for name in reversed(names) if _is_legible(name)}
-    return [name for name in names if persons.get(_as_read(name)) == name and _as_read(name) not in applying]
+    persons: dict[str, str] = {}
+    for name in names:
+        persons.setdefault(_as_read(name), name)
+    return [name for person, name in persons.items() if person not in applying]

@@ -11,7 +11,6 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -396,12 +395,6 @@ def test_an_entry_cannot_hide_a_missing_torn_line(tmp_path: Path) -> None:
     lines = _lines(tmp_path / "a")
     assert verify(tmp_path / "a").torn == (2,)
     assert [flaw.flaw for flaw in _judge([lines[0], *lines[2:]]).flaws] == [Flaw.EDITED]
-
-
-def test_an_entry_knows_whether_it_is_its_own(tmp_path: Path) -> None:
-    (one,) = _filled(tmp_path / "a", 1)
-    assert one.holds
-    assert not replace(one, who="another person").holds
 
 
 @pytest.mark.parametrize("strange", [[1], {"a": 1}, None, "1", 1.5])

@@ -12,7 +12,7 @@ from daq.config.cell_file import load_cell
 from daq.config.policy import HistoryPlace
 from daq.errors import ExitCode
 from daq.ledger.audit import AuditAction, read
-from daq.ledger.entry import WriteAction
+from daq.ledger.fold import WriteAction
 from tests.daq.calibrations import calibration_for
 from tests.daq.histories import history_of
 

@@ -23,7 +23,7 @@ from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import decode_calibration, encode_calibration
 from daq.errors import DataError, ExitCode, OutputFailed, exit_code
 from daq.ledger.audit import AuditAction, append, head_file, read, verify
-from daq.ledger.entry import Acknowledgement, WriteAction, iso, utc
+from daq.ledger.fold import Acknowledgement, WriteAction, iso, utc
 from daq.ledger.ledger import (
     MAY_LACK,
     Ledger,

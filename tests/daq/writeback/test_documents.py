@@ -16,9 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daq.config.controller import ControllerFormat
+from daq.config.yaml_file import MAX_BYTES
 from daq.errors import ControllerUnfit
 from daq.formats.dcf_document import DcfDocument
-from daq.formats.document import FORMATS, MAX_BYTES, decode_document, format_of, read_controller_file
+from daq.formats.document import FORMATS, decode_document, format_of, read_controller_file
 from daq.formats.json_document import JsonDocument
 from daq.formats.scalar import ControllerDocument, rewrite_gain
 from daq.formats.xml_document import XmlDocument

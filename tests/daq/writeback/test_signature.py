@@ -17,7 +17,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daq.cli.app import main
-from daq.config import signers
 from daq.config.signers import parse_public_key
 from daq.documents.calibration_file import save_calibration
 from daq.errors import (
@@ -348,39 +347,3 @@ def test_line_ends_of_another_system_do_not_change_a_signature() -> None:
     minisign.check_signature(parse_public_key(PUBLIC), windows, CONTENT)
     with pytest.raises(ValueError, match="four lines"):
         minisign.parse_signature(SIGNATURE.replace("\n", "\r"))
-
-
-P = 2**255 - 19
-D = -121665 * pow(121666, -1, P) % P
-
-
-def _multiplied(y: int, factor: int) -> tuple[int, int]:
-    """Factor times the point of this y, on −x² + y² = 1 + d x² y² (RFC 8032, section 5.1)."""
-    square = (y * y - 1) * pow(D * y * y + 1, -1, P) % P
-    x = pow(square, (P + 3) // 8, P)
-    if (x * x - square) % P:
-        x = x * pow(2, (P - 1) // 4, P) % P
-    assert (x * x - square) % P == 0
-    point, found = (x, y % P), (0, 1)
-    for _ in range(factor):
-        (x1, y1), (x2, y2) = point, found
-        both = D * x1 * x2 * y1 * y2
-        found = (
-            (x1 * y2 + x2 * y1) * pow(1 + both, -1, P) % P,
-            (y1 * y2 + x1 * x2) * pow(1 - both, -1, P) % P,
-        )
-    return found
-
-
-def test_a_public_key_of_small_order_is_refused() -> None:
-    """Under the identity, R = S·B is a signature of everything."""
-    assert all(_multiplied(y, 8) == (0, 1) for y in signers._SMALL_ORDER)
-    assert _multiplied(signers._ORDER_8, 4) != (0, 1)
-    encodings = [y + more for y in signers._SMALL_ORDER for more in (0, P) if y + more < 2**255]
-    assert len(encodings) == 7  # with the two that are not reduced, as in libsodium's list
-    for y in encodings:
-        for sign_of_x in (0, 2**255):
-            line = signers.PublicKey(b"12345678", (y + sign_of_x).to_bytes(32, "little")).line
-            with pytest.raises(ValueError, match="small order"):
-                parse_public_key(line)
-    assert parse_public_key(PUBLIC).line == PUBLIC
