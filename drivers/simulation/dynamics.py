@@ -85,7 +85,6 @@ def advance(
     position: FloatArray,
     velocity: FloatArray,
     load_torque: FloatArray,
-    motor_rad: FloatArray,
 ) -> float:
     """Advance by one step unless dry friction stays unsolved; return its certificate [rad/s].
 
@@ -101,50 +100,43 @@ def advance(
         impulse: λ, of the step before and then of this one, shape (m,).
         position, velocity: state, changed in place, shape (N,).
         load_torque: torque of the links on each joint, M a + c(q, q̇) [Nm], shape (n,), output.
-        motor_rad: rotor angles at the end of the step, shape (n,), output.
     """
     mechanics = Mechanics(*constants)
-    directions, step_s = mechanics.directions, mechanics.step_s
-    total = len(velocity)
-    inertia, free_velocity = _assemble(mechanics, mass, bias, viscous, motor_torque, torque, velocity)
+    directions = mechanics.directions
+    step_s = mechanics.step_s
+    inertia, after = _assemble(mechanics, mass, bias, viscous, motor_torque, torque, velocity)
     _factorise(inertia)
-    _substitute(inertia, free_velocity)
-    response, free_speed, delassus = _respond(inertia, free_velocity, directions)
+    _substitute(inertia, after)
+    response, free_speed, delassus = _respond(inertia, after, directions)
     residual = solve(delassus, free_speed, bound, impulse, TOLERANCE_RAD_S, MAX_SWEEPS, DEPENDENT)
     if not residual <= TOLERANCE_RAD_S:
         return residual
-    change = np.empty(total)
-    for i in range(total):
-        v = free_velocity[i]
-        for k in range(len(impulse)):
-            v += response[i, k] * impulse[k]
-        change[i] = v - velocity[i]
+    _add_times(response, impulse, after)
+    change = np.empty(len(velocity))
     resting = _resting(impulse, bound, directions, mechanics.lone)
-    for i in range(total):
-        if resting[i]:
-            # Written so that v + change is exactly zero.
-            change[i] = -velocity[i]
+    for i in range(len(velocity)):
+        # Written so that v + change is exactly zero.
+        change[i] = -velocity[i] if resting[i] else after[i] - velocity[i]
     for i in range(len(bias)):
-        s = bias[i]
+        load_torque[i] = bias[i]
         for j in range(len(bias)):
-            s += mass[i, j] * change[j] / step_s
-        load_torque[i] = s
-    for i in range(total):
+            load_torque[i] += mass[i, j] * change[j] / step_s
+    for i in range(len(velocity)):
         velocity[i] += change[i]
         position[i] += step_s * velocity[i]
-    for i in range(len(motor_rad)):
-        s = 0.0
-        for j in range(total):
-            s += mechanics.rotor_direction[i, j] * position[j]
-        motor_rad[i] = s
     return residual
+
+
+@compiled
+def turn_rotors(rotor_direction: FloatArray, position: FloatArray, motor_rad: FloatArray) -> None:
+    """Compute the rotor angles at the end of a step, shape (m,), output, from the positions, shape (N,)."""
+    motor_rad[:] = 0.0
+    _add_times(rotor_direction, position, motor_rad)
 
 
 @compiled
 def advance_closed(
     constants: tuple[Any, ...],
-    order: NDArray[np.int64],
-    basis: FloatArray,
     mass: FloatArray,
     bias: FloatArray,
     viscous: FloatArray,
@@ -155,29 +147,24 @@ def advance_closed(
     position: FloatArray,
     velocity: FloatArray,
     load_torque: FloatArray,
+    basis: FloatArray,
     resting: NDArray[np.bool_],
 ) -> float:
     """Advance a closed chain as `advance` does; the positions still have to be settled on its closures.
 
     Args:
-        constants: of the plant, its Mechanics as a plain tuple.
-        order: place of each joint in the mass matrix and bias, shape (n,).
-        basis: G at the position, shape (n, d).
-        mass, bias, viscous, motor_torque, torque, bound, impulse, position, velocity: as for `advance`.
+        constants, mass, bias, viscous, motor_torque, torque, bound, impulse, position, velocity: as for `advance`.
         load_torque: torque that passes from each joint to the links [Nm], shape (n,), output.
+        basis: G at the position, shape (n, d).
         resting: coordinates whose speed became exactly zero, shape (N,), output.
 
     Returns:
         zero, or the certificate of a step that was not done.
     """
     mechanics = Mechanics(*constants)
-    step_s, n, d, total = mechanics.step_s, basis.shape[0], basis.shape[1], len(velocity)
-    ordered_mass, ordered_bias = np.empty((n, n)), np.empty(n)
-    for i in range(n):
-        ordered_bias[i] = bias[order[i]]
-        for j in range(n):
-            ordered_mass[i, j] = mass[order[i], order[j]]
-    inertia, momentum = _assemble(mechanics, ordered_mass, ordered_bias, viscous, motor_torque, torque, velocity)
+    n, d = basis.shape
+    total = len(velocity)
+    inertia, momentum = _assemble(mechanics, mass, bias, viscous, motor_torque, torque, velocity)
     whole = np.zeros((total, d + total - n))
     for i in range(n):
         for j in range(d):
@@ -210,7 +197,7 @@ def advance_closed(
     _pass_on(mechanics, viscous, motor_torque, torque, impulse, velocity, after, load_torque)
     for i in range(total):
         velocity[i] = after[i]
-        position[i] += step_s * after[i]
+        position[i] += mechanics.step_s * after[i]
     return 0.0
 
 
@@ -274,10 +261,16 @@ def _product(left: FloatArray, right: FloatArray) -> FloatArray:
 def _times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
     """Return matrix · vector."""
     product = np.zeros(matrix.shape[0])
+    _add_times(matrix, vector, product)
+    return product
+
+
+@compiled
+def _add_times(matrix: FloatArray, vector: FloatArray, total: FloatArray) -> None:
+    """Add matrix · vector to the first numbers of a total."""
     for i in range(matrix.shape[0]):
         for k in range(matrix.shape[1]):
-            product[i] += matrix[i, k] * vector[k]
-    return product
+            total[i] += matrix[i, k] * vector[k]
 
 
 @compiled
@@ -341,24 +334,23 @@ def _assemble(
     velocity: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Return A, shape (N, N), and the right side of A v_free, shape (N,)."""
-    direction, step_s = mechanics.motor_direction, mechanics.step_s
+    direction = mechanics.motor_direction
+    step_s = mechanics.step_s
     total = len(velocity)
     inertia = np.zeros((total, total))
     momentum = np.zeros(total)
+    _add_times(mass, velocity, momentum)
     for i in range(len(bias)):
         for j in range(len(bias)):
             inertia[i, j] = mass[i, j]
-            momentum[i] += mass[i, j] * velocity[j]
         momentum[i] -= step_s * bias[i]
     for i in range(total):
         momentum[i] += step_s * torque[i]
         inertia[i, i] += step_s * viscous[i]
+    speed = _times(direction, velocity)
     for k in range(len(direction)):
-        speed = 0.0
-        for j in range(total):
-            speed += direction[k, j] * velocity[j]
         implicit = mechanics.motor_inertia[k] + step_s * mechanics.motor_viscous[k]
-        push = mechanics.motor_inertia[k] * speed + step_s * motor_torque[k]
+        push = mechanics.motor_inertia[k] * speed[k] + step_s * motor_torque[k]
         for i in range(total):
             p = direction[k, i]
             if p != 0.0:
@@ -373,28 +365,10 @@ def _respond(
     lower: FloatArray, free_velocity: FloatArray, directions: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return A⁻¹ Dᵀ, shape (N, m), D v_free, shape (m,), and W, shape (m, m); A = L Lᵀ."""
-    m, total = directions.shape
-    response = np.empty((total, m))
-    free_speed = np.empty(m)
-    delassus = np.empty((m, m))
-    column = np.empty(total)
-    for k in range(m):
-        for i in range(total):
-            column[i] = directions[k, i]
-        _substitute(lower, column)
-        for i in range(total):
-            response[i, k] = column[i]
-        s = 0.0
-        for i in range(total):
-            s += directions[k, i] * free_velocity[i]
-        free_speed[k] = s
-    for k in range(m):
-        for j in range(m):
-            s = 0.0
-            for i in range(total):
-                s += directions[k, i] * response[i, j]
-            delassus[k, j] = s
-    return response, free_speed, delassus
+    response = directions.T.copy()
+    for k in range(len(directions)):
+        _substitute(lower, response[:, k])
+    return response, _times(directions, free_velocity), _product(directions, response)
 
 
 @compiled

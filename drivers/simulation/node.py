@@ -239,7 +239,7 @@ class Node:
             raise SdoAbort(0x08000024)  # no data available
         if entry.kind is Kind.TEXT:
             return entry.text.encode("ascii")
-        return entry.encode(self._source((index, subindex))())
+        return entry.kind.encode(self._source((index, subindex))())
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
         """Write an entry.
@@ -308,10 +308,8 @@ class Node:
         """Set the values of a receive PDO; a controlword last, so that it acts on its companions."""
         values = dict(zip(pdo.mapped, pdo.layout.unpack_from(data), strict=True))
         for key in sorted(values, key=lambda key: key == (0x6040, 0)):
-            entry = self._dictionary[key]
-            value = values[key]
-            if (entry.lowest is None or value >= entry.lowest) and (entry.highest is None or value <= entry.highest):
-                self._set(key, value)
+            if self._dictionary[key].accepts(values[key]):
+                self._set(key, values[key])
 
     def _set(self, key: tuple[int, int], value: int) -> None:
         self._values[key] = value

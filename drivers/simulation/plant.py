@@ -9,7 +9,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from drivers.simulation.closures import OPEN, SINGULAR, Mechanism, link_frame, settle
-from drivers.simulation.dynamics import TOLERANCE_RAD_S, Mechanics, advance, advance_closed
+from drivers.simulation.dynamics import TOLERANCE_RAD_S, Mechanics, advance, advance_closed, turn_rotors
 from drivers.simulation.effects import AMBIENT_C, Coupling, Effect, Elasticity, Lag, Moment, build_effect
 from drivers.simulation.noise import ColouredNoise, random_streams
 from drivers.simulation.spec import (
@@ -133,8 +133,15 @@ class Plant:
                 f"{n} axes, a URDF of {model.nv} joints, a drive train of shape {spec.ratio.shape} and a start "
                 f"position of shape {spec.start_rad.shape}; all must have the same number of axes"
             )
-        start_rad = spec.start_rad if self.mechanism is None else self.mechanism.start_rad
-        self._passive_joints = () if self.mechanism is None else self.mechanism.joints[n:]
+        start_rad = spec.start_rad
+        mobility = n
+        self._passive_joints: tuple[str, ...] = ()
+        self._order: slice | NDArray[np.int64] = slice(None)  # of the joints in Pinocchio's model
+        if self.mechanism is not None:
+            start_rad = self.mechanism.start_rad
+            mobility = self.mechanism.mobility
+            self._passive_joints = self.mechanism.joints[n:]
+            self._order = self.mechanism.order
         effects = [build_effect(effect, n, self._passive_joints) for effect in spec.effects]
         self._joints = n + len(self._passive_joints)
         self._mechanics, flexible = lay_out(spec, effects, self._joints)
@@ -146,7 +153,7 @@ class Plant:
         self.position_rad = np.concatenate([start_rad, [drive.row @ start_rad[:n] for drive in flexible]])
         self.velocity_rad_s = np.zeros(total)
         self.load_torque_nm = np.zeros(self._joints)
-        self.motor_rad = self._mechanics.rotor_direction @ self.position_rad
+        self.motor_rad = np.zeros(n)
         self.temperature_c = np.full(n, AMBIENT_C)
         self._model, self._data = model, model.createData()
         self._acting = tuple(e for e in effects if not isinstance(e, Lag))
@@ -176,8 +183,9 @@ class Plant:
         )
         self._impulse = np.zeros(m)
         self._resting = np.zeros(total, dtype=np.bool_)
-        self._basis = np.zeros((self._joints, n if self.mechanism is None else self.mechanism.mobility))
+        self._basis = np.eye(self._joints, mobility)
         self._settle()
+        turn_rotors(self._mechanics.rotor_direction, self.position_rad, self.motor_rad)
         self.disturbance_nm = np.zeros(n)
         self._disturbance = _disturbance(spec, self._mechanics.step_s)
         self._refuse_stiff(flexible, spec)
@@ -195,15 +203,15 @@ class Plant:
         """
         if not flexible:
             return
-        step_s, n = self._mechanics.step_s, len(spec.axes)
+        step_s = self._mechanics.step_s
         bare = link_model(spec.urdf, spec.gravity_m_s2, None, spec.platform)
+        postures = [self.position_rad[: self._joints]]
         if self.mechanism is None:
-            basis, postures = np.eye(n), tuple(np.transpose(self.postures(spec.start_rad, POSTURES)))
-        else:
-            basis, postures = self._basis, (self.position_rad[: self._joints],)
+            postures = list(np.transpose(self.postures(spec.start_rad, POSTURES)))
+        basis = self._basis
         masses = [basis.T @ self._mass(bare, bare.createData(), position) @ basis for position in postures]
         for drive in flexible:
-            row = drive.row @ basis[:n]
+            row = drive.row @ basis[: len(spec.axes)]
             links = min(1.0 / float(row @ np.linalg.solve(mass, row)) for mass in masses)
             motor = spec.axes[drive.axis].motor_inertia_kg_m2
             stiff = (2.0 * drive.damping_nm_s_per_rad + drive.stiffness_nm_per_rad * step_s) * step_s
@@ -243,16 +251,15 @@ class Plant:
         Redundant drives cannot rest alone: with A = P G theirs is (A⁺ᵀ Gᵀ M G A⁺)ᵢᵢ / (A A⁺)ᵢᵢ, the share of motor i by
         least squares in the motion that turns it most. A closed chain has the position of its last step alone.
         """
-        if self.mechanism is not None:
-            n = len(self._gain)
-            links = self._mass(self._model, self._data, self.position_rad[: self._joints])
-            motors = self._rows @ self._basis[:n]
-            to_speed = np.linalg.pinv(motors)
-            shared = to_speed.T @ self._basis.T @ links @ self._basis @ to_speed
-            return np.asarray(np.diag(shared) / np.diag(motors @ to_speed) + self._mechanics.motor_inertia)
-        to_joint = np.linalg.inv(self._rows)
-        links = self._mass(self._model, self._data, position_rad)
-        return np.asarray(np.diag(to_joint.T @ links @ to_joint) + self._mechanics.motor_inertia)
+        if self.mechanism is None:
+            to_joint = np.linalg.inv(self._rows)
+            links = self._mass(self._model, self._data, position_rad)
+            return np.asarray(np.diag(to_joint.T @ links @ to_joint) + self._mechanics.motor_inertia)
+        links = self._mass(self._model, self._data, self.position_rad[: self._joints])
+        motors = self._rows @ self._basis[: len(self._gain)]
+        to_speed = np.linalg.pinv(motors)
+        shared = to_speed.T @ self._basis.T @ links @ self._basis @ to_speed
+        return np.asarray(np.diag(shared) / np.diag(motors @ to_speed) + self._mechanics.motor_inertia)
 
     def step(self, current_a: FloatArray) -> None:
         """Advance by one substep with the motor currents, shape (m,).
@@ -274,24 +281,29 @@ class Plant:
         if self._disturbance is not None:
             self.disturbance_nm = self._disturbance.advance()
             moment.motor_torque_nm += self.disturbance_nm
-        residual = self._advance() if self.mechanism is None else self._advance_closed(self.mechanism)
+        residual = self._advance()
         if not residual <= TOLERANCE_RAD_S:
             raise FrictionUnsolved(
                 f"dry friction at {self.time_s:.6f} s: residual {residual:.3g} rad/s, expected at most "
                 f"{TOLERANCE_RAD_S:.3g}; check the inertias and friction of the cell for values that differ by many "
                 "orders of magnitude"
             )
-        if self.mechanism is not None and not self._resting.all():
+        if not self._resting.all():
             self._settle()
+        turn_rotors(self._mechanics.rotor_direction, self.position_rad, self.motor_rad)
         self.time_s += self._mechanics.step_s
 
     def _advance(self) -> float:
-        n, moment = self._joints, self._moment
-        position = self.position_rad[:n]
-        return advance(
+        n = self._joints
+        position = np.empty(n)
+        velocity = np.empty(n)
+        position[self._order] = self.position_rad[:n]
+        velocity[self._order] = self.velocity_rad_s[:n]
+        moment = self._moment
+        step = (
             self._constants,
-            np.ascontiguousarray(pin.crba(self._model, self._data, position)),
-            pin.nonLinearEffects(self._model, self._data, position, self.velocity_rad_s[:n]),
+            self._mass(self._model, self._data, self.position_rad[:n]),
+            pin.nonLinearEffects(self._model, self._data, position, velocity)[self._order],
             moment.viscous_nm_s_rad,
             moment.motor_torque_nm,
             moment.torque_nm,
@@ -300,42 +312,16 @@ class Plant:
             self.position_rad,
             self.velocity_rad_s,
             self.load_torque_nm,
-            self.motor_rad,
         )
-
-    def _advance_closed(self, mechanism: Mechanism) -> float:
-        n, moment = self._joints, self._moment
-        position, velocity = np.empty(n), np.empty(n)
-        position[mechanism.order], velocity[mechanism.order] = self.position_rad[:n], self.velocity_rad_s[:n]
-        return advance_closed(
-            self._constants,
-            mechanism.order,
-            self._basis,
-            np.ascontiguousarray(pin.crba(self._model, self._data, position)),
-            pin.nonLinearEffects(self._model, self._data, position, velocity),
-            moment.viscous_nm_s_rad,
-            moment.motor_torque_nm,
-            moment.torque_nm,
-            moment.bound_nm * self._mechanics.step_s,
-            self._impulse,
-            self.position_rad,
-            self.velocity_rad_s,
-            self.load_torque_nm,
-            self._resting,
-        )
+        if self.mechanism is None:
+            return advance(*step)
+        return advance_closed(*step, self._basis, self._resting)
 
     def _settle(self) -> None:
         """Return the joints of a closed chain to its closures; nothing is done for a serial robot."""
         if self.mechanism is None:
             return
-        open_by, pivot = settle(
-            self.mechanism.constants,
-            self._mechanics.rotor_direction,
-            self._resting,
-            self.position_rad,
-            self._basis,
-            self.motor_rad,
-        )
+        open_by, pivot = settle(self.mechanism.constants, self._resting, self.position_rad, self._basis)
         if not (open_by <= OPEN and pivot >= SINGULAR):
             raise ClosureLost(
                 f"closures at {self.time_s:.6f} s: open by {open_by:.3g} m or rad, smallest pivot {pivot:.3g} of the "
@@ -345,10 +331,9 @@ class Plant:
 
     def _mass(self, model: pin.Model, data: pin.Data, position_rad: FloatArray) -> FloatArray:
         """Return the mass matrix of the links in the order of the plant's joints, shape (n, n)."""
-        order = np.arange(self._joints) if self.mechanism is None else self.mechanism.order
-        position = np.empty(len(order))
-        position[order] = position_rad
-        return np.array(pin.crba(model, data, position))[np.ix_(order, order)]
+        position = np.empty(self._joints)
+        position[self._order] = position_rad
+        return np.ascontiguousarray(pin.crba(model, data, position)[self._order][:, self._order])
 
 
 def _disturbance(spec: CellSpec, step_s: float) -> ColouredNoise | None:
