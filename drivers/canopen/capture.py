@@ -126,23 +126,6 @@ class Batch:
         return message.received, message.flags, stamp_ns, drops
 
 
-class DropCounter:
-    """The kernel's drop counter of 32 bits, continued beyond them."""
-
-    def __init__(self) -> None:
-        self.total = 0  #: Frames dropped since the first
-
-    def see(self, raw: int) -> int:
-        """Process a reading; returns the total.
-
-        A frame carries the count of the time when it was queued, which may be less than a reading of the socket.
-        """
-        ahead = (raw - self.total) & 0xFFFF_FFFF
-        if ahead < 0x8000_0000:
-            self.total += ahead
-        return self.total
-
-
 class MonotonicTime:
     """Converts the kernel's wall-clock stamps to the monotonic clock, also when the wall clock is set.
 
@@ -190,7 +173,7 @@ class Capture:
         self._out = out
         self._most_bytes = backlog_records * RECORD.size
         self._backlog = bytearray()
-        self._drops = DropCounter()
+        self._kernel_dropped = 0
         self._now_ns = time.monotonic_ns()
         self._time = MonotonicTime(time.time_ns(), self._now_ns)
         self._backlog_dropped = self._interface_dropped = 0
@@ -228,7 +211,7 @@ class Capture:
                 with suppress(OSError):  # before Linux 4.12 the next frame reports it
                     counters = self._bus.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size)
                     if len(counters) == _MEMINFO.size:
-                        self._drops.see(_MEMINFO.unpack(counters)[_DROPS])
+                        self._see_drops(_MEMINFO.unpack(counters)[_DROPS])
             if not self.forward():
                 return
             if self._now_ns >= look_ns:
@@ -255,7 +238,7 @@ class Capture:
             if size == 0:
                 return errno.ENODEV
             if drops is not None:
-                self._drops.see(drops)
+                self._see_drops(drops)
             can_id, length, payload = FRAME.unpack_from(self._batch.frames, index * FRAME.size)
             if flags & MSG_OWN and can_id != SYNC:
                 continue  # of our own frames only SYNC is of interest: its actual time
@@ -271,6 +254,10 @@ class Capture:
             self._backlog += RECORD.pack(*head, can_id, RecordKind.FRAME, length, own, local, payload)
         return number
 
+    def _see_drops(self, count: int) -> None:
+        # A frame carries the count of the time when it was queued, which may be less than a reading of the socket.
+        self._kernel_dropped = max(count, self._kernel_dropped)
+
     def _note(self, kind: RecordKind, number: int = 0) -> None:
         """Append a note to the backlog, even when that is full: notes are few."""
         self._reported_drops = self._counts
@@ -278,7 +265,7 @@ class Capture:
 
     @property
     def _counts(self) -> tuple[int, int, int]:
-        return (self._drops.total, self._interface_dropped, self._backlog_dropped)
+        return (self._kernel_dropped, self._interface_dropped, self._backlog_dropped)
 
     def _read_interface(self) -> int:
         total = 0

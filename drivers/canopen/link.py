@@ -11,11 +11,10 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol
 
 import can
 
-from drivers.canopen.bus import bus_errors, send_burst
+from drivers.canopen.bus import base_frame, bus_errors, send_burst
 from drivers.canopen.emcy import describe_error_code
 from drivers.canopen.sdo import SDO_ANSWER, SDO_REQUEST, Clock, ObjectAccess, SdoPolicy, SynchronousSdoClient
 from drivers.canopen.socketcan import CapturedMessage, receive_only
@@ -73,11 +72,8 @@ class Beat:
     syncs: int  #: SYNCs of another producer until then
 
 
-class SdoListener(Protocol):
-    """Receives every SDO answer of one node."""
-
-    def receive(self, data: bytearray) -> None:
-        """Take an answer; most are for others."""
+SdoListener = Callable[[bytearray], None]
+"""Receives every SDO answer of one node; most are for others."""
 
 
 def never() -> bool:
@@ -216,7 +212,7 @@ class Link:
 
     def pass_time(self) -> None:
         """Send one SYNC and handle frames for 1 ms: a cell in lockstep advances by SYNC alone."""
-        self.send((can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False),))
+        self.send((base_frame(SYNC_COB_ID),))
         self.wait(0.001)
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
@@ -249,8 +245,7 @@ class Link:
 
     def start_heartbeat(self, node_id: int, period_ms: int) -> None:
         """Send a heartbeat with this node id from now on, whenever the bus is read."""
-        state = bytes((NmtState.OPERATIONAL,))
-        self._beat = can.Message(arbitration_id=HEARTBEAT + node_id, is_extended_id=False, data=state)
+        self._beat = base_frame(HEARTBEAT + node_id, bytes((NmtState.OPERATIONAL,)))
         self._beat_period_ns, self._next_beat_ns = period_ms * 1_000_000, self.clock()
 
     def stop_heartbeat(self) -> None:
@@ -298,7 +293,7 @@ class Link:
         elif service == SDO_ANSWER:
             self.answered[node_id] += 1
             for listener in self._listeners.get(node_id, ()):
-                listener.receive(message.data)
+                listener(message.data)
         else:
             return False
         return True
@@ -341,20 +336,16 @@ class Link:
 
     def _note_heartbeat(self, node_id: int, message: can.Message) -> None:
         previous, state, now_ns = self.nmt.get(node_id), message.data[0] & 0x7F, self.clock()
-        self._note_boot(node_id, state, now_ns)
         if state == NmtState.BOOT_UP:
             self.count_beats(node_id)
+            if previous == state and now_ns - self.heard_ns[node_id] < BOOTS_S * 1e9:
+                self.boots[node_id] += 1
         else:
             beat = Beat(_sent_ns(message, now_ns), state, self._foreign_syncs)
             self._beats.setdefault(node_id, deque(maxlen=BEATS_KEPT)).append(beat)
         self.nmt[node_id], self.heard_ns[node_id] = state, now_ns
         if previous != state:
             self._events.append((node_id, EventKind.NMT, state, f"NMT {nmt_name(previous)} -> {nmt_name(state)}"))
-
-    def _note_boot(self, node_id: int, state: int, now_ns: int) -> None:
-        again = state == NmtState.BOOT_UP == self.nmt.get(node_id)
-        if again and now_ns - self.heard_ns[node_id] < BOOTS_S * 1e9:
-            self.boots[node_id] += 1
 
     def note_twice(self, node_id: int, first: bytes, second: bytes) -> None:
         """Note that a node gave two answers to one request, unless another program asked the same."""
@@ -415,7 +406,7 @@ class Link:
         policy = policy or self.policy
         if (node_id, policy) not in self._access:
             client = SynchronousSdoClient(node_id, self, policy)
-            self.listen(node_id, client)
+            self.listen(node_id, client.receive)
             self._access[node_id, policy] = ObjectAccess(node_id, client, policy, self.names.get(node_id, ""))
         return self._access[node_id, policy]
 
@@ -426,7 +417,7 @@ class Link:
     def command_nmt(self, node_id: int, command: NmtCommand) -> int:
         """Send an NMT command; node 0 means all. Returns the time by the clock [ns]."""
         now = self.clock()
-        self.send((can.Message(arbitration_id=0, is_extended_id=False, data=bytes((command, node_id))),))
+        self.send((base_frame(NMT_COB_ID, bytes((command, node_id))),))
         return now
 
     def confirm_nmt(self, node_id: int, state: NmtState, since_ns: int, within_s: float) -> None:

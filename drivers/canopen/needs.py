@@ -16,7 +16,7 @@ from drivers.canopen.sdo import NO_SUCH_OBJECT, ObjectAccess
 from drivers.errors import ObjectAccessError
 from drivers.profiles.profile import DriveProfile, ObjectEntry
 
-HEARTBEAT_TIME = ObjectEntry(0x1017, 0, 16, signed=False)
+HEARTBEAT_TIME = ObjectEntry(0x1017, 0, 16)
 MODE_OF_OPERATION = ObjectEntry(0x6060, 0, 8, signed=True)
 MODE_DISPLAY = ObjectEntry(0x6061, 0, 8, signed=True)
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
-from types import TracebackType
 from typing import Self
 
 import can
@@ -147,40 +146,31 @@ class CanopenNetwork:
         self.link.open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         try:
             with self.block_signals() as asked_again:
                 problems = self._restore(asked_again or never) if self._setups else []
         except BaseException as cut:
             cut.add_note(f"{WHILE}closing the network: it was cut short, and not every axis has its settings back")
-            self._note_powered(cut)
+            self._note(cut, ())
             raise
         finally:
             self.link.close()
         if error is not None:
             self._note(error, problems)
-            self._note_powered(error)
         elif problems:
             self._note(problems[0], problems[1:])
-            self._note_powered(problems[0])
             raise problems[0]
 
     def _note(self, error: BaseException, problems: Sequence[DriverError]) -> None:
-        """Attach failures to close the network, with their own notes, to the error that the operator gets."""
+        """Attach failures to close the network, with their own notes, and the axes that may still have power."""
         for problem in problems:
             error.add_note(f"{WHILE}closing the network: {problem}")
             for note in getattr(problem, "__notes__", ()):
                 error.add_note(note)
-
-    def _note_powered(self, error: BaseException) -> None:
-        """Name on an error the axes that may still have power."""
-        if self.powered:
-            names = ", ".join(
-                node_label(node_id, self.link.names) for node_id in self.node_ids if node_id in self.powered
-            )
-            error.add_note(POWERED + names)
+        powered = [node_label(axis) for axis in self.axes if axis.node_id in self.powered]
+        if powered:
+            error.add_note(POWERED + ", ".join(powered))
 
     def see(self, axis: Axis, state: State) -> None:
         """Remember whether an axis has power."""
@@ -330,14 +320,6 @@ class CanopenNetwork:
             BusBusy: another master commands this bus.
         """
         self.link.require_quiet(self.bounds.listen_s)
-
-    def require_alone(self) -> None:
-        """Check the frames that arrived since `require_quiet`.
-
-        Raises:
-            BusBusy: a command of another master was among them.
-        """
-        self.link.require_alone()
 
     def other_master(self) -> str:
         """Describe SDO requests of another master since `require_quiet`; empty without any."""

@@ -18,16 +18,16 @@ from drivers.errors import ObjectAccessError
 from drivers.profiles.cia402 import State, decode
 from drivers.profiles.profile import Identity, ObjectEntry
 
-VENDOR_ID = ObjectEntry(0x1018, 1, 32, signed=False)
-PRODUCT_CODE = ObjectEntry(0x1018, 2, 32, signed=False)
-REVISION = ObjectEntry(0x1018, 3, 32, signed=False)
-SERIAL = ObjectEntry(0x1018, 4, 32, signed=False)
+VENDOR_ID = ObjectEntry(0x1018, 1, 32)
+PRODUCT_CODE = ObjectEntry(0x1018, 2, 32)
+REVISION = ObjectEntry(0x1018, 3, 32)
+SERIAL = ObjectEntry(0x1018, 4, 32)
 T = TypeVar("T")
 SCAN_POLICY = SdoPolicy(attempts=2, transfer_s=1.0, most_bytes=256)
 """One node that never ends must not keep the others from being found."""
 NODE_S = 3.0  #: After this time, nothing more is asked of a node
 SCAN_S = 30.0  #: After this time, nothing more is asked of any node
-_DEVICE_TYPE = ObjectEntry(0x1000, 0, 32, signed=False)
+_DEVICE_TYPE = ObjectEntry(0x1000, 0, 32)
 
 
 @dataclass(frozen=True, slots=True)

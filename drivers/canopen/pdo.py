@@ -28,12 +28,12 @@ _EXTENDED = 1 << 29  #: COB-ID of 29 bits
 _COB_ID_BITS = NOT_VALID | 0x1FFF_FFFF  # bit 30 (RTR) is set by some drives on their own
 SYNCHRONOUS = 1  #: Transmission type: sent, or acted upon, at every SYNC
 
-STATUSWORD = ObjectEntry(0x6041, 0, 16, signed=False)
-CONTROLWORD = ObjectEntry(0x6040, 0, 16, signed=False)
+STATUSWORD = ObjectEntry(0x6041, 0, 16)
+CONTROLWORD = ObjectEntry(0x6040, 0, 16)
 TARGET_POSITION = ObjectEntry(0x607A, 0, 32, signed=True)
-PROFILE_VELOCITY = ObjectEntry(0x6081, 0, 32, signed=False)
-PROFILE_ACCELERATION = ObjectEntry(0x6083, 0, 32, signed=False)
-PROFILE_DECELERATION = ObjectEntry(0x6084, 0, 32, signed=False)
+PROFILE_VELOCITY = ObjectEntry(0x6081, 0, 32)
+PROFILE_ACCELERATION = ObjectEntry(0x6083, 0, 32)
+PROFILE_DECELERATION = ObjectEntry(0x6084, 0, 32)
 
 _CODES = {(8, True): "b", (8, False): "B", (16, True): "h", (16, False): "H", (32, True): "i", (32, False): "I"}
 
@@ -211,14 +211,14 @@ def record_payload(record: PdoRecord, entries: Sequence[ObjectEntry]) -> tuple[s
 def _parameters(direction: Direction, number: int) -> tuple[ObjectEntry, ObjectEntry, ObjectEntry]:
     communication, mapping, _ = direction.value
     return (
-        ObjectEntry(communication + number, 1, 32, signed=False),
-        ObjectEntry(communication + number, 2, 8, signed=False),
-        ObjectEntry(mapping + number, 0, 8, signed=False),
+        ObjectEntry(communication + number, 1, 32),
+        ObjectEntry(communication + number, 2, 8),
+        ObjectEntry(mapping + number, 0, 8),
     )
 
 
 def _entry(count: ObjectEntry, subindex: int) -> ObjectEntry:
-    return ObjectEntry(count.index, subindex, 32, signed=False)
+    return ObjectEntry(count.index, subindex, 32)
 
 
 def read_pdo_record(access: ObjectAccess, direction: Direction, number: int) -> PdoRecord | None:

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 from drivers.canopen.sdo import ObjectAccess
-from drivers.errors import Node, SetupRefused
+from drivers.errors import SetupRefused
 from drivers.profiles.profile import Amplitude, DriveProfile
 
 SMALLEST_RATED_A, LARGEST_RATED_A = 0.01, 1000.0
@@ -50,7 +50,7 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
     """
 
     def implausible(found: str, expected: str, remedy: str) -> SetupRefused:
-        return _implausible(access, profile.name, found, expected, remedy)
+        return SetupRefused(access, f"profile {profile.name}: found {found}; expected {expected}; {remedy}")
 
     scale, entry = profile.current_scale, profile.current
     values = {str(entry): access.read(entry) for entry in scale.objects}
@@ -126,7 +126,3 @@ def _name_plate(access: ObjectAccess, profile: DriveProfile) -> tuple[float | No
         found = f"{missing}; the torque constant cannot be checked{unlogged}"
         return current * rated.ampere_per_unit, None, (found,)
     return current * rated.ampere_per_unit, torque * rated.newton_metre_per_unit, ()
-
-
-def _implausible(node: Node, profile: str, found: str, expected: str, remedy: str) -> SetupRefused:
-    return SetupRefused(node, f"profile {profile}: found {found}; expected {expected}; {remedy}")

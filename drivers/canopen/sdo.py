@@ -12,6 +12,7 @@ from canopen import ObjectDictionary
 from canopen.sdo.client import BlockUploadStream, ReadableStream, SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
+from drivers.canopen.bus import base_frame
 from drivers.errors import ObjectAccessError
 from drivers.profiles.profile import ObjectEntry
 
@@ -44,14 +45,14 @@ class UploadAnswer:
 def upload_request(node_id: int, entry: ObjectEntry) -> can.Message:
     """Return the request for an object."""
     data = _HEAD.pack(_UPLOAD_REQUEST, entry.index, entry.subindex) + bytes(4)
-    return can.Message(arbitration_id=SDO_REQUEST + node_id, is_extended_id=False, data=data)
+    return base_frame(SDO_REQUEST + node_id, data)
 
 
 def download_request(node_id: int, entry: ObjectEntry, value: int) -> can.Message:
     """Return the request to write an object of at most four bytes."""
     command = _INITIATE_DOWNLOAD << 5 | (4 - entry.bits // 8) << 2 | 0x03  # expedited, with its size
     data = _HEAD.pack(command, entry.index, entry.subindex) + struct.pack("<L", value)
-    return can.Message(arbitration_id=SDO_REQUEST + node_id, is_extended_id=False, data=data)
+    return base_frame(SDO_REQUEST + node_id, data)
 
 
 def upload_answer(data: bytes, entry: ObjectEntry) -> UploadAnswer | None:
@@ -230,7 +231,7 @@ class SynchronousSdoClient(SdoClient):
 
     def send_request(self, request: bytes) -> None:
         """Send a request; a failing bus raises BusError."""
-        self._bus.send((can.Message(arbitration_id=self.rx_cobid, is_extended_id=False, data=request),))
+        self._bus.send((base_frame(self.rx_cobid, request),))
         self._bus.asked_by[self.rx_cobid - SDO_REQUEST] = self
 
     def abort(self, abort_code: int = _ABORT_TIMED_OUT) -> None:

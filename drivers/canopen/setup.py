@@ -41,7 +41,7 @@ from drivers.errors import DriverError, ObjectAccessError, SetupRefused, StateRe
 from drivers.profiles.profile import Axis, Identity, ObjectEntry
 
 PROFILE_POSITION_MODE = 1
-CONSUMERS = ObjectEntry(0x1016, 0, 8, signed=False)
+CONSUMERS = ObjectEntry(0x1016, 0, 8)
 ABORT_CONNECTION = ObjectEntry(0x6007, 0, 16, signed=True)
 QUICK_STOP_ON_LOSS = 3
 SMALL_PDO_BYTES = 6  #: Tried where a drive refuses PDOs of eight bytes
@@ -61,7 +61,7 @@ def read_consumers(access: ObjectAccess) -> Consumers | None:
     found: list[tuple[ObjectEntry, int]] = []
     try:
         for sub in range(1, min(access.read(CONSUMERS), MOST_CONSUMERS) + 1):
-            entry = ObjectEntry(CONSUMERS.index, sub, 32, signed=False)
+            entry = ObjectEntry(CONSUMERS.index, sub, 32)
             found.append((entry, access.read(entry)))
     except ObjectAccessError as error:
         if error.abort_code is None:

@@ -74,8 +74,8 @@ class CapturedMessage(can.Message):
 
 def losses_of(bus: can.BusABC) -> Losses:
     """Return the frames of a bus that this machine lost; zeros where a bus does not count them."""
-    found = getattr(bus, "losses", NO_LOSSES)
-    return found if isinstance(found, Losses) else NO_LOSSES
+    losses: Losses = getattr(bus, "losses", NO_LOSSES)
+    return losses
 
 
 def receive_only(bus: can.BusABC, wanted: Sequence[tuple[int, int]]) -> None:
@@ -90,8 +90,8 @@ def read_until_ns(bus: can.BusABC) -> int | None:
 
     On a bus with stamps our own SYNC comes back, in its place among the other frames.
     """
-    found = getattr(bus, "read_until_ns", None)
-    return found if isinstance(found, int) else None
+    until_ns: int | None = getattr(bus, "read_until_ns", None)
+    return until_ns
 
 
 def lags_behind(bus: can.BusABC, time_ns: int) -> bool:
@@ -210,7 +210,7 @@ class SocketcanBus(BurstBus):
             raise can.CanOperationError(f"no CAN FD frames on this bus: {msg}")
         flags = _EXTENDED * msg.is_extended_id | _REMOTE * msg.is_remote_frame | _ERROR * msg.is_error_frame
         frame = FRAME.pack(msg.arbitration_id | flags, msg.dlc, bytes(msg.data))
-        deadline: float | None = None
+        deadline = time.monotonic() + (SEND_S if timeout is None else timeout)
         while True:
             try:
                 self._socket.send(frame, socket.MSG_DONTWAIT)
@@ -219,9 +219,7 @@ class SocketcanBus(BurstBus):
                 if error.errno not in (errno.ENOBUFS, errno.EAGAIN):
                     raise can.CanOperationError(_reason(error.errno or errno.EIO)) from error
                 # The interface's queue holds ten frames by default; a burst of set-points is longer.
-                now = time.monotonic()
-                deadline = now + (SEND_S if timeout is None else timeout) if deadline is None else deadline
-                if now >= deadline:
+                if time.monotonic() >= deadline:
                     raise can.CanOperationError(
                         f"the transmit queue stays full for {SEND_S:g} s: does any node acknowledge frames?"
                     ) from error

@@ -29,6 +29,7 @@ LONGEST_LEFT_OUT_S = 0.1  #: Time after a time-out in which frames that are left
 LARGEST_RUN = 64  #: Frames of one bus in a row while another has one too: a lagging clock must not silence the others
 BUS_OFF = 0x40  # linux/can/error.h, class CAN_ERR_BUSOFF of an error frame
 BUS_OFF_REASON = "bus-off: the CAN controller disconnected itself; check the wiring"
+_FAILURES = (can.CanError, OSError, BusError)
 _FROM_NODES = frozenset((0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700))
 """Services that nodes send: EMCY, TPDO1 to 4, SDO answer, heartbeat."""
 
@@ -167,7 +168,7 @@ class SplitBus(can.BusABC):
                         continue
                     try:
                         send_burst(self._ends[index], burst)
-                    except (can.CanError, OSError, BusError) as error:
+                    except _FAILURES as error:
                         failures.append(self._failure(index, error))
         if failures:
             raise failures[0]
@@ -202,7 +203,7 @@ class SplitBus(can.BusABC):
     def _take(self, index: int, timeout_s: float) -> can.Message | None:
         try:
             message = self._ends[index].recv(timeout_s)
-        except (can.CanError, OSError, BusError) as error:
+        except _FAILURES as error:
             raise self._failure(index, error) from error
         if message is None:
             return None
@@ -284,7 +285,7 @@ class SplitBus(can.BusABC):
         for index, end in enumerate(self._ends):
             try:
                 end.shutdown()
-            except (can.CanError, OSError, BusError) as error:
+            except _FAILURES as error:
                 failures.append(self._failure(index, error))
         if failures:
             raise failures[0]

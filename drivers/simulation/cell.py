@@ -7,12 +7,11 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
-from types import TracebackType
 
 import can
 import numpy as np
 
-from drivers.canopen.bus import SocketcandBus, send_burst
+from drivers.canopen.bus import SocketcandBus, base_frame, send_burst
 from drivers.canopen.split_bus import SplitBus
 from drivers.errors import BusError
 from drivers.simulation.amplifier import AmplifierSet
@@ -169,9 +168,7 @@ class SimulatedCell:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self.stop()
         if self._thread is not None:
             self._thread.join()
@@ -359,7 +356,7 @@ class SimulatedCell:
             self._send(*frame)
 
     def _send(self, can_id: int, data: bytes) -> None:
-        message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+        message = base_frame(can_id, data)
         if self._burst is None:
             self._put((message,))
         else:

@@ -15,7 +15,6 @@ import socket
 import struct
 from contextlib import AbstractContextManager
 from math import ceil
-from types import TracebackType
 
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.capture import FRAME
@@ -26,8 +25,8 @@ from drivers.errors import WHILE, BusError, DriverError
 from drivers.profiles.profile import ObjectEntry
 from drivers.stream.sync import FollowedSync
 
-SYNC_COB_ID_OBJECT = ObjectEntry(0x1005, 0, 32, signed=False)
-CYCLE_PERIOD = ObjectEntry(0x1006, 0, 32, signed=False)
+SYNC_COB_ID_OBJECT = ObjectEntry(0x1005, 0, 32)
+CYCLE_PERIOD = ObjectEntry(0x1006, 0, 32)
 """Period [us]; a producer sends no SYNC while it is 0 (CiA 301)."""
 PRODUCES = 1 << 30
 LEASE_S = 0.4  #: Time for which the kernel goes on alone; less than the 0.5 s of the amplifiers' own watch
@@ -158,9 +157,7 @@ class DriveProducer(AbstractContextManager["DriveProducer"]):
         self._before: tuple[int, int] | None = None
         self._produces = False
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         try:
             if error is not None:
                 self._network.begin_closing()

@@ -23,7 +23,7 @@ from drivers.canopen.link import SYNC_COB_ID
 from drivers.canopen.sdo import Clock
 from drivers.canopen.socketcan import CapturedMessage, lags_behind, read_until_ns
 from drivers.errors import BusError
-from drivers.messages import CellEvent, EventKind
+from drivers.messages import EventKind
 from drivers.stream.cycles import LARGEST_LAG_NS, CycleBus, Cycles, arrived_ns, is_sync
 
 SHORTENED, STRAGGLING = 16, 4
@@ -356,7 +356,7 @@ class FollowedCycles(_CyclesByOrder):
         bus = self.bus
         pacing = self._pacing
         reason = f"no SYNC from {pacing.producer} for {pacing.timeout_s:g} s"
-        bus.emit(CellEvent(bus.time_ns, None, EventKind.SYNC_LOST, bus.cycles, reason))
+        bus.report(None, EventKind.SYNC_LOST, bus.cycles, reason)
         bus.faults.append(BusError(str(bus.link.address), reason))
         due_ns = bus.clock()
         if bus.cycles:

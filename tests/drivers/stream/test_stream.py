@@ -457,7 +457,7 @@ def test_what_is_to_be_sent_goes_out_at_once(followed: Followed) -> None:
     stream, bus, producer, _ = followed
     next(stream)
     frame = can.Message(arbitration_id=0x201, is_extended_id=False, data=bytes(6))
-    stream.outgoing.append(frame)
+    stream.bus.outgoing.append(frame)
     producer.pulse()
     next(stream)
     assert bus.sent[-1] is frame
