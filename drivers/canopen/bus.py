@@ -147,8 +147,10 @@ class VirtualEnd(BurstBus, VirtualBus):
         for queue in self.channel:
             if queue is not self.queue:
                 frame = msg.__copy__()
-                frame.data, frame.timestamp = msg.data[:], time.time()
-                frame.channel, frame.is_rx = self.channel_id, True
+                frame.data = msg.data[:]
+                frame.timestamp = time.time()
+                frame.channel = self.channel_id
+                frame.is_rx = True
                 queue.put(frame)
 
     def _fill(self, timeout_s: float | None) -> None:

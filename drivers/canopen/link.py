@@ -24,7 +24,8 @@ from drivers.messages import CellEvent, EventKind
 
 SYNC_COB_ID = 0x080
 NMT_COB_ID = 0x000
-EMCY, HEARTBEAT = 0x080, 0x700
+EMCY = 0x080
+HEARTBEAT = 0x700
 LSS = frozenset((0x7E4, 0x7E5))  #: Layer setting services (CiA 305): a device gets another node id or bit rate
 _RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))  #: Set-points of a drive (CiA 301, predefined connection set)
 _WRITES = frozenset((0, 1, 6))  #: Command specifiers (upper three bits) of downloads: segment, begin, block
@@ -39,8 +40,12 @@ PERIODS_HEARD = 3.0  #: Periods in which two devices send `BEATS_JUDGED` heartbe
 LISTEN_S = 0.2  #: Usual time to listen for other masters before the first frame is sent
 PUMP_S = 0.1  #: Longest time spent on frames that have already arrived, however fast more arrive
 # linux/can/error.h: classes of an error frame, and the controller's state in its second byte.
-_CONTROLLER, _RESTARTED = 0x004, 0x100
-_OVERFLOW, _WARNING, _PASSIVE, _ACTIVE = 0x03, 0x0C, 0x30, 0x40
+_CONTROLLER = 0x004
+_RESTARTED = 0x100
+_OVERFLOW = 0x03
+_WARNING = 0x0C
+_PASSIVE = 0x30
+_ACTIVE = 0x40
 
 
 class NmtState(IntEnum):
@@ -90,7 +95,8 @@ def nmt_name(state: int | None) -> str:
 
 def command_name(identifier: int, names: Mapping[int, str]) -> str:
     """Describe a frame that only the recorder should send; `names` of the axes are by node id."""
-    shown, node_id = f"({identifier:03X}h)", identifier & 0x7F
+    shown = f"({identifier:03X}h)"
+    node_id = identifier & 0x7F
     if identifier >= HEARTBEAT and identifier not in LSS:
         name = f"a heartbeat with the recorder's own node id {node_id}"
     elif identifier >= SDO_REQUEST and identifier not in LSS:
@@ -267,7 +273,8 @@ class Link:
             self._note_error_frame(message)
         if message.is_error_frame or not message.is_rx:
             return True  # also our own SYNC, which is received for its time stamp
-        service, node_id = message.arbitration_id & 0x780, message.arbitration_id & 0x7F
+        service = message.arbitration_id & 0x780
+        node_id = message.arbitration_id & 0x7F
         if message.is_extended_id or message.is_remote_frame:
             return False
         ours = (service in _RPDOS and node_id in self.names) or self.is_own(message.arbitration_id)
@@ -335,7 +342,9 @@ class Link:
             self._events.append((0, EventKind.BUS_BUSY, identifier, f"{seen} that we did not send"))
 
     def _note_heartbeat(self, node_id: int, message: can.Message) -> None:
-        previous, state, now_ns = self.nmt.get(node_id), message.data[0] & 0x7F, self.clock()
+        previous = self.nmt.get(node_id)
+        state = message.data[0] & 0x7F
+        now_ns = self.clock()
         if state == NmtState.BOOT_UP:
             self.count_beats(node_id)
             if previous == state and now_ns - self.heard_ns[node_id] < BOOTS_S * 1e9:
@@ -343,7 +352,8 @@ class Link:
         else:
             beat = Beat(_sent_ns(message, now_ns), state, self._foreign_syncs)
             self._beats.setdefault(node_id, deque(maxlen=BEATS_KEPT)).append(beat)
-        self.nmt[node_id], self.heard_ns[node_id] = state, now_ns
+        self.nmt[node_id] = state
+        self.heard_ns[node_id] = now_ns
         if previous != state:
             self._events.append((node_id, EventKind.NMT, state, f"NMT {nmt_name(previous)} -> {nmt_name(state)}"))
 
@@ -393,7 +403,8 @@ class Link:
 
     def take_events(self, time_ns: int, node_ids: Sequence[int]) -> tuple[CellEvent, ...]:
         """Return the events since the last call in their order; axis is None for nodes that are no axes of ours."""
-        taken, self._events = self._events, deque()
+        taken = self._events
+        self._events = deque()
         found = []
         for node, kind, code, text in taken:
             axis = node_ids.index(node) if node in node_ids else None

@@ -291,7 +291,8 @@ class CanopenNetwork:
         awaited = {producer_of(value) for value in watched if value & 0xFFFF != self.guard_ms}
         left = [n for n in range(127, 0, -1) if n not in awaited and n not in self.node_ids]
         while left := [n for n in left if n not in self.link.heard]:
-            asked, left = left[:ASKED_AT_ONCE], left[ASKED_AT_ONCE:]
+            asked = left[:ASKED_AT_ONCE]
+            left = left[ASKED_AT_ONCE:]
             if free := free_ids(self.link, asked, self.bounds.free_s):
                 self.recorder_id = self.link.own_id = free[0]
                 return
@@ -466,7 +467,8 @@ class CanopenNetwork:
                 if goal is Goal.SWITCH_ON_DISABLED:
                     raise StateRefused(axis, str(State.SWITCH_ON_DISABLED), str(state), statusword)
                 # The ramp did not end by itself: some drives stay in QUICK STOP ACTIVE (605Ah = 5..8).
-                goal, deadline = Goal.SWITCH_ON_DISABLED, deadline + round(self.bounds.disable_s * 1e9)
+                goal = Goal.SWITCH_ON_DISABLED
+                deadline += round(self.bounds.disable_s * 1e9)
             access.write(CONTROLWORD, next_command(state, goal))
             self.link.pass_time()
 

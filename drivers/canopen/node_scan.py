@@ -98,7 +98,8 @@ def _describe(link: Link, node_id: int, scan_end_ns: int) -> tuple[FoundNode, in
 
     An object that it reports badly does not keep the others from it.
     """
-    access, problems = link.objects(node_id, SCAN_POLICY), list[str]()
+    access = link.objects(node_id, SCAN_POLICY)
+    problems = list[str]()
     end_ns = min(link.clock() + round(NODE_S * 1e9), scan_end_ns)
     unasked = f"the rest was not asked: its answers took longer than {NODE_S:g} s"
     if link.clock() >= scan_end_ns:

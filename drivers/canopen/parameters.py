@@ -234,7 +234,8 @@ def _undo(
     error: BaseException,
 ) -> None:
     """Restore the old values, and save them where the new ones may have been saved; ParametersMixed if not all are."""
-    restored, problems = [], []
+    restored = []
+    problems = []
     try:
         # One time limit for all drives that do not answer.
         network.find_silent([value.axis for value in tried])

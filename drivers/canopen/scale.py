@@ -52,7 +52,8 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
     def implausible(found: str, expected: str, remedy: str) -> SetupRefused:
         return SetupRefused(access, f"profile {profile.name}: found {found}; expected {expected}; {remedy}")
 
-    scale, entry = profile.current_scale, profile.current
+    scale = profile.current_scale
+    entry = profile.current
     values = {str(entry): access.read(entry) for entry in scale.objects}
     for name, value in values.items():
         if value <= 0:
@@ -72,7 +73,8 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
             expected = f"{SMALLEST_RATED_A:g} to {LARGEST_RATED_A:g} A"
             remedy = "was it entered in another unit than the drive's manual says?"
             raise implausible(f"a rated current of {rated_a:g} A", expected, remedy)
-        steps, most = rated_a / ampere, 2 ** (entry.bits - 1 if entry.signed else entry.bits) - 1
+        steps = rated_a / ampere
+        most = 2 ** (entry.bits - 1 if entry.signed else entry.bits) - 1
         if not MIN_STEPS <= steps <= most:
             raise implausible(
                 f"a rated current of {rated_a:g} A in steps of {ampere:.4g} A, {steps:.3g} of them",
@@ -92,7 +94,8 @@ def check_name_plate(reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a
     Returns:
         Warnings for a poor fit; none where the drive does not report both values, of which the reading warns.
     """
-    reported, declared = reading.torque_constant_nm_per_a, abs(motor_nm_per_a)
+    reported = reading.torque_constant_nm_per_a
+    declared = abs(motor_nm_per_a)
     if reported is None:
         return ()
     ratio = reported / declared

@@ -19,11 +19,15 @@ from drivers.profiles.profile import ObjectEntry
 NO_SUCH_OBJECT = frozenset((0x0602_0000, 0x0609_0011))
 """Aborts of a drive that lacks the object or its sub-index (CiA 301); any other may be gone at the next request."""
 SDO_REQUEST, SDO_ANSWER = 0x600, 0x580  #: COB-IDs, to which the node id is added (CiA 301)
-_ABORT_TIMED_OUT, _ABORT_UNKNOWN_COMMAND, _ABORT_OUT_OF_MEMORY = 0x0504_0000, 0x0504_0001, 0x0504_0005
+_ABORT_TIMED_OUT = 0x0504_0000
+_ABORT_UNKNOWN_COMMAND = 0x0504_0001
+_ABORT_OUT_OF_MEMORY = 0x0504_0005
 _ABORT = 0x80
 _SEGMENT_BYTES = 7
 MOST_SURPLUS = 64  #: Answers to other requests that are skipped, before a node counts as one that does not answer
-_INITIATE_DOWNLOAD, _INITIATE_UPLOAD, _INITIATE_BLOCK_UPLOAD = 1, 2, 5
+_INITIATE_DOWNLOAD = 1
+_INITIATE_UPLOAD = 2
+_INITIATE_BLOCK_UPLOAD = 5
 _UPLOAD_REQUEST = _INITIATE_UPLOAD << 5
 _EXPEDITED, _SIZE_INDICATED = 0x42, 0x01  #: Bits of an upload answer with its data, and of one that says their size
 _HEAD = struct.Struct("<BHB")
@@ -200,10 +204,12 @@ class SynchronousSdoClient(SdoClient):
 
     def _read_whole(self, index: int, subindex: int, *, block: bool) -> bytes:
         deadline = self._bus.clock() + round(self._policy.transfer_s * 1e9)
-        most, data = self._policy.most_bytes, bytearray()
+        most = self._policy.most_bytes
+        data = bytearray()
         try:
             with BlockUploadStream(self, index, subindex) if block else ReadableStream(self, index, subindex) as stream:
-                size, read = stream.size or 0, cast("Callable[[int], bytes]", stream.read)
+                size = stream.size or 0
+                read = cast("Callable[[int], bytes]", stream.read)
                 while size <= most and (segment := read(_SEGMENT_BYTES)):
                     data += segment
                     size = max(size, len(data))
@@ -261,7 +267,8 @@ class SynchronousSdoClient(SdoClient):
         """Send a request and return the answer that belongs to it, or raise SdoAbortedError, SdoCommunicationError."""
         self._bus.pump(0.0)
         self.responses.queue.clear()
-        before, self._answered = self._answered, b""
+        before = self._answered
+        self._answered = b""
         if self._bus.asked_by.get(self.tx_cobid - SDO_ANSWER) is not self:
             before = b""
         self.send_request(sdo_request)

@@ -84,7 +84,8 @@ class HeartbeatGuard:
         self._option_before: int | None = None
         for entry, value in consumers or ():
             if (ours := left_over(value)) or not value & 0xFFFF:
-                self._consumer, self._consumer_before = entry, 0 if ours else value
+                self._consumer = entry
+                self._consumer_before = 0 if ours else value
                 break
         else:
             free = "" if consumers is None else "free "
@@ -113,7 +114,8 @@ class HeartbeatGuard:
         if self._consumer is None:
             return
         if self._option_before is not None and (refused := self._refused(ABORT_CONNECTION, QUICK_STOP_ON_LOSS)):
-            before, self._option_before = self._option_before, None
+            before = self._option_before
+            self._option_before = None
             self.lack = f"6007h = {before} rules how it stops when the recorder is killed: 3 is {refused}"
         if refused := self._refused(self._consumer, recorder_id << 16 | silence_ms):
             if self._option_before is not None:
@@ -160,7 +162,8 @@ class AxisSetup:
             SetupRefused: it does not; `profiles` are those from which one that fits is named.
             ObjectAccessError: the drive does not answer.
         """
-        access, axis = self._access, self._axis
+        access = self._access
+        axis = self._axis
         if found := misfit(access, axis.profile, profiles):
             raise SetupRefused(axis, found)
         if access.read_optional(PROFILE_DECELERATION) is None:

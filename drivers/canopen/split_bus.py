@@ -188,7 +188,8 @@ class SplitBus(can.BusABC):
                     self._waiting[index] = self._take(index, 0.0)
             oldest = self._oldest()
             if oldest is not None:
-                message, self._waiting[oldest] = self._waiting[oldest], None
+                message = self._waiting[oldest]
+                self._waiting[oldest] = None
                 if message is not None and self._belongs(message, oldest):
                     return message
                 if end_s is not None and self._clock() > end_s + LONGEST_LEFT_OUT_S:

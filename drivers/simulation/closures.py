@@ -208,8 +208,10 @@ def eliminate(matrix: FloatArray, rank: int, held: NDArray[np.bool_], pivots: ND
         the smallest pivot over the largest.
     """
     n = matrix.shape[1] - 1
-    used, barred = np.zeros(n, dtype=np.bool_), np.empty(n, dtype=np.bool_)
-    largest, smallest = 0.0, np.inf
+    used = np.zeros(n, dtype=np.bool_)
+    barred = np.empty(n, dtype=np.bool_)
+    largest = 0.0
+    smallest = np.inf
     for i in range(rank):
         for j in range(n):
             barred[j] = used[j] or held[j]
@@ -218,7 +220,8 @@ def eliminate(matrix: FloatArray, rank: int, held: NDArray[np.bool_], pivots: ND
             best, at_row, column = _find_pivot(matrix, i, used)
         if not best > 0.0:
             return 0.0
-        largest, smallest = max(largest, best), min(smallest, best)
+        largest = max(largest, best)
+        smallest = min(smallest, best)
         used[column] = True
         pivots[i] = column
         for j in range(n + 1):
@@ -237,11 +240,15 @@ def eliminate(matrix: FloatArray, rank: int, held: NDArray[np.bool_], pivots: ND
 @compiled
 def _find_pivot(matrix: FloatArray, first: int, barred: NDArray[np.bool_]) -> tuple[float, int, int]:
     """Return the largest value from a row on outside the barred columns and the last one, its row and column."""
-    best, at_row, at_column = 0.0, first, 0
+    best = 0.0
+    at_row = first
+    at_column = 0
     for k in range(first, matrix.shape[0]):
         for j in range(matrix.shape[1] - 1):
             if not barred[j] and abs(matrix[k, j]) > best:
-                best, at_row, at_column = abs(matrix[k, j]), k, j
+                best = abs(matrix[k, j])
+                at_row = k
+                at_column = j
     return best, at_row, at_column
 
 
@@ -350,7 +357,8 @@ class Mechanism:
 
     def at(self, position_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return φ, shape (c,), and J_c, shape (c, n)."""
-        error, jacobian = np.zeros(self.rows), np.zeros((self.rows, len(self.joints)))
+        error = np.zeros(self.rows)
+        jacobian = np.zeros((self.rows, len(self.joints)))
         evaluate(self.constants, np.ascontiguousarray(position_rad, dtype=np.float64), error, jacobian)
         return error, jacobian
 

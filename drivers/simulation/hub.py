@@ -108,7 +108,9 @@ class _Client(asyncio.Protocol):
             self.drop()
 
     def data_received(self, data: bytes) -> None:
-        buffer, end, frames = self._incoming + data, 0, []
+        buffer = self._incoming + data
+        end = 0
+        frames = []
         stamp = b"%.6f" % self._hub.clock()
         for match in _COMMAND.finditer(buffer):
             end = match.end()

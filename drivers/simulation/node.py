@@ -28,7 +28,9 @@ Send = Callable[[int, bytes], None]
 
 NOT_STORED = 0x08000020
 NOT_IN_THIS_STATE = 0x08000022
-GAIN, STORE, LOAD_DEFAULTS = 0x2003, 0x1010, 0x1011
+GAIN = 0x2003
+STORE = 0x1010
+LOAD_DEFAULTS = 0x1011
 QUICK_STOP = 3  #: Value of 6007h
 
 
@@ -66,7 +68,10 @@ class Node:
         self.node_id = axis.node_id
         self.nmt = NmtState.INITIALISING
         self.drive = Drive(index, amplifiers, self._number)
-        self._index, self._axis, self._amplifiers, self._send = index, axis, amplifiers, send
+        self._index = index
+        self._axis = axis
+        self._amplifiers = amplifiers
+        self._send = send
         self._dictionary = amplifier_dictionary(axis)
         self._signals = {current.key: current.source(amplifiers, index) for current in vendor(axis).currents}
         self._values = {key: entry.default for key, entry in self._dictionary.items()}
@@ -77,7 +82,8 @@ class Node:
         self._history: list[int] = []
         self._sdo = SdoServer(self.read, self.write)
         self._now_us = 0
-        self._beat_us, self._beat_wall_s = 0, 0.0
+        self._beat_us = 0
+        self._beat_wall_s = 0.0
         self._heard_wall_s: float | None = None
         self._toggle = 0
         self._toggle_mask = 0 if axis.toggle_bit is None else 1 << axis.toggle_bit
@@ -89,7 +95,8 @@ class Node:
         self._apply_settings()
         self._send(0x700 + self.node_id, bytes([NmtState.INITIALISING]))
         self.nmt = NmtState.PRE_OPERATIONAL
-        self._beat_us, self._beat_wall_s = self._now_us, wall_s
+        self._beat_us = self._now_us
+        self._beat_wall_s = wall_s
 
     def command_nmt(self, command: int, wall_s: float) -> None:
         """Execute an NMT command; unknown ones are ignored, as CiA 301 requires."""
@@ -116,6 +123,20 @@ class Node:
             self._restore(self.saved, first=0x1000, last=0x1FFF)
             self.boot(wall_s)
 
+    def receive(self, can_id: int, data: bytes, clock: Callable[[], float]) -> None:
+        """Take a frame of the bus that is no SYNC; most are for others."""
+        service = can_id & 0x780
+        if can_id == 0:
+            if len(data) >= 2 and data[1] in (0, self.node_id):
+                self.command_nmt(data[0], clock())
+        elif service == 0x600:
+            if can_id == 0x600 + self.node_id:
+                self.request(data)
+        elif service == 0x700:
+            self.hear_heartbeat(can_id - 0x700, clock())
+        else:
+            self.receive_pdo(can_id, data)
+
     def hear_heartbeat(self, producer: int, wall_s: float) -> None:
         """Note a heartbeat; that of the node in 1016h is monitored from its first one on."""
         if self._number(0x1016, 1) >> 16 & 0x7F == producer:
@@ -128,7 +149,8 @@ class Node:
             whether the monitored heartbeat has become overdue now.
         """
         # Without SYNC plant time is stopped: the first is judged by wall time, the second by the faster of both.
-        allowed_ms, heard_s = self._values[0x1016, 1] & 0xFFFF, self._heard_wall_s
+        allowed_ms = self._values[0x1016, 1] & 0xFFFF
+        heard_s = self._heard_wall_s
         lost = bool(allowed_ms) and heard_s is not None and (wall_s - heard_s) * 1e3 >= allowed_ms
         if lost or not allowed_ms:
             self._heard_wall_s = None
@@ -139,7 +161,8 @@ class Node:
         if period_ms == 0 or self.nmt is NmtState.INITIALISING:
             return lost
         if now_us - self._beat_us >= 1000 * period_ms or (wall_s - self._beat_wall_s) * 1e3 >= period_ms:
-            self._beat_us, self._beat_wall_s = now_us, wall_s
+            self._beat_us = now_us
+            self._beat_wall_s = wall_s
             self._send(0x700 + self.node_id, bytes([self.nmt]))
         return lost
 
@@ -190,7 +213,8 @@ class Node:
     def begin_cycle(self) -> None:
         """Apply the synchronous receive PDOs on SYNC."""
         if self._pending:
-            pending, self._pending = self._pending, {}
+            pending = self._pending
+            self._pending = {}
             for number, data in pending.items():
                 self._unpack(self._receive[number], data)
 
@@ -281,7 +305,9 @@ class Node:
         return side[number]
 
     def _source(self, key: tuple[int, int]) -> Callable[[], int]:
-        i, drive, amplifiers = self._index, self.drive, self._amplifiers
+        i = self._index
+        drive = self.drive
+        amplifiers = self._amplifiers
         live: dict[int, Callable[[], int]] = {
             0x1001: lambda: int(drive.error is not ErrorCode.NONE),
             0x2005: lambda: round(10.0 * float(amplifiers.temperature_c[i])),

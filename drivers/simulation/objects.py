@@ -98,7 +98,8 @@ class Entry:
 
 Dictionary = dict[tuple[int, int], Entry]
 
-_REAL32, _REAL32_BITS = struct.Struct("<f"), struct.Struct("<I")
+_REAL32 = struct.Struct("<f")
+_REAL32_BITS = struct.Struct("<I")
 
 SAVE = int.from_bytes(b"save", "little")
 LOAD = int.from_bytes(b"load", "little")
@@ -107,67 +108,68 @@ LOAD = int.from_bytes(b"load", "little")
 def _cia402(axis: AxisSpec) -> tuple[Entry, ...]:
     counts = axis.counts_per_revolution
     peak_per_mille = round(1000 * axis.peak_current_a / axis.rated_current_a)
+    i8, u8, i16, u16, i32, u32, text = Kind
     ro, rw, tpdo, rpdo = Access
     return (
-        Entry(0x1000, 0, Kind.U32, ro, 0x00020192),  # servo drive (2) of profile 402
-        Entry(0x1001, 0, Kind.U8, tpdo),
-        Entry(0x1003, 0, Kind.U8, rw, highest=0),  # writing zero clears the history
-        Entry(0x1003, 1, Kind.U32),
-        Entry(0x1005, 0, Kind.U32, ro, 0x80),
-        Entry(0x1008, 0, Kind.TEXT, text="drivegain simulated CiA 402 amplifier"),
-        Entry(0x1009, 0, Kind.TEXT, text="1.0"),
-        Entry(0x100A, 0, Kind.TEXT, text="1.0"),
-        Entry(0x1010, 0, Kind.U8, ro, 1),
-        Entry(0x1010, 1, Kind.U32, rw, 1),
-        Entry(0x1011, 0, Kind.U8, ro, 1),
-        Entry(0x1011, 1, Kind.U32, rw, 1),
-        Entry(0x1014, 0, Kind.U32, ro, 0x80 + axis.node_id),
-        Entry(0x1016, 0, Kind.U8, ro, 1),
-        Entry(0x1016, 1, Kind.U32, rw),  # monitored node id << 16 | ms
-        Entry(0x1017, 0, Kind.U16, rw, 100),
-        Entry(0x1018, 0, Kind.U8, ro, 4),
-        Entry(0x1018, 1, Kind.U32, ro, axis.vendor_id),
-        Entry(0x1018, 2, Kind.U32, ro, axis.product_code),
-        Entry(0x1018, 3, Kind.U32, ro, axis.revision),
-        Entry(0x1018, 4, Kind.U32, ro, axis.serial),
-        Entry(0x1019, 0, Kind.U8),
+        Entry(0x1000, 0, u32, ro, 0x00020192),  # servo drive (2) of profile 402
+        Entry(0x1001, 0, u8, tpdo),
+        Entry(0x1003, 0, u8, rw, highest=0),  # writing zero clears the history
+        Entry(0x1003, 1, u32),
+        Entry(0x1005, 0, u32, ro, 0x80),
+        Entry(0x1008, 0, text, text="drivegain simulated CiA 402 amplifier"),
+        Entry(0x1009, 0, text, text="1.0"),
+        Entry(0x100A, 0, text, text="1.0"),
+        Entry(0x1010, 0, u8, ro, 1),
+        Entry(0x1010, 1, u32, rw, 1),
+        Entry(0x1011, 0, u8, ro, 1),
+        Entry(0x1011, 1, u32, rw, 1),
+        Entry(0x1014, 0, u32, ro, 0x80 + axis.node_id),
+        Entry(0x1016, 0, u8, ro, 1),
+        Entry(0x1016, 1, u32, rw),  # monitored node id << 16 | ms
+        Entry(0x1017, 0, u16, rw, 100),
+        Entry(0x1018, 0, u8, ro, 4),
+        Entry(0x1018, 1, u32, ro, axis.vendor_id),
+        Entry(0x1018, 2, u32, ro, axis.product_code),
+        Entry(0x1018, 3, u32, ro, axis.revision),
+        Entry(0x1018, 4, u32, ro, axis.serial),
+        Entry(0x1019, 0, u8),
         # Manufacturer specific: the entered joint drive gain, for masters only.
-        Entry(0x2003, 0, Kind.U8, ro, 2),
-        Entry(0x2003, 1, Kind.I32, rw, round(1000 * axis.entered_gain_nm_per_a)),
-        Entry(0x2003, 2, Kind.U32, rw, _REAL32_BITS.unpack(_REAL32.pack(axis.entered_gain_nm_per_a))[0]),
-        Entry(0x2005, 0, Kind.I16),  # manufacturer specific: temperature of the motor [0.1 °C]
-        Entry(0x6007, 0, Kind.I16, rw, 1, lowest=0, highest=3),
-        Entry(0x603F, 0, Kind.U16, tpdo),
-        Entry(0x6040, 0, Kind.U16, rpdo),
-        Entry(0x6041, 0, Kind.U16, tpdo),
-        Entry(0x605A, 0, Kind.I16, rw, 2, lowest=0, highest=6),
-        Entry(0x6060, 0, Kind.I8, rpdo, lowest=0, highest=1),
-        Entry(0x6061, 0, Kind.I8, tpdo),
-        Entry(0x6062, 0, Kind.I32, tpdo),
-        Entry(0x6063, 0, Kind.I32, tpdo),
-        Entry(0x6064, 0, Kind.I32, tpdo),
-        Entry(0x6065, 0, Kind.U32, rw, counts // 2),
-        Entry(0x6066, 0, Kind.U16, rw, 10),
-        Entry(0x6067, 0, Kind.U32, rw, counts // 100),
-        Entry(0x6068, 0, Kind.U16, rw, 10),
-        Entry(0x606C, 0, Kind.I32, tpdo),
-        Entry(0x6073, 0, Kind.U16, rpdo, peak_per_mille, highest=peak_per_mille),
-        Entry(0x6074, 0, Kind.I16, tpdo),
-        Entry(0x6075, 0, Kind.U32, ro, round(1000 * axis.rated_current_a)),
+        Entry(0x2003, 0, u8, ro, 2),
+        Entry(0x2003, 1, i32, rw, round(1000 * axis.entered_gain_nm_per_a)),
+        Entry(0x2003, 2, u32, rw, _REAL32_BITS.unpack(_REAL32.pack(axis.entered_gain_nm_per_a))[0]),
+        Entry(0x2005, 0, i16),  # manufacturer specific: temperature of the motor [0.1 °C]
+        Entry(0x6007, 0, i16, rw, 1, lowest=0, highest=3),
+        Entry(0x603F, 0, u16, tpdo),
+        Entry(0x6040, 0, u16, rpdo),
+        Entry(0x6041, 0, u16, tpdo),
+        Entry(0x605A, 0, i16, rw, 2, lowest=0, highest=6),
+        Entry(0x6060, 0, i8, rpdo, lowest=0, highest=1),
+        Entry(0x6061, 0, i8, tpdo),
+        Entry(0x6062, 0, i32, tpdo),
+        Entry(0x6063, 0, i32, tpdo),
+        Entry(0x6064, 0, i32, tpdo),
+        Entry(0x6065, 0, u32, rw, counts // 2),
+        Entry(0x6066, 0, u16, rw, 10),
+        Entry(0x6067, 0, u32, rw, counts // 100),
+        Entry(0x6068, 0, u16, rw, 10),
+        Entry(0x606C, 0, i32, tpdo),
+        Entry(0x6073, 0, u16, rpdo, peak_per_mille, highest=peak_per_mille),
+        Entry(0x6074, 0, i16, tpdo),
+        Entry(0x6075, 0, u32, ro, round(1000 * axis.rated_current_a)),
         # Zero unless the motor's rated torque was entered: the cell must not reveal its true torque constant.
-        Entry(0x6076, 0, Kind.U32, rw, round(1000 * axis.entered_torque_nm)),
-        Entry(0x6077, 0, Kind.I16, tpdo),
-        Entry(0x6078, 0, Kind.I16, tpdo),
-        Entry(0x607A, 0, Kind.I32, rpdo),
-        Entry(0x6081, 0, Kind.U32, rpdo, 10 * counts, lowest=1),
-        Entry(0x6083, 0, Kind.U32, rpdo, 50 * counts, lowest=1),
-        Entry(0x6084, 0, Kind.U32, rpdo, 50 * counts, lowest=1),
-        Entry(0x6085, 0, Kind.U32, rpdo, 100 * counts, lowest=1),
-        Entry(0x608F, 0, Kind.U8, ro, 2),
-        Entry(0x608F, 1, Kind.U32, ro, counts),
-        Entry(0x608F, 2, Kind.U32, ro, 1),
-        Entry(0x60F4, 0, Kind.I32, tpdo),
-        Entry(0x6502, 0, Kind.U32, ro, 1),  # profile position alone
+        Entry(0x6076, 0, u32, rw, round(1000 * axis.entered_torque_nm)),
+        Entry(0x6077, 0, i16, tpdo),
+        Entry(0x6078, 0, i16, tpdo),
+        Entry(0x607A, 0, i32, rpdo),
+        Entry(0x6081, 0, u32, rpdo, 10 * counts, lowest=1),
+        Entry(0x6083, 0, u32, rpdo, 50 * counts, lowest=1),
+        Entry(0x6084, 0, u32, rpdo, 50 * counts, lowest=1),
+        Entry(0x6085, 0, u32, rpdo, 100 * counts, lowest=1),
+        Entry(0x608F, 0, u8, ro, 2),
+        Entry(0x608F, 1, u32, ro, counts),
+        Entry(0x608F, 2, u32, ro, 1),
+        Entry(0x60F4, 0, i32, tpdo),
+        Entry(0x6502, 0, u32, ro, 1),  # profile position alone
     )
 
 
@@ -193,7 +195,8 @@ class SdoServer:
     """SDO server of one node: expedited and segmented transfers (CiA 301 §7.2.4.3)."""
 
     def __init__(self, read: Callable[[int, int], bytes], write: Callable[[int, int, bytes], None]) -> None:
-        self._read, self._write = read, write
+        self._read = read
+        self._write = write
         self._entry = (0, 0)
         self._upload: bytes | None = None
         self._download: bytearray | None = None
@@ -222,14 +225,16 @@ class SdoServer:
         data = self._read(*self._entry)
         if len(data) <= 4:
             return _HEAD.pack(0x43 | (4 - len(data)) << 2, *self._entry) + data.ljust(4, b"\0")
-        self._upload, self._toggle = data, 0
+        self._upload = data
+        self._toggle = 0
         return _HEAD.pack(0x41, *self._entry) + struct.pack("<I", len(data))
 
     def _continue_upload(self, request: bytes) -> bytes:
         if self._upload is None:
             raise SdoAbort(UNKNOWN_COMMAND)
         self._check_toggle(request)
-        part, rest = self._upload[:7], self._upload[7:]
+        part = self._upload[:7]
+        rest = self._upload[7:]
         answer = bytes([self._toggle | (7 - len(part)) << 1 | (not rest)]) + part.ljust(7, b"\0")
         self._toggle ^= 0x10
         self._upload = rest or None
@@ -240,7 +245,8 @@ class SdoServer:
             size = 4 - (request[0] >> 2 & 3) if request[0] & 0x01 else 4
             self._write(*self._entry, request[4 : 4 + size])
         else:
-            self._download, self._toggle = bytearray(), 0
+            self._download = bytearray()
+            self._toggle = 0
         return _HEAD.pack(0x60, *self._entry) + bytes(4)
 
     def _continue_download(self, request: bytes) -> bytes:
@@ -251,7 +257,8 @@ class SdoServer:
         answer = bytes([0x20 | self._toggle]) + bytes(7)
         self._toggle ^= 0x10
         if request[0] & 0x01:
-            data, self._download = bytes(self._download), None
+            data = bytes(self._download)
+            self._download = None
             self._write(*self._entry, data)
         return answer
 

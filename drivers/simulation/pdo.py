@@ -58,7 +58,9 @@ class Pdo:
     """
 
     def __init__(self, direction: Access, parameters: PdoParameters, dictionary: Dictionary, source: Finder) -> None:
-        self._direction, self._dictionary, self._source = direction, dictionary, source
+        self._direction = direction
+        self._dictionary = dictionary
+        self._source = source
         self.parameters = parameters
         self.layout = struct.Struct("<")
         self.mapped: tuple[tuple[int, int], ...] = ()
@@ -74,7 +76,8 @@ class Pdo:
     @parameters.setter
     def parameters(self, parameters: PdoParameters) -> None:
         self._parameters = parameters
-        self.valid, self.can_id = not parameters.cob_id & INVALID, parameters.cob_id & 0x7FF
+        self.valid = not parameters.cob_id & INVALID
+        self.can_id = parameters.cob_id & 0x7FF
 
     def restore(self, parameters: PdoParameters) -> None:
         """Replace all parameters by defaults or saved ones."""
@@ -83,7 +86,8 @@ class Pdo:
 
     def reset(self) -> None:
         """Forget the last data sent (the node enters OPERATIONAL, or the PDO was changed)."""
-        self._syncs, self._last = 0, b""
+        self._syncs = 0
+        self._last = b""
         self._last_us: int | None = None
 
     def _map(self, parameters: PdoParameters) -> None:
@@ -122,7 +126,8 @@ class Pdo:
             return None
         if since_us is not None and since_us < 100 * parameters.inhibit_100us:
             return None
-        self._last, self._last_us = data, now_us
+        self._last = data
+        self._last_us = now_us
         return data
 
     def _data(self) -> bytes:
@@ -214,15 +219,17 @@ class Pdo:
 def default_pdos(node_id: int, dictionary: Dictionary, source: Finder) -> tuple[tuple[Pdo, ...], tuple[Pdo, ...]]:
     """Return receive and transmit PDOs with the default mapping of CiA 402-2; only the first of each is valid."""
 
-    def default(direction: Access, cob_id: int, mapping: tuple[int, ...]) -> Pdo:
-        entries = mapping + (0,) * (MAX_ENTRIES - len(mapping))
-        return Pdo(direction, PdoParameters(cob_id, 255, 0, 0, entries, len(mapping)), dictionary, source)
+    def made(direction: Access, first_cob_id: int, mappings: tuple[tuple[int, ...], ...]) -> tuple[Pdo, ...]:
+        pdos = []
+        for number, mapping in enumerate(mappings):
+            cob_id = first_cob_id + 0x100 * number + node_id
+            if number:
+                cob_id |= INVALID
+            entries = mapping + (0,) * (MAX_ENTRIES - len(mapping))
+            parameters = PdoParameters(cob_id, 255, 0, 0, entries, len(mapping))
+            pdos.append(Pdo(direction, parameters, dictionary, source))
+        return tuple(pdos)
 
     receive = ((0x60400010,), (0x60400010, 0x60600008), (0x60400010, 0x607A0020), (0x60400010,))
     transmit = ((0x60410010,), (0x60410010, 0x60610008), (0x60410010, 0x60640020), (0x60410010, 0x606C0020))
-    first = (node_id + 0x180) | NO_RTR
-    offsets = [0x100 * number | (INVALID if number else 0) for number in range(4)]
-    return (
-        tuple(default(Access.RPDO, 0x200 + node_id + k, m) for k, m in zip(offsets, receive, strict=True)),
-        tuple(default(Access.TPDO, first + k, m) for k, m in zip(offsets, transmit, strict=True)),
-    )
+    return made(Access.RPDO, 0x200, receive), made(Access.TPDO, 0x180 | NO_RTR, transmit)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -13,7 +14,7 @@ from drivers.simulation.dynamics import TOLERANCE_RAD_S, Mechanics, advance, adv
 from drivers.simulation.effects import AMBIENT_C, Coupling, Effect, Elasticity, Lag, Moment, build_effect
 from drivers.simulation.noise import ColouredNoise, random_streams
 from drivers.simulation.spec import (
-    Body,
+    AxisSpec,
     CellSpec,
     ClosureLost,
     FloatArray,
@@ -42,14 +43,17 @@ def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag], joints: int) -> tup
     Raises:
         SpecInvalid: the drive train is wrong, or two flexible drives are given for one motor.
     """
-    n, rows, step_s = len(spec.axes), motor_rows(spec.ratio), spec.sync_period_us * 1e-6 / spec.substeps
+    n = len(spec.axes)
+    rows = motor_rows(spec.ratio)
+    step_s = spec.sync_period_us * 1e-6 / spec.substeps
     flexible = tuple(effect for effect in effects if isinstance(effect, Elasticity))
     if len({drive.axis for drive in flexible}) < len(flexible):
         raise SpecInvalid("two flexible drives on one motor; give elasticity and gap in one backlash effect")
     total = joints + len(flexible)
     motor_direction = np.hstack([rows, np.zeros((n, total - n))])
     for coordinate, drive in enumerate(flexible, start=joints):
-        drive.coordinate, drive.row = coordinate, rows[drive.axis]
+        drive.coordinate = coordinate
+        drive.row = rows[drive.axis]
         motor_direction[drive.axis] = np.eye(total)[coordinate]
     directions = list(np.eye(joints, total))
     own_row = np.zeros(n, dtype=np.int64)
@@ -125,12 +129,16 @@ class Plant:
             SpecInvalid: URDF, drive train, axes, closures and start position do not fit together, or an undeclared
                 effect or its parameters do not exist.
         """
-        model = link_model(spec.urdf, spec.gravity_m_s2, spec.payload, spec.platform)
+        self.mount(spec)
         n = len(spec.axes)
-        self.mechanism = Mechanism(model, spec) if spec.closures else None
-        if (self.mechanism is None and model.nv != n) or spec.ratio.shape != (n, n) or spec.start_rad.shape != (n,):
+        self.mechanism = Mechanism(self._model, spec) if spec.closures else None
+        if (
+            (self.mechanism is None and self._model.nv != n)
+            or spec.ratio.shape != (n, n)
+            or spec.start_rad.shape != (n,)
+        ):
             raise SpecInvalid(
-                f"{n} axes, a URDF of {model.nv} joints, a drive train of shape {spec.ratio.shape} and a start "
+                f"{n} axes, a URDF of {self._model.nv} joints, a drive train of shape {spec.ratio.shape} and a start "
                 f"position of shape {spec.start_rad.shape}; all must have the same number of axes"
             )
         start_rad = spec.start_rad
@@ -147,25 +155,26 @@ class Plant:
         self._mechanics, flexible = lay_out(spec, effects, self._joints)
         self._constants = tuple(self._mechanics)
         m, total = self._mechanics.directions.shape
-        axes, added = spec.axes, [0.0] * len(flexible)
-        passive = [spec.passive.get(name, PassiveFriction()) for name in self._passive_joints]
+        with_friction: list[AxisSpec | PassiveFriction] = [*spec.axes]
+        with_friction += [spec.passive.get(name, PassiveFriction()) for name in self._passive_joints]
         self.time_s = 0.0
         self.position_rad = np.concatenate([start_rad, [drive.row @ start_rad[:n] for drive in flexible]])
         self.velocity_rad_s = np.zeros(total)
         self.load_torque_nm = np.zeros(self._joints)
         self.motor_rad = np.zeros(n)
         self.temperature_c = np.full(n, AMBIENT_C)
-        self._model, self._data = model, model.createData()
         self._acting = tuple(e for e in effects if not isinstance(e, Lag))
         self._rows = motor_rows(spec.ratio)
-        self._gain = np.array([a.gain_nm_per_a for a in axes])
-        self._viscous = np.array([a.viscous_nm_s_rad for a in axes] + [p.viscous_nm_s_rad for p in passive] + added)
+        self._gain = np.array([a.gain_nm_per_a for a in spec.axes])
+        self._viscous = np.zeros(total)
+        self._viscous[: self._joints] = [joint.viscous_nm_s_rad for joint in with_friction]
         # The paper's offset is on the motor's side of eq. 1, so it acts against the joint.
-        self._torque = np.array([-a.offset_nm for a in axes] + [0.0] * len(passive) + added)
+        self._torque = np.zeros(total)
+        self._torque[:n] = [-a.offset_nm for a in spec.axes]
         self._free_bound = np.zeros(m)
-        self._free_bound[: self._joints] = [a.coulomb_nm for a in axes] + [p.coulomb_nm for p in passive]
-        np.add.at(self._free_bound, self._mechanics.own_row, [a.motor_coulomb_nm for a in axes])
-        self._brake_nm = np.array([BRAKE_FACTOR * abs(a.gain_nm_per_a) * a.peak_current_a for a in axes])
+        self._free_bound[: self._joints] = [joint.coulomb_nm for joint in with_friction]
+        np.add.at(self._free_bound, self._mechanics.own_row, [a.motor_coulomb_nm for a in spec.axes])
+        self._brake_nm = np.array([BRAKE_FACTOR * abs(a.gain_nm_per_a) * a.peak_current_a for a in spec.axes])
         self._bound = self._free_bound.copy()
         self._moment = Moment(
             time_s=0.0,
@@ -204,7 +213,7 @@ class Plant:
         if not flexible:
             return
         step_s = self._mechanics.step_s
-        bare = link_model(spec.urdf, spec.gravity_m_s2, None, spec.platform)
+        bare = link_model(replace(spec, payload=None))
         postures = [self.position_rad[: self._joints]]
         if self.mechanism is None:
             postures = list(np.transpose(self.postures(spec.start_rad, POSTURES)))
@@ -228,7 +237,7 @@ class Plant:
 
     def mount(self, spec: CellSpec) -> None:
         """Replace the payload by that of another description of the same cell; the state is kept."""
-        self._model = link_model(spec.urdf, spec.gravity_m_s2, spec.payload, spec.platform)
+        self._model = link_model(spec)
         self._data = self._model.createData()
 
     def postures(self, start_rad: FloatArray, count: int) -> tuple[FloatArray, ...]:
@@ -237,7 +246,8 @@ class Plant:
         They are spread over one revolution from the start of a revolute joint, or over the travel of a prismatic one.
         """
         angles = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
-        lower, upper = self._model.lowerPositionLimit, self._model.upperPositionLimit
+        lower = self._model.lowerPositionLimit
+        upper = self._model.upperPositionLimit
         # Pinocchio has a joint type for each sliding axis, as JointModelPX, or JointModelPrismaticUnaligned.
         sliding = [str(joint.shortname()).startswith("JointModelP") for joint in self._model.joints[1:]]
         return tuple(
@@ -346,17 +356,15 @@ def _disturbance(spec: CellSpec, step_s: float) -> ColouredNoise | None:
     return ColouredNoise(random_streams(spec.seed, len(spec.axes), DISTURBANCE), sigma_nm, correlation_s, step_s)
 
 
-def link_model(
-    urdf: str, gravity_m_s2: tuple[float, float, float], payload: Body | None, platform: str | None = None
-) -> pin.Model:
-    """Return the links of a URDF, with a payload fixed to the last joint or to the link `platform`.
+def link_model(spec: CellSpec) -> pin.Model:
+    """Return the links of a cell, with its payload fixed to the last joint or to the link `platform`.
 
     Raises:
         SpecInvalid: the text is no URDF, a joint is neither revolute nor prismatic with limits, or there is no such
             link.
     """
     try:
-        model = pin.buildModelFromXML(urdf)
+        model = pin.buildModelFromXML(spec.urdf)
     except (ValueError, RuntimeError) as error:
         raise SpecInvalid(f"the URDF of the plant cannot be read: {error}") from error
     if model.nq != model.nv or model.nv != model.njoints - 1:
@@ -364,14 +372,15 @@ def link_model(
             f"the URDF has {model.njoints - 1} joints with {model.nq} coordinates and {model.nv} degrees of freedom; "
             "expected revolute or prismatic joints alone (a continuous joint is written as revolute with wide limits)"
         )
-    model.gravity.linear = np.asarray(gravity_m_s2, dtype=np.float64)
+    model.gravity.linear = np.asarray(spec.gravity_m_s2, dtype=np.float64)
+    payload = spec.payload
     if payload is not None:
         xx, xy, xz, yy, yz, zz = payload.inertia_kg_m2
         inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         body = pin.Inertia(payload.mass_kg, np.asarray(payload.centre_m, dtype=np.float64), inertia)
-        if platform is None:
+        if spec.platform is None:
             model.appendBodyToJoint(model.njoints - 1, body, pin.SE3.Identity())
         else:
-            frame = link_frame(model, platform)
+            frame = link_frame(model, spec.platform)
             model.appendBodyToJoint(frame.parentJoint, body, frame.placement)
     return model

@@ -112,7 +112,8 @@ class _AxisWatch:
             None if self.delay_ns is None else self.delay_ns * 1e-9,
             tuple(self.refused[column] for column in sorted(self.refused)),
         )
-        self.readings, self.delay_ns = 0, None
+        self.readings = 0
+        self.delay_ns = None
         return reading
 
     def hear(self, cob_id: int, data: bytes) -> None:
@@ -164,7 +165,8 @@ class _AxisWatch:
 
     def drop(self) -> None:
         """Wait for no answer any more."""
-        self.asked_ns, self.asked = None, -1
+        self.asked_ns = None
+        self.asked = -1
 
 
 class CellMonitor:
@@ -190,7 +192,9 @@ class CellMonitor:
         """
         self.period_ns: int | None = None
         """Period of SYNC; SYNCs that this program missed then leave a gap in the samples' cycles. None counts SYNCs."""
-        self._link, self._on_sample, self._offset_ns = link, on_sample, wall_minus_monotonic_ns
+        self._link = link
+        self._on_sample = on_sample
+        self._offset_ns = wall_minus_monotonic_ns
         self._taken = taken
         self._axes = tuple(_AxisWatch(axis) for axis in axes)
         self._by_cob_id = {cob_id: axis for axis in self._axes for cob_id in axis.slots}
@@ -228,7 +232,8 @@ class CellMonitor:
         axes = tuple(axis.take(self._link.nmt.get(axis.node_id), self._since_ns, now_ns) for axis in self._axes)
         self._since_ns = now_ns
         frames = tuple(tuple(self._frames[bus, length] for length in range(9)) for bus in range(len(self._buses)))
-        sync_hz, self._syncs = self._syncs / lasted_s, 0
+        sync_hz = self._syncs / lasted_s
+        self._syncs = 0
         self._frames.clear()
         events = self._link.take_events(now_ns + self._offset_ns, tuple(self._by_node))
         return CellReading(self.source, lasted_s, axes, sync_hz, frames, events)
@@ -286,7 +291,8 @@ class CellMonitor:
 
     def _sample_overheard(self, stamp_s: float) -> None:
         """Complete the sample of the SYNC before this one, which has the given time stamp."""
-        before, self._sync = self._sync, (self._link.clock(), stamp_s)
+        before = self._sync
+        self._sync = (self._link.clock(), stamp_s)
         if before is None:
             return
         self._emit(before[0], [axis.seen != axis.slots.keys() for axis in self._axes])

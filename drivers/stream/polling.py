@@ -50,7 +50,8 @@ class Polling:
     """
 
     def __init__(self, network: CanopenNetwork, *, beside_stream: bool = True) -> None:
-        self._network, self._beside_stream = network, beside_stream
+        self._network = network
+        self._beside_stream = beside_stream
         self._stream: SyncStream | None = None
         self._keep: Callable[[SlowReading], None] = lambda _: None
         self._asked: _Source | None = None
@@ -103,7 +104,8 @@ class Polling:
         Args:
             time_ns: on the clock of the samples [ns].
         """
-        self._asked, found = None, []
+        self._asked = None
+        found = []
         for source in self._sources:
             if source.quantity is Quantity.TEMPERATURE:
                 with suppress(ObjectAccessError, BusError):
@@ -114,7 +116,9 @@ class Polling:
     def begin(self, stream: SyncStream, keep: Callable[[SlowReading], None]) -> None:
         """Pass readings on from now on, made beside a stream until it stops the axes, if the bus has room."""
         if self._beside_stream:
-            self._stream, self._keep, stream.bus.spare = stream, keep, self._request
+            self._stream = stream
+            self._keep = keep
+            stream.bus.spare = self._request
 
     def _request(self, now_ns: int) -> Sequence[can.Message]:
         """Return the request that is due; none while another one waits for its answer."""
@@ -125,7 +129,8 @@ class Polling:
         if source is None or source.due_ns > now_ns:
             return ()
         source.due_ns = now_ns + PERIOD_NS[source.quantity]  # from now on: after a pause nothing is caught up
-        self._asked, self._asked_ns = source, now_ns
+        self._asked = source
+        self._asked_ns = now_ns
         return (upload_request(source.node_id, source.entry),)
 
     def _take(self, source: _Source, data: bytearray) -> None:
@@ -147,7 +152,8 @@ class Polling:
     def _drop(self, source: _Source, why: str) -> None:
         """Ask no more for an object, and say so in the log and in the remarks."""
         self._sources.remove(source)
-        name, entry = self._network.axes[source.axis].name, source.entry
+        name = self._network.axes[source.axis].name
+        entry = source.entry
         text = f"{name}: the {source.quantity.value} in {entry} {why}; it is not logged"
         self._remarks.append(text)
         if self._stream is not None:

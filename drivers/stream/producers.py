@@ -35,7 +35,10 @@ RENEWAL_S = 0.025  #: Time between two renewals
 STEERING_S = 0.25  #: Time between two corrections of the kernel's interval
 LARGEST_CORRECTION = 0.2
 """Fraction of the period; a kernel that is later than that produces time stamps which are refused."""
-_TX_SETUP, _SET_TIMER, _SET_AND_START_TIMER = 1, 0x1, 0x3  # linux/can/bcm.h
+# linux/can/bcm.h
+_TX_SETUP = 1
+_SET_TIMER = 0x1
+_SET_AND_START_TIMER = 0x3
 # struct bcm_msg_head: opcode, flags, count, two intervals of (s, us), identifier, number of frames; then can_frame.
 _HEAD = struct.Struct("@3I4l2I0q")
 
@@ -121,7 +124,9 @@ class KernelProducer(AbstractContextManager["KernelProducer"]):
             self._renewed_ns = monotonic_ns
             self._socket.send(setup_message(_SET_TIMER, self._interval_us))
         if periods == 0:
-            self._begun_ns, self._phase_ns, self._periods = monotonic_ns, 0, 0
+            self._begun_ns = monotonic_ns
+            self._phase_ns = 0
+            self._periods = 0
             return
         self._periods += periods
         if self._periods < self._window or self._socket is None:
@@ -129,7 +134,8 @@ class KernelProducer(AbstractContextManager["KernelProducer"]):
         late_ns = monotonic_ns - self._begun_ns - 1000 * self._period_us * self._periods
         self._phase_ns += late_ns
         interval_us = steered_us(self._period_us, self._interval_us, late_ns, self._phase_ns, self._periods)
-        self._begun_ns, self._periods = monotonic_ns, 0
+        self._begun_ns = monotonic_ns
+        self._periods = 0
         if interval_us != self._interval_us:
             self._interval_us = interval_us
             self._socket.send(setup_message(_SET_TIMER, interval_us))
@@ -200,7 +206,9 @@ class DriveProducer(AbstractContextManager["DriveProducer"]):
 
     def stop(self) -> None:
         """Restore both objects, if started and if the drive still answers."""
-        before, self._before, self._produces = self._before, None, False
+        before = self._before
+        self._before = None
+        self._produces = False
         try:
             if before is not None and self._node_id not in self._network.link.silent:
                 access = self._network.link.objects(self._node_id)

@@ -146,7 +146,8 @@ class Watch:
         self._begun = True
 
     def _note_statuswords(self, statuswords: tuple[int, ...], missing: int) -> None:
-        before, self._statuswords = self._statuswords, statuswords
+        before = self._statuswords
+        self._statuswords = statuswords
         for axis, word in enumerate(statuswords):
             first = bool(self._unheard >> axis & 1)
             if first and missing >> axis & 1:
