@@ -120,8 +120,13 @@ def open_bus(address: BusAddress, *, answering: bool = False) -> can.BusABC:
 
 
 def base_frame(cob_id: int, data: bytes = b"") -> can.Message:
-    """Return a data frame with a base identifier, as all of CANopen are."""
+    """Return a data frame with a base identifier."""
     return can.Message(arbitration_id=cob_id, is_extended_id=False, data=data)
+
+
+def is_plain(message: can.Message) -> bool:
+    """Return whether a frame is a data frame with a base identifier, as all of CANopen are."""
+    return not (message.is_error_frame or message.is_extended_id or message.is_remote_frame)
 
 
 def send_burst(bus: can.BusABC, messages: Sequence[can.Message]) -> None:

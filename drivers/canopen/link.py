@@ -148,7 +148,7 @@ class Link:
         self.heard: set[int] = set()  #: Node ids of which any frame arrived since the bus was opened
         #: Number of frames by identifier that only we should send (NMT, SYNC, LSS, SDO request, set-point of one of our
         #: axes, any frame with our own node id) and that we did not send.
-        self.foreign: dict[int, int] = {}
+        self.foreign: Counter[int] = Counter()
         self.written: dict[int, str] = {}  #: Downloads to our axes that we did not send, by identifier
         self.own_id: int | None = None  #: Node id of our heartbeat, None before one was chosen
         self.names: Mapping[int, str] = {}  #: Of our axes by node id
@@ -328,7 +328,7 @@ class Link:
 
     def note_foreign(self, identifier: int) -> None:
         """Count a command, or a heartbeat with our node id, that neither we nor our SYNC producer sent."""
-        self.foreign[identifier] = self.foreign.get(identifier, 0) + 1
+        self.foreign[identifier] += 1
         self._foreign_syncs += identifier == SYNC_COB_ID
         if self.foreign[identifier] == 1:  # once: a master would fill the log
             seen = command_name(identifier, self.names)

@@ -86,7 +86,7 @@ def read_parameters(
     identities = dict(zip(network.node_ids, network.check_identities(), strict=True))
     found = []
     for axis, parameter in wanted:
-        word = network.link.objects(axis.node_id).read(parameter.entry)
+        word = network.objects(axis).read(parameter.entry)
         found.append(ParameterValue(axis, identities[axis.node_id], parameter, word))
     return tuple(found)
 
@@ -129,7 +129,7 @@ def write_parameters(
             if value.word != write.word:
                 tried.append(value)
                 _require_powerless(network, write.axis)
-                network.link.objects(write.axis.node_id).write(write.parameter.entry, write.word)
+                network.objects(write.axis).write(write.parameter.entry, write.word)
                 _check(network, write)
                 _require_powerless(network, write.axis)
                 network.link.require_alone()
@@ -161,7 +161,7 @@ def recording_leftover(network: CanopenNetwork, axis: Axis) -> str:
 
     They are lost with the drive's power, and a save would keep them.
     """
-    access = network.link.objects(axis.node_id)
+    access = network.objects(axis)
     # A recording sets the watch for its heartbeat first, and restores it last. Only a missing 1016h proves that there
     # is no watch; any other refusal may hide one.
     for sub in range(1, (access.read_optional(CONSUMERS) or 0) + 1):
@@ -182,7 +182,7 @@ def recording_leftover(network: CanopenNetwork, axis: Axis) -> str:
 
 
 def _check(network: CanopenNetwork, write: ParameterWrite | ParameterValue) -> None:
-    found = network.link.objects(write.axis.node_id).read(write.parameter.entry)
+    found = network.objects(write.axis).read(write.parameter.entry)
     if found != write.word:
         written, read = (f"{write.parameter.value(word):.9g} ({word:#x})" for word in (write.word, found))
         raise ParameterRefused(
@@ -201,7 +201,7 @@ def _save(network: CanopenNetwork, axis: Axis) -> None:
 
 
 def _require_powerless(network: CanopenNetwork, axis: Axis) -> None:
-    statusword = network.link.objects(axis.node_id).read(STATUSWORD)
+    statusword = network.objects(axis).read(STATUSWORD)
     state = decode(statusword)
     if state not in POWERLESS:
         raise ParameterRefused(
@@ -256,7 +256,7 @@ def _undo(
 def _put_back(network: CanopenNetwork, value: ParameterValue, *, save: bool) -> None:
     if value.axis.node_id in network.link.silent:
         raise ObjectAccessError(value.axis, str(value.parameter), "the node does not answer any more")
-    access = network.link.objects(value.axis.node_id)
+    access = network.objects(value.axis)
     if access.read(value.parameter.entry) != value.word:
         _require_powerless(network, value.axis)
         access.write(value.parameter.entry, value.word)

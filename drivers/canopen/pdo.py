@@ -91,11 +91,6 @@ def pack(entries: Sequence[ObjectEntry], most_bytes: int = PDO_BYTES) -> tuple[t
     return tuple(tuple(pdo) for pdo in pdos)
 
 
-def record_struct(entries: Sequence[ObjectEntry]) -> struct.Struct:
-    """Return the payload of a PDO: little endian, at constant offsets."""
-    return struct.Struct("<" + "".join(_CODES[entry.bits, entry.signed] for entry in entries))
-
-
 def records(
     direction: Direction,
     node_id: int,
@@ -136,11 +131,10 @@ class AxisPdos:
 
     def payloads(self, values: Mapping[ObjectEntry, int]) -> Iterator[tuple[int, bytes]]:
         """Yield COB-ID and payload of each RPDO all of whose objects have a value, in the order of their numbers."""
-        entries = {word(entry): entry for entry in values}
         for record in self.setpoints:
-            if all(mapped in entries for mapped in record.entries):
-                pdo = [entries[mapped] for mapped in record.entries]
-                yield record.cob_id & 0x7FF, record_struct(pdo).pack(*(values[entry] for entry in pdo))
+            layout, entries = record_payload(record, tuple(values))
+            if len(entries) == len(record.entries):
+                yield record.cob_id & 0x7FF, layout.pack(*(values[entry] for entry in entries))
 
 
 def wanted_pdos(

@@ -30,7 +30,7 @@ LARGEST_RUN = 64  #: Frames of one bus in a row while another has one too: a lag
 BUS_OFF = 0x40  # linux/can/error.h, class CAN_ERR_BUSOFF of an error frame
 BUS_OFF_REASON = "bus-off: the CAN controller disconnected itself; check the wiring"
 _FAILURES = (can.CanError, OSError, BusError)
-_FROM_NODES = frozenset((0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700))
+FROM_NODES = frozenset((0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700))
 """Services that nodes send: EMCY, TPDO1 to 4, SDO answer, heartbeat."""
 
 
@@ -242,7 +242,7 @@ class SplitBus(can.BusABC):
         """Whether a frame comes from the bus of its node; our own SYNC, received for its time, from the first bus."""
         if not message.is_rx:
             return index == min(set(range(len(self._ends))) - self._failed, default=index)
-        if message.is_extended_id or message.is_error_frame or message.arbitration_id & 0x780 not in _FROM_NODES:
+        if message.is_extended_id or message.is_error_frame or message.arbitration_id & 0x780 not in FROM_NODES:
             return True
         node_id = message.arbitration_id & 0x7F
         home = self._homes.get(node_id, index)

@@ -13,7 +13,7 @@ from drivers.simulation.dynamics import compiled
 from drivers.simulation.effects import Lag, build_effect
 from drivers.simulation.noise import ColouredNoise, random_streams
 from drivers.simulation.plant import Plant, reduction
-from drivers.simulation.spec import CellSpec, FloatArray
+from drivers.simulation.spec import CellSpec, FloatArray, IntArray
 
 VELOCITY_BANDWIDTH_RAD_S = 220.0
 """Bandwidth of the closed velocity loop at the tuned inertia; an axis a few times lighter is still stable."""
@@ -257,9 +257,7 @@ class Readings:
 
 
 @compiled
-def _fill(
-    loops: NDArray[np.void], reported_a: FloatArray, rated_current_a: FloatArray, readings: NDArray[np.int64]
-) -> None:
+def _fill(loops: NDArray[np.void], reported_a: FloatArray, rated_current_a: FloatArray, readings: IntArray) -> None:
     """Fill one row for each field of Readings, in their order, shape (8, n)."""
     for i in range(len(loops)):
         axis = loops[i]

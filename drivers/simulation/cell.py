@@ -11,7 +11,7 @@ from functools import partial
 import can
 import numpy as np
 
-from drivers.canopen.bus import SocketcandBus, base_frame, send_burst
+from drivers.canopen.bus import SocketcandBus, base_frame, is_plain, send_burst
 from drivers.canopen.split_bus import SplitBus
 from drivers.errors import BusError
 from drivers.simulation.amplifier import AmplifierSet
@@ -199,9 +199,7 @@ class SimulatedCell:
             node.boot(wall_s)
         while not self._stopping.is_set():
             message = self._next_frame()
-            if message is not None and not (
-                message.is_error_frame or message.is_remote_frame or message.is_extended_id
-            ):
+            if message is not None and is_plain(message):
                 self._receive(message)
             elif message is None and self._gate.open:
                 for wires in self._gate.close():

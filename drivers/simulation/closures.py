@@ -20,10 +20,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from drivers.simulation.dynamics import compiled
-from drivers.simulation.spec import DIRECTIONS, CellSpec, FloatArray, SpecInvalid
+from drivers.simulation.spec import DIRECTIONS, BoolArray, CellSpec, FloatArray, IntArray, SpecInvalid
 
 CLOSED = 1e-12  #: Largest |φ| [m or rad] at which Newton's method stops
 
@@ -45,17 +44,17 @@ START_TOLERANCE = 1e-3  #: Largest correction of a start position of redundant d
 class Tree(NamedTuple):
     """Geometry of n joints and k closures. The base is joint 0, the joints of the plant follow in their order."""
 
-    parent: NDArray[np.int64]  #: joint before each joint, shape (n + 1,)
-    outwards: NDArray[np.int64]  #: the joints without the base, each after its parent, shape (n,)
+    parent: IntArray  #: joint before each joint, shape (n + 1,)
+    outwards: IntArray  #: the joints without the base, each after its parent, shape (n,)
     rotation: FloatArray  #: placement of each joint in the frame of its parent, shape (n + 1, 3, 3)
     offset: FloatArray  #: the same, its origin [m], shape (n + 1, 3)
     slide: FloatArray  #: unit vector of each prismatic joint in its own frame, else zero, shape (n + 1, 3)
     turn: FloatArray  #: unit vector of each revolute joint in its own frame, else zero, shape (n + 1, 3)
-    frame_joint: NDArray[np.int64]  #: joint that moves each frame, shape (k, 2)
+    frame_joint: IntArray  #: joint that moves each frame, shape (k, 2)
     frame_rotation: FloatArray  #: placement of each frame in that joint's, shape (k, 2, 3, 3)
     frame_offset: FloatArray  #: the same, its origin [m], shape (k, 2, 3)
     #: Closure of each of the c closed directions, and number of the direction: x, y, z, rx, ry, rz; shape (c, 2).
-    closed: NDArray[np.int64]
+    closed: IntArray
 
 
 class Placed(NamedTuple):
@@ -195,7 +194,7 @@ def _close(tree: Tree, k: int, placed: Placed, error: FloatArray, motion: FloatA
 
 
 @compiled
-def eliminate(matrix: FloatArray, rank: int, held: NDArray[np.bool_], pivots: NDArray[np.int64]) -> float:
+def eliminate(matrix: FloatArray, rank: int, held: BoolArray, pivots: IntArray) -> float:
     """Reduce [J_c | φ], shape (c, n + 1), in place by Gauss-Jordan steps with full pivots.
 
     Args:
@@ -238,7 +237,7 @@ def eliminate(matrix: FloatArray, rank: int, held: NDArray[np.bool_], pivots: ND
 
 
 @compiled
-def _find_pivot(matrix: FloatArray, first: int, barred: NDArray[np.bool_]) -> tuple[float, int, int]:
+def _find_pivot(matrix: FloatArray, first: int, barred: BoolArray) -> tuple[float, int, int]:
     """Return the largest value from a row on outside the barred columns and the last one, its row and column."""
     best = 0.0
     at_row = first
@@ -254,7 +253,7 @@ def _find_pivot(matrix: FloatArray, first: int, barred: NDArray[np.bool_]) -> tu
 
 @compiled
 def settle(
-    constants: tuple[Any, ...], resting: NDArray[np.bool_], position: FloatArray, basis: FloatArray
+    constants: tuple[Any, ...], resting: BoolArray, position: FloatArray, basis: FloatArray
 ) -> tuple[float, float]:
     """Return positions to φ = 0, and compute G there.
 
@@ -293,7 +292,7 @@ def settle(
 
 
 @compiled
-def _span(matrix: FloatArray, pivots: NDArray[np.int64], basis: FloatArray) -> None:
+def _span(matrix: FloatArray, pivots: IntArray, basis: FloatArray) -> None:
     """Fill G from an eliminated matrix: the identity in the rows of the independent joints."""
     basis[:] = 0.0
     dependent = np.zeros(len(basis), dtype=np.bool_)

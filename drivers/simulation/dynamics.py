@@ -27,9 +27,8 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from drivers.simulation.spec import FloatArray
+from drivers.simulation.spec import BoolArray, FloatArray, IntArray
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -67,8 +66,8 @@ class Mechanics(NamedTuple):
     motor_inertia: FloatArray  #: Ia along the rows of P, shape (n,)
     motor_viscous: FloatArray  #: Fv_m along the rows of P, shape (n,)
     directions: FloatArray  #: D of dry friction, shape (m, N); the first n are the joints
-    own_row: NDArray[np.int64]  #: direction that carries each motor's own dry friction and brake, shape (n,)
-    lone: NDArray[np.int64]  #: coordinate of each direction that has only one, else -1, shape (m,)
+    own_row: IntArray  #: direction that carries each motor's own dry friction and brake, shape (n,)
+    lone: IntArray  #: coordinate of each direction that has only one, else -1, shape (m,)
     step_s: float  #: h
 
 
@@ -148,7 +147,7 @@ def advance_closed(
     velocity: FloatArray,
     load_torque: FloatArray,
     basis: FloatArray,
-    resting: NDArray[np.bool_],
+    resting: BoolArray,
 ) -> float:
     """Advance a closed chain as `advance` does; the positions still have to be settled on its closures.
 
@@ -278,8 +277,8 @@ def _resting_closed(
     impulse: FloatArray,
     bound: FloatArray,
     directions: FloatArray,
-    lone: NDArray[np.int64],
-    resting: NDArray[np.bool_],
+    lone: IntArray,
+    resting: BoolArray,
 ) -> None:
     """Find the coordinates at rest: all where the sticking directions span the speeds, else those that stick alone."""
     size = directions.shape[1]
@@ -399,9 +398,7 @@ def _substitute(lower: FloatArray, vector: FloatArray) -> None:
 
 
 @compiled
-def _resting(
-    impulse: FloatArray, bound: FloatArray, directions: FloatArray, lone: NDArray[np.int64]
-) -> NDArray[np.bool_]:
+def _resting(impulse: FloatArray, bound: FloatArray, directions: FloatArray, lone: IntArray) -> BoolArray:
     """Return the coordinates held at rest by sticking directions, shape (N,)."""
     resting = np.zeros(directions.shape[1], dtype=np.bool_)
     for k in range(len(impulse)):
@@ -521,7 +518,7 @@ def _stick(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: F
 
 @compiled
 def _step_to_bound(
-    lower: FloatArray, inside: NDArray[np.bool_], bound: FloatArray, impulse: FloatArray, step: FloatArray
+    lower: FloatArray, inside: BoolArray, bound: FloatArray, impulse: FloatArray, step: FloatArray
 ) -> bool:
     """Finish the substitution, step as far as the bounds allow, and return whether a bound was met."""
     m = len(step)

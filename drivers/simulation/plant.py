@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from drivers.simulation.closures import OPEN, SINGULAR, Mechanism, link_frame, settle
 from drivers.simulation.dynamics import TOLERANCE_RAD_S, Mechanics, advance, advance_closed, turn_rotors
@@ -15,10 +14,12 @@ from drivers.simulation.effects import AMBIENT_C, Coupling, Effect, Elasticity, 
 from drivers.simulation.noise import ColouredNoise, random_streams
 from drivers.simulation.spec import (
     AxisSpec,
+    BoolArray,
     CellSpec,
     ClosureLost,
     FloatArray,
     FrictionUnsolved,
+    IntArray,
     PassiveFriction,
     SpecInvalid,
 )
@@ -144,7 +145,7 @@ class Plant:
         start_rad = spec.start_rad
         mobility = n
         self._passive_joints: tuple[str, ...] = ()
-        self._order: slice | NDArray[np.int64] = slice(None)  # of the joints in Pinocchio's model
+        self._order: slice | IntArray = slice(None)  # of the joints in Pinocchio's model
         if self.mechanism is not None:
             start_rad = self.mechanism.start_rad
             mobility = self.mechanism.mobility
@@ -230,7 +231,7 @@ class Plant:
                     f"motor inertia of {motor:g} kg m² and {links:.3g} kg m² behind it; lower stiffness or damping"
                 )
 
-    def set_brakes(self, closed: NDArray[np.bool_]) -> None:
+    def set_brakes(self, closed: BoolArray) -> None:
         """Close or open the brake of each motor, shape (n,)."""
         self._bound[:] = self._free_bound
         np.add.at(self._bound, self._mechanics.own_row, np.where(closed, self._brake_nm, 0.0))

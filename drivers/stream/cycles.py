@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import can
 
-from drivers.canopen.bus import base_frame
+from drivers.canopen.bus import base_frame, is_plain
 from drivers.canopen.link import SYNC_COB_ID, Link
 from drivers.canopen.sdo import Clock
 from drivers.canopen.socketcan import CapturedMessage
@@ -22,11 +22,6 @@ LOOK_EVERY = 64  #: Frames between two looks at the clock while frames are waiti
 def nothing_to_send(_: int) -> Sequence[can.Message]:
     """Return no frames: see `CycleBus.spare`."""
     return ()
-
-
-def is_plain(message: can.Message) -> bool:
-    """Return whether a frame is a data frame with a base identifier, as all of CANopen are."""
-    return not (message.is_error_frame or message.is_extended_id or message.is_remote_frame)
 
 
 def is_sync(message: can.Message) -> bool:

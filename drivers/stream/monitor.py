@@ -14,11 +14,11 @@ from enum import Enum
 
 import can
 
-from drivers.canopen.bus import bus_errors
-from drivers.canopen.link import EMCY, HEARTBEAT, SYNC_COB_ID, Link
+from drivers.canopen.bus import bus_errors, is_plain
+from drivers.canopen.link import SYNC_COB_ID, Link
 from drivers.canopen.pdo import feedback_entries
 from drivers.canopen.sdo import SDO_ANSWER, SDO_REQUEST, upload_answer, upload_request
-from drivers.canopen.split_bus import SplitAddress
+from drivers.canopen.split_bus import FROM_NODES, SplitAddress
 from drivers.messages import CellEvent, Sample
 from drivers.profiles.profile import Axis, ObjectEntry
 from drivers.stream.answers import slots_of
@@ -27,8 +27,6 @@ QUIET_S = 2.0  #: Silence of other masters after which the axes are read by SDO
 ANSWER_S = 0.3  #: Time allowed for an answer; CiA 301 sets no limit, and drives answer within milliseconds
 ABANDONED_S = 1.0  #: A request without an answer for so long is lost, and the axis is asked anew
 READING_S = 0.1  #: Time between two SDO readings of an axis: six axes then load a bus of 1 Mbit/s by some 5 %
-SENT_BY_NODES = frozenset((EMCY, 0x180, 0x280, 0x380, 0x480, SDO_ANSWER, HEARTBEAT))
-"""COB-IDs of what a node sends, without its node id (CiA 301, predefined connection set)."""
 
 
 class ReadingSource(Enum):
@@ -258,12 +256,12 @@ class CellMonitor:
     def _hear(self, message: can.Message) -> None:
         bus = 0 if self._split is None else self._buses.index(str(message.channel))
         self._frames[bus, len(message.data)] += 1
-        if message.is_error_frame or message.is_extended_id or message.is_remote_frame:
+        if not is_plain(message):
             self._link.dispatch(message)
             return
         identifier = message.arbitration_id
         axis = self._by_node.get(identifier & 0x7F)
-        if axis is not None and identifier & ~0x7F in SENT_BY_NODES:
+        if axis is not None and identifier & ~0x7F in FROM_NODES:
             axis.heard_ns = self._link.clock()
         if identifier == SYNC_COB_ID:
             self._syncs += 1

@@ -70,7 +70,7 @@ class Polling:
         for number, (axis, scale) in enumerate(zip(network.axes, network.scales(), strict=True)):
             for quantity, (entry, per_unit) in slow_objects(axis, scale).items():
                 try:
-                    network.link.objects(axis.node_id).read(entry)
+                    network.objects(axis).read(entry)
                 except ObjectAccessError as error:
                     if error.abort_code is None or error.abort_code in NO_SUCH_OBJECT:
                         why = "" if error.abort_code is not None else f" that can be read ({error.reason})"

@@ -12,13 +12,13 @@ from collections.abc import Iterator
 
 import can
 
-from drivers.canopen.bus import bus_errors
+from drivers.canopen.bus import bus_errors, is_plain
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.socketcan import Losses, lags_behind, losses_of, remarks_of
 from drivers.errors import BusError, DriveFault, NodeMisplaced, SampleLost, node_label
 from drivers.messages import EventKind, EventSink, Sample
 from drivers.stream.answers import Answers, Slot, StreamStatistics
-from drivers.stream.cycles import CycleBus, Cycles, is_plain
+from drivers.stream.cycles import CycleBus, Cycles
 from drivers.stream.sync import PATIENCE_S, Pacing
 from drivers.stream.watch import Watch
 
