@@ -30,7 +30,6 @@ class Need:
 
     entry: ObjectEntry
     purpose: str  #: in a message
-    mapped: bool = False  #: whether a PDO must carry it
 
 
 def needs_of(profile: DriveProfile) -> tuple[Need, ...]:
@@ -38,13 +37,13 @@ def needs_of(profile: DriveProfile) -> tuple[Need, ...]:
     scale = profile.current_scale
     switch = () if scale.switch is None else (scale.switch,)
     return (
-        Need(profile.position, "position", mapped=True),
-        Need(profile.current, "current", mapped=True),
-        Need(STATUSWORD, "statusword", mapped=True),
-        Need(CONTROLWORD, "controlword", mapped=True),
-        Need(TARGET_POSITION, "target position", mapped=True),
-        Need(PROFILE_VELOCITY, "profile velocity", mapped=True),
-        Need(PROFILE_ACCELERATION, "profile acceleration", mapped=True),
+        Need(profile.position, "position"),
+        Need(profile.current, "current"),
+        Need(STATUSWORD, "statusword"),
+        Need(CONTROLWORD, "controlword"),
+        Need(TARGET_POSITION, "target position"),
+        Need(PROFILE_VELOCITY, "profile velocity"),
+        Need(PROFILE_ACCELERATION, "profile acceleration"),
         Need(MODE_OF_OPERATION, "mode of operation"),
         Need(MODE_DISPLAY, "mode display"),
         Need(HEARTBEAT_TIME, "heartbeat period"),

@@ -23,9 +23,6 @@ FINE = 1.25  #: Ratio that tolerances of Kt and a gear's efficiency explain
 class ScaleReading:
     """Current scale and motor data of a drive."""
 
-    node_id: int  #: node id of the axis
-    name: str  #: name of the axis
-    profile: str  #: name of its profile
     ampere_per_unit: float  #: of the mapped current object [A]
     objects: dict[str, int]  #: values of the scale objects, by object
     rated_current_a: float | None  #: rated current of the motor, None where the drive reports none
@@ -81,7 +78,7 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
                 f"{MIN_STEPS:g} to {most} steps, the range of {entry}",
                 "the scale is not this drive's, or the rated current is not its motor's: check profile and set-up",
             )
-    return ScaleReading(access.node_id, access.name, profile.name, ampere, values, rated_a, rated_nm, warnings)
+    return ScaleReading(ampere, values, rated_a, rated_nm, warnings)
 
 
 def check_name_plate(reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a: float) -> tuple[str, ...]:

@@ -174,6 +174,13 @@ class _Bus(Protocol):
     def note_twice(self, node_id: int, first: bytes, second: bytes) -> None: ...
 
 
+def _unaborted(response: bytes) -> bytes:
+    """Return an answer, or raise the abort that it is."""
+    if response[0] == _ABORT:
+        raise SdoAbortedError(struct.unpack_from("<L", response, 4)[0])
+    return response
+
+
 class SynchronousSdoClient(SdoClient):
     """canopen's SDO client without its thread: it reads the bus while it waits.
 
@@ -246,10 +253,7 @@ class SynchronousSdoClient(SdoClient):
 
     def read_response(self) -> bytes:
         """Wait for the next answer of the node; SdoCommunicationError where none comes in time."""
-        response = self._read_until(self._deadline())
-        if response[0] == _ABORT:
-            raise SdoAbortedError(struct.unpack_from("<L", response, 4)[0])
-        return response
+        return _unaborted(self._read_until(self._deadline()))
 
     def _deadline(self) -> int:
         return self._bus.clock() + round(self._bus.allowed_s(self._policy.timeout_s) * 1e9)
@@ -287,9 +291,7 @@ class SynchronousSdoClient(SdoClient):
                 continue
             self._answered = response if names_object and requested not in self._unanswered else b""
             self._unanswered.discard(requested)
-            if response[0] == _ABORT:
-                raise SdoAbortedError(struct.unpack_from("<L", response, 4)[0])
-            return response
+            return _unaborted(response)
         self._give_up(requested)
         raise SdoCommunicationError(f"{MOST_SURPLUS} answers to other requests")
 

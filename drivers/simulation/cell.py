@@ -15,9 +15,9 @@ from drivers.canopen.bus import SocketcandBus, base_frame, is_plain, send_burst
 from drivers.canopen.split_bus import SplitBus
 from drivers.errors import BusError
 from drivers.simulation.amplifier import AmplifierSet
-from drivers.simulation.drive import ErrorCode, PowerState
+from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import ERROR_FRAMES, FOREIGN_SDO, Disturbance, FaultKind, FaultSpec
-from drivers.simulation.node import NmtCommand, Node
+from drivers.simulation.node import Node
 from drivers.simulation.plant import Plant
 from drivers.simulation.spec import CellSpec, SpecInvalid
 
@@ -287,19 +287,12 @@ class SimulatedCell:
 
     def _begin_faults(self) -> None:
         """Apply the faults that begin with this cycle, before the plant moves."""
-        strike: dict[FaultKind, Callable[[Node, FaultSpec], None]] = {
-            FaultKind.EMERGENCY: lambda node, fault: node.fail(fault.value),
-            FaultKind.FOLLOWING_ERROR: lambda node, _: node.fail(ErrorCode.FOLLOWING_ERROR),
-            FaultKind.FALLS_BACK: lambda node, _: node.fall_back(),
-            FaultKind.REBOOTS: lambda node, _: node.command_nmt(NmtCommand.RESET_NODE, self._clock()),
-            FaultKind.LOSES_POWER: lambda node, _: node.drive.reset(),
-        }
         for index, node in enumerate(self.nodes):
             node.drive.limited = self._disturbance.active(FaultKind.LIMIT, index)
         for fault in self._disturbance.beginning():
             for index, node in enumerate(self.nodes):
-                if fault.kind in strike and fault.concerns(index):
-                    strike[fault.kind](node, fault)
+                if fault.concerns(index):
+                    node.strike(fault, self._clock())
             if fault.kind in ERROR_FRAMES:
                 error_class, data = ERROR_FRAMES[fault.kind]
                 self._bus.send(can.Message(is_error_frame=True, arbitration_id=error_class, data=data))

@@ -9,7 +9,7 @@ from enum import IntEnum
 
 from drivers.simulation.amplifier import AmplifierSet
 from drivers.simulation.drive import Drive, ErrorCode
-from drivers.simulation.faults import FaultKind
+from drivers.simulation.faults import FaultKind, FaultSpec
 from drivers.simulation.objects import (
     LOAD,
     NO_OBJECT,
@@ -179,22 +179,37 @@ class Node:
 
     def inject(self, kind: FaultKind) -> None:
         """Inject a fault that lasts from power-on; other kinds have no effect here."""
-        if kind is FaultKind.REFUSES_NMT:
-            self._obeys_nmt = False
-        elif kind is FaultKind.OTHER_SERIAL:
-            self._values[0x1018, 4] = self._number(0x1018, 4) + 1
-        elif kind is FaultKind.REFUSES_MAPPING:
-            for pdo in self._transmit:
-                pdo.locked = True
-        elif kind is FaultKind.SYNC_PRODUCER:
-            self._values[0x1005, 0] = self._number(0x1005) | 1 << 30  # the cell sends the SYNC
-        elif kind is FaultKind.NO_GUARD:
-            for key in ((0x1016, 0), (0x1016, 1)):
-                del self._dictionary[key]  # its value stays zero: no heartbeat is monitored
-        elif kind is FaultKind.REFUSES_WRITE:
-            self._refused.add(GAIN)
-        elif kind is FaultKind.REFUSES_SAVE:
-            self._refused.add(STORE)
+        match kind:
+            case FaultKind.REFUSES_NMT:
+                self._obeys_nmt = False
+            case FaultKind.OTHER_SERIAL:
+                self._values[0x1018, 4] += 1
+            case FaultKind.REFUSES_MAPPING:
+                for pdo in self._transmit:
+                    pdo.locked = True
+            case FaultKind.SYNC_PRODUCER:
+                self._values[0x1005, 0] |= 1 << 30  # the cell sends the SYNC
+            case FaultKind.NO_GUARD:
+                for subindex in range(2):
+                    del self._dictionary[0x1016, subindex]  # its value stays zero: no heartbeat is monitored
+            case FaultKind.REFUSES_WRITE:
+                self._refused.add(GAIN)
+            case FaultKind.REFUSES_SAVE:
+                self._refused.add(STORE)
+
+    def strike(self, fault: FaultSpec, wall_s: float) -> None:
+        """Undergo a fault that happens once; other kinds have no effect here."""
+        match fault.kind:
+            case FaultKind.EMERGENCY:
+                self.fail(fault.value)
+            case FaultKind.FOLLOWING_ERROR:
+                self.fail(ErrorCode.FOLLOWING_ERROR)
+            case FaultKind.FALLS_BACK:
+                self.fall_back()
+            case FaultKind.REBOOTS:
+                self.command_nmt(NmtCommand.RESET_NODE, wall_s)
+            case FaultKind.LOSES_POWER:
+                self.drive.reset()
 
     def receive_pdo(self, can_id: int, data: bytes) -> None:
         """Accept a receive PDO of this node: at once if event-driven, else with the next SYNC."""

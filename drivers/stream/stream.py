@@ -68,7 +68,6 @@ class SyncStream:
         self._read_on = False  # since the last cycle
         self._base = Losses()  # before the first SYNC
         self._counted = Losses()
-        self._losses = Losses()
         self._incomplete_cycles = 0
         self._silent_cycles = 0
 
@@ -80,12 +79,13 @@ class SyncStream:
     @property
     def statistics(self) -> StreamStatistics:
         """Counts up to now."""
+        losses = self._counted.since(self._base)
         return StreamStatistics(
             cycles=self.bus.cycles,
             skipped_periods=self.bus.skipped,
-            kernel_dropped=self._losses.kernel,
-            interface_dropped=self._losses.interface,
-            backlog_dropped=self._losses.backlog,
+            kernel_dropped=losses.kernel,
+            interface_dropped=losses.interface,
+            backlog_dropped=losses.backlog,
             **self._counts,
         )
 
@@ -286,7 +286,6 @@ class SyncStream:
             return
         new = counted.since(self._counted)
         self._counted = counted
-        self._losses = counted.since(self._base)
         for count, where in (
             (new.kernel, "in the kernel's receive buffer, which was full"),
             (new.interface, "by the interface, before the receive buffer"),
