@@ -27,6 +27,7 @@ NMT_COB_ID = 0x000
 EMCY = 0x080
 HEARTBEAT = 0x700
 LSS = frozenset((0x7E4, 0x7E5))  #: Layer setting services (CiA 305): a device gets another node id or bit rate
+_COMMANDS = LSS | {NMT_COB_ID, SYNC_COB_ID}
 _RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))  #: Set-points of a drive (CiA 301, predefined connection set)
 _WRITES = frozenset((0, 1, 6))  #: Command specifiers (upper three bits) of downloads: segment, begin, block
 _LSS_NAME = "a layer setting service, which changes node ids"
@@ -175,7 +176,7 @@ class Link:
         """Receive from now on only what concerns our axes, or is a command: a flood of others costs nothing."""
         services = (EMCY, *range(0x180, SDO_REQUEST, 0x80), HEARTBEAT)
         wanted = [(service + node_id, 0x7FF) for service in services for node_id in self.names]
-        wanted += [(number, 0x7FF) for number in (NMT_COB_ID, SYNC_COB_ID, *LSS)]
+        wanted += [(number, 0x7FF) for number in sorted(_COMMANDS)]
         wanted += [(SDO_REQUEST, 0x780), (self.own_id or NMT_COB_ID, 0x7F)]
         receive_only(self.bus, wanted)
 
@@ -273,17 +274,18 @@ class Link:
             self._note_error_frame(message)
         if message.is_error_frame or not message.is_rx:
             return True  # also our own SYNC, which is received for its time stamp
-        service = message.arbitration_id & 0x780
-        node_id = message.arbitration_id & 0x7F
+        identifier = message.arbitration_id
+        service = identifier & 0x780
+        node_id = identifier & 0x7F
         if message.is_extended_id or message.is_remote_frame:
             return False
-        ours = (service in _RPDOS and node_id in self.names) or self.is_own(message.arbitration_id)
-        ours = ours or message.arbitration_id in LSS
-        if message.arbitration_id in (NMT_COB_ID, SYNC_COB_ID) or (service == SDO_REQUEST and node_id) or ours:
-            if message.arbitration_id != SYNC_COB_ID or self.sync_producer is None:
-                self.note_foreign(message.arbitration_id)
+        setpoint = service in _RPDOS and node_id in self.names
+        request = service == SDO_REQUEST and node_id != 0
+        if identifier in _COMMANDS or setpoint or request or self.is_own(identifier):
+            if identifier != SYNC_COB_ID or self.sync_producer is None:
+                self.note_foreign(identifier)
             if service == SDO_REQUEST and node_id in self.names and message.data and message.data[0] >> 5 in _WRITES:
-                self._note_write(message.arbitration_id)
+                self._note_write(identifier)
             return True
         if node_id == 0:
             return False

@@ -12,12 +12,11 @@ import can
 
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import HEARTBEAT, LISTEN_S, LSS, Link, NmtCommand, NmtState, command_name, never
-from drivers.canopen.needs import Profiles
 from drivers.canopen.node_scan import FoundNode, answering, free_ids, read_identity, scan_link
 from drivers.canopen.pdo import CONTROLWORD, HEARTBEAT_MS, STATUSWORD, AxisPdos, wanted_pdos
 from drivers.canopen.scale import ScaleReading, read_scale
 from drivers.canopen.sdo import SDO_REQUEST, Clock, ObjectAccess, SdoPolicy
-from drivers.canopen.setup import AxisSetup, HeartbeatGuard, producer_of, read_consumers
+from drivers.canopen.setup import AxisSetup, HeartbeatGuard, Profiles, producer_of, read_consumers
 from drivers.canopen.split_bus import CellAddress, open_cell_bus
 from drivers.errors import (
     POWERED,

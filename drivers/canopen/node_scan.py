@@ -10,9 +10,9 @@ from typing import TypeVar
 
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import LISTEN_S, Link
-from drivers.canopen.needs import HEARTBEAT_TIME
 from drivers.canopen.pdo import STATUSWORD
 from drivers.canopen.sdo import SDO_REQUEST, ObjectAccess, SdoPolicy, upload_request
+from drivers.canopen.setup import HEARTBEAT_TIME
 from drivers.canopen.split_bus import CellAddress
 from drivers.errors import ObjectAccessError
 from drivers.profiles.cia402 import State, decode

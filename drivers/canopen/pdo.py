@@ -10,6 +10,7 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from itertools import chain
 from typing import TYPE_CHECKING
 
 from drivers.errors import ObjectAccessError, SetupRefused
@@ -164,8 +165,7 @@ def wanted_pdos(
 
 def fixed_feedback(axis: Axis, found: Sequence[PdoRecord]) -> tuple[PdoRecord, ...]:
     """Return those of a drive's own TPDOs that carry every object of a Sample, synchronous; empty where they do not."""
-    needed = set(map(word, feedback_entries(axis)))
-    return _carrying(needed, found)
+    return _carrying(set(map(word, feedback_entries(axis))), found)
 
 
 def fixed_setpoints(found: Sequence[PdoRecord], absent: Sequence[ObjectEntry] = ()) -> tuple[PdoRecord, ...]:
@@ -173,21 +173,24 @@ def fixed_setpoints(found: Sequence[PdoRecord], absent: Sequence[ObjectEntry] = 
 
     Empty where they do not, or where a controlword comes before its target.
     """
-    command, profile = (
-        {word(entry) for entry in entries if entry not in absent} for entries in (COMMAND, MOTION_PROFILE)
-    )
+    command = set(map(word, COMMAND))
+    profile = {word(entry) for entry in MOTION_PROFILE if entry not in absent}
     used = _carrying(command | profile, found)
     if any(not (set(record.entries) <= command or set(record.entries) <= profile) for record in used):
         return ()
-    order = [mapped for record in used for mapped in record.entries if mapped in command]
+    order = [mapped for mapped in _all_mapped(used) if mapped in command]
     return used if order == list(map(word, COMMAND)) else ()
+
+
+def _all_mapped(pdos: Sequence[PdoRecord]) -> tuple[int, ...]:
+    return tuple(chain.from_iterable(record.entries for record in pdos))
 
 
 def _carrying(needed: set[int], found: Sequence[PdoRecord]) -> tuple[PdoRecord, ...]:
     used = [record for record in found if needed & set(record.entries) and not record.cob_id & (NOT_VALID | _EXTENDED)]
-    carried = [mapped for record in used for mapped in record.entries if mapped in needed]
-    whole_bytes = all((mapped & 0xFF) % 8 == 0 for record in used for mapped in record.entries)
-    if sorted(carried) != sorted(needed) or not whole_bytes:
+    every = _all_mapped(used)
+    whole_bytes = all((mapped & 0xFF) % 8 == 0 for mapped in every)
+    if sorted(mapped for mapped in every if mapped in needed) != sorted(needed) or not whole_bytes:
         return ()
     return tuple(replace(record, transmission=SYNCHRONOUS) for record in used)
 

@@ -110,8 +110,11 @@ class SplitBus(can.BusABC):
         self.channel_info = str(address)
         self._ends = tuple(ends)
         self._names = tuple(map(str, address.parts))
-        self._homes = {node_id: index for index, part in enumerate(address.parts) for node_id in part.node_ids}
-        self._axis_names = {node_id: name for part in address.parts for node_id, name in part.axis_names.items()}
+        self._homes: dict[int, int] = {}
+        self._axis_names: dict[int, str] = {}
+        for index, part in enumerate(address.parts):
+            self._homes |= dict.fromkeys(part.node_ids, index)
+            self._axis_names |= part.axis_names
         self._clock = clock
         self._waiting: list[can.Message | None] = [None] * len(self._ends)
         self._failed: set[int] = set()

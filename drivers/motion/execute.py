@@ -319,21 +319,22 @@ class _Execution:
             self.report(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
             self.problems = self.problems or [error]
             return
+        unheard: tuple[int, ...] = ()
         if silent is not None:
+            unheard = silent.node_ids
             self.problems.append(silent)
-        heard = [axis for axis in unconfirmed if silent is None or self._nodes[axis].node_id not in silent.node_ids]
-        if heard:
-            self._network.begin_stop([self._nodes[axis] for axis in heard])
-        for axis in unconfirmed:
-            if axis not in heard:
-                text = f"{node_label(self._nodes[axis])} does not answer: its standstill is not confirmed"
-                self.report(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
-                continue
+        nodes = [self._nodes[axis] for axis in unconfirmed]
+        self._network.begin_stop([node for node in nodes if node.node_id not in unheard])
+        for axis, node in zip(unconfirmed, nodes, strict=True):
             try:
-                self._network.disable(self._nodes[axis])
+                if node.node_id not in unheard:
+                    self._network.disable(node)
+                    continue
+                text = f"{node_label(node)} does not answer: its standstill is not confirmed"
             except DriverError as error:
-                self.report(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], str(error))
+                text = str(error)
                 self.problems.append(error)
+            self.report(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
 
     def _stop_by_pdo(self) -> Generator[Sample, None, tuple[int, ...]]:
         """Stop by synchronous RPDOs; returns the axes whose statusword does not confirm the stop."""

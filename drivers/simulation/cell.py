@@ -141,8 +141,6 @@ class SimulatedCell:
         Plant(spec).step(np.zeros(len(ids)))
         AmplifierSet(spec, self.plant).control(self.plant.motor_rad)
         self._enabled = np.zeros(len(ids), dtype=np.int64)
-        self._substeps = spec.substeps
-        self._period_us = spec.sync_period_us
         self._bus = bus
         self._clock = clock
         self._burst: list[can.Message] | None = None
@@ -234,7 +232,7 @@ class SimulatedCell:
     @property
     def time_us(self) -> int:
         """Plant time since power-on [us]."""
-        return self.cycles * self._period_us
+        return self.cycles * self._spec.sync_period_us
 
     def _serve_and_keep(self) -> None:
         try:
@@ -254,7 +252,7 @@ class SimulatedCell:
     def _run_alone(self, wall_s: float) -> None:
         """Advance by wall time while the axes of a master that is gone come to rest; no node receives a SYNC."""
         lone = self._lone
-        period_s = self._period_us * 1e-6
+        period_s = self._spec.sync_period_us * 1e-6
         for _ in range(LONE_CYCLES):
             # Another bus of this cell may still have its master, whose next SYNC ends this.
             if lone is None or lone.cycles * period_s > wall_s - lone.since_s - IDLE_S:
@@ -316,7 +314,7 @@ class SimulatedCell:
             self._enabled = loops["enabled"].copy()
             plant.set_brakes(self._enabled == 0)
         current_a = loops["current_a"]
-        for _ in range(self._substeps):
+        for _ in range(self._spec.substeps):
             plant.step(current_a)
             # The loops read the position at the end of the step: a reported current belongs to its reported position.
             amplifiers.control(plant.motor_rad)

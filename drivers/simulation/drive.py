@@ -209,9 +209,12 @@ class Drive:
         return bool(self._axis["piece"] < SEGMENTS)
 
     def _start(self, setpoint: Setpoint) -> None:
-        move = plan(float(self._axis["demand"]), float(self._axis["demand_velocity"]), *setpoint)
-        self._amplifiers.move(self._index, move)
+        self._amplifiers.move(self._index, plan(*self._demand, *setpoint))
 
     def _stop(self, deceleration: float) -> None:
-        move = ramp_down(float(self._axis["demand"]), float(self._axis["demand_velocity"]), deceleration)
-        self._amplifiers.move(self._index, move)
+        self._amplifiers.move(self._index, ramp_down(*self._demand, deceleration))
+
+    @property
+    def _demand(self) -> tuple[float, float]:
+        """Position and velocity of the set-point."""
+        return float(self._axis["demand"]), float(self._axis["demand_velocity"])

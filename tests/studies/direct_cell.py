@@ -26,11 +26,10 @@ from daq.log.conversion import SiScaling, moves, scaling
 from daq.log.metadata import AxisReadback, Readback
 from daq.workflow.plan import Plan
 from daq.workflow.record import motor_limits, motor_moves
-from drivers.canopen.needs import MODE_OF_OPERATION
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.pdo import SETPOINT_PDOS, Direction, records, wanted_pdos, write_pdo_record
 from drivers.canopen.sdo import ObjectAccess
-from drivers.canopen.setup import PROFILE_POSITION_MODE
+from drivers.canopen.setup import MODE_OF_OPERATION, PROFILE_POSITION_MODE
 from drivers.messages import CellEvent, EventKind, Sample
 from drivers.motion.execute import execute
 from drivers.move import MotionPermission

@@ -13,8 +13,8 @@ from canopen.objectdictionary import ObjectDictionary, ODVariable
 from canopen.objectdictionary.datatypes import INTEGER_TYPES, SIGNED_TYPES
 from canopen.objectdictionary.eds import import_eds
 
-from drivers.canopen.needs import needs_of
 from drivers.canopen.pdo import COMMAND, MOTION_PROFILE, PROFILE_DECELERATION, STATUSWORD, Direction, wanted_pdos
+from drivers.canopen.setup import needs_of
 from drivers.profiles.profile import Axis, DriveProfile, ObjectEntry
 
 LARGEST_BYTES = 4 * 2**20
