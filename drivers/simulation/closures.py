@@ -78,7 +78,7 @@ def evaluate(constants: tuple[Any, ...], position: FloatArray, error: FloatArray
         _place_joint(tree, i, position[i - 1], placed)
     closures = len(tree.frame_joint)
     every_error = np.zeros((closures, 6))
-    motion = np.zeros((closures, 6, joints))
+    motion = np.zeros((closures, joints, 6))
     for k in range(closures):
         _close(tree, k, placed, every_error[k], motion[k])
     for row in range(len(error)):
@@ -86,7 +86,7 @@ def evaluate(constants: tuple[Any, ...], position: FloatArray, error: FloatArray
         direction = tree.closed[row, 1]
         error[row] = every_error[k, direction]
         for j in range(1, joints):
-            jacobian[row, j - 1] = motion[k, direction, j]
+            jacobian[row, j - 1] = motion[k, j, direction]
 
 
 @compiled
@@ -146,7 +146,7 @@ def _turned(axis: FloatArray, angle: float) -> FloatArray:
 
 @compiled
 def _close(tree: Tree, k: int, placed: Placed, error: FloatArray, motion: FloatArray) -> None:
-    """Compute φ of closure k in all six directions, shape (6,), and what each joint does to it, shape (6, n + 1).
+    """Compute φ of closure k in all six directions, shape (6,), and what each joint does to it, shape (n + 1, 6).
 
     With Ṙ = [ω] R the second part of φ changes by ½ (tr(R) I − R) ω, ω in the first frame: `spin`.
     """
@@ -158,7 +158,7 @@ def _close(tree: Tree, k: int, placed: Placed, error: FloatArray, motion: FloatA
             p[side, a] = placed.origin[joint, a]
         _add(placed.rotation[joint], tree.frame_offset[k, side], p[side])
         _add_product(placed.rotation[joint], tree.frame_rotation[k, side], r[side])
-    to_first = r[0].T
+    to_first = r[0].T.copy()
     between = np.zeros((3, 3))
     _add_product(to_first, r[1], between)
     trace = between[0, 0] + between[1, 1] + between[2, 2]
@@ -176,8 +176,9 @@ def _close(tree: Tree, k: int, placed: Placed, error: FloatArray, motion: FloatA
         sign = 1.0 if side == 1 else -1.0
         j = tree.frame_joint[k, side]
         while j > 0:
-            velocity = np.zeros(3)
+            velocity = np.empty(3)
             angular = np.zeros(3)
+            _add(to_first, placed.turn[j], angular)
             for a in range(3):
                 b = (a + 1) % 3
                 c = (a + 2) % 3
@@ -186,10 +187,9 @@ def _close(tree: Tree, k: int, placed: Placed, error: FloatArray, motion: FloatA
                 lever_c = p[1, c] - placed.origin[j, c]
                 across = placed.turn[j, b] * lever_c - placed.turn[j, c] * lever_b
                 velocity[a] = sign * (placed.slide[j, a] + across)
-                for e in range(3):
-                    angular[a] += sign * r[0, e, a] * placed.turn[j, e]
-            _add(to_first, velocity, motion[:3, j])
-            _add(spin, angular, motion[3:, j])
+                angular[a] *= sign
+            _add(to_first, velocity, motion[j, :3])
+            _add(spin, angular, motion[j, 3:])
             j = tree.parent[j]
 
 

@@ -364,9 +364,13 @@ def _respond(
     lower: FloatArray, free_velocity: FloatArray, directions: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return A⁻¹ Dᵀ, shape (N, m), D v_free, shape (m,), and W, shape (m, m); A = L Lᵀ."""
-    response = directions.T.copy()
-    for k in range(len(directions)):
-        _substitute(lower, response[:, k])
+    m, total = directions.shape
+    response = np.empty((total, m))
+    for k in range(m):
+        column = directions[k].copy()
+        _substitute(lower, column)
+        for i in range(total):
+            response[i, k] = column[i]
     return response, _times(directions, free_velocity), _product(directions, response)
 
 
