@@ -26,52 +26,71 @@ from typing import TYPE_CHECKING
 
 from lazy_names import lazy_names
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # the names of a module stand together
+    # ruff: noqa: I001
     from drivers.canopen.bus import BusAddress as BusAddress
-    from drivers.canopen.network import CanopenNetwork as CanopenNetwork
-    from drivers.canopen.network import open_cell as open_cell
-    from drivers.canopen.node_scan import FoundNode as FoundNode
-    from drivers.canopen.node_scan import scan as scan
-    from drivers.canopen.split_bus import BusPart as BusPart
-    from drivers.canopen.split_bus import SplitAddress as SplitAddress
-    from drivers.errors import BusBusy as BusBusy
-    from drivers.errors import BusError as BusError
-    from drivers.errors import DriveFault as DriveFault
-    from drivers.errors import DriverError as DriverError
-    from drivers.errors import MotionRefused as MotionRefused
-    from drivers.errors import MotionTimeout as MotionTimeout
-    from drivers.errors import NodeError as NodeError
-    from drivers.errors import NodeMisplaced as NodeMisplaced
-    from drivers.errors import NodeMissing as NodeMissing
-    from drivers.errors import ObjectAccessError as ObjectAccessError
-    from drivers.errors import ParameterRefused as ParameterRefused
-    from drivers.errors import ParametersMixed as ParametersMixed
-    from drivers.errors import SampleLost as SampleLost
-    from drivers.errors import SetupRefused as SetupRefused
-    from drivers.errors import StateRefused as StateRefused
-    from drivers.messages import CellEvent as CellEvent
-    from drivers.messages import EventKind as EventKind
-    from drivers.messages import Sample as Sample
+    from drivers.canopen.network import (
+        CanopenNetwork as CanopenNetwork,
+        open_cell as open_cell,
+    )
+    from drivers.canopen.node_scan import (
+        FoundNode as FoundNode,
+        scan as scan,
+    )
+    from drivers.canopen.split_bus import (
+        BusPart as BusPart,
+        SplitAddress as SplitAddress,
+    )
+    from drivers.errors import (
+        BusBusy as BusBusy,
+        BusError as BusError,
+        DriveFault as DriveFault,
+        DriverError as DriverError,
+        MotionRefused as MotionRefused,
+        MotionTimeout as MotionTimeout,
+        NodeError as NodeError,
+        NodeMisplaced as NodeMisplaced,
+        NodeMissing as NodeMissing,
+        ObjectAccessError as ObjectAccessError,
+        ParameterRefused as ParameterRefused,
+        ParametersMixed as ParametersMixed,
+        SampleLost as SampleLost,
+        SetupRefused as SetupRefused,
+        StateRefused as StateRefused,
+    )
+    from drivers.messages import (
+        CellEvent as CellEvent,
+        EventKind as EventKind,
+        Sample as Sample,
+    )
     from drivers.motion.execute import execute as execute
-    from drivers.move import AxisLimits as AxisLimits
-    from drivers.move import MotionPermission as MotionPermission
-    from drivers.move import Move as Move
-    from drivers.move import synchronised_move as synchronised_move
-    from drivers.profiles.cia402 import State as State
-    from drivers.profiles.cia402 import decode as decode
-    from drivers.profiles.profile import CIA402 as CIA402
-    from drivers.profiles.profile import Amplitude as Amplitude
-    from drivers.profiles.profile import Axis as Axis
-    from drivers.profiles.profile import CurrentScale as CurrentScale
-    from drivers.profiles.profile import DriveProfile as DriveProfile
-    from drivers.profiles.profile import Identity as Identity
-    from drivers.profiles.profile import ObjectEntry as ObjectEntry
-    from drivers.profiles.profile import TapPoint as TapPoint
+    from drivers.move import (
+        AxisLimits as AxisLimits,
+        MotionPermission as MotionPermission,
+        Move as Move,
+        synchronised_move as synchronised_move,
+    )
+    from drivers.profiles.cia402 import (
+        State as State,
+        decode as decode,
+    )
+    from drivers.profiles.profile import (
+        CIA402 as CIA402,
+        Amplitude as Amplitude,
+        Axis as Axis,
+        CurrentScale as CurrentScale,
+        DriveProfile as DriveProfile,
+        Identity as Identity,
+        ObjectEntry as ObjectEntry,
+        TapPoint as TapPoint,
+    )
     from drivers.stream.answers import StreamStatistics as StreamStatistics
     from drivers.stream.stream import SyncStream as SyncStream
-    from drivers.stream.sync import FollowedSync as FollowedSync
-    from drivers.stream.sync import LockstepSync as LockstepSync
-    from drivers.stream.sync import TimedSync as TimedSync
+    from drivers.stream.sync import (
+        FollowedSync as FollowedSync,
+        LockstepSync as LockstepSync,
+        TimedSync as TimedSync,
+    )
 
     __all__: list[str]
 else:

@@ -191,7 +191,8 @@ class StateRefused(NodeError):
         self, node: Node, asked: str, found: str, statusword: int | None = None, *, remedy: str | None = None
     ) -> None:
         if statusword is None:
-            shown, usual = f"its heartbeat still says {found}", "read its error register 1001h"
+            shown = f"its heartbeat still says {found}"
+            usual = "read its error register 1001h"
         else:
             shown = f"statusword {statusword:#06x} says {found}"
             usual = "check the power stage, the safety chain (STO) and the fault memory"
@@ -251,7 +252,9 @@ class MotionRefused(DriverError):
 
     def __init__(self, found: str, *, expected: str = "", remedy: str = "") -> None:
         super().__init__(f"found {found}; expected {expected}; {remedy}" if remedy else found)
-        self.found, self.expected, self.remedy = found, expected, remedy
+        self.found = found
+        self.expected = expected
+        self.remedy = remedy
 
 
 class MotionTimeout(DriverError):
@@ -271,12 +274,14 @@ class MotionTimeout(DriverError):
     ) -> None:
         names = ", ".join(map(node_label, nodes))
         if acknowledge is None:
-            found, remedy = "did not reach the target", "check brakes and limits, or use slower moves"
+            found = "did not reach the target"
+            remedy = "check brakes and limits, or use slower moves"
         else:
             found = f"did not {'set' if acknowledge else 'clear'} statusword bit 12 (set-point acknowledge)"
             remedy = "check that the drive is in profile position mode (6061h = 1) and accepts set-points by RPDO"
         if other_master:
-            found, remedy = f"{found}, and {other_master},", f"end the other program first; else {remedy}"
+            found = f"{found}, and {other_master},"
+            remedy = f"end the other program first; else {remedy}"
         super().__init__(f"move {move}: {names} {found} within {waited_s:g} s; stopping all axes; {remedy}")
         self.move = move
         self.axes = axes

@@ -73,7 +73,8 @@ def synchronised_move(
     Raises:
         ValueError: a limit is not above 2 counts/s or counts/s².
     """
-    start, target = np.asarray(start_counts, dtype=np.float64), np.asarray(target_counts, dtype=np.float64)
+    start = np.asarray(start_counts, dtype=np.float64)
+    target = np.asarray(target_counts, dtype=np.float64)
     # One count less than allowed leaves room for rounding up.
     path = synchronised(
         start,
@@ -81,7 +82,8 @@ def synchronised_move(
         np.array([limit.velocity_counts_s - 1.0 for limit in limits]),
         np.array([limit.acceleration_counts_s2 - 1.0 for limit in limits]),
     )
-    velocities, accelerations = [], []
+    velocities = []
+    accelerations = []
     for distance, speed in zip(np.abs(target - start), np.abs(path.velocity), strict=True):
         velocity = max(1, math.ceil(speed))
         ramp_s = path.duration_s - distance / velocity
@@ -162,7 +164,8 @@ class Trapezoid:
         t = np.clip(np.asarray(time_s, dtype=np.float64), 0.0, self.duration_s)[:, None]
         rising = np.minimum(t, self.ramp_s)
         falling = np.maximum(t - (self.duration_s - self.ramp_s), 0.0)
-        acceleration, velocity = self.acceleration, self.velocity
+        acceleration = self.acceleration
+        velocity = self.velocity
         distance = 0.5 * acceleration * rising**2 + velocity * (t - rising) - 0.5 * acceleration * falling**2
         speed = acceleration * (rising - falling)
         inside = (np.asarray(time_s)[:, None] >= 0.0) & (np.asarray(time_s)[:, None] < self.duration_s)
@@ -182,16 +185,17 @@ def synchronised(
     Raises:
         ValueError: a limit is not positive.
     """
-    start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
-    if np.any(np.asarray(velocity_limit) <= 0) or np.any(np.asarray(acceleration_limit) <= 0):
+    limits = np.array([velocity_limit, acceleration_limit], dtype=np.float64)
+    if np.any(limits <= 0):
         raise ValueError(f"limits must be positive, found {velocity_limit!r} and {acceleration_limit!r}")
+    start = np.asarray(start, dtype=np.float64)
+    end = np.asarray(end, dtype=np.float64)
     distance = np.abs(end - start)
-    if not distance.any():
+    moving = distance > 0
+    if not moving.any():
         return Trapezoid(start, end, 0.0, 0.0)
     # Normalised to the path 0..1, the slowest axis in velocity and in acceleration decides for all.
-    with np.errstate(divide="ignore"):
-        rate = float(np.min(np.where(distance > 0, velocity_limit / np.maximum(distance, 1e-300), np.inf)))
-        ramp_rate = float(np.min(np.where(distance > 0, acceleration_limit / np.maximum(distance, 1e-300), np.inf)))
+    rate, ramp_rate = np.min(limits[:, moving] / distance[moving], axis=1).tolist()
     ramp_s = min(rate / ramp_rate, ramp_rate**-0.5)
     cruise_s = 1.0 / (ramp_rate * ramp_s)
     return Trapezoid(start, end, cruise_s + ramp_s, ramp_s)

@@ -154,7 +154,7 @@ def _scale_of(network: CanopenNetwork, axis: Axis) -> ScaleReading | None:
 def _misfit_of(network: CanopenNetwork, axis: Axis) -> str:
     """Describe the objects of its profile that a drive lacks; empty where it has them, or does not answer."""
     from daq.config.drive import shipped_profiles
-    from drivers.canopen.needs import misfit
+    from drivers.canopen.setup import misfit
     from drivers.errors import DriverError
 
     try:

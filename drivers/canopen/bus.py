@@ -119,6 +119,16 @@ def open_bus(address: BusAddress, *, answering: bool = False) -> can.BusABC:
             raise BusError(str(address), str(error)) from error
 
 
+def base_frame(cob_id: int, data: bytes = b"") -> can.Message:
+    """Return a data frame with a base identifier."""
+    return can.Message(arbitration_id=cob_id, is_extended_id=False, data=data)
+
+
+def is_plain(message: can.Message) -> bool:
+    """Return whether a frame is a data frame with a base identifier, as all of CANopen are."""
+    return not (message.is_error_frame or message.is_extended_id or message.is_remote_frame)
+
+
 def send_burst(bus: can.BusABC, messages: Sequence[can.Message]) -> None:
     """Send several frames, in one call where the bus has a ``send_burst``."""
     burst: Callable[[Sequence[can.Message]], None] | None = getattr(bus, "send_burst", None)
@@ -142,8 +152,10 @@ class VirtualEnd(BurstBus, VirtualBus):
         for queue in self.channel:
             if queue is not self.queue:
                 frame = msg.__copy__()
-                frame.data, frame.timestamp = msg.data[:], time.time()
-                frame.channel, frame.is_rx = self.channel_id, True
+                frame.data = msg.data[:]
+                frame.timestamp = time.time()
+                frame.channel = self.channel_id
+                frame.is_rx = True
                 queue.put(frame)
 
     def _fill(self, timeout_s: float | None) -> None:
@@ -208,12 +220,11 @@ class SocketcandBus(BurstBus):
         if self._stuck is not None:
             raise can.CanOperationError(self._stuck)
         data = memoryview(b"".join(map(_command, messages)))
-        end_s: float | None = None
+        end_s = time.monotonic() + SEND_S
         while data:
             try:
                 data = data[self._socket.send(data, socket.MSG_DONTWAIT) :]
             except BlockingIOError:
-                end_s = time.monotonic() + SEND_S if end_s is None else end_s
                 left_s = end_s - time.monotonic()
                 if left_s <= 0 or not select.select((), (self._socket,), (), left_s)[1]:
                     self._stuck = f"{self.channel_info}: the server accepts nothing for {SEND_S:g} s"

@@ -21,7 +21,10 @@ import time
 from contextlib import suppress
 from enum import IntEnum
 
-SO_RXQ_OVFL, SCM_TIMESTAMPNS, SO_MEMINFO = 40, 35, 55  # asm-generic/socket.h
+# asm-generic/socket.h
+SO_RXQ_OVFL = 40
+SCM_TIMESTAMPNS = 35
+SO_MEMINFO = 55
 MSG_OWN, MSG_LOCAL = 0x800, 0x4
 """linux/can/raw.h: MSG_CONFIRM (sent by this socket) and MSG_DONTROUTE (sent by this machine)."""
 BACKLOG_RECORDS = 1 << 20  #: A hundred seconds of a full bus in 56 MiB
@@ -32,7 +35,9 @@ INTERFACE_COUNTERS = ("rx_dropped", "rx_over_errors", "rx_missed_errors")
 """Frames that were lost before any socket: in the kernel's queue behind the driver, and in the controller."""
 FRAME = struct.Struct("=IB3x8s")  #: struct can_frame
 SYNC = 0x080
-_TIMESPEC, _U32, _MEMINFO = struct.Struct("@ll"), struct.Struct("=I"), struct.Struct("=9I")
+_TIMESPEC = struct.Struct("@ll")
+_U32 = struct.Struct("=I")
+_MEMINFO = struct.Struct("=9I")
 _DROPS = 8  # SK_MEMINFO_DROPS
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_U32.size)
 _ANCILLARY_HEAD = struct.Struct("@Nii")  # struct cmsghdr: its length with the data, level, type
@@ -93,9 +98,12 @@ class Batch:
         self._vectors = (_Vector * BURST)()
         self._messages = (_Message * BURST)()
         for number in range(BURST):
-            vector, message = self._vectors[number], self._messages[number]
-            vector.base, vector.length = ctypes.addressof(self.frames) + number * FRAME.size, FRAME.size
-            message.vectors, message.vector_count = ctypes.addressof(self._vectors) + number * ctypes.sizeof(_Vector), 1
+            vector = self._vectors[number]
+            message = self._messages[number]
+            vector.base = ctypes.addressof(self.frames) + number * FRAME.size
+            vector.length = FRAME.size
+            message.vectors = ctypes.addressof(self._vectors) + number * ctypes.sizeof(_Vector)
+            message.vector_count = 1
             message.control = ctypes.addressof(self._control) + number * _ANCILLARY_BYTES
             message.control_length = _ANCILLARY_BYTES
         self._fresh = bytes(self._messages)
@@ -113,7 +121,8 @@ class Batch:
         message = self._messages[number]
         stamp_ns: int | None = None
         drops: int | None = None
-        at, end = number * _ANCILLARY_BYTES, number * _ANCILLARY_BYTES + message.control_length
+        at = number * _ANCILLARY_BYTES
+        end = number * _ANCILLARY_BYTES + message.control_length
         while at + _ANCILLARY_HEAD.size <= end:
             length, level, kind = _ANCILLARY_HEAD.unpack_from(self._control, at)
             data = at + socket.CMSG_LEN(0)
@@ -124,23 +133,6 @@ class Batch:
                 (drops,) = _U32.unpack_from(self._control, data)
             at += socket.CMSG_SPACE(length - socket.CMSG_LEN(0))
         return message.received, message.flags, stamp_ns, drops
-
-
-class DropCounter:
-    """The kernel's drop counter of 32 bits, continued beyond them."""
-
-    def __init__(self) -> None:
-        self.total = 0  #: Frames dropped since the first
-
-    def see(self, raw: int) -> int:
-        """Process a reading; returns the total.
-
-        A frame carries the count of the time when it was queued, which may be less than a reading of the socket.
-        """
-        ahead = (raw - self.total) & 0xFFFF_FFFF
-        if ahead < 0x8000_0000:
-            self.total += ahead
-        return self.total
 
 
 class MonotonicTime:
@@ -190,7 +182,7 @@ class Capture:
         self._out = out
         self._most_bytes = backlog_records * RECORD.size
         self._backlog = bytearray()
-        self._drops = DropCounter()
+        self._kernel_dropped = 0
         self._now_ns = time.monotonic_ns()
         self._time = MonotonicTime(time.time_ns(), self._now_ns)
         self._backlog_dropped = self._interface_dropped = 0
@@ -205,9 +197,11 @@ class Capture:
         poller = select.poll()
         poller.register(self._bus, select.POLLIN)
         poller.register(self._out, 0)
-        bus_number, out_number = self._bus.fileno(), self._out.fileno()
+        bus_number = self._bus.fileno()
+        out_number = self._out.fileno()
         self._note(RecordKind.READY)
-        look_ns, ended = self._now_ns + LOOK_NS, False
+        look_ns = self._now_ns + LOOK_NS
+        ended = False
         while not (ended and not self._backlog):
             poller.modify(self._out, select.POLLOUT if self._backlog else 0)
             ready = dict(poller.poll(IDLE_MS))
@@ -228,7 +222,7 @@ class Capture:
                 with suppress(OSError):  # before Linux 4.12 the next frame reports it
                     counters = self._bus.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size)
                     if len(counters) == _MEMINFO.size:
-                        self._drops.see(_MEMINFO.unpack(counters)[_DROPS])
+                        self._see_drops(_MEMINFO.unpack(counters)[_DROPS])
             if not self.forward():
                 return
             if self._now_ns >= look_ns:
@@ -246,7 +240,9 @@ class Capture:
             return 0
         except OSError as error:
             number = error.errno or errno.EIO
-        before_ns, wall_ns, self._now_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        before_ns = time.monotonic_ns()
+        wall_ns = time.time_ns()
+        self._now_ns = time.monotonic_ns()
         now_ns = (before_ns + self._now_ns) // 2
         if self._now_ns - before_ns > _PAUSE_NS:
             wall_ns = now_ns + self._time.offset_ns  # preempted between the readings: they do not belong together
@@ -255,7 +251,7 @@ class Capture:
             if size == 0:
                 return errno.ENODEV
             if drops is not None:
-                self._drops.see(drops)
+                self._see_drops(drops)
             can_id, length, payload = FRAME.unpack_from(self._batch.frames, index * FRAME.size)
             if flags & MSG_OWN and can_id != SYNC:
                 continue  # of our own frames only SYNC is of interest: its actual time
@@ -266,10 +262,15 @@ class Capture:
                 self._backlog_dropped += 1
                 continue
             self._reported_drops = self._counts
-            own, local = bool(flags & MSG_OWN), bool(flags & MSG_LOCAL)
+            own = bool(flags & MSG_OWN)
+            local = bool(flags & MSG_LOCAL)
             head = (stamp_ns, monotonic_ns, *self._reported_drops)
             self._backlog += RECORD.pack(*head, can_id, RecordKind.FRAME, length, own, local, payload)
         return number
+
+    def _see_drops(self, count: int) -> None:
+        # A frame carries the count of the time when it was queued, which may be less than a reading of the socket.
+        self._kernel_dropped = max(count, self._kernel_dropped)
 
     def _note(self, kind: RecordKind, number: int = 0) -> None:
         """Append a note to the backlog, even when that is full: notes are few."""
@@ -278,7 +279,7 @@ class Capture:
 
     @property
     def _counts(self) -> tuple[int, int, int]:
-        return (self._drops.total, self._interface_dropped, self._backlog_dropped)
+        return (self._kernel_dropped, self._interface_dropped, self._backlog_dropped)
 
     def _read_interface(self) -> int:
         total = 0

@@ -72,6 +72,6 @@ def describe_error_code(code: int) -> str:
 def read_error_code(access: ObjectAccess) -> int:
     """Read the error code of a drive (603Fh); 0 where it names none or does not answer."""
     try:
-        return access.read(ObjectEntry(0x603F, 0, 16, signed=False))
+        return access.read(ObjectEntry(0x603F, 0, 16))
     except DriverError:
         return 0

@@ -11,11 +11,10 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol
 
 import can
 
-from drivers.canopen.bus import bus_errors, send_burst
+from drivers.canopen.bus import base_frame, bus_errors, send_burst
 from drivers.canopen.emcy import describe_error_code
 from drivers.canopen.sdo import SDO_ANSWER, SDO_REQUEST, Clock, ObjectAccess, SdoPolicy, SynchronousSdoClient
 from drivers.canopen.socketcan import CapturedMessage, receive_only
@@ -25,8 +24,10 @@ from drivers.messages import CellEvent, EventKind
 
 SYNC_COB_ID = 0x080
 NMT_COB_ID = 0x000
-EMCY, HEARTBEAT = 0x080, 0x700
+EMCY = 0x080
+HEARTBEAT = 0x700
 LSS = frozenset((0x7E4, 0x7E5))  #: Layer setting services (CiA 305): a device gets another node id or bit rate
+_COMMANDS = LSS | {NMT_COB_ID, SYNC_COB_ID}
 _RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))  #: Set-points of a drive (CiA 301, predefined connection set)
 _WRITES = frozenset((0, 1, 6))  #: Command specifiers (upper three bits) of downloads: segment, begin, block
 _LSS_NAME = "a layer setting service, which changes node ids"
@@ -40,8 +41,12 @@ PERIODS_HEARD = 3.0  #: Periods in which two devices send `BEATS_JUDGED` heartbe
 LISTEN_S = 0.2  #: Usual time to listen for other masters before the first frame is sent
 PUMP_S = 0.1  #: Longest time spent on frames that have already arrived, however fast more arrive
 # linux/can/error.h: classes of an error frame, and the controller's state in its second byte.
-_CONTROLLER, _RESTARTED = 0x004, 0x100
-_OVERFLOW, _WARNING, _PASSIVE, _ACTIVE = 0x03, 0x0C, 0x30, 0x40
+_CONTROLLER = 0x004
+_RESTARTED = 0x100
+_OVERFLOW = 0x03
+_WARNING = 0x0C
+_PASSIVE = 0x30
+_ACTIVE = 0x40
 
 
 class NmtState(IntEnum):
@@ -73,11 +78,8 @@ class Beat:
     syncs: int  #: SYNCs of another producer until then
 
 
-class SdoListener(Protocol):
-    """Receives every SDO answer of one node."""
-
-    def receive(self, data: bytearray) -> None:
-        """Take an answer; most are for others."""
+SdoListener = Callable[[bytearray], None]
+"""Receives every SDO answer of one node; most are for others."""
 
 
 def never() -> bool:
@@ -94,7 +96,8 @@ def nmt_name(state: int | None) -> str:
 
 def command_name(identifier: int, names: Mapping[int, str]) -> str:
     """Describe a frame that only the recorder should send; `names` of the axes are by node id."""
-    shown, node_id = f"({identifier:03X}h)", identifier & 0x7F
+    shown = f"({identifier:03X}h)"
+    node_id = identifier & 0x7F
     if identifier >= HEARTBEAT and identifier not in LSS:
         name = f"a heartbeat with the recorder's own node id {node_id}"
     elif identifier >= SDO_REQUEST and identifier not in LSS:
@@ -146,7 +149,7 @@ class Link:
         self.heard: set[int] = set()  #: Node ids of which any frame arrived since the bus was opened
         #: Number of frames by identifier that only we should send (NMT, SYNC, LSS, SDO request, set-point of one of our
         #: axes, any frame with our own node id) and that we did not send.
-        self.foreign: dict[int, int] = {}
+        self.foreign: Counter[int] = Counter()
         self.written: dict[int, str] = {}  #: Downloads to our axes that we did not send, by identifier
         self.own_id: int | None = None  #: Node id of our heartbeat, None before one was chosen
         self.names: Mapping[int, str] = {}  #: Of our axes by node id
@@ -173,7 +176,7 @@ class Link:
         """Receive from now on only what concerns our axes, or is a command: a flood of others costs nothing."""
         services = (EMCY, *range(0x180, SDO_REQUEST, 0x80), HEARTBEAT)
         wanted = [(service + node_id, 0x7FF) for service in services for node_id in self.names]
-        wanted += [(number, 0x7FF) for number in (NMT_COB_ID, SYNC_COB_ID, *LSS)]
+        wanted += [(number, 0x7FF) for number in sorted(_COMMANDS)]
         wanted += [(SDO_REQUEST, 0x780), (self.own_id or NMT_COB_ID, 0x7F)]
         receive_only(self.bus, wanted)
 
@@ -216,7 +219,7 @@ class Link:
 
     def pass_time(self) -> None:
         """Send one SYNC and handle frames for 1 ms: a cell in lockstep advances by SYNC alone."""
-        self.send((can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False),))
+        self.send((base_frame(SYNC_COB_ID),))
         self.wait(0.001)
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
@@ -249,8 +252,7 @@ class Link:
 
     def start_heartbeat(self, node_id: int, period_ms: int) -> None:
         """Send a heartbeat with this node id from now on, whenever the bus is read."""
-        state = bytes((NmtState.OPERATIONAL,))
-        self._beat = can.Message(arbitration_id=HEARTBEAT + node_id, is_extended_id=False, data=state)
+        self._beat = base_frame(HEARTBEAT + node_id, bytes((NmtState.OPERATIONAL,)))
         self._beat_period_ns, self._next_beat_ns = period_ms * 1_000_000, self.clock()
 
     def stop_heartbeat(self) -> None:
@@ -272,16 +274,18 @@ class Link:
             self._note_error_frame(message)
         if message.is_error_frame or not message.is_rx:
             return True  # also our own SYNC, which is received for its time stamp
-        service, node_id = message.arbitration_id & 0x780, message.arbitration_id & 0x7F
+        identifier = message.arbitration_id
+        service = identifier & 0x780
+        node_id = identifier & 0x7F
         if message.is_extended_id or message.is_remote_frame:
             return False
-        ours = (service in _RPDOS and node_id in self.names) or self.is_own(message.arbitration_id)
-        ours = ours or message.arbitration_id in LSS
-        if message.arbitration_id in (NMT_COB_ID, SYNC_COB_ID) or (service == SDO_REQUEST and node_id) or ours:
-            if message.arbitration_id != SYNC_COB_ID or self.sync_producer is None:
-                self.note_foreign(message.arbitration_id)
+        setpoint = service in _RPDOS and node_id in self.names
+        request = service == SDO_REQUEST and node_id != 0
+        if identifier in _COMMANDS or setpoint or request or self.is_own(identifier):
+            if identifier != SYNC_COB_ID or self.sync_producer is None:
+                self.note_foreign(identifier)
             if service == SDO_REQUEST and node_id in self.names and message.data and message.data[0] >> 5 in _WRITES:
-                self._note_write(message.arbitration_id)
+                self._note_write(identifier)
             return True
         if node_id == 0:
             return False
@@ -298,7 +302,7 @@ class Link:
         elif service == SDO_ANSWER:
             self.answered[node_id] += 1
             for listener in self._listeners.get(node_id, ()):
-                listener.receive(message.data)
+                listener(message.data)
         else:
             return False
         return True
@@ -326,7 +330,7 @@ class Link:
 
     def note_foreign(self, identifier: int) -> None:
         """Count a command, or a heartbeat with our node id, that neither we nor our SYNC producer sent."""
-        self.foreign[identifier] = self.foreign.get(identifier, 0) + 1
+        self.foreign[identifier] += 1
         self._foreign_syncs += identifier == SYNC_COB_ID
         if self.foreign[identifier] == 1:  # once: a master would fill the log
             seen = command_name(identifier, self.names)
@@ -340,21 +344,20 @@ class Link:
             self._events.append((0, EventKind.BUS_BUSY, identifier, f"{seen} that we did not send"))
 
     def _note_heartbeat(self, node_id: int, message: can.Message) -> None:
-        previous, state, now_ns = self.nmt.get(node_id), message.data[0] & 0x7F, self.clock()
-        self._note_boot(node_id, state, now_ns)
+        previous = self.nmt.get(node_id)
+        state = message.data[0] & 0x7F
+        now_ns = self.clock()
         if state == NmtState.BOOT_UP:
             self.count_beats(node_id)
+            if previous == state and now_ns - self.heard_ns[node_id] < BOOTS_S * 1e9:
+                self.boots[node_id] += 1
         else:
             beat = Beat(_sent_ns(message, now_ns), state, self._foreign_syncs)
             self._beats.setdefault(node_id, deque(maxlen=BEATS_KEPT)).append(beat)
-        self.nmt[node_id], self.heard_ns[node_id] = state, now_ns
+        self.nmt[node_id] = state
+        self.heard_ns[node_id] = now_ns
         if previous != state:
             self._events.append((node_id, EventKind.NMT, state, f"NMT {nmt_name(previous)} -> {nmt_name(state)}"))
-
-    def _note_boot(self, node_id: int, state: int, now_ns: int) -> None:
-        again = state == NmtState.BOOT_UP == self.nmt.get(node_id)
-        if again and now_ns - self.heard_ns[node_id] < BOOTS_S * 1e9:
-            self.boots[node_id] += 1
 
     def note_twice(self, node_id: int, first: bytes, second: bytes) -> None:
         """Note that a node gave two answers to one request, unless another program asked the same."""
@@ -402,7 +405,8 @@ class Link:
 
     def take_events(self, time_ns: int, node_ids: Sequence[int]) -> tuple[CellEvent, ...]:
         """Return the events since the last call in their order; axis is None for nodes that are no axes of ours."""
-        taken, self._events = self._events, deque()
+        taken = self._events
+        self._events = deque()
         found = []
         for node, kind, code, text in taken:
             axis = node_ids.index(node) if node in node_ids else None
@@ -415,7 +419,7 @@ class Link:
         policy = policy or self.policy
         if (node_id, policy) not in self._access:
             client = SynchronousSdoClient(node_id, self, policy)
-            self.listen(node_id, client)
+            self.listen(node_id, client.receive)
             self._access[node_id, policy] = ObjectAccess(node_id, client, policy, self.names.get(node_id, ""))
         return self._access[node_id, policy]
 
@@ -426,7 +430,7 @@ class Link:
     def command_nmt(self, node_id: int, command: NmtCommand) -> int:
         """Send an NMT command; node 0 means all. Returns the time by the clock [ns]."""
         now = self.clock()
-        self.send((can.Message(arbitration_id=0, is_extended_id=False, data=bytes((command, node_id))),))
+        self.send((base_frame(NMT_COB_ID, bytes((command, node_id))),))
         return now
 
     def confirm_nmt(self, node_id: int, state: NmtState, since_ns: int, within_s: float) -> None:

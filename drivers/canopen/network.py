@@ -6,20 +6,17 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from functools import partial
-from types import TracebackType
 from typing import Self
 
 import can
 
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import HEARTBEAT, LISTEN_S, LSS, Link, NmtCommand, NmtState, command_name, never
-from drivers.canopen.needs import Profiles
 from drivers.canopen.node_scan import FoundNode, answering, free_ids, read_identity, scan_link
 from drivers.canopen.pdo import CONTROLWORD, HEARTBEAT_MS, STATUSWORD, AxisPdos, wanted_pdos
 from drivers.canopen.scale import ScaleReading, read_scale
-from drivers.canopen.sdo import SDO_REQUEST, Clock, SdoPolicy
-from drivers.canopen.setup import AxisSetup, HeartbeatGuard, producer_of, read_consumers
+from drivers.canopen.sdo import SDO_REQUEST, Clock, ObjectAccess, SdoPolicy
+from drivers.canopen.setup import AxisSetup, HeartbeatGuard, Profiles, producer_of, read_consumers
 from drivers.canopen.split_bus import CellAddress, open_cell_bus
 from drivers.errors import (
     POWERED,
@@ -68,12 +65,23 @@ SignalBlocker = Callable[[], AbstractContextManager[Callable[[], bool] | None]]
 
 It yields None, or a function that returns whether the operator has asked a second time: restoring is then given up.
 """
-UNRESTORED = (
-    WHILE + "closing the network: settings of {} not restored; switch these drives off and on before they are used"
-)
-"""Note on the error of nodes that could not be reached."""
 DEFAULT_BOUNDS = Bounds()
 DEFAULT_POLICY = SdoPolicy()
+
+
+def _unrestored(axes: Sequence[Axis]) -> str:
+    """Return the note on the error of axes that could not be reached."""
+    settings = f"settings of {', '.join(map(node_label, axes))} not restored"
+    return f"{WHILE}closing the network: {settings}; switch these drives off and on before they are used"
+
+
+@contextmanager
+def _collected(problems: list[DriverError]) -> Iterator[None]:
+    """Append a failure to the others, and go on."""
+    try:
+        yield
+    except DriverError as problem:
+        problems.append(problem)
 
 
 @contextmanager
@@ -147,40 +155,35 @@ class CanopenNetwork:
         self.link.open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         try:
             with self.block_signals() as asked_again:
                 problems = self._restore(asked_again or never) if self._setups else []
         except BaseException as cut:
             cut.add_note(f"{WHILE}closing the network: it was cut short, and not every axis has its settings back")
-            self._note_powered(cut)
+            self._note(cut, ())
             raise
         finally:
             self.link.close()
         if error is not None:
             self._note(error, problems)
-            self._note_powered(error)
         elif problems:
             self._note(problems[0], problems[1:])
-            self._note_powered(problems[0])
             raise problems[0]
 
     def _note(self, error: BaseException, problems: Sequence[DriverError]) -> None:
-        """Attach failures to close the network, with their own notes, to the error that the operator gets."""
+        """Attach failures to close the network, with their own notes, and the axes that may still have power."""
         for problem in problems:
             error.add_note(f"{WHILE}closing the network: {problem}")
             for note in getattr(problem, "__notes__", ()):
                 error.add_note(note)
+        powered = [node_label(axis) for axis in self.axes if axis.node_id in self.powered]
+        if powered:
+            error.add_note(POWERED + ", ".join(powered))
 
-    def _note_powered(self, error: BaseException) -> None:
-        """Name on an error the axes that may still have power."""
-        if self.powered:
-            names = ", ".join(
-                node_label(node_id, self.link.names) for node_id in self.node_ids if node_id in self.powered
-            )
-            error.add_note(POWERED + names)
+    def objects(self, axis: Axis) -> ObjectAccess:
+        """Return access to the object dictionary of an axis."""
+        return self.link.objects(axis.node_id)
 
     def see(self, axis: Axis, state: State) -> None:
         """Remember whether an axis has power."""
@@ -219,7 +222,7 @@ class CanopenNetwork:
         if missing := [axis for axis in self.axes if axis.node_id not in answered]:
             raise NodeMissing(missing, answered, self.bounds.answer_s)
         try:
-            identities = tuple(read_identity(self.link.objects(node_id)) for node_id in self.node_ids)
+            identities = tuple(read_identity(self.objects(axis)) for axis in self.axes)
         except ObjectAccessError:
             # The refusal may be that of a second device with this node id, which was faster.
             self.link.wait(SECOND_ANSWER_S)
@@ -256,13 +259,11 @@ class CanopenNetwork:
         """
         self.require_quiet()
         identities = self.check_identities()
-        consumers = [read_consumers(self.link.objects(node_id)) for node_id in self.node_ids]
+        consumers = [read_consumers(self.objects(axis)) for axis in self.axes]
         if self.link.own_id is None:
             self._take_recorder_id([value for entries in consumers for _, value in entries or ()])
         new = {
-            axis.node_id: AxisSetup(
-                self.link, axis, HeartbeatGuard(self.link.objects(axis.node_id), entries, self.was_ours)
-            )
+            axis.node_id: AxisSetup(self.link, axis, HeartbeatGuard(self.objects(axis), entries, self.was_ours))
             for axis, entries in zip(self.axes, consumers, strict=True)
             if axis.node_id not in self._setups
         }
@@ -292,8 +293,9 @@ class CanopenNetwork:
     @property
     def pdos(self) -> tuple[AxisPdos, ...]:
         """PDOs of each axis: as they are mapped, or before `prepare` as they will be on most drives."""
-        setups = ((axis, self._setups.get(axis.node_id)) for axis in self.axes)
-        return tuple(wanted_pdos(axis) if setup is None else setup.pdos for axis, setup in setups)
+        return tuple(
+            self._setups[axis.node_id].pdos if axis.node_id in self._setups else wanted_pdos(axis) for axis in self.axes
+        )
 
     def _take_recorder_id(self, watched: Sequence[int]) -> None:
         """Choose the highest node id that no device uses, and that no amplifier waits for by its entries of 1016h."""
@@ -301,7 +303,8 @@ class CanopenNetwork:
         awaited = {producer_of(value) for value in watched if value & 0xFFFF != self.guard_ms}
         left = [n for n in range(127, 0, -1) if n not in awaited and n not in self.node_ids]
         while left := [n for n in left if n not in self.link.heard]:
-            asked, left = left[:ASKED_AT_ONCE], left[ASKED_AT_ONCE:]
+            asked = left[:ASKED_AT_ONCE]
+            left = left[ASKED_AT_ONCE:]
             if free := free_ids(self.link, asked, self.bounds.free_s):
                 self.recorder_id = self.link.own_id = free[0]
                 return
@@ -330,14 +333,6 @@ class CanopenNetwork:
             BusBusy: another master commands this bus.
         """
         self.link.require_quiet(self.bounds.listen_s)
-
-    def require_alone(self) -> None:
-        """Check the frames that arrived since `require_quiet`.
-
-        Raises:
-            BusBusy: a command of another master was among them.
-        """
-        self.link.require_alone()
 
     def other_master(self) -> str:
         """Describe SDO requests of another master since `require_quiet`; empty without any."""
@@ -369,8 +364,8 @@ class CanopenNetwork:
 
     def unguarded(self) -> tuple[str, ...]:
         """Report the amplifiers of the prepared network that do not stop by themselves when the recorder is killed."""
-        setups = [(axis, self._setups[axis.node_id]) for axis in self.axes if axis.node_id in self._setups]
-        return tuple(f"{axis.name}: {setup.guard.lack}" for axis, setup in setups if setup.guard.lack)
+        lacks = {axis.name: self._setups[axis.node_id].guard.lack for axis in self.axes if axis.node_id in self._setups}
+        return tuple(f"{name}: {lack}" for name, lack in lacks.items() if lack)
 
     def without_guard(self) -> tuple[str, ...]:
         """Return the names of the axes of the prepared network that go on moving when the recorder is killed."""
@@ -393,7 +388,7 @@ class CanopenNetwork:
         """
         for axis, by_pdo in zip(self.axes, sample.position_counts, strict=True):
             entry = axis.profile.position
-            by_sdo = self.link.objects(axis.node_id).read(entry)
+            by_sdo = self.objects(axis).read(entry)
             if abs(by_sdo - by_pdo) > STANDSTILL_COUNTS:
                 raise SetupRefused(
                     axis,
@@ -424,7 +419,7 @@ class CanopenNetwork:
             ObjectAccessError, SetupRefused: as `drivers.canopen.scale.read_scale`.
         """
         if not self._scales:
-            self._scales = tuple(read_scale(self.link.objects(axis.node_id), axis.profile) for axis in self.axes)
+            self._scales = tuple(read_scale(self.objects(axis), axis.profile) for axis in self.axes)
         return self._scales
 
     def readback(self) -> dict[str, object]:
@@ -433,7 +428,7 @@ class CanopenNetwork:
 
     def statuswords(self) -> tuple[int, ...]:
         """Read 6041h of every axis by SDO."""
-        return tuple(self.link.objects(node_id).read(STATUSWORD) for node_id in self.node_ids)
+        return tuple(self.objects(axis).read(STATUSWORD) for axis in self.axes)
 
     def reset_faults(self) -> None:
         """Reset the faults of all axes; an operator's decision, never taken by a recording itself.
@@ -442,7 +437,7 @@ class CanopenNetwork:
             StateRefused: an axis is still in fault.
         """
         for axis in self.axes:
-            access = self.link.objects(axis.node_id)
+            access = self.objects(axis)
             if decode(access.read(STATUSWORD)) is not State.FAULT:
                 continue
             for command in FAULT_RESET_SEQUENCE:
@@ -455,7 +450,7 @@ class CanopenNetwork:
     def begin_stop(self, axes: Sequence[Axis]) -> None:
         """Request quick stop by SDO of all these axes; `disable`, which waits for each, reports failures."""
         for axis in axes:
-            access = self.link.objects(axis.node_id)
+            access = self.objects(axis)
             with suppress(DriverError):
                 state = decode(access.read(STATUSWORD))
                 self.see(axis, state)
@@ -473,7 +468,7 @@ class CanopenNetwork:
             StateRefused: not reached within ``bounds.disable_s``.
             ObjectAccessError: it does not answer.
         """
-        access = self.link.objects(axis.node_id)
+        access = self.objects(axis)
         deadline = self.link.clock() + round(self.bounds.disable_s * 1e9)
         while True:
             state = decode(statusword := access.read(STATUSWORD))
@@ -484,7 +479,8 @@ class CanopenNetwork:
                 if goal is Goal.SWITCH_ON_DISABLED:
                     raise StateRefused(axis, str(State.SWITCH_ON_DISABLED), str(state), statusword)
                 # The ramp did not end by itself: some drives stay in QUICK STOP ACTIVE (605Ah = 5..8).
-                goal, deadline = Goal.SWITCH_ON_DISABLED, deadline + round(self.bounds.disable_s * 1e9)
+                goal = Goal.SWITCH_ON_DISABLED
+                deadline += round(self.bounds.disable_s * 1e9)
             access.write(CONTROLWORD, next_command(state, goal))
             self.link.pass_time()
 
@@ -493,36 +489,38 @@ class CanopenNetwork:
         self.begin_closing()
         problems: list[DriverError] = []
         axes = [axis for axis in self.axes if axis.node_id in self._setups]
-        for attempt in ("first", "last"):
+        for _ in range(2):
             try:
                 # One time limit for all: asked in turn, six dead nodes would take a minute and more.
                 silent = self.find_silent(axes)
                 break
             except DriverError as problem:
                 # A failure of one of several buses is reported once, and then the others go on.
-                if not problems or str(problem) != str(problems[0]):
+                if str(problem) not in map(str, problems):
                     problems.append(problem)
-                if attempt == "last":
-                    names = ", ".join(node_label(axis) for axis in axes)
-                    problems[-1].add_note(UNRESTORED.format(names))
-                    self._setups.clear()
-                    return problems
+        else:
+            problems[-1].add_note(_unrestored(axes))
+            self._setups.clear()
+            return problems
         if silent is not None:
-            silent.add_note(UNRESTORED.format(", ".join(node_label(n, self.link.names) for n in silent.node_ids)))
+            silent.add_note(_unrestored([axis for axis in axes if axis.node_id in silent.node_ids]))
             problems.append(silent)
             axes = [axis for axis in axes if axis.node_id not in silent.node_ids]
         self.begin_stop(axes)
-        self._try(problems, [partial(self.disable, axis) for axis in axes])
+        for axis in axes:
+            with _collected(problems):
+                self.disable(axis)
         since_ns = self.link.clock()
-        pre_operational = NmtCommand.ENTER_PRE_OPERATIONAL
-        self._try(problems, [partial(self.link.command_nmt, axis.node_id, pre_operational) for axis in axes])
+        for axis in axes:
+            with _collected(problems):
+                self.link.command_nmt(axis.node_id, NmtCommand.ENTER_PRE_OPERATIONAL)
         self.link.given_up = asked_again
-        left = dict[str, tuple[str, ...]]()
+        left: dict[str, tuple[str, ...]] = {}
         for axis in axes:
             left_s = max(self.bounds.nmt_s - (self.link.clock() - since_ns) * 1e-9, 0.0)
             if self.link.allowed_s(left_s) > 0.0:
-                state = NmtState.PRE_OPERATIONAL
-                self._try(problems, [partial(self.link.confirm_nmt, axis.node_id, state, since_ns, left_s)])
+                with _collected(problems):
+                    self.link.confirm_nmt(axis.node_id, NmtState.PRE_OPERATIONAL, since_ns, left_s)
             left[axis.name] = self._setups[axis.node_id].restore(problems)
         if any(left.values()):
             cause = "asked a second time" if asked_again() else "some did not answer, or the time limit was over"
@@ -531,10 +529,3 @@ class CanopenNetwork:
             problems.append(BusError(str(self.link.address), f"settings not restored ({cause}): {names}; {remedy}"))
         self._setups.clear()
         return problems
-
-    def _try(self, problems: list[DriverError], steps: Sequence[Callable[[], object]]) -> None:
-        for step in steps:
-            try:
-                step()
-            except DriverError as problem:
-                problems.append(problem)

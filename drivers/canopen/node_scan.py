@@ -10,24 +10,24 @@ from typing import TypeVar
 
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import LISTEN_S, Link
-from drivers.canopen.needs import HEARTBEAT_TIME
 from drivers.canopen.pdo import STATUSWORD
 from drivers.canopen.sdo import SDO_REQUEST, ObjectAccess, SdoPolicy, upload_request
+from drivers.canopen.setup import HEARTBEAT_TIME
 from drivers.canopen.split_bus import CellAddress
 from drivers.errors import ObjectAccessError
 from drivers.profiles.cia402 import State, decode
 from drivers.profiles.profile import Identity, ObjectEntry
 
-VENDOR_ID = ObjectEntry(0x1018, 1, 32, signed=False)
-PRODUCT_CODE = ObjectEntry(0x1018, 2, 32, signed=False)
-REVISION = ObjectEntry(0x1018, 3, 32, signed=False)
-SERIAL = ObjectEntry(0x1018, 4, 32, signed=False)
+VENDOR_ID = ObjectEntry(0x1018, 1, 32)
+PRODUCT_CODE = ObjectEntry(0x1018, 2, 32)
+REVISION = ObjectEntry(0x1018, 3, 32)
+SERIAL = ObjectEntry(0x1018, 4, 32)
 T = TypeVar("T")
 SCAN_POLICY = SdoPolicy(attempts=2, transfer_s=1.0, most_bytes=256)
 """One node that never ends must not keep the others from being found."""
 NODE_S = 3.0  #: After this time, nothing more is asked of a node
 SCAN_S = 30.0  #: After this time, nothing more is asked of any node
-_DEVICE_TYPE = ObjectEntry(0x1000, 0, 32, signed=False)
+_DEVICE_TYPE = ObjectEntry(0x1000, 0, 32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,8 @@ def _describe(link: Link, node_id: int, scan_end_ns: int) -> tuple[FoundNode, in
 
     An object that it reports badly does not keep the others from it.
     """
-    access, problems = link.objects(node_id, SCAN_POLICY), list[str]()
+    access = link.objects(node_id, SCAN_POLICY)
+    problems = list[str]()
     end_ns = min(link.clock() + round(NODE_S * 1e9), scan_end_ns)
     unasked = f"the rest was not asked: its answers took longer than {NODE_S:g} s"
     if link.clock() >= scan_end_ns:

@@ -86,7 +86,7 @@ def read_parameters(
     identities = dict(zip(network.node_ids, network.check_identities(), strict=True))
     found = []
     for axis, parameter in wanted:
-        word = network.link.objects(axis.node_id).read(parameter.entry)
+        word = network.objects(axis).read(parameter.entry)
         found.append(ParameterValue(axis, identities[axis.node_id], parameter, word))
     return tuple(found)
 
@@ -96,8 +96,6 @@ def write_parameters(
     writes: Sequence[ParameterWrite],
     saving: Saving,
     begin: Callable[[tuple[ParameterValue, ...]], None],
-    *,
-    save_timeout_s: float = SAVE_TIMEOUT_S,
 ) -> tuple[ParameterChange, ...]:
     """Write a parameter of each axis, all of them or none.
 
@@ -106,7 +104,6 @@ def write_parameters(
         writes: at most one an axis; the network's own axes define how an axis saves.
         saving: whether the drives save.
         begin: called with the old values after all checks and before the first write; an exception stops the write.
-        save_timeout_s: time allowed for a save.
 
     Raises:
         ParameterRefused: an axis has power (checked before and after each write), a drive cannot save, or a value reads
@@ -123,7 +120,7 @@ def write_parameters(
     if saving is not Saving.RAM:
         for write in writes:
             _require_savable(network, write.axis, saving)
-    network.require_alone()
+    network.link.require_alone()
     begin(old)
     tried: list[ParameterValue] = []
     saved: list[Axis] = []
@@ -132,15 +129,15 @@ def write_parameters(
             if value.word != write.word:
                 tried.append(value)
                 _require_powerless(network, write.axis)
-                network.link.objects(write.axis.node_id).write(write.parameter.entry, write.word)
+                network.objects(write.axis).write(write.parameter.entry, write.word)
                 _check(network, write)
                 _require_powerless(network, write.axis)
-                network.require_alone()
+                network.link.require_alone()
         if saving is not Saving.RAM:
             for write in writes:
                 saved.append(write.axis)
                 try:
-                    _save(network, write.axis, save_timeout_s)
+                    _save(network, write.axis)
                 except ObjectAccessError as error:
                     if error.abort_code is not None:
                         saved.remove(write.axis)  # an abort confirms that nothing was saved
@@ -148,10 +145,10 @@ def write_parameters(
                 _check(network, write)
         for axis in network.axes:
             _require_powerless(network, axis)
-        network.require_alone()
+        network.link.require_alone()
     except BaseException as error:  # an interrupt too: a cell with half of the new gains has no valid set
         with network.block_signals():
-            _undo(network, tried, saved, save_timeout_s, error)
+            _undo(network, tried, saved, error)
         raise
     return tuple(
         ParameterChange(write.axis.name, write.parameter, value.word, write.word, saving is not Saving.RAM)
@@ -164,11 +161,11 @@ def recording_leftover(network: CanopenNetwork, axis: Axis) -> str:
 
     They are lost with the drive's power, and a save would keep them.
     """
-    access = network.link.objects(axis.node_id)
+    access = network.objects(axis)
     # A recording sets the watch for its heartbeat first, and restores it last. Only a missing 1016h proves that there
     # is no watch; any other refusal may hide one.
     for sub in range(1, (access.read_optional(CONSUMERS) or 0) + 1):
-        value = access.read_optional(ObjectEntry(CONSUMERS.index, sub, 32, signed=False))
+        value = access.read_optional(ObjectEntry(CONSUMERS.index, sub, 32))
         if value is None:
             break
         if network.was_ours(value):
@@ -185,7 +182,7 @@ def recording_leftover(network: CanopenNetwork, axis: Axis) -> str:
 
 
 def _check(network: CanopenNetwork, write: ParameterWrite | ParameterValue) -> None:
-    found = network.link.objects(write.axis.node_id).read(write.parameter.entry)
+    found = network.objects(write.axis).read(write.parameter.entry)
     if found != write.word:
         written, read = (f"{write.parameter.value(word):.9g} ({word:#x})" for word in (write.word, found))
         raise ParameterRefused(
@@ -195,16 +192,16 @@ def _check(network: CanopenNetwork, write: ParameterWrite | ParameterValue) -> N
         )
 
 
-def _save(network: CanopenNetwork, axis: Axis, timeout_s: float) -> None:
+def _save(network: CanopenNetwork, axis: Axis) -> None:
     save = axis.profile.save
     if save is not None:
         _require_powerless(network, axis)
         # One attempt: a drive that is late is still busy with the first.
-        network.link.objects(axis.node_id, SdoPolicy(timeout_s, 1)).write(save.command, save.signature)
+        network.link.objects(axis.node_id, SdoPolicy(SAVE_TIMEOUT_S, 1)).write(save.command, save.signature)
 
 
 def _require_powerless(network: CanopenNetwork, axis: Axis) -> None:
-    statusword = network.link.objects(axis.node_id).read(STATUSWORD)
+    statusword = network.objects(axis).read(STATUSWORD)
     state = decode(statusword)
     if state not in POWERLESS:
         raise ParameterRefused(
@@ -234,11 +231,11 @@ def _undo(
     network: CanopenNetwork,
     tried: Sequence[ParameterValue],
     saved: Sequence[Axis],
-    timeout_s: float,
     error: BaseException,
 ) -> None:
     """Restore the old values, and save them where the new ones may have been saved; ParametersMixed if not all are."""
-    restored, problems = [], []
+    restored = []
+    problems = []
     try:
         # One time limit for all drives that do not answer.
         network.find_silent([value.axis for value in tried])
@@ -246,7 +243,7 @@ def _undo(
         problems.append(str(problem))
     for value in tried:
         try:
-            _put_back(network, value, save=value.axis in saved, timeout_s=timeout_s)
+            _put_back(network, value, save=value.axis in saved)
             restored.append(value.axis.name)
         except DriverError as problem:
             problems.append(str(problem) if isinstance(problem, NodeError) else f"{value.axis.name}: {problem}")
@@ -256,14 +253,14 @@ def _undo(
         error.add_note(f"kept: the old values are restored in {', '.join(restored)}")
 
 
-def _put_back(network: CanopenNetwork, value: ParameterValue, *, save: bool, timeout_s: float) -> None:
+def _put_back(network: CanopenNetwork, value: ParameterValue, *, save: bool) -> None:
     if value.axis.node_id in network.link.silent:
         raise ObjectAccessError(value.axis, str(value.parameter), "the node does not answer any more")
-    access = network.link.objects(value.axis.node_id)
+    access = network.objects(value.axis)
     if access.read(value.parameter.entry) != value.word:
         _require_powerless(network, value.axis)
         access.write(value.parameter.entry, value.word)
     _check(network, value)
     if save:
-        _save(network, value.axis, timeout_s)
+        _save(network, value.axis)
         _check(network, value)

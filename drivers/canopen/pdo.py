@@ -10,6 +10,7 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from itertools import chain
 from typing import TYPE_CHECKING
 
 from drivers.errors import ObjectAccessError, SetupRefused
@@ -28,12 +29,12 @@ _EXTENDED = 1 << 29  #: COB-ID of 29 bits
 _COB_ID_BITS = NOT_VALID | 0x1FFF_FFFF  # bit 30 (RTR) is set by some drives on their own
 SYNCHRONOUS = 1  #: Transmission type: sent, or acted upon, at every SYNC
 
-STATUSWORD = ObjectEntry(0x6041, 0, 16, signed=False)
-CONTROLWORD = ObjectEntry(0x6040, 0, 16, signed=False)
+STATUSWORD = ObjectEntry(0x6041, 0, 16)
+CONTROLWORD = ObjectEntry(0x6040, 0, 16)
 TARGET_POSITION = ObjectEntry(0x607A, 0, 32, signed=True)
-PROFILE_VELOCITY = ObjectEntry(0x6081, 0, 32, signed=False)
-PROFILE_ACCELERATION = ObjectEntry(0x6083, 0, 32, signed=False)
-PROFILE_DECELERATION = ObjectEntry(0x6084, 0, 32, signed=False)
+PROFILE_VELOCITY = ObjectEntry(0x6081, 0, 32)
+PROFILE_ACCELERATION = ObjectEntry(0x6083, 0, 32)
+PROFILE_DECELERATION = ObjectEntry(0x6084, 0, 32)
 
 _CODES = {(8, True): "b", (8, False): "B", (16, True): "h", (16, False): "H", (32, True): "i", (32, False): "I"}
 
@@ -91,11 +92,6 @@ def pack(entries: Sequence[ObjectEntry], most_bytes: int = PDO_BYTES) -> tuple[t
     return tuple(tuple(pdo) for pdo in pdos)
 
 
-def record_struct(entries: Sequence[ObjectEntry]) -> struct.Struct:
-    """Return the payload of a PDO: little endian, at constant offsets."""
-    return struct.Struct("<" + "".join(_CODES[entry.bits, entry.signed] for entry in entries))
-
-
 def records(
     direction: Direction,
     node_id: int,
@@ -136,11 +132,10 @@ class AxisPdos:
 
     def payloads(self, values: Mapping[ObjectEntry, int]) -> Iterator[tuple[int, bytes]]:
         """Yield COB-ID and payload of each RPDO all of whose objects have a value, in the order of their numbers."""
-        entries = {word(entry): entry for entry in values}
         for record in self.setpoints:
-            if all(mapped in entries for mapped in record.entries):
-                pdo = [entries[mapped] for mapped in record.entries]
-                yield record.cob_id & 0x7FF, record_struct(pdo).pack(*(values[entry] for entry in pdo))
+            layout, entries = record_payload(record, tuple(values))
+            if len(entries) == len(record.entries):
+                yield record.cob_id & 0x7FF, layout.pack(*(values[entry] for entry in entries))
 
 
 def wanted_pdos(
@@ -170,8 +165,7 @@ def wanted_pdos(
 
 def fixed_feedback(axis: Axis, found: Sequence[PdoRecord]) -> tuple[PdoRecord, ...]:
     """Return those of a drive's own TPDOs that carry every object of a Sample, synchronous; empty where they do not."""
-    needed = set(map(word, feedback_entries(axis)))
-    return _carrying(needed, found)
+    return _carrying(set(map(word, feedback_entries(axis))), found)
 
 
 def fixed_setpoints(found: Sequence[PdoRecord], absent: Sequence[ObjectEntry] = ()) -> tuple[PdoRecord, ...]:
@@ -179,21 +173,24 @@ def fixed_setpoints(found: Sequence[PdoRecord], absent: Sequence[ObjectEntry] = 
 
     Empty where they do not, or where a controlword comes before its target.
     """
-    command, profile = (
-        {word(entry) for entry in entries if entry not in absent} for entries in (COMMAND, MOTION_PROFILE)
-    )
+    command = set(map(word, COMMAND))
+    profile = {word(entry) for entry in MOTION_PROFILE if entry not in absent}
     used = _carrying(command | profile, found)
     if any(not (set(record.entries) <= command or set(record.entries) <= profile) for record in used):
         return ()
-    order = [mapped for record in used for mapped in record.entries if mapped in command]
+    order = [mapped for mapped in _all_mapped(used) if mapped in command]
     return used if order == list(map(word, COMMAND)) else ()
+
+
+def _all_mapped(pdos: Sequence[PdoRecord]) -> tuple[int, ...]:
+    return tuple(chain.from_iterable(record.entries for record in pdos))
 
 
 def _carrying(needed: set[int], found: Sequence[PdoRecord]) -> tuple[PdoRecord, ...]:
     used = [record for record in found if needed & set(record.entries) and not record.cob_id & (NOT_VALID | _EXTENDED)]
-    carried = [mapped for record in used for mapped in record.entries if mapped in needed]
-    whole_bytes = all((mapped & 0xFF) % 8 == 0 for record in used for mapped in record.entries)
-    if sorted(carried) != sorted(needed) or not whole_bytes:
+    every = _all_mapped(used)
+    whole_bytes = all((mapped & 0xFF) % 8 == 0 for mapped in every)
+    if sorted(mapped for mapped in every if mapped in needed) != sorted(needed) or not whole_bytes:
         return ()
     return tuple(replace(record, transmission=SYNCHRONOUS) for record in used)
 
@@ -211,14 +208,14 @@ def record_payload(record: PdoRecord, entries: Sequence[ObjectEntry]) -> tuple[s
 def _parameters(direction: Direction, number: int) -> tuple[ObjectEntry, ObjectEntry, ObjectEntry]:
     communication, mapping, _ = direction.value
     return (
-        ObjectEntry(communication + number, 1, 32, signed=False),
-        ObjectEntry(communication + number, 2, 8, signed=False),
-        ObjectEntry(mapping + number, 0, 8, signed=False),
+        ObjectEntry(communication + number, 1, 32),
+        ObjectEntry(communication + number, 2, 8),
+        ObjectEntry(mapping + number, 0, 8),
     )
 
 
 def _entry(count: ObjectEntry, subindex: int) -> ObjectEntry:
-    return ObjectEntry(count.index, subindex, 32, signed=False)
+    return ObjectEntry(count.index, subindex, 32)
 
 
 def read_pdo_record(access: ObjectAccess, direction: Direction, number: int) -> PdoRecord | None:

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 from drivers.canopen.sdo import ObjectAccess
-from drivers.errors import Node, SetupRefused
+from drivers.errors import SetupRefused
 from drivers.profiles.profile import Amplitude, DriveProfile
 
 SMALLEST_RATED_A, LARGEST_RATED_A = 0.01, 1000.0
@@ -23,9 +23,6 @@ FINE = 1.25  #: Ratio that tolerances of Kt and a gear's efficiency explain
 class ScaleReading:
     """Current scale and motor data of a drive."""
 
-    node_id: int  #: node id of the axis
-    name: str  #: name of the axis
-    profile: str  #: name of its profile
     ampere_per_unit: float  #: of the mapped current object [A]
     objects: dict[str, int]  #: values of the scale objects, by object
     rated_current_a: float | None  #: rated current of the motor, None where the drive reports none
@@ -50,9 +47,10 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
     """
 
     def implausible(found: str, expected: str, remedy: str) -> SetupRefused:
-        return _implausible(access, profile.name, found, expected, remedy)
+        return SetupRefused(access, f"profile {profile.name}: found {found}; expected {expected}; {remedy}")
 
-    scale, entry = profile.current_scale, profile.current
+    scale = profile.current_scale
+    entry = profile.current
     values = {str(entry): access.read(entry) for entry in scale.objects}
     for name, value in values.items():
         if value <= 0:
@@ -72,14 +70,15 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
             expected = f"{SMALLEST_RATED_A:g} to {LARGEST_RATED_A:g} A"
             remedy = "was it entered in another unit than the drive's manual says?"
             raise implausible(f"a rated current of {rated_a:g} A", expected, remedy)
-        steps, most = rated_a / ampere, 2 ** (entry.bits - 1 if entry.signed else entry.bits) - 1
+        steps = rated_a / ampere
+        most = 2 ** (entry.bits - 1 if entry.signed else entry.bits) - 1
         if not MIN_STEPS <= steps <= most:
             raise implausible(
                 f"a rated current of {rated_a:g} A in steps of {ampere:.4g} A, {steps:.3g} of them",
                 f"{MIN_STEPS:g} to {most} steps, the range of {entry}",
                 "the scale is not this drive's, or the rated current is not its motor's: check profile and set-up",
             )
-    return ScaleReading(access.node_id, access.name, profile.name, ampere, values, rated_a, rated_nm, warnings)
+    return ScaleReading(ampere, values, rated_a, rated_nm, warnings)
 
 
 def check_name_plate(reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a: float) -> tuple[str, ...]:
@@ -92,7 +91,8 @@ def check_name_plate(reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a
     Returns:
         Warnings for a poor fit; none where the drive does not report both values, of which the reading warns.
     """
-    reported, declared = reading.torque_constant_nm_per_a, abs(motor_nm_per_a)
+    reported = reading.torque_constant_nm_per_a
+    declared = abs(motor_nm_per_a)
     if reported is None:
         return ()
     ratio = reported / declared
@@ -126,7 +126,3 @@ def _name_plate(access: ObjectAccess, profile: DriveProfile) -> tuple[float | No
         found = f"{missing}; the torque constant cannot be checked{unlogged}"
         return current * rated.ampere_per_unit, None, (found,)
     return current * rated.ampere_per_unit, torque * rated.newton_metre_per_unit, ()
-
-
-def _implausible(node: Node, profile: str, found: str, expected: str, remedy: str) -> SetupRefused:
-    return SetupRefused(node, f"profile {profile}: found {found}; expected {expected}; {remedy}")

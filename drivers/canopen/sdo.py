@@ -12,17 +12,22 @@ from canopen import ObjectDictionary
 from canopen.sdo.client import BlockUploadStream, ReadableStream, SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
+from drivers.canopen.bus import base_frame
 from drivers.errors import ObjectAccessError
 from drivers.profiles.profile import ObjectEntry
 
 NO_SUCH_OBJECT = frozenset((0x0602_0000, 0x0609_0011))
 """Aborts of a drive that lacks the object or its sub-index (CiA 301); any other may be gone at the next request."""
 SDO_REQUEST, SDO_ANSWER = 0x600, 0x580  #: COB-IDs, to which the node id is added (CiA 301)
-_ABORT_TIMED_OUT, _ABORT_UNKNOWN_COMMAND, _ABORT_OUT_OF_MEMORY = 0x0504_0000, 0x0504_0001, 0x0504_0005
+_ABORT_TIMED_OUT = 0x0504_0000
+_ABORT_UNKNOWN_COMMAND = 0x0504_0001
+_ABORT_OUT_OF_MEMORY = 0x0504_0005
 _ABORT = 0x80
 _SEGMENT_BYTES = 7
 MOST_SURPLUS = 64  #: Answers to other requests that are skipped, before a node counts as one that does not answer
-_INITIATE_DOWNLOAD, _INITIATE_UPLOAD, _INITIATE_BLOCK_UPLOAD = 1, 2, 5
+_INITIATE_DOWNLOAD = 1
+_INITIATE_UPLOAD = 2
+_INITIATE_BLOCK_UPLOAD = 5
 _UPLOAD_REQUEST = _INITIATE_UPLOAD << 5
 _EXPEDITED, _SIZE_INDICATED = 0x42, 0x01  #: Bits of an upload answer with its data, and of one that says their size
 _HEAD = struct.Struct("<BHB")
@@ -44,14 +49,14 @@ class UploadAnswer:
 def upload_request(node_id: int, entry: ObjectEntry) -> can.Message:
     """Return the request for an object."""
     data = _HEAD.pack(_UPLOAD_REQUEST, entry.index, entry.subindex) + bytes(4)
-    return can.Message(arbitration_id=SDO_REQUEST + node_id, is_extended_id=False, data=data)
+    return base_frame(SDO_REQUEST + node_id, data)
 
 
 def download_request(node_id: int, entry: ObjectEntry, value: int) -> can.Message:
     """Return the request to write an object of at most four bytes."""
     command = _INITIATE_DOWNLOAD << 5 | (4 - entry.bits // 8) << 2 | 0x03  # expedited, with its size
     data = _HEAD.pack(command, entry.index, entry.subindex) + struct.pack("<L", value)
-    return can.Message(arbitration_id=SDO_REQUEST + node_id, is_extended_id=False, data=data)
+    return base_frame(SDO_REQUEST + node_id, data)
 
 
 def upload_answer(data: bytes, entry: ObjectEntry) -> UploadAnswer | None:
@@ -169,6 +174,13 @@ class _Bus(Protocol):
     def note_twice(self, node_id: int, first: bytes, second: bytes) -> None: ...
 
 
+def _unaborted(response: bytes) -> bytes:
+    """Return an answer, or raise the abort that it is."""
+    if response[0] == _ABORT:
+        raise SdoAbortedError(struct.unpack_from("<L", response, 4)[0])
+    return response
+
+
 class SynchronousSdoClient(SdoClient):
     """canopen's SDO client without its thread: it reads the bus while it waits.
 
@@ -199,10 +211,12 @@ class SynchronousSdoClient(SdoClient):
 
     def _read_whole(self, index: int, subindex: int, *, block: bool) -> bytes:
         deadline = self._bus.clock() + round(self._policy.transfer_s * 1e9)
-        most, data = self._policy.most_bytes, bytearray()
+        most = self._policy.most_bytes
+        data = bytearray()
         try:
             with BlockUploadStream(self, index, subindex) if block else ReadableStream(self, index, subindex) as stream:
-                size, read = stream.size or 0, cast("Callable[[int], bytes]", stream.read)
+                size = stream.size or 0
+                read = cast("Callable[[int], bytes]", stream.read)
                 while size <= most and (segment := read(_SEGMENT_BYTES)):
                     data += segment
                     size = max(size, len(data))
@@ -230,7 +244,7 @@ class SynchronousSdoClient(SdoClient):
 
     def send_request(self, request: bytes) -> None:
         """Send a request; a failing bus raises BusError."""
-        self._bus.send((can.Message(arbitration_id=self.rx_cobid, is_extended_id=False, data=request),))
+        self._bus.send((base_frame(self.rx_cobid, request),))
         self._bus.asked_by[self.rx_cobid - SDO_REQUEST] = self
 
     def abort(self, abort_code: int = _ABORT_TIMED_OUT) -> None:
@@ -239,10 +253,7 @@ class SynchronousSdoClient(SdoClient):
 
     def read_response(self) -> bytes:
         """Wait for the next answer of the node; SdoCommunicationError where none comes in time."""
-        response = self._read_until(self._deadline())
-        if response[0] == _ABORT:
-            raise SdoAbortedError(struct.unpack_from("<L", response, 4)[0])
-        return response
+        return _unaborted(self._read_until(self._deadline()))
 
     def _deadline(self) -> int:
         return self._bus.clock() + round(self._bus.allowed_s(self._policy.timeout_s) * 1e9)
@@ -260,7 +271,8 @@ class SynchronousSdoClient(SdoClient):
         """Send a request and return the answer that belongs to it, or raise SdoAbortedError, SdoCommunicationError."""
         self._bus.pump(0.0)
         self.responses.queue.clear()
-        before, self._answered = self._answered, b""
+        before = self._answered
+        self._answered = b""
         if self._bus.asked_by.get(self.tx_cobid - SDO_ANSWER) is not self:
             before = b""
         self.send_request(sdo_request)
@@ -279,9 +291,7 @@ class SynchronousSdoClient(SdoClient):
                 continue
             self._answered = response if names_object and requested not in self._unanswered else b""
             self._unanswered.discard(requested)
-            if response[0] == _ABORT:
-                raise SdoAbortedError(struct.unpack_from("<L", response, 4)[0])
-            return response
+            return _unaborted(response)
         self._give_up(requested)
         raise SdoCommunicationError(f"{MOST_SURPLUS} answers to other requests")
 

@@ -1,5 +1,7 @@
 """Set one amplifier up for a recording, and restore afterwards the settings that it had before.
 
+The objects that a recording needs are compared with those that the drive has, before anything is written.
+
 The amplifier also watches the recorder, so that it stops by itself when the recorder is killed, hangs or is cut off.
 The recorder sends a heartbeat while axes have power; the amplifier watches it (CiA 301, consumer heartbeat time 1016h,
 which begins with the first heartbeat). When none comes, it acts by its abort connection option code (CiA 402-2, 6007h):
@@ -14,17 +16,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 
 from drivers.canopen.link import Link
-from drivers.canopen.needs import HEARTBEAT_TIME, MODE_DISPLAY, MODE_OF_OPERATION, Profiles, misfit
 from drivers.canopen.pdo import (
+    CONTROLWORD,
     NOT_VALID,
     PDO_BYTES,
     PDOS,
+    PROFILE_ACCELERATION,
     PROFILE_DECELERATION,
+    PROFILE_VELOCITY,
     STATUSWORD,
+    TARGET_POSITION,
     AxisPdos,
     Direction,
     PdoRecord,
@@ -36,12 +41,15 @@ from drivers.canopen.pdo import (
     write_pdo_record,
 )
 from drivers.canopen.scale import ScaleReading
-from drivers.canopen.sdo import ObjectAccess
+from drivers.canopen.sdo import NO_SUCH_OBJECT, ObjectAccess
 from drivers.errors import DriverError, ObjectAccessError, SetupRefused, StateRefused
-from drivers.profiles.profile import Axis, Identity, ObjectEntry
+from drivers.profiles.profile import Axis, DriveProfile, Identity, ObjectEntry
 
+HEARTBEAT_TIME = ObjectEntry(0x1017, 0, 16)
+MODE_OF_OPERATION = ObjectEntry(0x6060, 0, 8, signed=True)
+MODE_DISPLAY = ObjectEntry(0x6061, 0, 8, signed=True)
 PROFILE_POSITION_MODE = 1
-CONSUMERS = ObjectEntry(0x1016, 0, 8, signed=False)
+CONSUMERS = ObjectEntry(0x1016, 0, 8)
 ABORT_CONNECTION = ObjectEntry(0x6007, 0, 16, signed=True)
 QUICK_STOP_ON_LOSS = 3
 SMALL_PDO_BYTES = 6  #: Tried where a drive refuses PDOs of eight bytes
@@ -61,13 +69,87 @@ def read_consumers(access: ObjectAccess) -> Consumers | None:
     found: list[tuple[ObjectEntry, int]] = []
     try:
         for sub in range(1, min(access.read(CONSUMERS), MOST_CONSUMERS) + 1):
-            entry = ObjectEntry(CONSUMERS.index, sub, 32, signed=False)
+            entry = ObjectEntry(CONSUMERS.index, sub, 32)
             found.append((entry, access.read(entry)))
     except ObjectAccessError as error:
         if error.abort_code is None:
             raise
         return tuple(found) or None
     return tuple(found)
+
+
+Profiles = Callable[[], Sequence[DriveProfile]]
+"""Returns the profiles from which one that fits a drive is suggested."""
+
+
+@dataclass(frozen=True, slots=True)
+class Need:
+    """One object without which a drive cannot be recorded."""
+
+    entry: ObjectEntry
+    purpose: str  #: in a message
+
+
+def needs_of(profile: DriveProfile) -> tuple[Need, ...]:
+    """Return the objects that a recording with a profile needs; 1016h, 6007h and 6084h may be missing."""
+    scale = profile.current_scale
+    switch = () if scale.switch is None else (scale.switch,)
+    return (
+        Need(profile.position, "position"),
+        Need(profile.current, "current"),
+        Need(STATUSWORD, "statusword"),
+        Need(CONTROLWORD, "controlword"),
+        Need(TARGET_POSITION, "target position"),
+        Need(PROFILE_VELOCITY, "profile velocity"),
+        Need(PROFILE_ACCELERATION, "profile acceleration"),
+        Need(MODE_OF_OPERATION, "mode of operation"),
+        Need(MODE_DISPLAY, "mode display"),
+        Need(HEARTBEAT_TIME, "heartbeat period"),
+        *(Need(entry, "scale of the current") for entry in (*scale.objects, *switch)),
+    )
+
+
+def misfit(access: ObjectAccess, profile: DriveProfile, others: Profiles = tuple) -> str:
+    """Describe the objects of a profile that a drive does not have, and name a profile that fits; empty if it has all.
+
+    Raises:
+        ObjectAccessError: the drive does not answer.
+    """
+    lacking = _lacking(access, profile)
+    if not lacking:
+        return ""
+    fitting = [other for other in others() if other.name != profile.name and not _lacking(access, other)]
+    if fitting:
+        advice = " or ".join(f"`{other.name}` ({_difference(other, profile)})" for other in fitting)
+        remedy = f"use a profile that fits this drive: {advice}"
+    else:
+        remedy = "no shipped profile fits this drive: write one with the objects of its manual"
+    return f"found {', '.join(lacking)}; expected every object of profile {profile.name}; {remedy}"
+
+
+def _lacking(access: ObjectAccess, profile: DriveProfile) -> tuple[str, ...]:
+    found = []
+    for need in needs_of(profile):
+        try:
+            bits = 8 * len(access.read_bytes(need.entry.index, need.entry.subindex))
+        except ObjectAccessError as error:
+            if error.abort_code is None:
+                raise
+            if error.abort_code in NO_SUCH_OBJECT:
+                found.append(f"no object {need.entry} ({need.purpose})")
+            continue  # an object that cannot be read now exists
+        if bits < need.entry.bits:
+            found.append(f"object {need.entry} ({need.purpose}) of {bits} bits instead of {need.entry.bits}")
+    return tuple(found)
+
+
+def _difference(other: DriveProfile, profile: DriveProfile) -> str:
+    """Describe the objects by which another profile differs."""
+    same = needs_of(profile)
+    parts = [f"{need.purpose} from {need.entry}" for need in needs_of(other) if need not in same]
+    if other.rated is not None and (profile.rated is None or other.rated.current != profile.rated.current):
+        parts.append(f"rated current from {other.rated.current}")
+    return ", ".join(parts) or "the same objects in other units"
 
 
 class HeartbeatGuard:
@@ -84,7 +166,8 @@ class HeartbeatGuard:
         self._option_before: int | None = None
         for entry, value in consumers or ():
             if (ours := left_over(value)) or not value & 0xFFFF:
-                self._consumer, self._consumer_before = entry, 0 if ours else value
+                self._consumer = entry
+                self._consumer_before = 0 if ours else value
                 break
         else:
             free = "" if consumers is None else "free "
@@ -113,7 +196,8 @@ class HeartbeatGuard:
         if self._consumer is None:
             return
         if self._option_before is not None and (refused := self._refused(ABORT_CONNECTION, QUICK_STOP_ON_LOSS)):
-            before, self._option_before = self._option_before, None
+            before = self._option_before
+            self._option_before = None
             self.lack = f"6007h = {before} rules how it stops when the recorder is killed: 3 is {refused}"
         if refused := self._refused(self._consumer, recorder_id << 16 | silence_ms):
             if self._option_before is not None:
@@ -160,7 +244,8 @@ class AxisSetup:
             SetupRefused: it does not; `profiles` are those from which one that fits is named.
             ObjectAccessError: the drive does not answer.
         """
-        access, axis = self._access, self._axis
+        access = self._access
+        axis = self._axis
         if found := misfit(access, axis.profile, profiles):
             raise SetupRefused(axis, found)
         if access.read_optional(PROFILE_DECELERATION) is None:

@@ -32,12 +32,16 @@ START_S = 20.0  #: Time for the capture process to start; a loaded machine is sl
 END_S = 1.0
 SEND_S = 0.1  #: Longest time of a full transmit queue: at 10 kbit/s a frame takes 13 ms
 RETRY_S = 0.0002
-SO_RCVBUFFORCE, SO_TIMESTAMPNS = 33, 35  # asm-generic/socket.h; the first is allowed to CAP_NET_ADMIN
+# asm-generic/socket.h; the first is allowed to CAP_NET_ADMIN
+SO_RCVBUFFORCE = 33
+SO_TIMESTAMPNS = 35
 CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h; Python's socket has no name for it
 ERROR_CLASSES = 0x4 | 0x40 | 0x100
 """Controller problems (error passive, overflow), bus-off, restarted: linux/can/error.h. Single bus errors are not
 requested: a bus without a second node sends thousands a second."""
-_EXTENDED, _REMOTE, _ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
+_EXTENDED = 0x8000_0000
+_REMOTE = 0x4000_0000
+_ERROR = 0x2000_0000
 _PAIR_BYTES = 1 << 18
 _FILTER = struct.Struct("=II")  #: struct can_filter
 
@@ -74,8 +78,8 @@ class CapturedMessage(can.Message):
 
 def losses_of(bus: can.BusABC) -> Losses:
     """Return the frames of a bus that this machine lost; zeros where a bus does not count them."""
-    found = getattr(bus, "losses", NO_LOSSES)
-    return found if isinstance(found, Losses) else NO_LOSSES
+    losses: Losses = getattr(bus, "losses", NO_LOSSES)
+    return losses
 
 
 def receive_only(bus: can.BusABC, wanted: Sequence[tuple[int, int]]) -> None:
@@ -90,8 +94,8 @@ def read_until_ns(bus: can.BusABC) -> int | None:
 
     On a bus with stamps our own SYNC comes back, in its place among the other frames.
     """
-    found = getattr(bus, "read_until_ns", None)
-    return found if isinstance(found, int) else None
+    until_ns: int | None = getattr(bus, "read_until_ns", None)
+    return until_ns
 
 
 def lags_behind(bus: can.BusABC, time_ns: int) -> bool:
@@ -210,7 +214,7 @@ class SocketcanBus(BurstBus):
             raise can.CanOperationError(f"no CAN FD frames on this bus: {msg}")
         flags = _EXTENDED * msg.is_extended_id | _REMOTE * msg.is_remote_frame | _ERROR * msg.is_error_frame
         frame = FRAME.pack(msg.arbitration_id | flags, msg.dlc, bytes(msg.data))
-        deadline: float | None = None
+        deadline = time.monotonic() + (SEND_S if timeout is None else timeout)
         while True:
             try:
                 self._socket.send(frame, socket.MSG_DONTWAIT)
@@ -219,9 +223,7 @@ class SocketcanBus(BurstBus):
                 if error.errno not in (errno.ENOBUFS, errno.EAGAIN):
                     raise can.CanOperationError(_reason(error.errno or errno.EIO)) from error
                 # The interface's queue holds ten frames by default; a burst of set-points is longer.
-                now = time.monotonic()
-                deadline = now + (SEND_S if timeout is None else timeout) if deadline is None else deadline
-                if now >= deadline:
+                if time.monotonic() >= deadline:
                     raise can.CanOperationError(
                         f"the transmit queue stays full for {SEND_S:g} s: does any node acknowledge frames?"
                     ) from error
@@ -272,7 +274,10 @@ class SocketcanBus(BurstBus):
         """Parse the chunks into frames; an exception meanwhile, such as Ctrl-C, leaves them for the next time."""
         chunk = b"".join(self._chunks)
         whole = len(chunk) - len(chunk) % RECORD.size
-        rest, received, ready, end = deque((chunk[whole:],)), self._received.copy(), self._ready, self._end
+        rest = deque((chunk[whole:],))
+        received = self._received.copy()
+        ready = self._ready
+        end = self._end
         lost: list[int] = list(self.losses)
         monotonic_ns = self.read_until_ns
         for record in RECORD.iter_unpack(memoryview(chunk)[:whole]):
@@ -283,7 +288,8 @@ class SocketcanBus(BurstBus):
                 ready = True
             elif kind == RecordKind.END:
                 end = _reason(can_id)
-        losses, until_ns = Losses(*lost), max(monotonic_ns, self.read_until_ns)
+        losses = Losses(*lost)
+        until_ns = max(monotonic_ns, self.read_until_ns)
         # No call from here on: the state changes whole, or not at all.
         self._chunks, self._received, self._ready, self._end, self.losses = rest, received, ready, end, losses
         self.read_until_ns = until_ns
@@ -291,7 +297,8 @@ class SocketcanBus(BurstBus):
     def _message(
         self, kernel_ns: int, monotonic_ns: int, can_id: int, data: bytes, own: bool, local: bool
     ) -> CapturedMessage:
-        extended, error = bool(can_id & _EXTENDED), bool(can_id & _ERROR)
+        extended = bool(can_id & _EXTENDED)
+        error = bool(can_id & _ERROR)
         message = CapturedMessage(
             timestamp=kernel_ns * 1e-9,
             arbitration_id=can_id & (0x1FFF_FFFF if extended or error else 0x7FF),
@@ -303,7 +310,9 @@ class SocketcanBus(BurstBus):
             data=b"" if can_id & _REMOTE else data,
             dlc=len(data),
         )
-        message.kernel_ns, message.monotonic_ns, message.local = kernel_ns, monotonic_ns, local
+        message.kernel_ns = kernel_ns
+        message.monotonic_ns = monotonic_ns
+        message.local = local
         return message
 
     def shutdown(self) -> None:

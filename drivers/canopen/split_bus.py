@@ -29,7 +29,8 @@ LONGEST_LEFT_OUT_S = 0.1  #: Time after a time-out in which frames that are left
 LARGEST_RUN = 64  #: Frames of one bus in a row while another has one too: a lagging clock must not silence the others
 BUS_OFF = 0x40  # linux/can/error.h, class CAN_ERR_BUSOFF of an error frame
 BUS_OFF_REASON = "bus-off: the CAN controller disconnected itself; check the wiring"
-_FROM_NODES = frozenset((0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700))
+_FAILURES = (can.CanError, OSError, BusError)
+FROM_NODES = frozenset((0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700))
 """Services that nodes send: EMCY, TPDO1 to 4, SDO answer, heartbeat."""
 
 
@@ -109,8 +110,11 @@ class SplitBus(can.BusABC):
         self.channel_info = str(address)
         self._ends = tuple(ends)
         self._names = tuple(map(str, address.parts))
-        self._homes = {node_id: index for index, part in enumerate(address.parts) for node_id in part.node_ids}
-        self._axis_names = {node_id: name for part in address.parts for node_id, name in part.axis_names.items()}
+        self._homes: dict[int, int] = {}
+        self._axis_names: dict[int, str] = {}
+        for index, part in enumerate(address.parts):
+            self._homes |= dict.fromkeys(part.node_ids, index)
+            self._axis_names |= part.axis_names
         self._clock = clock
         self._waiting: list[can.Message | None] = [None] * len(self._ends)
         self._failed: set[int] = set()
@@ -167,7 +171,7 @@ class SplitBus(can.BusABC):
                         continue
                     try:
                         send_burst(self._ends[index], burst)
-                    except (can.CanError, OSError, BusError) as error:
+                    except _FAILURES as error:
                         failures.append(self._failure(index, error))
         if failures:
             raise failures[0]
@@ -187,7 +191,8 @@ class SplitBus(can.BusABC):
                     self._waiting[index] = self._take(index, 0.0)
             oldest = self._oldest()
             if oldest is not None:
-                message, self._waiting[oldest] = self._waiting[oldest], None
+                message = self._waiting[oldest]
+                self._waiting[oldest] = None
                 if message is not None and self._belongs(message, oldest):
                     return message
                 if end_s is not None and self._clock() > end_s + LONGEST_LEFT_OUT_S:
@@ -202,7 +207,7 @@ class SplitBus(can.BusABC):
     def _take(self, index: int, timeout_s: float) -> can.Message | None:
         try:
             message = self._ends[index].recv(timeout_s)
-        except (can.CanError, OSError, BusError) as error:
+        except _FAILURES as error:
             raise self._failure(index, error) from error
         if message is None:
             return None
@@ -240,7 +245,7 @@ class SplitBus(can.BusABC):
         """Whether a frame comes from the bus of its node; our own SYNC, received for its time, from the first bus."""
         if not message.is_rx:
             return index == min(set(range(len(self._ends))) - self._failed, default=index)
-        if message.is_extended_id or message.is_error_frame or message.arbitration_id & 0x780 not in _FROM_NODES:
+        if message.is_extended_id or message.is_error_frame or message.arbitration_id & 0x780 not in FROM_NODES:
             return True
         node_id = message.arbitration_id & 0x7F
         home = self._homes.get(node_id, index)
@@ -284,7 +289,7 @@ class SplitBus(can.BusABC):
         for index, end in enumerate(self._ends):
             try:
                 end.shutdown()
-            except (can.CanError, OSError, BusError) as error:
+            except _FAILURES as error:
                 failures.append(self._failure(index, error))
         if failures:
             raise failures[0]

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-import can
-
+from drivers.canopen.bus import base_frame
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.pdo import (
     CONTROLWORD,
@@ -29,7 +28,7 @@ from drivers.errors import (
     node_label,
     text_of,
 )
-from drivers.messages import CellEvent, EventKind, Sample
+from drivers.messages import EventKind, Sample
 from drivers.move import MotionPermission, Move, check_moves
 from drivers.profiles.cia402 import (
     CONTROL_CHANGE_IMMEDIATELY,
@@ -140,6 +139,7 @@ class _Execution:
         self.unreported: Exception | None = None  #: First failure to report an event of a stop
         self._network = network
         self._stream = stream
+        self._bus = stream.bus
         self._bounds = bounds
         self._sample = first
         self._pdos = network.pdos
@@ -163,18 +163,12 @@ class _Execution:
 
     def _send(self, axis: int, values: Mapping[ObjectEntry, int]) -> None:
         """Send values of one axis with the next SYNC, in its RPDOs; those of objects that it does not have are left."""
-        self._stream.outgoing.extend(
-            can.Message(arbitration_id=cob_id, is_extended_id=False, data=data)
-            for cob_id, data in self._pdos[axis].payloads(values)
-        )
-
-    def emit(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
-        self._stream.emit(CellEvent(self._stream.time_ns, axis, kind, code, text))
+        self._bus.outgoing += [base_frame(cob_id, data) for cob_id, data in self._pdos[axis].payloads(values)]
 
     def report(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
         """Emit an event of a stop, which goes on where the event cannot be logged or shown."""
         try:
-            self.emit(axis, kind, code, text)
+            self._bus.report(axis, kind, code, text)
         except Exception as failure:  # noqa: BLE001 - whatever the receiver raises, the axes are stopped first
             self.unreported = self.unreported or failure
 
@@ -196,7 +190,7 @@ class _Execution:
 
     def enable(self, granted_by: str) -> Iterator[Sample]:
         """Bring all axes to OPERATION ENABLED, each holding where it is."""
-        self.emit(None, EventKind.STATE, 0, f"enabling all axes, permission by {granted_by}")
+        self._bus.report(None, EventKind.STATE, 0, f"enabling all axes, permission by {granted_by}")
         for axis in self._axes:
             if self._state(axis) in (State.FAULT, State.FAULT_REACTION_ACTIVE):
                 raise self._refusal(axis)
@@ -235,7 +229,7 @@ class _Execution:
             self._targets[axis] = move.target_counts[axis]
             self._send_command(axis, _NEW_SETPOINT)
         sample = self._checked()
-        self.emit(None, EventKind.MOVE_START, number, f"move {number} to {move.target_counts}")
+        self._bus.report(None, EventKind.MOVE_START, number, f"move {number} to {move.target_counts}")
         yield sample
         yield from self._handshake(number, moving)
         duration_s = max(move.duration_s(start))
@@ -250,7 +244,7 @@ class _Execution:
                     reason = f"move {number}: position {position} and current {current} do not change during the move"
                     remedy = "is its data frozen, its encoder or its motor cable off?"
                     error = DriveFault(self._nodes[axis], reason, remedy=remedy)
-                    self.emit(axis, EventKind.FROZEN, number, str(error))
+                    self._bus.report(axis, EventKind.FROZEN, number, str(error))
                     raise error
             if self._sample.cycle >= end and all(self._arrived(axis, start[axis]) for axis in moving):
                 break
@@ -259,7 +253,7 @@ class _Execution:
             late = tuple(axis for axis in moving if not self._arrived(axis, start[axis]))
             if late:
                 raise self._timeout(number, late, allowed_s)
-        self.emit(None, EventKind.MOVE_END, number, f"move {number} ended at {self._sample.position_counts}")
+        self._bus.report(None, EventKind.MOVE_END, number, f"move {number} ended at {self._sample.position_counts}")
         for _ in range(move.dwell_cycles):
             yield self._checked()
 
@@ -304,8 +298,8 @@ class _Execution:
 
     def stop(self) -> Iterator[Sample]:
         """Quick stop all axes, then remove their power; failures to confirm it are in `problems`."""
-        self._stream.outgoing.clear()  # a set-point that was not sent yet must not start a move now
-        self._stream.spare = nothing_to_send
+        self._bus.outgoing.clear()  # a set-point that was not sent yet must not start a move now
+        self._bus.spare = nothing_to_send
         self.report(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
         self.problems = []
         self._network.begin_closing()
@@ -325,21 +319,22 @@ class _Execution:
             self.report(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
             self.problems = self.problems or [error]
             return
+        unheard: tuple[int, ...] = ()
         if silent is not None:
+            unheard = silent.node_ids
             self.problems.append(silent)
-        heard = [axis for axis in unconfirmed if silent is None or self._nodes[axis].node_id not in silent.node_ids]
-        if heard:
-            self._network.begin_stop([self._nodes[axis] for axis in heard])
-        for axis in unconfirmed:
-            if axis not in heard:
-                text = f"{node_label(self._nodes[axis])} does not answer: its standstill is not confirmed"
-                self.report(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
-                continue
+        nodes = [self._nodes[axis] for axis in unconfirmed]
+        self._network.begin_stop([node for node in nodes if node.node_id not in unheard])
+        for axis, node in zip(unconfirmed, nodes, strict=True):
             try:
-                self._network.disable(self._nodes[axis])
+                if node.node_id not in unheard:
+                    self._network.disable(node)
+                    continue
+                text = f"{node_label(node)} does not answer: its standstill is not confirmed"
             except DriverError as error:
-                self.report(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], str(error))
+                text = str(error)
                 self.problems.append(error)
+            self.report(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
 
     def _stop_by_pdo(self) -> Generator[Sample, None, tuple[int, ...]]:
         """Stop by synchronous RPDOs; returns the axes whose statusword does not confirm the stop."""
@@ -366,7 +361,7 @@ class _Execution:
             powered = [axis for axis in self._axes if missing >> axis & 1 or self._state(axis) not in POWERLESS]
             self._network.powered -= {self._nodes[axis].node_id for axis in self._axes if axis not in powered}
             # A stream that waits for answers has waited long enough in one cycle.
-            waited = self._stream.silent and self._stream.pacing.waits_for_answers
+            waited = self._bus.silent and self._stream.pacing.waits_for_answers
             tolerated = 0 if waited else MAX_MISSING_CYCLES
             if not powered or silent > tolerated:
                 break

@@ -43,10 +43,15 @@ FAULTY = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 STATE_BITS = 0x6F  #: Bits of the statusword that encode the state
 
 
-_STATES = tuple(  # six decodes a SYNC: a table, not a search
-    next((state for state in State if bits & state.value[0] == state.value[1]), State.UNKNOWN)
-    for bits in range(STATE_BITS + 1)
-)
+def _state(bits: int) -> State:
+    for state in State:
+        mask, pattern = state.value
+        if bits & mask == pattern:
+            return state
+    return State.UNKNOWN
+
+
+_STATES = tuple(map(_state, range(STATE_BITS + 1)))  # six decodes a SYNC: a table, not a search
 
 
 def decode(statusword: int) -> State:

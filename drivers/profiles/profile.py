@@ -77,7 +77,7 @@ class ObjectEntry:
     index: int
     subindex: int
     bits: int
-    signed: bool
+    signed: bool = False
 
     def __str__(self) -> str:
         return f"{self.index:04X}h:{self.subindex:02X}"
@@ -179,14 +179,14 @@ CIA402 = DriveProfile(
     name="cia402",
     position=ObjectEntry(0x6064, 0, 32, signed=True),
     current=ObjectEntry(0x6074, 0, 16, signed=True),
-    current_scale=CurrentScale(1e-6, (ObjectEntry(0x6075, 0, 32, signed=False),), ScaleForm.PER_MILLE),
+    current_scale=CurrentScale(1e-6, (ObjectEntry(0x6075, 0, 32),), ScaleForm.PER_MILLE),
     amplitude=Amplitude.RMS,
     tap=TapPoint.REFERENCE,
     saturation_bit=11,
     update_period_us=1000,
     save_semantics="unknown",
     source="CiA 402-2 (objects 6041h, 6064h, 6074h, 6075h, 6076h)",
-    rated=RatedMotor(ObjectEntry(0x6075, 0, 32, signed=False), torque=ObjectEntry(0x6076, 0, 32, signed=False)),
+    rated=RatedMotor(ObjectEntry(0x6075, 0, 32), torque=ObjectEntry(0x6076, 0, 32)),
 )
 """An amplifier that follows the standard: position in 6064h, torque demand in 6074h as per mille of rated current."""
 
@@ -261,7 +261,7 @@ class DriveParameter:
     @property
     def entry(self) -> ObjectEntry:
         """The object as it goes over the bus: its bits as an unsigned word."""
-        return ObjectEntry(self.index, self.subindex, self.kind.bits, signed=False)
+        return ObjectEntry(self.index, self.subindex, self.kind.bits)
 
     def word(self, value: float) -> int:
         """Return the bits of the nearest number that it can hold.

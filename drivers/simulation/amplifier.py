@@ -13,7 +13,7 @@ from drivers.simulation.dynamics import compiled
 from drivers.simulation.effects import Lag, build_effect
 from drivers.simulation.noise import ColouredNoise, random_streams
 from drivers.simulation.plant import Plant, reduction
-from drivers.simulation.spec import CellSpec, FloatArray
+from drivers.simulation.spec import CellSpec, FloatArray, IntArray
 
 VELOCITY_BANDWIDTH_RAD_S = 220.0
 """Bandwidth of the closed velocity loop at the tuned inertia; an axis a few times lighter is still stable."""
@@ -32,39 +32,34 @@ POSTURES = 3  #: Positions tried for each joint in tuning
 
 SEGMENTS = 4  #: Largest number of pieces of one move: stop, acceleration, cruise, deceleration
 
+SETTINGS = (
+    "inertia_a_s2",
+    "position_1_s",
+    "velocity_1_s",
+    "integral_1_s",
+    "filter",
+    "limit_a",
+    "error_window",
+    "error_time_s",
+    "target_window",
+    "target_time_s",
+)
+STATE = (
+    "demand",
+    "demand_velocity",
+    "demand_acceleration",
+    "target",
+    "piece_time_s",
+    "velocity",
+    "integral_a",
+    "current_a",
+    "error_for_s",
+    "inside_for_s",
+)
+COUNTERS = ("enabled", "piece", "counts")
+STATUS_BITS = ("reached", "limited", "following_error")  #: `limited` is kept for a whole sample period
 LOOP = np.dtype(
-    [
-        # settings
-        ("inertia_a_s2", "f8"),
-        ("position_1_s", "f8"),
-        ("velocity_1_s", "f8"),
-        ("integral_1_s", "f8"),
-        ("filter", "f8"),
-        ("limit_a", "f8"),
-        ("error_window", "f8"),
-        ("error_time_s", "f8"),
-        ("target_window", "f8"),
-        ("target_time_s", "f8"),
-        # state
-        ("enabled", "i8"),
-        ("demand", "f8"),
-        ("demand_velocity", "f8"),
-        ("demand_acceleration", "f8"),
-        ("target", "f8"),
-        ("piece", "i8"),
-        ("piece_time_s", "f8"),
-        ("counts", "i8"),
-        ("velocity", "f8"),
-        ("integral_a", "f8"),
-        ("current_a", "f8"),
-        ("error_for_s", "f8"),
-        ("inside_for_s", "f8"),
-        # status bits; limited is kept for a whole sample period
-        ("reached", "i8"),
-        ("limited", "i8"),
-        ("following_error", "i8"),
-    ],
-    align=True,
+    [*((name, "f8") for name in SETTINGS + STATE), *((name, "i8") for name in COUNTERS + STATUS_BITS)], align=True
 )
 """One record an axis; positions in motor counts, velocities in counts/s, accelerations in counts/s²."""
 
@@ -120,9 +115,11 @@ def plan(
         if velocity * (target - stop) < 0.0:
             # It cannot stop before the target, or runs the other way: stop, then go back from rest.
             pieces.append((stop_s, math.copysign(deceleration, -velocity)))
-            start, velocity = stop, 0.0
+            start = stop
+            velocity = 0.0
     sign = math.copysign(1.0, target - start)
-    distance, moving = abs(target - start), abs(velocity)
+    distance = abs(target - start)
+    moving = abs(velocity)
     if moving > speed:
         slow_s = (moving - speed) / deceleration
         pieces.append((slow_s, -sign * deceleration))
@@ -260,9 +257,7 @@ class Readings:
 
 
 @compiled
-def _fill(
-    loops: NDArray[np.void], reported_a: FloatArray, rated_current_a: FloatArray, readings: NDArray[np.int64]
-) -> None:
+def _fill(loops: NDArray[np.void], reported_a: FloatArray, rated_current_a: FloatArray, readings: IntArray) -> None:
     """Fill one row for each field of Readings, in their order, shape (8, n)."""
     for i in range(len(loops)):
         axis = loops[i]
@@ -304,7 +299,8 @@ class AmplifierSet:
         # Read the encoders at power-on, so that the position of a resting axis does not jump.
         for state in ("counts", "demand", "target"):
             self.loops[state] = np.rint(plant.motor_rad * self._counts_per_rad)
-        self._piece_s, self._piece_acceleration = np.zeros((n, SEGMENTS)), np.zeros((n, SEGMENTS))
+        self._piece_s = np.zeros((n, SEGMENTS))
+        self._piece_acceleration = np.zeros((n, SEGMENTS))
         built = (build_effect(effect, n) for effect in spec.effects if effect.joint is None)
         self._lags = tuple(effect for effect in built if isinstance(effect, Lag))
         self._lagged_a = np.zeros(n)
@@ -339,7 +335,8 @@ class AmplifierSet:
 
     def move(self, index: int, move: ProfileMove) -> None:
         """Begin a move from the present set-point."""
-        self._piece_s[index], self._piece_acceleration[index] = move.duration_s, move.acceleration
+        self._piece_s[index] = move.duration_s
+        self._piece_acceleration[index] = move.acceleration
         axis = self.loops[index]
         axis["target"] = move.target
         axis["piece"] = 0

@@ -7,23 +7,21 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
-from types import TracebackType
 
 import can
 import numpy as np
 
-from drivers.canopen.bus import SocketcandBus, send_burst
+from drivers.canopen.bus import SocketcandBus, base_frame, is_plain, send_burst
 from drivers.canopen.split_bus import SplitBus
 from drivers.errors import BusError
 from drivers.simulation.amplifier import AmplifierSet
-from drivers.simulation.drive import ErrorCode, PowerState
+from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import ERROR_FRAMES, FOREIGN_SDO, Disturbance, FaultKind, FaultSpec
-from drivers.simulation.node import NmtCommand, Node
+from drivers.simulation.node import Node
 from drivers.simulation.plant import Plant
 from drivers.simulation.spec import CellSpec, SpecInvalid
 
 SYNC_ID = 0x080
-NMT_ID = 0x000
 
 IDLE_S = 0.02  #: Longest wait for a frame [s]; it limits the punctuality of heartbeats by wall time
 
@@ -134,7 +132,8 @@ class SimulatedCell:
             raise SpecInvalid(
                 f"sync period {spec.sync_period_us} us in {spec.substeps} substeps; both must be at least 1"
             )
-        self._spec, self._mounted = spec, mounted
+        self._spec = spec
+        self._mounted = mounted
         self.plant = Plant(spec)  #: its mechanics (read it when the cell is closed, or between answers)
         self.cycles = 0  #: SYNCs since power-on
         self._amplifiers = AmplifierSet(spec, self.plant)
@@ -142,8 +141,8 @@ class SimulatedCell:
         Plant(spec).step(np.zeros(len(ids)))
         AmplifierSet(spec, self.plant).control(self.plant.motor_rad)
         self._enabled = np.zeros(len(ids), dtype=np.int64)
-        self._substeps, self._period_us = spec.substeps, spec.sync_period_us
-        self._bus, self._clock = bus, clock
+        self._bus = bus
+        self._clock = clock
         self._burst: list[can.Message] | None = None
         self._disturbance = Disturbance(spec.faults)
         self.nodes = tuple(
@@ -158,7 +157,6 @@ class SimulatedCell:
             for kind in FaultKind:
                 if self._disturbance.active(kind, index):
                     node.inject(kind)
-        self._by_id = {node.node_id: node for node in self.nodes}
         self._lone: _LoneTime | None = None  # while time runs without SYNC
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
@@ -169,9 +167,7 @@ class SimulatedCell:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self.stop()
         if self._thread is not None:
             self._thread.join()
@@ -201,14 +197,13 @@ class SimulatedCell:
             node.boot(wall_s)
         while not self._stopping.is_set():
             message = self._next_frame()
-            if message is not None and not (
-                message.is_error_frame or message.is_remote_frame or message.is_extended_id
-            ):
+            if message is not None and is_plain(message):
                 self._receive(message)
             elif message is None and self._gate.open:
                 for wires in self._gate.close():
                     self._advance(wires)
-            wall_s, now_us = self._clock(), self.time_us
+            wall_s = self._clock()
+            now_us = self.time_us
             for node in self.nodes:
                 if node.keep_time(now_us, wall_s) and self._lone is None:
                     self._lone = _LoneTime(wall_s)
@@ -237,7 +232,7 @@ class SimulatedCell:
     @property
     def time_us(self) -> int:
         """Plant time since power-on [us]."""
-        return self.cycles * self._period_us
+        return self.cycles * self._spec.sync_period_us
 
     def _serve_and_keep(self) -> None:
         try:
@@ -246,39 +241,26 @@ class SimulatedCell:
             self._failure = error
 
     def _receive(self, message: can.Message) -> None:
-        can_id, data = message.arbitration_id, bytes(message.data)
         wire = self._wires.index(str(message.channel)) if len(self._wires) > 1 else 0
-        hearing = self._on_wire[wire]
-        if self._disturbance:
-            hearing = tuple(node for node in hearing if not self._disturbance.cut_off(self.nodes.index(node)))
-        if can_id == SYNC_ID:
+        if message.arbitration_id == SYNC_ID:
             self._receive_sync(wire)
-        elif can_id == NMT_ID:
-            if len(data) >= 2:
-                for node in hearing:
-                    if data[1] in (0, node.node_id):
-                        node.command_nmt(data[0], self._clock())
-        elif 0x600 < can_id < 0x680:
-            node_asked = self._by_id.get(can_id - 0x600)
-            if node_asked in hearing:
-                node_asked.request(data)
-        elif 0x700 < can_id < 0x780:
-            for node in hearing:
-                node.hear_heartbeat(can_id - 0x700, self._clock())
-        else:
-            for node in hearing:
-                node.receive_pdo(can_id, data)
+            return
+        for node in self._on_wire[wire]:
+            if not (self._disturbance and self._disturbance.cut_off(self.nodes.index(node))):
+                node.receive(message.arbitration_id, bytes(message.data), self._clock)
 
     def _run_alone(self, wall_s: float) -> None:
         """Advance by wall time while the axes of a master that is gone come to rest; no node receives a SYNC."""
-        lone, period_s = self._lone, self._period_us * 1e-6
+        lone = self._lone
+        period_s = self._spec.sync_period_us * 1e-6
         for _ in range(LONE_CYCLES):
             # Another bus of this cell may still have its master, whose next SYNC ends this.
             if lone is None or lone.cycles * period_s > wall_s - lone.since_s - IDLE_S:
                 return
             self._advance(())
             moving = any(node.drive.powered and node.drive.moving for node in self.nodes)
-            lone.cycles, lone.rested = lone.cycles + 1, 0 if moving else lone.rested + 1
+            lone.cycles = lone.cycles + 1
+            lone.rested = 0 if moving else lone.rested + 1
             if lone.rested * period_s >= LONE_REST_S:
                 lone = self._lone = None
 
@@ -303,26 +285,20 @@ class SimulatedCell:
 
     def _begin_faults(self) -> None:
         """Apply the faults that begin with this cycle, before the plant moves."""
-        strike: dict[FaultKind, Callable[[Node, FaultSpec], None]] = {
-            FaultKind.EMERGENCY: lambda node, fault: node.fail(fault.value),
-            FaultKind.FOLLOWING_ERROR: lambda node, _: node.fail(ErrorCode.FOLLOWING_ERROR),
-            FaultKind.FALLS_BACK: lambda node, _: node.fall_back(),
-            FaultKind.REBOOTS: lambda node, _: node.command_nmt(NmtCommand.RESET_NODE, self._clock()),
-            FaultKind.LOSES_POWER: lambda node, _: node.drive.reset(),
-        }
         for index, node in enumerate(self.nodes):
             node.drive.limited = self._disturbance.active(FaultKind.LIMIT, index)
         for fault in self._disturbance.beginning():
             for index, node in enumerate(self.nodes):
-                if fault.kind in strike and fault.concerns(index):
-                    strike[fault.kind](node, fault)
+                if fault.concerns(index):
+                    node.strike(fault, self._clock())
             if fault.kind in ERROR_FRAMES:
                 error_class, data = ERROR_FRAMES[fault.kind]
                 self._bus.send(can.Message(is_error_frame=True, arbitration_id=error_class, data=data))
 
     def _advance(self, wires: Collection[int]) -> None:
         """Run one cycle; the nodes on these buses received a SYNC."""
-        plant, amplifiers = self.plant, self._amplifiers
+        plant = self.plant
+        amplifiers = self._amplifiers
         synchronised = [node for wire in sorted(wires) for node in self._on_wire[wire]]
         for node in synchronised:
             node.begin_cycle()
@@ -338,7 +314,7 @@ class SimulatedCell:
             self._enabled = loops["enabled"].copy()
             plant.set_brakes(self._enabled == 0)
         current_a = loops["current_a"]
-        for _ in range(self._substeps):
+        for _ in range(self._spec.substeps):
             plant.step(current_a)
             # The loops read the position at the end of the step: a reported current belongs to its reported position.
             amplifiers.control(plant.motor_rad)
@@ -350,7 +326,8 @@ class SimulatedCell:
         self._burst = []
         for node in synchronised:
             node.send_sync(self.time_us)
-        burst, self._burst = self._burst, None
+        burst = self._burst
+        self._burst = None
         if burst:
             self._put(burst)
 
@@ -359,7 +336,7 @@ class SimulatedCell:
             self._send(*frame)
 
     def _send(self, can_id: int, data: bytes) -> None:
-        message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+        message = base_frame(can_id, data)
         if self._burst is None:
             self._put((message,))
         else:

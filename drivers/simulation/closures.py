@@ -20,10 +20,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from drivers.simulation.dynamics import compiled
-from drivers.simulation.spec import DIRECTIONS, CellSpec, FloatArray, SpecInvalid
+from drivers.simulation.spec import DIRECTIONS, BoolArray, CellSpec, FloatArray, IntArray, SpecInvalid
 
 CLOSED = 1e-12  #: Largest |φ| [m or rad] at which Newton's method stops
 
@@ -43,173 +42,159 @@ START_TOLERANCE = 1e-3  #: Largest correction of a start position of redundant d
 
 
 class Tree(NamedTuple):
-    """Geometry of n joints and k closures."""
+    """Geometry of n joints and k closures. The base is joint 0, the joints of the plant follow in their order."""
 
-    parent: NDArray[np.int64]  #: joint before each joint, -1 for the base, shape (n,)
-    outwards: NDArray[np.int64]  #: the joints, each after its parent, shape (n,)
-    rotation: FloatArray  #: placement of each joint in the frame of its parent, shape (n, 3, 3)
-    offset: FloatArray  #: the same, its origin [m], shape (n, 3)
-    axis: FloatArray  #: unit vector of each joint in its own frame, shape (n, 3)
-    sliding: NDArray[np.bool_]  #: whether each joint is prismatic, shape (n,)
-    frame_joint: NDArray[np.int64]  #: joint that moves each frame, -1 for the base, shape (k, 2)
+    parent: IntArray  #: joint before each joint, shape (n + 1,)
+    outwards: IntArray  #: the joints without the base, each after its parent, shape (n,)
+    rotation: FloatArray  #: placement of each joint in the frame of its parent, shape (n + 1, 3, 3)
+    offset: FloatArray  #: the same, its origin [m], shape (n + 1, 3)
+    slide: FloatArray  #: unit vector of each prismatic joint in its own frame, else zero, shape (n + 1, 3)
+    turn: FloatArray  #: unit vector of each revolute joint in its own frame, else zero, shape (n + 1, 3)
+    frame_joint: IntArray  #: joint that moves each frame, shape (k, 2)
     frame_rotation: FloatArray  #: placement of each frame in that joint's, shape (k, 2, 3, 3)
     frame_offset: FloatArray  #: the same, its origin [m], shape (k, 2, 3)
-    closed: NDArray[np.bool_]  #: whether each of x, y, z, rx, ry, rz of the first frame is closed, shape (k, 6)
-    first_row: NDArray[np.int64]  #: of each closure among the c closed directions, and c, shape (k + 1,)
+    #: Closure of each of the c closed directions, and number of the direction: x, y, z, rx, ry, rz; shape (c, 2).
+    closed: IntArray
+
+
+class Placed(NamedTuple):
+    """Joints in the base at one position, those of the tree."""
+
+    rotation: FloatArray  #: shape (n + 1, 3, 3)
+    origin: FloatArray  #: [m], shape (n + 1, 3)
+    slide: FloatArray  #: as in the tree, shape (n + 1, 3)
+    turn: FloatArray  #: as in the tree, shape (n + 1, 3)
 
 
 @compiled
 def evaluate(constants: tuple[Any, ...], position: FloatArray, error: FloatArray, jacobian: FloatArray) -> None:
     """Compute φ, shape (c,), and J_c, shape (c, n), in place at the first n positions."""
     tree = Tree(*constants)
-    n = len(tree.parent)
-    rotation, origin, axis = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))
+    joints = len(tree.parent)
+    placed = Placed(np.zeros((joints, 3, 3)), np.zeros((joints, 3)), np.zeros((joints, 3)), np.zeros((joints, 3)))
+    for a in range(3):
+        placed.rotation[0, a, a] = 1.0
     for i in tree.outwards:
-        _place_joint(tree, i, position[i], rotation, origin, axis)
-    r, p, spin = np.empty((2, 3, 3)), np.empty((2, 3)), np.empty((3, 3))
-    jacobian[:] = 0.0
-    arm = np.empty(3)
-    for k in range(len(tree.closed)):
-        row = tree.first_row[k]
-        for side in range(2):
-            _place_frame(tree, k, side, rotation, origin, r, p)
-        _close(tree.closed[k], row, r, p, error, spin)
-        for side in range(2):
-            j = tree.frame_joint[k, side]
-            while j >= 0:
-                # Seen from the first frame, so that its own turning moves the second frame's origin as well.
-                for a in range(3):
-                    arm[a] = p[1, a] - origin[j, a]
-                _add_joint(tree.closed[k], row, side, tree.sliding[j], axis[j], arm, r, spin, jacobian[:, j])
-                j = tree.parent[j]
+        _place_joint(tree, i, position[i - 1], placed)
+    closures = len(tree.frame_joint)
+    every_error = np.zeros((closures, 6))
+    motion = np.zeros((closures, joints, 6))
+    for k in range(closures):
+        _close(tree, k, placed, every_error[k], motion[k])
+    for row in range(len(error)):
+        k = tree.closed[row, 0]
+        direction = tree.closed[row, 1]
+        error[row] = every_error[k, direction]
+        for j in range(1, joints):
+            jacobian[row, j - 1] = motion[k, j, direction]
 
 
 @compiled
-def _close(
-    closed: NDArray[np.bool_], row: int, r: FloatArray, p: FloatArray, error: FloatArray, spin: FloatArray
-) -> None:
-    """Fill φ of one closure from a row on.
-
-    With Ṙ = [ω] R the second part of φ changes by ½ (tr(R) I − R) ω, ω in the first frame: `spin`, output.
-    """
-    turn = np.zeros((3, 3))
+def _add(matrix: FloatArray, vector: FloatArray, total: FloatArray) -> None:
+    """Add matrix · vector, of three dimensions, to a total."""
     for a in range(3):
         for b in range(3):
-            for e in range(3):
-                turn[a, b] += r[0, e, a] * r[1, e, b]
-    trace = turn[0, 0] + turn[1, 1] + turn[2, 2]
+            total[a] += matrix[a, b] * vector[b]
+
+
+@compiled
+def _add_product(left: FloatArray, right: FloatArray, total: FloatArray) -> None:
+    """Add left · right, of three dimensions, to a total."""
     for a in range(3):
         for b in range(3):
-            spin[a, b] = 0.5 * ((trace if a == b else 0.0) - turn[a, b])
-        if closed[a]:
-            error[row] = 0.0
-            for b in range(3):
-                error[row] += r[0, b, a] * (p[1, b] - p[0, b])
-            row += 1
-    for a in range(3):
-        if closed[3 + a]:
-            b, c = (a + 1) % 3, (a + 2) % 3
-            error[row] = 0.5 * (turn[c, b] - turn[b, c])
-            row += 1
+            for c in range(3):
+                total[a, c] += left[a, b] * right[b, c]
 
 
 @compiled
-def _add_joint(
-    closed: NDArray[np.bool_],
-    row: int,
-    side: int,
-    sliding: bool,
-    axis: FloatArray,
-    arm: FloatArray,
-    r: FloatArray,
-    spin: FloatArray,
-    column: FloatArray,
-) -> None:
-    """Add what a joint before one frame of a closure does, from a row on of its column of J_c.
-
-    Args:
-        closed: directions of the closure, shape (6,).
-        row: first row of the closure.
-        side: 0 for the first frame, 1 for the second.
-        sliding: whether the joint is prismatic.
-        axis: of the joint in the base, shape (3,).
-        arm: from the joint to the second frame, shape (3,).
-        r, spin: of the closure.
-        column: changed in place, shape (c,).
-    """
-    sign = 1.0 if side == 1 else -1.0
-    x, y, z = axis[0], axis[1], axis[2]
-    u, v, w = arm[0], arm[1], arm[2]
-    if sliding:
-        u, v, w, x, y, z = x, y, z, 0.0, 0.0, 0.0
-    else:
-        u, v, w = y * w - z * v, z * u - x * w, x * v - y * u
-    angular = np.empty(3)
-    for a in range(3):
-        angular[a] = r[0, 0, a] * x + r[0, 1, a] * y + r[0, 2, a] * z
-        if closed[a]:
-            column[row] += sign * (r[0, 0, a] * u + r[0, 1, a] * v + r[0, 2, a] * w)
-            row += 1
-    for a in range(3):
-        if closed[3 + a]:
-            column[row] += sign * (spin[a, 0] * angular[0] + spin[a, 1] * angular[1] + spin[a, 2] * angular[2])
-            row += 1
-
-
-@compiled
-def _place_joint(
-    tree: Tree, i: int, position: float, rotation: FloatArray, origin: FloatArray, axis: FloatArray
-) -> None:
-    """Place joint i in the base behind its parent: rotation, origin and axis, each indexed by the joint."""
+def _place_joint(tree: Tree, i: int, position: float, placed: Placed) -> None:
+    """Place joint i in the base behind its parent."""
     parent = tree.parent[i]
-    x, y, z = tree.axis[i, 0], tree.axis[i, 1], tree.axis[i, 2]
-    s, c = 0.0, 1.0
-    if not tree.sliding[i]:
-        s, c = np.sin(position), np.cos(position)
-    own = np.empty((3, 3))
-    own[0, 0], own[0, 1], own[0, 2] = c + x * x * (1 - c), x * y * (1 - c) - z * s, x * z * (1 - c) + y * s
-    own[1, 0], own[1, 1], own[1, 2] = x * y * (1 - c) + z * s, c + y * y * (1 - c), y * z * (1 - c) - x * s
-    own[2, 0], own[2, 1], own[2, 2] = x * z * (1 - c) - y * s, y * z * (1 - c) + x * s, c + z * z * (1 - c)
-    placed = np.zeros((3, 3))
+    neutral = np.zeros((3, 3))
+    _add_product(placed.rotation[parent], tree.rotation[i], neutral)
+    _add(neutral, tree.slide[i], placed.slide[i])
+    _add(neutral, tree.turn[i], placed.turn[i])
     for a in range(3):
-        if parent < 0:
-            origin[i, a] = tree.offset[i, a]
-            for e in range(3):
-                placed[a, e] = tree.rotation[i, a, e]
-        else:
-            origin[i, a] = origin[parent, a]
-            for b in range(3):
-                origin[i, a] += rotation[parent, a, b] * tree.offset[i, b]
-                for e in range(3):
-                    placed[a, e] += rotation[parent, a, b] * tree.rotation[i, b, e]
+        placed.origin[i, a] = placed.origin[parent, a]
+    _add(placed.rotation[parent], tree.offset[i], placed.origin[i])
     for a in range(3):
-        axis[i, a] = placed[a, 0] * x + placed[a, 1] * y + placed[a, 2] * z
-        if tree.sliding[i]:
-            origin[i, a] += position * axis[i, a]
-        for e in range(3):
-            rotation[i, a, e] = placed[a, 0] * own[0, e] + placed[a, 1] * own[1, e] + placed[a, 2] * own[2, e]
+        placed.origin[i, a] += position * placed.slide[i, a]
+    _add_product(neutral, _turned(tree.turn[i], position), placed.rotation[i])
 
 
 @compiled
-def _place_frame(
-    tree: Tree, k: int, side: int, rotation: FloatArray, origin: FloatArray, r: FloatArray, p: FloatArray
-) -> None:
-    """Place one frame of closure k in the base: r[side] and p[side]."""
-    joint = tree.frame_joint[k, side]
+def _turned(axis: FloatArray, angle: float) -> FloatArray:
+    """Return the rotation about a unit vector (Rodrigues); the identity for a zero vector, a joint that slides."""
+    x, y, z = axis
+    if x == 0.0 and y == 0.0 and z == 0.0:
+        angle = 0.0
+    s = np.sin(angle)
+    c = np.cos(angle)
+    rotation = np.empty((3, 3))
     for a in range(3):
-        p[side, a] = tree.frame_offset[k, side, a] if joint < 0 else origin[joint, a]
         for b in range(3):
-            if joint < 0:
-                r[side, a, b] = tree.frame_rotation[k, side, a, b]
-                continue
-            p[side, a] += rotation[joint, a, b] * tree.frame_offset[k, side, b]
-            r[side, a, b] = 0.0
-            for e in range(3):
-                r[side, a, b] += rotation[joint, a, e] * tree.frame_rotation[k, side, e, b]
+            rotation[a, b] = axis[a] * axis[b] * (1 - c)
+        rotation[a, a] += c
+    rotation[0, 1] -= z * s
+    rotation[0, 2] += y * s
+    rotation[1, 0] += z * s
+    rotation[1, 2] -= x * s
+    rotation[2, 0] -= y * s
+    rotation[2, 1] += x * s
+    return rotation
 
 
 @compiled
-def eliminate(matrix: FloatArray, rank: int, held: NDArray[np.bool_], pivots: NDArray[np.int64]) -> float:
+def _close(tree: Tree, k: int, placed: Placed, error: FloatArray, motion: FloatArray) -> None:
+    """Compute φ of closure k in all six directions, shape (6,), and what each joint does to it, shape (n + 1, 6).
+
+    With Ṙ = [ω] R the second part of φ changes by ½ (tr(R) I − R) ω, ω in the first frame: `spin`.
+    """
+    r = np.zeros((2, 3, 3))
+    p = np.zeros((2, 3))
+    for side in range(2):
+        joint = tree.frame_joint[k, side]
+        for a in range(3):
+            p[side, a] = placed.origin[joint, a]
+        _add(placed.rotation[joint], tree.frame_offset[k, side], p[side])
+        _add_product(placed.rotation[joint], tree.frame_rotation[k, side], r[side])
+    to_first = r[0].T.copy()
+    between = np.zeros((3, 3))
+    _add_product(to_first, r[1], between)
+    trace = between[0, 0] + between[1, 1] + between[2, 2]
+    apart = np.empty(3)
+    spin = np.empty((3, 3))
+    for a in range(3):
+        b = (a + 1) % 3
+        c = (a + 2) % 3
+        apart[a] = p[1, a] - p[0, a]
+        error[3 + a] = 0.5 * (between[c, b] - between[b, c])
+        for b in range(3):
+            spin[a, b] = 0.5 * ((trace if a == b else 0.0) - between[a, b])
+    _add(to_first, apart, error[:3])
+    for side in range(2):
+        sign = 1.0 if side == 1 else -1.0
+        j = tree.frame_joint[k, side]
+        while j > 0:
+            velocity = np.empty(3)
+            angular = np.zeros(3)
+            _add(to_first, placed.turn[j], angular)
+            for a in range(3):
+                b = (a + 1) % 3
+                c = (a + 2) % 3
+                # Seen from the first frame, so that its own turning moves the second frame's origin as well.
+                lever_b = p[1, b] - placed.origin[j, b]
+                lever_c = p[1, c] - placed.origin[j, c]
+                across = placed.turn[j, b] * lever_c - placed.turn[j, c] * lever_b
+                velocity[a] = sign * (placed.slide[j, a] + across)
+                angular[a] *= sign
+            _add(to_first, velocity, motion[j, :3])
+            _add(spin, angular, motion[j, 3:])
+            j = tree.parent[j]
+
+
+@compiled
+def eliminate(matrix: FloatArray, rank: int, held: BoolArray, pivots: IntArray) -> float:
     """Reduce [J_c | φ], shape (c, n + 1), in place by Gauss-Jordan steps with full pivots.
 
     Args:
@@ -222,8 +207,10 @@ def eliminate(matrix: FloatArray, rank: int, held: NDArray[np.bool_], pivots: ND
         the smallest pivot over the largest.
     """
     n = matrix.shape[1] - 1
-    used, barred = np.zeros(n, dtype=np.bool_), np.empty(n, dtype=np.bool_)
-    largest, smallest = 0.0, np.inf
+    used = np.zeros(n, dtype=np.bool_)
+    barred = np.empty(n, dtype=np.bool_)
+    largest = 0.0
+    smallest = np.inf
     for i in range(rank):
         for j in range(n):
             barred[j] = used[j] or held[j]
@@ -232,7 +219,8 @@ def eliminate(matrix: FloatArray, rank: int, held: NDArray[np.bool_], pivots: ND
             best, at_row, column = _find_pivot(matrix, i, used)
         if not best > 0.0:
             return 0.0
-        largest, smallest = max(largest, best), min(smallest, best)
+        largest = max(largest, best)
+        smallest = min(smallest, best)
         used[column] = True
         pivots[i] = column
         for j in range(n + 1):
@@ -249,53 +237,50 @@ def eliminate(matrix: FloatArray, rank: int, held: NDArray[np.bool_], pivots: ND
 
 
 @compiled
-def _find_pivot(matrix: FloatArray, first: int, barred: NDArray[np.bool_]) -> tuple[float, int, int]:
+def _find_pivot(matrix: FloatArray, first: int, barred: BoolArray) -> tuple[float, int, int]:
     """Return the largest value from a row on outside the barred columns and the last one, its row and column."""
-    best, at_row, at_column = 0.0, first, 0
+    best = 0.0
+    at_row = first
+    at_column = 0
     for k in range(first, matrix.shape[0]):
         for j in range(matrix.shape[1] - 1):
             if not barred[j] and abs(matrix[k, j]) > best:
-                best, at_row, at_column = abs(matrix[k, j]), k, j
+                best = abs(matrix[k, j])
+                at_row = k
+                at_column = j
     return best, at_row, at_column
 
 
 @compiled
 def settle(
-    constants: tuple[Any, ...],
-    rotor_direction: FloatArray,
-    resting: NDArray[np.bool_],
-    position: FloatArray,
-    basis: FloatArray,
-    motor_rad: FloatArray,
+    constants: tuple[Any, ...], resting: BoolArray, position: FloatArray, basis: FloatArray
 ) -> tuple[float, float]:
-    """Return positions to φ = 0, and compute G and the rotor angles there.
+    """Return positions to φ = 0, and compute G there.
 
     Args:
         constants: of the mechanism, its Tree as a plain tuple.
-        rotor_direction: how each rotor turns with the coordinates, shape (m, N).
         resting: coordinates that are at rest and stay where they are, shape (N,).
         position: changed in place, shape (N,).
         basis: G, shape (n, d), output.
-        motor_rad: rotor angles, shape (m,), output.
 
     Returns:
         the largest |φ| that is left, and the smallest pivot over the largest.
     """
     n, d = basis.shape
-    tree = Tree(*constants)
-    rank, rows = n - d, tree.first_row[len(tree.closed)]
-    matrix, error, jacobian = np.empty((rows, n + 1)), np.empty(rows), np.empty((rows, n))
+    rank = n - d
+    rows = len(Tree(*constants).closed)
+    matrix = np.empty((rows, n + 1))
+    error = np.empty(rows)
     pivots = np.zeros(rank, dtype=np.int64)
-    worst, ratio = np.inf, 1.0
+    worst = np.inf
+    ratio = 1.0
     for _ in range(MAX_NEWTON):
-        evaluate(constants, position, error, jacobian)
+        evaluate(constants, position, error, matrix)
         worst = 0.0
         for k in range(rows):
             if not np.isfinite(error[k]):
                 return np.inf, 0.0
             worst = max(worst, abs(error[k]))
-            for j in range(n):
-                matrix[k, j] = jacobian[k, j]
             matrix[k, n] = error[k]
         ratio = eliminate(matrix, rank, resting[:n], pivots)
         if worst <= CLOSED or ratio < SINGULAR:
@@ -303,15 +288,11 @@ def settle(
         for i in range(rank):
             position[pivots[i]] -= matrix[i, n]
     _span(matrix, pivots, basis)
-    for i in range(len(motor_rad)):
-        motor_rad[i] = 0.0
-        for j in range(len(position)):
-            motor_rad[i] += rotor_direction[i, j] * position[j]
     return worst, ratio
 
 
 @compiled
-def _span(matrix: FloatArray, pivots: NDArray[np.int64], basis: FloatArray) -> None:
+def _span(matrix: FloatArray, pivots: IntArray, basis: FloatArray) -> None:
     """Fill G from an eliminated matrix: the identity in the rows of the independent joints."""
     basis[:] = 0.0
     dependent = np.zeros(len(basis), dtype=np.bool_)
@@ -353,7 +334,8 @@ class Mechanism:
         self._closures = spec.closures
         tree = _tree(model, ids, spec)
         self.constants: tuple[Any, ...] = tuple(tree)
-        self.rows = int(tree.closed.sum())
+        self._closed_directions = tree.closed
+        self.rows = len(tree.closed)
         motors = len(spec.motors)
         assembled = self.closed(np.array([spec.assembly_rad[name] for name in self.joints]), (motors, 0))
         self.mobility = len(ids) - _rank(self.at(assembled)[1])
@@ -374,7 +356,8 @@ class Mechanism:
 
     def at(self, position_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return φ, shape (c,), and J_c, shape (c, n)."""
-        error, jacobian = np.zeros(self.rows), np.zeros((self.rows, len(self.joints)))
+        error = np.zeros(self.rows)
+        jacobian = np.zeros((self.rows, len(self.joints)))
         evaluate(self.constants, np.ascontiguousarray(position_rad, dtype=np.float64), error, jacobian)
         return error, jacobian
 
@@ -402,8 +385,8 @@ class Mechanism:
                     break
             if np.abs(self.at(position)[0]).max() <= OPEN:
                 return position
-        rows = np.repeat([c.name for c in self._closures], [len(c.directions) for c in self._closures])
-        name = str(rows[int(np.argmax(np.abs(error)))])
+        worst, _ = self._closed_directions[np.argmax(np.abs(error))]
+        name = self._closures[worst].name
         raise SpecInvalid(
             f"closures: {name} stays open by {float(np.abs(error).max()):.3g} m or rad; expected frames that can meet; "
             "correct the assembly, the start, the frames or the directions"
@@ -452,27 +435,33 @@ def _refuse_wrong_names(joints: Sequence[str], spec: CellSpec) -> None:
 
 def _tree(model: pin.Model, ids: Sequence[int], spec: CellSpec) -> Tree:
     """Copy the geometry from a Pinocchio model, its joints `ids` in the order of the plant."""
-    place = {0: -1} | {joint: index for index, joint in enumerate(ids)}
-    data, neutral = model.createData(), pin.neutral(model)
-    jacobians = [pin.computeJointJacobian(model, data, neutral, i).reshape(6, -1) for i in ids]
-    moves = np.array([jacobian[:, model.joints[i].idx_v] for jacobian, i in zip(jacobians, ids, strict=True)])
-    sliding = np.linalg.norm(moves[:, :3], axis=1) > 0.5
-    placements = [model.jointPlacements[i] for i in ids]
-    frames = [[link_frame(model, name) for name in (c.first, c.second)] for c in spec.closures]
-    closed = np.array([[d in c.directions for d in DIRECTIONS] for c in spec.closures])
+    with_base = [0, *ids]
+    place = {joint: index for index, joint in enumerate(with_base)}
+    data = model.createData()
+    neutral = pin.neutral(model)
+    motion = np.zeros((len(with_base), 6))
+    for index, joint in enumerate(ids, start=1):
+        jacobian = pin.computeJointJacobian(model, data, neutral, joint).reshape(6, -1)
+        motion[index] = jacobian[:, model.joints[joint].idx_v]
+    sliding = np.linalg.norm(motion[:, :3], axis=1, keepdims=True) > 0.5
+    placements = [model.jointPlacements[joint] for joint in with_base]
+    frames: list[pin.Frame] = []
+    closed: list[tuple[int, int]] = []
+    for k, closure in enumerate(spec.closures):
+        frames += [link_frame(model, closure.first), link_frame(model, closure.second)]
+        closed += [(k, number) for number, direction in enumerate(DIRECTIONS) if direction in closure.directions]
     return Tree(
-        parent=np.array([place[model.parents[i]] for i in ids], dtype=np.int64),
+        parent=np.array([place[model.parents[joint]] for joint in with_base], dtype=np.int64),
         # Pinocchio numbers a joint after its parent.
-        outwards=np.argsort(ids).astype(np.int64),
+        outwards=1 + np.argsort(ids).astype(np.int64),
         rotation=np.array([p.rotation for p in placements]),
         offset=np.array([p.translation for p in placements]),
-        axis=np.ascontiguousarray(np.where(sliding[:, None], moves[:, :3], moves[:, 3:])),
-        sliding=sliding,
-        frame_joint=np.array([[place[f.parentJoint] for f in pair] for pair in frames], dtype=np.int64),
-        frame_rotation=np.array([[f.placement.rotation for f in pair] for pair in frames]),
-        frame_offset=np.array([[f.placement.translation for f in pair] for pair in frames]),
-        closed=closed,
-        first_row=np.concatenate(([0], np.cumsum(closed.sum(axis=1)))),
+        slide=np.where(sliding, motion[:, :3], 0.0),
+        turn=np.where(sliding, 0.0, motion[:, 3:]),
+        frame_joint=np.array([place[frame.parentJoint] for frame in frames], dtype=np.int64).reshape(-1, 2),
+        frame_rotation=np.array([frame.placement.rotation for frame in frames]).reshape(-1, 2, 3, 3),
+        frame_offset=np.array([frame.placement.translation for frame in frames]).reshape(-1, 2, 3),
+        closed=np.array(closed, dtype=np.int64),
     )
 
 

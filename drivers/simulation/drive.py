@@ -71,7 +71,8 @@ class Drive:
     """Power state and profile position mode of one axis; the loops themselves are in the AmplifierSet."""
 
     def __init__(self, index: int, amplifiers: AmplifierSet, number: Callable[[int], int]) -> None:
-        self._index, self._amplifiers = index, amplifiers
+        self._index = index
+        self._amplifiers = amplifiers
         self._axis = amplifiers.loops[index]  # a view
         self._number = number  # present value of an object
         self.state = PowerState.SWITCH_ON_DISABLED  #: CiA 402 power state
@@ -84,11 +85,13 @@ class Drive:
     def reset(self) -> None:
         """Return to the power-on state; the brake closes."""
         self._enter(PowerState.SWITCH_ON_DISABLED)
-        self.controlword, self.error = 0, ErrorCode.NONE
+        self.controlword = 0
+        self.error = ErrorCode.NONE
 
     def command(self, controlword: int) -> None:
         """Obey a controlword."""
-        previous, self.controlword = self.controlword, controlword
+        previous = self.controlword
+        self.controlword = controlword
         state = next_state(self.state, controlword, previous, self._stays_in_quick_stop)
         if state is not self.state:
             if self.state is PowerState.FAULT:
@@ -111,7 +114,8 @@ class Drive:
             if not self._stays_in_quick_stop and not self.moving:
                 self._enter(PowerState.SWITCH_ON_DISABLED)  # transition 12
         elif self._waiting is not None and not self.moving:
-            waiting, self._waiting = self._waiting, None
+            waiting = self._waiting
+            self._waiting = None
             self._acknowledged = bool(self.controlword & 0x10)
             self._start(waiting)
         if self._amplifiers.readings.following_error[self._index] and self.powered:
@@ -158,7 +162,8 @@ class Drive:
             if option == 0:  # disable at once
                 self._enter(PowerState.SWITCH_ON_DISABLED)
                 return
-            self._waiting, self._acknowledged = None, False
+            self._waiting = None
+            self._acknowledged = False
             self._stop(self._number(0x6084 if option in (1, 5) else 0x6085))  # slow down, or quick stop
             self.state = state
             return
@@ -176,7 +181,8 @@ class Drive:
         axis["demand"] = axis["target"] = axis["counts"]
         axis["demand_velocity"] = axis["demand_acceleration"] = 0.0
         axis["piece"] = SEGMENTS
-        self._waiting, self._acknowledged = None, False
+        self._waiting = None
+        self._acknowledged = False
         self.state = state
 
     def _request(self, controlword: int) -> None:
@@ -203,9 +209,12 @@ class Drive:
         return bool(self._axis["piece"] < SEGMENTS)
 
     def _start(self, setpoint: Setpoint) -> None:
-        move = plan(float(self._axis["demand"]), float(self._axis["demand_velocity"]), *setpoint)
-        self._amplifiers.move(self._index, move)
+        self._amplifiers.move(self._index, plan(*self._demand, *setpoint))
 
     def _stop(self, deceleration: float) -> None:
-        move = ramp_down(float(self._axis["demand"]), float(self._axis["demand_velocity"]), deceleration)
-        self._amplifiers.move(self._index, move)
+        self._amplifiers.move(self._index, ramp_down(*self._demand, deceleration))
+
+    @property
+    def _demand(self) -> tuple[float, float]:
+        """Position and velocity of the set-point."""
+        return float(self._axis["demand"]), float(self._axis["demand_velocity"])

@@ -27,9 +27,8 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from drivers.simulation.spec import FloatArray
+from drivers.simulation.spec import BoolArray, FloatArray, IntArray
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -67,8 +66,8 @@ class Mechanics(NamedTuple):
     motor_inertia: FloatArray  #: Ia along the rows of P, shape (n,)
     motor_viscous: FloatArray  #: Fv_m along the rows of P, shape (n,)
     directions: FloatArray  #: D of dry friction, shape (m, N); the first n are the joints
-    own_row: NDArray[np.int64]  #: direction that carries each motor's own dry friction and brake, shape (n,)
-    lone: NDArray[np.int64]  #: coordinate of each direction that has only one, else -1, shape (m,)
+    own_row: IntArray  #: direction that carries each motor's own dry friction and brake, shape (n,)
+    lone: IntArray  #: coordinate of each direction that has only one, else -1, shape (m,)
     step_s: float  #: h
 
 
@@ -85,7 +84,6 @@ def advance(
     position: FloatArray,
     velocity: FloatArray,
     load_torque: FloatArray,
-    motor_rad: FloatArray,
 ) -> float:
     """Advance by one step unless dry friction stays unsolved; return its certificate [rad/s].
 
@@ -101,50 +99,43 @@ def advance(
         impulse: λ, of the step before and then of this one, shape (m,).
         position, velocity: state, changed in place, shape (N,).
         load_torque: torque of the links on each joint, M a + c(q, q̇) [Nm], shape (n,), output.
-        motor_rad: rotor angles at the end of the step, shape (n,), output.
     """
     mechanics = Mechanics(*constants)
-    directions, step_s = mechanics.directions, mechanics.step_s
-    total = len(velocity)
-    inertia, free_velocity = _assemble(mechanics, mass, bias, viscous, motor_torque, torque, velocity)
+    directions = mechanics.directions
+    step_s = mechanics.step_s
+    inertia, after = _assemble(mechanics, mass, bias, viscous, motor_torque, torque, velocity)
     _factorise(inertia)
-    _substitute(inertia, free_velocity)
-    response, free_speed, delassus = _respond(inertia, free_velocity, directions)
+    _substitute(inertia, after)
+    response, free_speed, delassus = _respond(inertia, after, directions)
     residual = solve(delassus, free_speed, bound, impulse, TOLERANCE_RAD_S, MAX_SWEEPS, DEPENDENT)
     if not residual <= TOLERANCE_RAD_S:
         return residual
-    change = np.empty(total)
-    for i in range(total):
-        v = free_velocity[i]
-        for k in range(len(impulse)):
-            v += response[i, k] * impulse[k]
-        change[i] = v - velocity[i]
+    _add_times(response, impulse, after)
+    change = np.empty(len(velocity))
     resting = _resting(impulse, bound, directions, mechanics.lone)
-    for i in range(total):
-        if resting[i]:
-            # Written so that v + change is exactly zero.
-            change[i] = -velocity[i]
+    for i in range(len(velocity)):
+        # Written so that v + change is exactly zero.
+        change[i] = -velocity[i] if resting[i] else after[i] - velocity[i]
     for i in range(len(bias)):
-        s = bias[i]
+        load_torque[i] = bias[i]
         for j in range(len(bias)):
-            s += mass[i, j] * change[j] / step_s
-        load_torque[i] = s
-    for i in range(total):
+            load_torque[i] += mass[i, j] * change[j] / step_s
+    for i in range(len(velocity)):
         velocity[i] += change[i]
         position[i] += step_s * velocity[i]
-    for i in range(len(motor_rad)):
-        s = 0.0
-        for j in range(total):
-            s += mechanics.rotor_direction[i, j] * position[j]
-        motor_rad[i] = s
     return residual
+
+
+@compiled
+def turn_rotors(rotor_direction: FloatArray, position: FloatArray, motor_rad: FloatArray) -> None:
+    """Compute the rotor angles at the end of a step, shape (m,), output, from the positions, shape (N,)."""
+    motor_rad[:] = 0.0
+    _add_times(rotor_direction, position, motor_rad)
 
 
 @compiled
 def advance_closed(
     constants: tuple[Any, ...],
-    order: NDArray[np.int64],
-    basis: FloatArray,
     mass: FloatArray,
     bias: FloatArray,
     viscous: FloatArray,
@@ -155,29 +146,24 @@ def advance_closed(
     position: FloatArray,
     velocity: FloatArray,
     load_torque: FloatArray,
-    resting: NDArray[np.bool_],
+    basis: FloatArray,
+    resting: BoolArray,
 ) -> float:
     """Advance a closed chain as `advance` does; the positions still have to be settled on its closures.
 
     Args:
-        constants: of the plant, its Mechanics as a plain tuple.
-        order: place of each joint in the mass matrix and bias, shape (n,).
-        basis: G at the position, shape (n, d).
-        mass, bias, viscous, motor_torque, torque, bound, impulse, position, velocity: as for `advance`.
+        constants, mass, bias, viscous, motor_torque, torque, bound, impulse, position, velocity: as for `advance`.
         load_torque: torque that passes from each joint to the links [Nm], shape (n,), output.
+        basis: G at the position, shape (n, d).
         resting: coordinates whose speed became exactly zero, shape (N,), output.
 
     Returns:
         zero, or the certificate of a step that was not done.
     """
     mechanics = Mechanics(*constants)
-    step_s, n, d, total = mechanics.step_s, basis.shape[0], basis.shape[1], len(velocity)
-    ordered_mass, ordered_bias = np.empty((n, n)), np.empty(n)
-    for i in range(n):
-        ordered_bias[i] = bias[order[i]]
-        for j in range(n):
-            ordered_mass[i, j] = mass[order[i], order[j]]
-    inertia, momentum = _assemble(mechanics, ordered_mass, ordered_bias, viscous, motor_torque, torque, velocity)
+    n, d = basis.shape
+    total = len(velocity)
+    inertia, momentum = _assemble(mechanics, mass, bias, viscous, motor_torque, torque, velocity)
     whole = np.zeros((total, d + total - n))
     for i in range(n):
         for j in range(d):
@@ -210,7 +196,7 @@ def advance_closed(
     _pass_on(mechanics, viscous, motor_torque, torque, impulse, velocity, after, load_torque)
     for i in range(total):
         velocity[i] = after[i]
-        position[i] += step_s * after[i]
+        position[i] += mechanics.step_s * after[i]
     return 0.0
 
 
@@ -274,10 +260,16 @@ def _product(left: FloatArray, right: FloatArray) -> FloatArray:
 def _times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
     """Return matrix · vector."""
     product = np.zeros(matrix.shape[0])
+    _add_times(matrix, vector, product)
+    return product
+
+
+@compiled
+def _add_times(matrix: FloatArray, vector: FloatArray, total: FloatArray) -> None:
+    """Add matrix · vector to the first numbers of a total."""
     for i in range(matrix.shape[0]):
         for k in range(matrix.shape[1]):
-            product[i] += matrix[i, k] * vector[k]
-    return product
+            total[i] += matrix[i, k] * vector[k]
 
 
 @compiled
@@ -285,8 +277,8 @@ def _resting_closed(
     impulse: FloatArray,
     bound: FloatArray,
     directions: FloatArray,
-    lone: NDArray[np.int64],
-    resting: NDArray[np.bool_],
+    lone: IntArray,
+    resting: BoolArray,
 ) -> None:
     """Find the coordinates at rest: all where the sticking directions span the speeds, else those that stick alone."""
     size = directions.shape[1]
@@ -341,24 +333,23 @@ def _assemble(
     velocity: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Return A, shape (N, N), and the right side of A v_free, shape (N,)."""
-    direction, step_s = mechanics.motor_direction, mechanics.step_s
+    direction = mechanics.motor_direction
+    step_s = mechanics.step_s
     total = len(velocity)
     inertia = np.zeros((total, total))
     momentum = np.zeros(total)
+    _add_times(mass, velocity, momentum)
     for i in range(len(bias)):
         for j in range(len(bias)):
             inertia[i, j] = mass[i, j]
-            momentum[i] += mass[i, j] * velocity[j]
         momentum[i] -= step_s * bias[i]
     for i in range(total):
         momentum[i] += step_s * torque[i]
         inertia[i, i] += step_s * viscous[i]
+    speed = _times(direction, velocity)
     for k in range(len(direction)):
-        speed = 0.0
-        for j in range(total):
-            speed += direction[k, j] * velocity[j]
         implicit = mechanics.motor_inertia[k] + step_s * mechanics.motor_viscous[k]
-        push = mechanics.motor_inertia[k] * speed + step_s * motor_torque[k]
+        push = mechanics.motor_inertia[k] * speed[k] + step_s * motor_torque[k]
         for i in range(total):
             p = direction[k, i]
             if p != 0.0:
@@ -375,26 +366,12 @@ def _respond(
     """Return A⁻¹ Dᵀ, shape (N, m), D v_free, shape (m,), and W, shape (m, m); A = L Lᵀ."""
     m, total = directions.shape
     response = np.empty((total, m))
-    free_speed = np.empty(m)
-    delassus = np.empty((m, m))
-    column = np.empty(total)
     for k in range(m):
-        for i in range(total):
-            column[i] = directions[k, i]
+        column = directions[k].copy()
         _substitute(lower, column)
         for i in range(total):
             response[i, k] = column[i]
-        s = 0.0
-        for i in range(total):
-            s += directions[k, i] * free_velocity[i]
-        free_speed[k] = s
-    for k in range(m):
-        for j in range(m):
-            s = 0.0
-            for i in range(total):
-                s += directions[k, i] * response[i, j]
-            delassus[k, j] = s
-    return response, free_speed, delassus
+    return response, _times(directions, free_velocity), _product(directions, response)
 
 
 @compiled
@@ -425,9 +402,7 @@ def _substitute(lower: FloatArray, vector: FloatArray) -> None:
 
 
 @compiled
-def _resting(
-    impulse: FloatArray, bound: FloatArray, directions: FloatArray, lone: NDArray[np.int64]
-) -> NDArray[np.bool_]:
+def _resting(impulse: FloatArray, bound: FloatArray, directions: FloatArray, lone: IntArray) -> BoolArray:
     """Return the coordinates held at rest by sticking directions, shape (N,)."""
     resting = np.zeros(directions.shape[1], dtype=np.bool_)
     for k in range(len(impulse)):
@@ -547,7 +522,7 @@ def _stick(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: F
 
 @compiled
 def _step_to_bound(
-    lower: FloatArray, inside: NDArray[np.bool_], bound: FloatArray, impulse: FloatArray, step: FloatArray
+    lower: FloatArray, inside: BoolArray, bound: FloatArray, impulse: FloatArray, step: FloatArray
 ) -> bool:
     """Finish the substitution, step as far as the bounds allow, and return whether a bound was met."""
     m = len(step)

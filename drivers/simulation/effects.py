@@ -151,7 +151,8 @@ class TemperatureFriction:
 
     def __call__(self, moment: Moment) -> None:
         """Heat the drive over the step by the exact solution for constant losses, and change its friction."""
-        axis, speed = self.axis, abs(moment.velocity_rad_s[self.axis])
+        axis = self.axis
+        speed = abs(moment.velocity_rad_s[self.axis])
         above_k = moment.temperature_c[axis] - AMBIENT_C
         for friction, percent in (
             (moment.bound_nm, self.coulomb_percent_per_k),
@@ -224,7 +225,8 @@ class Elasticity:
 
     def __call__(self, moment: Moment) -> None:
         """Add the drive's torque to the links and subtract it from the motor."""
-        n, half_gap_rad = len(self.row), self.gap_rad / 2.0
+        n = len(self.row)
+        half_gap_rad = self.gap_rad / 2.0
         twist = float(moment.position_rad[self.coordinate] - self.row @ moment.position_rad[:n])
         rate = float(moment.velocity_rad_s[self.coordinate] - self.row @ moment.velocity_rad_s[:n])
         deflection = twist - min(max(twist, -half_gap_rad), half_gap_rad)

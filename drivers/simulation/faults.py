@@ -108,7 +108,8 @@ class Disturbance:
             return [frame]
         if self.active(FaultKind.LOST, axis):
             return []
-        frozen, stale = self.active(FaultKind.FROZEN, axis), self.active(FaultKind.STALE, axis)
+        frozen = self.active(FaultKind.FROZEN, axis)
+        stale = self.active(FaultKind.STALE, axis)
         if frozen or stale:
             kept = self._frozen.setdefault(axis, data)
             frame = (identifier, kept if stale else kept[:_FROZEN_BYTES] + data[_FROZEN_BYTES:])
@@ -128,5 +129,6 @@ class Disturbance:
 
     def release(self) -> list[Frame]:
         """Return the TPDOs held back since the previous SYNC."""
-        held, self._held = self._held, []
+        held = self._held
+        self._held = []
         return held

@@ -13,7 +13,6 @@ import re
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import Self, cast
 
 from drivers.canopen.bus import BusAddress
@@ -70,9 +69,7 @@ class Hub:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         if self._server is not None:
@@ -111,7 +108,9 @@ class _Client(asyncio.Protocol):
             self.drop()
 
     def data_received(self, data: bytes) -> None:
-        buffer, end, frames = self._incoming + data, 0, []
+        buffer = self._incoming + data
+        end = 0
+        frames = []
         stamp = b"%.6f" % self._hub.clock()
         for match in _COMMAND.finditer(buffer):
             end = match.end()

@@ -9,7 +9,7 @@ from enum import IntEnum
 
 from drivers.simulation.amplifier import AmplifierSet
 from drivers.simulation.drive import Drive, ErrorCode
-from drivers.simulation.faults import FaultKind
+from drivers.simulation.faults import FaultKind, FaultSpec
 from drivers.simulation.objects import (
     LOAD,
     NO_OBJECT,
@@ -28,7 +28,9 @@ Send = Callable[[int, bytes], None]
 
 NOT_STORED = 0x08000020
 NOT_IN_THIS_STATE = 0x08000022
-GAIN, STORE, LOAD_DEFAULTS = 0x2003, 0x1010, 0x1011
+GAIN = 0x2003
+STORE = 0x1010
+LOAD_DEFAULTS = 0x1011
 QUICK_STOP = 3  #: Value of 6007h
 
 
@@ -66,7 +68,10 @@ class Node:
         self.node_id = axis.node_id
         self.nmt = NmtState.INITIALISING
         self.drive = Drive(index, amplifiers, self._number)
-        self._index, self._axis, self._amplifiers, self._send = index, axis, amplifiers, send
+        self._index = index
+        self._axis = axis
+        self._amplifiers = amplifiers
+        self._send = send
         self._dictionary = amplifier_dictionary(axis)
         self._signals = {current.key: current.source(amplifiers, index) for current in vendor(axis).currents}
         self._values = {key: entry.default for key, entry in self._dictionary.items()}
@@ -77,7 +82,8 @@ class Node:
         self._history: list[int] = []
         self._sdo = SdoServer(self.read, self.write)
         self._now_us = 0
-        self._beat_us, self._beat_wall_s = 0, 0.0
+        self._beat_us = 0
+        self._beat_wall_s = 0.0
         self._heard_wall_s: float | None = None
         self._toggle = 0
         self._toggle_mask = 0 if axis.toggle_bit is None else 1 << axis.toggle_bit
@@ -89,7 +95,8 @@ class Node:
         self._apply_settings()
         self._send(0x700 + self.node_id, bytes([NmtState.INITIALISING]))
         self.nmt = NmtState.PRE_OPERATIONAL
-        self._beat_us, self._beat_wall_s = self._now_us, wall_s
+        self._beat_us = self._now_us
+        self._beat_wall_s = wall_s
 
     def command_nmt(self, command: int, wall_s: float) -> None:
         """Execute an NMT command; unknown ones are ignored, as CiA 301 requires."""
@@ -116,6 +123,20 @@ class Node:
             self._restore(self.saved, first=0x1000, last=0x1FFF)
             self.boot(wall_s)
 
+    def receive(self, can_id: int, data: bytes, clock: Callable[[], float]) -> None:
+        """Take a frame of the bus that is no SYNC; most are for others."""
+        service = can_id & 0x780
+        if can_id == 0:
+            if len(data) >= 2 and data[1] in (0, self.node_id):
+                self.command_nmt(data[0], clock())
+        elif service == 0x600:
+            if can_id == 0x600 + self.node_id:
+                self.request(data)
+        elif service == 0x700:
+            self.hear_heartbeat(can_id - 0x700, clock())
+        else:
+            self.receive_pdo(can_id, data)
+
     def hear_heartbeat(self, producer: int, wall_s: float) -> None:
         """Note a heartbeat; that of the node in 1016h is monitored from its first one on."""
         if self._number(0x1016, 1) >> 16 & 0x7F == producer:
@@ -128,7 +149,8 @@ class Node:
             whether the monitored heartbeat has become overdue now.
         """
         # Without SYNC plant time is stopped: the first is judged by wall time, the second by the faster of both.
-        allowed_ms, heard_s = self._values[0x1016, 1] & 0xFFFF, self._heard_wall_s
+        allowed_ms = self._values[0x1016, 1] & 0xFFFF
+        heard_s = self._heard_wall_s
         lost = bool(allowed_ms) and heard_s is not None and (wall_s - heard_s) * 1e3 >= allowed_ms
         if lost or not allowed_ms:
             self._heard_wall_s = None
@@ -139,7 +161,8 @@ class Node:
         if period_ms == 0 or self.nmt is NmtState.INITIALISING:
             return lost
         if now_us - self._beat_us >= 1000 * period_ms or (wall_s - self._beat_wall_s) * 1e3 >= period_ms:
-            self._beat_us, self._beat_wall_s = now_us, wall_s
+            self._beat_us = now_us
+            self._beat_wall_s = wall_s
             self._send(0x700 + self.node_id, bytes([self.nmt]))
         return lost
 
@@ -156,22 +179,37 @@ class Node:
 
     def inject(self, kind: FaultKind) -> None:
         """Inject a fault that lasts from power-on; other kinds have no effect here."""
-        if kind is FaultKind.REFUSES_NMT:
-            self._obeys_nmt = False
-        elif kind is FaultKind.OTHER_SERIAL:
-            self._values[0x1018, 4] = self._number(0x1018, 4) + 1
-        elif kind is FaultKind.REFUSES_MAPPING:
-            for pdo in self._transmit:
-                pdo.locked = True
-        elif kind is FaultKind.SYNC_PRODUCER:
-            self._values[0x1005, 0] = self._number(0x1005) | 1 << 30  # the cell sends the SYNC
-        elif kind is FaultKind.NO_GUARD:
-            for key in ((0x1016, 0), (0x1016, 1)):
-                del self._dictionary[key]  # its value stays zero: no heartbeat is monitored
-        elif kind is FaultKind.REFUSES_WRITE:
-            self._refused.add(GAIN)
-        elif kind is FaultKind.REFUSES_SAVE:
-            self._refused.add(STORE)
+        match kind:
+            case FaultKind.REFUSES_NMT:
+                self._obeys_nmt = False
+            case FaultKind.OTHER_SERIAL:
+                self._values[0x1018, 4] += 1
+            case FaultKind.REFUSES_MAPPING:
+                for pdo in self._transmit:
+                    pdo.locked = True
+            case FaultKind.SYNC_PRODUCER:
+                self._values[0x1005, 0] |= 1 << 30  # the cell sends the SYNC
+            case FaultKind.NO_GUARD:
+                for subindex in range(2):
+                    del self._dictionary[0x1016, subindex]  # its value stays zero: no heartbeat is monitored
+            case FaultKind.REFUSES_WRITE:
+                self._refused.add(GAIN)
+            case FaultKind.REFUSES_SAVE:
+                self._refused.add(STORE)
+
+    def strike(self, fault: FaultSpec, wall_s: float) -> None:
+        """Undergo a fault that happens once; other kinds have no effect here."""
+        match fault.kind:
+            case FaultKind.EMERGENCY:
+                self.fail(fault.value)
+            case FaultKind.FOLLOWING_ERROR:
+                self.fail(ErrorCode.FOLLOWING_ERROR)
+            case FaultKind.FALLS_BACK:
+                self.fall_back()
+            case FaultKind.REBOOTS:
+                self.command_nmt(NmtCommand.RESET_NODE, wall_s)
+            case FaultKind.LOSES_POWER:
+                self.drive.reset()
 
     def receive_pdo(self, can_id: int, data: bytes) -> None:
         """Accept a receive PDO of this node: at once if event-driven, else with the next SYNC."""
@@ -190,7 +228,8 @@ class Node:
     def begin_cycle(self) -> None:
         """Apply the synchronous receive PDOs on SYNC."""
         if self._pending:
-            pending, self._pending = self._pending, {}
+            pending = self._pending
+            self._pending = {}
             for number, data in pending.items():
                 self._unpack(self._receive[number], data)
 
@@ -239,7 +278,7 @@ class Node:
             raise SdoAbort(0x08000024)  # no data available
         if entry.kind is Kind.TEXT:
             return entry.text.encode("ascii")
-        return entry.encode(self._source((index, subindex))())
+        return entry.kind.encode(self._source((index, subindex))())
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
         """Write an entry.
@@ -281,7 +320,9 @@ class Node:
         return side[number]
 
     def _source(self, key: tuple[int, int]) -> Callable[[], int]:
-        i, drive, amplifiers = self._index, self.drive, self._amplifiers
+        i = self._index
+        drive = self.drive
+        amplifiers = self._amplifiers
         live: dict[int, Callable[[], int]] = {
             0x1001: lambda: int(drive.error is not ErrorCode.NONE),
             0x2005: lambda: round(10.0 * float(amplifiers.temperature_c[i])),
@@ -308,10 +349,8 @@ class Node:
         """Set the values of a receive PDO; a controlword last, so that it acts on its companions."""
         values = dict(zip(pdo.mapped, pdo.layout.unpack_from(data), strict=True))
         for key in sorted(values, key=lambda key: key == (0x6040, 0)):
-            entry = self._dictionary[key]
-            value = values[key]
-            if (entry.lowest is None or value >= entry.lowest) and (entry.highest is None or value <= entry.highest):
-                self._set(key, value)
+            if self._dictionary[key].accepts(values[key]):
+                self._set(key, values[key])
 
     def _set(self, key: tuple[int, int], value: int) -> None:
         self._values[key] = value

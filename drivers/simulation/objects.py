@@ -40,30 +40,49 @@ class Kind(Enum):
         """Width in bits; 0 for text."""
         return 0 if self is Kind.TEXT else 8 * struct.calcsize("<" + self.value)
 
+    def encode(self, value: int) -> bytes:
+        """Return the bytes for the bus."""
+        return struct.pack("<" + self.value, value)
 
-class Mappable(Enum):
-    """Kind of PDO that an entry may be mapped into."""
+    def decode(self, data: bytes) -> int:
+        """Return the value of bytes from the bus; SdoAbort for a wrong length."""
+        size = self.bits // 8
+        if len(data) != size:
+            raise SdoAbort(TOO_LONG if len(data) > size else TOO_SHORT)
+        (value,) = struct.unpack("<" + self.value, data)
+        return int(value)
 
-    NO = ""
-    TRANSMIT = "t"
-    RECEIVE = "r"
+
+class Access(Enum):
+    """Access to an entry by SDO, and the kind of PDO that it may be mapped into."""
+
+    RO = "read"
+    RW = "read and write"
+    TPDO = "read, or a transmit PDO"
+    RPDO = "read and write, or a receive PDO"
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
     """One entry of the dictionary."""
 
+    index: int
+    subindex: int
     kind: Kind  #: data type
+    access: Access = Access.RO
     default: int = 0  #: at power-on, if the node does not compute it
-    writable: bool = False  #: by SDO
-    mappable: Mappable = Mappable.NO  #: into PDOs
     lowest: int | None = None  #: lowest accepted value, None for the type's own
     highest: int | None = None  #: highest accepted value, None for the type's own
     text: str = ""  #: value of an entry of kind TEXT
 
-    def encode(self, value: int) -> bytes:
-        """Return the bytes for the bus."""
-        return struct.pack("<" + self.kind.value, value)
+    @property
+    def writable(self) -> bool:
+        """Whether it can be written by SDO."""
+        return self.access in (Access.RW, Access.RPDO)
+
+    def accepts(self, value: int) -> bool:
+        """Return whether a value is in its range."""
+        return (self.lowest is None or value >= self.lowest) and (self.highest is None or value <= self.highest)
 
     def decode(self, data: bytes) -> int:
         """Return the value of bytes from the bus.
@@ -71,88 +90,87 @@ class Entry:
         Raises:
             SdoAbort: wrong length, or outside the range of values.
         """
-        size = self.kind.bits // 8
-        if len(data) != size:
-            raise SdoAbort(TOO_LONG if len(data) > size else TOO_SHORT)
-        (value,) = struct.unpack("<" + self.kind.value, data)
-        if (self.lowest is not None and value < self.lowest) or (self.highest is not None and value > self.highest):
+        value = self.kind.decode(data)
+        if not self.accepts(value):
             raise SdoAbort(INVALID_VALUE)
-        return int(value)
+        return value
 
 
 Dictionary = dict[tuple[int, int], Entry]
 
-_REAL32, _REAL32_BITS = struct.Struct("<f"), struct.Struct("<I")
+_REAL32 = struct.Struct("<f")
+_REAL32_BITS = struct.Struct("<I")
 
 SAVE = int.from_bytes(b"save", "little")
 LOAD = int.from_bytes(b"load", "little")
 
 
-def _cia402(axis: AxisSpec) -> Dictionary:
+def _cia402(axis: AxisSpec) -> tuple[Entry, ...]:
     counts = axis.counts_per_revolution
     peak_per_mille = round(1000 * axis.peak_current_a / axis.rated_current_a)
-    transmit, receive = Mappable.TRANSMIT, Mappable.RECEIVE
-    return {
-        (0x1000, 0): Entry(Kind.U32, 0x00020192),  # servo drive (2) of profile 402
-        (0x1001, 0): Entry(Kind.U8, mappable=transmit),
-        (0x1003, 0): Entry(Kind.U8, writable=True, highest=0),  # writing zero clears the history
-        (0x1003, 1): Entry(Kind.U32),
-        (0x1005, 0): Entry(Kind.U32, 0x80),
-        (0x1008, 0): Entry(Kind.TEXT, text="drivegain simulated CiA 402 amplifier"),
-        (0x1009, 0): Entry(Kind.TEXT, text="1.0"),
-        (0x100A, 0): Entry(Kind.TEXT, text="1.0"),
-        (0x1010, 0): Entry(Kind.U8, 1),
-        (0x1010, 1): Entry(Kind.U32, 1, writable=True),
-        (0x1011, 0): Entry(Kind.U8, 1),
-        (0x1011, 1): Entry(Kind.U32, 1, writable=True),
-        (0x1014, 0): Entry(Kind.U32, 0x80 + axis.node_id),
-        (0x1016, 0): Entry(Kind.U8, 1),
-        (0x1016, 1): Entry(Kind.U32, writable=True),  # monitored node id << 16 | ms
-        (0x1017, 0): Entry(Kind.U16, 100, writable=True),
-        (0x1018, 0): Entry(Kind.U8, 4),
-        (0x1018, 1): Entry(Kind.U32, axis.vendor_id),
-        (0x1018, 2): Entry(Kind.U32, axis.product_code),
-        (0x1018, 3): Entry(Kind.U32, axis.revision),
-        (0x1018, 4): Entry(Kind.U32, axis.serial),
-        (0x1019, 0): Entry(Kind.U8),
+    i8, u8, i16, u16, i32, u32, text = Kind
+    ro, rw, tpdo, rpdo = Access
+    return (
+        Entry(0x1000, 0, u32, ro, 0x00020192),  # servo drive (2) of profile 402
+        Entry(0x1001, 0, u8, tpdo),
+        Entry(0x1003, 0, u8, rw, highest=0),  # writing zero clears the history
+        Entry(0x1003, 1, u32),
+        Entry(0x1005, 0, u32, ro, 0x80),
+        Entry(0x1008, 0, text, text="drivegain simulated CiA 402 amplifier"),
+        Entry(0x1009, 0, text, text="1.0"),
+        Entry(0x100A, 0, text, text="1.0"),
+        Entry(0x1010, 0, u8, ro, 1),
+        Entry(0x1010, 1, u32, rw, 1),
+        Entry(0x1011, 0, u8, ro, 1),
+        Entry(0x1011, 1, u32, rw, 1),
+        Entry(0x1014, 0, u32, ro, 0x80 + axis.node_id),
+        Entry(0x1016, 0, u8, ro, 1),
+        Entry(0x1016, 1, u32, rw),  # monitored node id << 16 | ms
+        Entry(0x1017, 0, u16, rw, 100),
+        Entry(0x1018, 0, u8, ro, 4),
+        Entry(0x1018, 1, u32, ro, axis.vendor_id),
+        Entry(0x1018, 2, u32, ro, axis.product_code),
+        Entry(0x1018, 3, u32, ro, axis.revision),
+        Entry(0x1018, 4, u32, ro, axis.serial),
+        Entry(0x1019, 0, u8),
         # Manufacturer specific: the entered joint drive gain, for masters only.
-        (0x2003, 0): Entry(Kind.U8, 2),
-        (0x2003, 1): Entry(Kind.I32, round(1000 * axis.entered_gain_nm_per_a), writable=True),
-        (0x2003, 2): Entry(Kind.U32, _REAL32_BITS.unpack(_REAL32.pack(axis.entered_gain_nm_per_a))[0], writable=True),
-        (0x2005, 0): Entry(Kind.I16),  # manufacturer specific: temperature of the motor [0.1 °C]
-        (0x6007, 0): Entry(Kind.I16, 1, writable=True, lowest=0, highest=3),
-        (0x603F, 0): Entry(Kind.U16, mappable=transmit),
-        (0x6040, 0): Entry(Kind.U16, writable=True, mappable=receive),
-        (0x6041, 0): Entry(Kind.U16, mappable=transmit),
-        (0x605A, 0): Entry(Kind.I16, 2, writable=True, lowest=0, highest=6),
-        (0x6060, 0): Entry(Kind.I8, 0, writable=True, mappable=receive, lowest=0, highest=1),
-        (0x6061, 0): Entry(Kind.I8, mappable=transmit),
-        (0x6062, 0): Entry(Kind.I32, mappable=transmit),
-        (0x6063, 0): Entry(Kind.I32, mappable=transmit),
-        (0x6064, 0): Entry(Kind.I32, mappable=transmit),
-        (0x6065, 0): Entry(Kind.U32, counts // 2, writable=True),
-        (0x6066, 0): Entry(Kind.U16, 10, writable=True),
-        (0x6067, 0): Entry(Kind.U32, counts // 100, writable=True),
-        (0x6068, 0): Entry(Kind.U16, 10, writable=True),
-        (0x606C, 0): Entry(Kind.I32, mappable=transmit),
-        (0x6073, 0): Entry(Kind.U16, peak_per_mille, writable=True, mappable=receive, highest=peak_per_mille),
-        (0x6074, 0): Entry(Kind.I16, mappable=transmit),
-        (0x6075, 0): Entry(Kind.U32, round(1000 * axis.rated_current_a)),
+        Entry(0x2003, 0, u8, ro, 2),
+        Entry(0x2003, 1, i32, rw, round(1000 * axis.entered_gain_nm_per_a)),
+        Entry(0x2003, 2, u32, rw, _REAL32_BITS.unpack(_REAL32.pack(axis.entered_gain_nm_per_a))[0]),
+        Entry(0x2005, 0, i16),  # manufacturer specific: temperature of the motor [0.1 °C]
+        Entry(0x6007, 0, i16, rw, 1, lowest=0, highest=3),
+        Entry(0x603F, 0, u16, tpdo),
+        Entry(0x6040, 0, u16, rpdo),
+        Entry(0x6041, 0, u16, tpdo),
+        Entry(0x605A, 0, i16, rw, 2, lowest=0, highest=6),
+        Entry(0x6060, 0, i8, rpdo, lowest=0, highest=1),
+        Entry(0x6061, 0, i8, tpdo),
+        Entry(0x6062, 0, i32, tpdo),
+        Entry(0x6063, 0, i32, tpdo),
+        Entry(0x6064, 0, i32, tpdo),
+        Entry(0x6065, 0, u32, rw, counts // 2),
+        Entry(0x6066, 0, u16, rw, 10),
+        Entry(0x6067, 0, u32, rw, counts // 100),
+        Entry(0x6068, 0, u16, rw, 10),
+        Entry(0x606C, 0, i32, tpdo),
+        Entry(0x6073, 0, u16, rpdo, peak_per_mille, highest=peak_per_mille),
+        Entry(0x6074, 0, i16, tpdo),
+        Entry(0x6075, 0, u32, ro, round(1000 * axis.rated_current_a)),
         # Zero unless the motor's rated torque was entered: the cell must not reveal its true torque constant.
-        (0x6076, 0): Entry(Kind.U32, round(1000 * axis.entered_torque_nm), writable=True),
-        (0x6077, 0): Entry(Kind.I16, mappable=transmit),
-        (0x6078, 0): Entry(Kind.I16, mappable=transmit),
-        (0x607A, 0): Entry(Kind.I32, writable=True, mappable=receive),
-        (0x6081, 0): Entry(Kind.U32, 10 * counts, writable=True, mappable=receive, lowest=1),
-        (0x6083, 0): Entry(Kind.U32, 50 * counts, writable=True, mappable=receive, lowest=1),
-        (0x6084, 0): Entry(Kind.U32, 50 * counts, writable=True, mappable=receive, lowest=1),
-        (0x6085, 0): Entry(Kind.U32, 100 * counts, writable=True, mappable=receive, lowest=1),
-        (0x608F, 0): Entry(Kind.U8, 2),
-        (0x608F, 1): Entry(Kind.U32, counts),
-        (0x608F, 2): Entry(Kind.U32, 1),
-        (0x60F4, 0): Entry(Kind.I32, mappable=transmit),
-        (0x6502, 0): Entry(Kind.U32, 1),  # profile position alone
-    }
+        Entry(0x6076, 0, u32, rw, round(1000 * axis.entered_torque_nm)),
+        Entry(0x6077, 0, i16, tpdo),
+        Entry(0x6078, 0, i16, tpdo),
+        Entry(0x607A, 0, i32, rpdo),
+        Entry(0x6081, 0, u32, rpdo, 10 * counts, lowest=1),
+        Entry(0x6083, 0, u32, rpdo, 50 * counts, lowest=1),
+        Entry(0x6084, 0, u32, rpdo, 50 * counts, lowest=1),
+        Entry(0x6085, 0, u32, rpdo, 100 * counts, lowest=1),
+        Entry(0x608F, 0, u8, ro, 2),
+        Entry(0x608F, 1, u32, ro, counts),
+        Entry(0x608F, 2, u32, ro, 1),
+        Entry(0x60F4, 0, i32, tpdo),
+        Entry(0x6502, 0, u32, ro, 1),  # profile position alone
+    )
 
 
 def find(dictionary: Dictionary, index: int, subindex: int) -> Entry:
@@ -177,7 +195,8 @@ class SdoServer:
     """SDO server of one node: expedited and segmented transfers (CiA 301 §7.2.4.3)."""
 
     def __init__(self, read: Callable[[int, int], bytes], write: Callable[[int, int, bytes], None]) -> None:
-        self._read, self._write = read, write
+        self._read = read
+        self._write = write
         self._entry = (0, 0)
         self._upload: bytes | None = None
         self._download: bytearray | None = None
@@ -206,14 +225,16 @@ class SdoServer:
         data = self._read(*self._entry)
         if len(data) <= 4:
             return _HEAD.pack(0x43 | (4 - len(data)) << 2, *self._entry) + data.ljust(4, b"\0")
-        self._upload, self._toggle = data, 0
+        self._upload = data
+        self._toggle = 0
         return _HEAD.pack(0x41, *self._entry) + struct.pack("<I", len(data))
 
     def _continue_upload(self, request: bytes) -> bytes:
         if self._upload is None:
             raise SdoAbort(UNKNOWN_COMMAND)
         self._check_toggle(request)
-        part, rest = self._upload[:7], self._upload[7:]
+        part = self._upload[:7]
+        rest = self._upload[7:]
         answer = bytes([self._toggle | (7 - len(part)) << 1 | (not rest)]) + part.ljust(7, b"\0")
         self._toggle ^= 0x10
         self._upload = rest or None
@@ -224,7 +245,8 @@ class SdoServer:
             size = 4 - (request[0] >> 2 & 3) if request[0] & 0x01 else 4
             self._write(*self._entry, request[4 : 4 + size])
         else:
-            self._download, self._toggle = bytearray(), 0
+            self._download = bytearray()
+            self._toggle = 0
         return _HEAD.pack(0x60, *self._entry) + bytes(4)
 
     def _continue_download(self, request: bytes) -> bytes:
@@ -235,7 +257,8 @@ class SdoServer:
         answer = bytes([0x20 | self._toggle]) + bytes(7)
         self._toggle ^= 0x10
         if request[0] & 0x01:
-            data, self._download = bytes(self._download), None
+            data = bytes(self._download)
+            self._download = None
             self._write(*self._entry, data)
         return answer
 
@@ -267,7 +290,7 @@ class Vendor(NamedTuple):
 
     absent: frozenset[int] = frozenset()  #: objects that they lack
     currents: tuple[CurrentObject, ...] = ()  #: in addition to, or in place of, 6074h, 6077h and 6078h
-    others: tuple[tuple[tuple[int, int], Entry], ...] = ()  #: further objects
+    others: tuple[Entry, ...] = ()  #: further objects
 
 
 def vendor(axis: AxisSpec) -> Vendor:
@@ -281,7 +304,7 @@ def vendor(axis: AxisSpec) -> Vendor:
                 CurrentObject((0x30D1, 1), Kind.I32, 1e-3, is_reference=False),
                 CurrentObject((0x30D1, 2), Kind.I32, 1e-3, is_reference=False),
             ),
-            (((0x3001, 1), Entry(Kind.U32, round(1000 * axis.rated_current_a), writable=True)),),
+            (Entry(0x3001, 1, Kind.U32, Access.RW, round(1000 * axis.rated_current_a)),),
         ),
         Dialect.COPLEY: Vendor(
             frozenset({0x6073, 0x6074, 0x6075, 0x6076, 0x6077, 0x6078}),
@@ -289,7 +312,7 @@ def vendor(axis: AxisSpec) -> Vendor:
                 CurrentObject((0x221D, 0), Kind.I16, 0.01, is_reference=True),  # 10 mA
                 CurrentObject((0x221C, 0), Kind.I16, 0.01, is_reference=False),
             ),
-            (((0x2240, 0), Entry(Kind.I32, mappable=Mappable.TRANSMIT)),),  # the motor's encoder
+            (Entry(0x2240, 0, Kind.I32, Access.TPDO),),  # the motor's encoder
         ),
         Dialect.IPOS: Vendor(
             frozenset({0x6073, 0x6074, 0x6075, 0x6076, 0x6078}),
@@ -300,7 +323,7 @@ def vendor(axis: AxisSpec) -> Vendor:
             frozenset({0x6073, 0x6075, 0x6076, 0x6078}),
             # 3280 digits are the peak current.
             (CurrentObject((0x6074, 0), Kind.I16, axis.peak_current_a / 3280.0, is_reference=True),),
-            (((0x3529, 1), Entry(Kind.I32, round(1000 * axis.peak_current_a))),),
+            (Entry(0x3529, 1, Kind.I32, default=round(1000 * axis.peak_current_a)),),
         ),
     }
     return by_dialect[axis.dialect]
@@ -309,6 +332,7 @@ def vendor(axis: AxisSpec) -> Vendor:
 def amplifier_dictionary(axis: AxisSpec) -> Dictionary:
     """Return all entries of an amplifier except the PDO parameters (1400h-1BFFh), which are in pdo.py."""
     make = vendor(axis)
-    objects = {key: entry for key, entry in _cia402(axis).items() if key[0] not in make.absent}
-    currents = {current.key: Entry(current.kind, mappable=Mappable.TRANSMIT) for current in make.currents}
-    return objects | currents | dict(make.others)
+    entries = [entry for entry in _cia402(axis) if entry.index not in make.absent]
+    entries += [Entry(*current.key, current.kind, Access.TPDO) for current in make.currents]
+    entries += make.others
+    return {(entry.index, entry.subindex): entry for entry in entries}

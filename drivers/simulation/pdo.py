@@ -12,10 +12,9 @@ from drivers.simulation.objects import (
     NO_OBJECT,
     NO_SUBINDEX,
     READ_ONLY,
+    Access,
     Dictionary,
-    Entry,
     Kind,
-    Mappable,
 )
 from drivers.simulation.spec import SdoAbort
 
@@ -58,8 +57,10 @@ class Pdo:
         locked: the mapping cannot be written.
     """
 
-    def __init__(self, direction: Mappable, parameters: PdoParameters, dictionary: Dictionary, source: Finder) -> None:
-        self._direction, self._dictionary, self._source = direction, dictionary, source
+    def __init__(self, direction: Access, parameters: PdoParameters, dictionary: Dictionary, source: Finder) -> None:
+        self._direction = direction
+        self._dictionary = dictionary
+        self._source = source
         self.parameters = parameters
         self.layout = struct.Struct("<")
         self.mapped: tuple[tuple[int, int], ...] = ()
@@ -75,7 +76,8 @@ class Pdo:
     @parameters.setter
     def parameters(self, parameters: PdoParameters) -> None:
         self._parameters = parameters
-        self.valid, self.can_id = not parameters.cob_id & INVALID, parameters.cob_id & 0x7FF
+        self.valid = not parameters.cob_id & INVALID
+        self.can_id = parameters.cob_id & 0x7FF
 
     def restore(self, parameters: PdoParameters) -> None:
         """Replace all parameters by defaults or saved ones."""
@@ -84,7 +86,8 @@ class Pdo:
 
     def reset(self) -> None:
         """Forget the last data sent (the node enters OPERATIONAL, or the PDO was changed)."""
-        self._syncs, self._last = 0, b""
+        self._syncs = 0
+        self._last = b""
         self._last_us: int | None = None
 
     def _map(self, parameters: PdoParameters) -> None:
@@ -123,7 +126,8 @@ class Pdo:
             return None
         if since_us is not None and since_us < 100 * parameters.inhibit_100us:
             return None
-        self._last, self._last_us = data, now_us
+        self._last = data
+        self._last_us = now_us
         return data
 
     def _data(self) -> bytes:
@@ -133,18 +137,21 @@ class Pdo:
     def _fields(self) -> dict[int, tuple[Kind, str]]:
         """Entries of 1400h or 1800h: data type and parameter."""
         fields = {1: (Kind.U32, "cob_id"), 2: (Kind.U8, "transmission")}
-        if self._direction is Mappable.TRANSMIT:
+        if self._direction is Access.TPDO:
             fields |= {3: (Kind.U16, "inhibit_100us"), 5: (Kind.U16, "event_timer_ms")}
         return fields
+
+    def _field(self, subindex: int) -> tuple[Kind, str]:
+        if subindex not in self._fields:
+            raise SdoAbort(NO_SUBINDEX)
+        return self._fields[subindex]
 
     def read_communication(self, subindex: int) -> bytes:
         """Return an entry of 1400h or 1800h."""
         if subindex == 0:
             return bytes([max(self._fields)])
-        if subindex not in self._fields:
-            raise SdoAbort(NO_SUBINDEX)
-        kind, name = self._fields[subindex]
-        return Entry(kind).encode(getattr(self.parameters, name))
+        kind, name = self._field(subindex)
+        return kind.encode(getattr(self.parameters, name))
 
     def read_mapping(self, subindex: int) -> bytes:
         """Return an entry of 1600h or 1A00h."""
@@ -152,18 +159,16 @@ class Pdo:
             return bytes([self.parameters.count])
         if subindex > MAX_ENTRIES:
             raise SdoAbort(NO_SUBINDEX)
-        return struct.pack("<I", self.parameters.entries[subindex - 1])
+        return Kind.U32.encode(self.parameters.entries[subindex - 1])
 
     def write_communication(self, subindex: int, data: bytes) -> None:
         """Write an entry of 1400h or 1800h."""
         if subindex == 0:
             raise SdoAbort(READ_ONLY)
-        if subindex not in self._fields:
-            raise SdoAbort(NO_SUBINDEX)
-        kind, name = self._fields[subindex]
+        kind, name = self._field(subindex)
         if name == "inhibit_100us" and self.valid:
             raise SdoAbort(UNSUPPORTED_ACCESS)  # the inhibit time shall not change while the PDO exists
-        value = Entry(kind).decode(data)
+        value = kind.decode(data)
         if name == "cob_id":
             if value & (1 << 29) or not 0x180 < (value & 0x7FF) < 0x580 or value >> 11 & 0x3FFFF:
                 raise SdoAbort(INVALID_VALUE)  # base frames alone, and no identifier that CiA 301 restricts
@@ -182,7 +187,7 @@ class Pdo:
         if self.valid:
             raise SdoAbort(UNSUPPORTED_ACCESS)
         if subindex == 0:
-            count = Entry(Kind.U8).decode(data)
+            count = Kind.U8.decode(data)
             if count > MAX_ENTRIES:
                 raise SdoAbort(INVALID_VALUE)
             used = self.parameters.entries[:count]
@@ -196,7 +201,7 @@ class Pdo:
             raise SdoAbort(NO_SUBINDEX)
         if self.parameters.count:
             raise SdoAbort(UNSUPPORTED_ACCESS)
-        entry = Entry(Kind.U32).decode(data)
+        entry = Kind.U32.decode(data)
         if entry:
             self._check(entry)
         entries = list(self.parameters.entries)
@@ -207,22 +212,24 @@ class Pdo:
         entry = self._dictionary.get((mapping >> 16, mapping >> 8 & 0xFF))
         if entry is None:
             raise SdoAbort(NO_OBJECT)
-        if entry.mappable is not self._direction or entry.kind.bits != mapping & 0xFF:
+        if entry.access is not self._direction or entry.kind.bits != mapping & 0xFF:
             raise SdoAbort(NOT_MAPPABLE)
 
 
 def default_pdos(node_id: int, dictionary: Dictionary, source: Finder) -> tuple[tuple[Pdo, ...], tuple[Pdo, ...]]:
     """Return receive and transmit PDOs with the default mapping of CiA 402-2; only the first of each is valid."""
 
-    def default(direction: Mappable, cob_id: int, mapping: tuple[int, ...]) -> Pdo:
-        entries = mapping + (0,) * (MAX_ENTRIES - len(mapping))
-        return Pdo(direction, PdoParameters(cob_id, 255, 0, 0, entries, len(mapping)), dictionary, source)
+    def made(direction: Access, first_cob_id: int, mappings: tuple[tuple[int, ...], ...]) -> tuple[Pdo, ...]:
+        pdos = []
+        for number, mapping in enumerate(mappings):
+            cob_id = first_cob_id + 0x100 * number + node_id
+            if number:
+                cob_id |= INVALID
+            entries = mapping + (0,) * (MAX_ENTRIES - len(mapping))
+            parameters = PdoParameters(cob_id, 255, 0, 0, entries, len(mapping))
+            pdos.append(Pdo(direction, parameters, dictionary, source))
+        return tuple(pdos)
 
     receive = ((0x60400010,), (0x60400010, 0x60600008), (0x60400010, 0x607A0020), (0x60400010,))
     transmit = ((0x60410010,), (0x60410010, 0x60610008), (0x60410010, 0x60640020), (0x60410010, 0x606C0020))
-    first = (node_id + 0x180) | NO_RTR
-    offsets = [0x100 * number | (INVALID if number else 0) for number in range(4)]
-    return (
-        tuple(default(Mappable.RECEIVE, 0x200 + node_id + k, m) for k, m in zip(offsets, receive, strict=True)),
-        tuple(default(Mappable.TRANSMIT, first + k, m) for k, m in zip(offsets, transmit, strict=True)),
-    )
+    return made(Access.RPDO, 0x200, receive), made(Access.TPDO, 0x180 | NO_RTR, transmit)

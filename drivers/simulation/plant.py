@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from drivers.simulation.closures import OPEN, SINGULAR, Mechanism, link_frame, settle
-from drivers.simulation.dynamics import TOLERANCE_RAD_S, Mechanics, advance, advance_closed
+from drivers.simulation.dynamics import TOLERANCE_RAD_S, Mechanics, advance, advance_closed, turn_rotors
 from drivers.simulation.effects import AMBIENT_C, Coupling, Effect, Elasticity, Lag, Moment, build_effect
 from drivers.simulation.noise import ColouredNoise, random_streams
 from drivers.simulation.spec import (
-    Body,
+    AxisSpec,
+    BoolArray,
     CellSpec,
     ClosureLost,
     FloatArray,
     FrictionUnsolved,
+    IntArray,
     PassiveFriction,
     SpecInvalid,
 )
@@ -42,14 +44,17 @@ def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag], joints: int) -> tup
     Raises:
         SpecInvalid: the drive train is wrong, or two flexible drives are given for one motor.
     """
-    n, rows, step_s = len(spec.axes), motor_rows(spec.ratio), spec.sync_period_us * 1e-6 / spec.substeps
+    n = len(spec.axes)
+    rows = motor_rows(spec.ratio)
+    step_s = spec.sync_period_us * 1e-6 / spec.substeps
     flexible = tuple(effect for effect in effects if isinstance(effect, Elasticity))
     if len({drive.axis for drive in flexible}) < len(flexible):
         raise SpecInvalid("two flexible drives on one motor; give elasticity and gap in one backlash effect")
     total = joints + len(flexible)
     motor_direction = np.hstack([rows, np.zeros((n, total - n))])
     for coordinate, drive in enumerate(flexible, start=joints):
-        drive.coordinate, drive.row = coordinate, rows[drive.axis]
+        drive.coordinate = coordinate
+        drive.row = rows[drive.axis]
         motor_direction[drive.axis] = np.eye(total)[coordinate]
     directions = list(np.eye(joints, total))
     own_row = np.zeros(n, dtype=np.int64)
@@ -125,40 +130,52 @@ class Plant:
             SpecInvalid: URDF, drive train, axes, closures and start position do not fit together, or an undeclared
                 effect or its parameters do not exist.
         """
-        model = link_model(spec.urdf, spec.gravity_m_s2, spec.payload, spec.platform)
+        self.mount(spec)
         n = len(spec.axes)
-        self.mechanism = Mechanism(model, spec) if spec.closures else None
-        if (self.mechanism is None and model.nv != n) or spec.ratio.shape != (n, n) or spec.start_rad.shape != (n,):
+        self.mechanism = Mechanism(self._model, spec) if spec.closures else None
+        if (
+            (self.mechanism is None and self._model.nv != n)
+            or spec.ratio.shape != (n, n)
+            or spec.start_rad.shape != (n,)
+        ):
             raise SpecInvalid(
-                f"{n} axes, a URDF of {model.nv} joints, a drive train of shape {spec.ratio.shape} and a start "
+                f"{n} axes, a URDF of {self._model.nv} joints, a drive train of shape {spec.ratio.shape} and a start "
                 f"position of shape {spec.start_rad.shape}; all must have the same number of axes"
             )
-        start_rad = spec.start_rad if self.mechanism is None else self.mechanism.start_rad
-        self._passive_joints = () if self.mechanism is None else self.mechanism.joints[n:]
+        start_rad = spec.start_rad
+        mobility = n
+        self._passive_joints: tuple[str, ...] = ()
+        self._order: slice | IntArray = slice(None)  # of the joints in Pinocchio's model
+        if self.mechanism is not None:
+            start_rad = self.mechanism.start_rad
+            mobility = self.mechanism.mobility
+            self._passive_joints = self.mechanism.joints[n:]
+            self._order = self.mechanism.order
         effects = [build_effect(effect, n, self._passive_joints) for effect in spec.effects]
         self._joints = n + len(self._passive_joints)
         self._mechanics, flexible = lay_out(spec, effects, self._joints)
         self._constants = tuple(self._mechanics)
         m, total = self._mechanics.directions.shape
-        axes, added = spec.axes, [0.0] * len(flexible)
-        passive = [spec.passive.get(name, PassiveFriction()) for name in self._passive_joints]
+        with_friction: list[AxisSpec | PassiveFriction] = [*spec.axes]
+        with_friction += [spec.passive.get(name, PassiveFriction()) for name in self._passive_joints]
         self.time_s = 0.0
         self.position_rad = np.concatenate([start_rad, [drive.row @ start_rad[:n] for drive in flexible]])
         self.velocity_rad_s = np.zeros(total)
         self.load_torque_nm = np.zeros(self._joints)
-        self.motor_rad = self._mechanics.rotor_direction @ self.position_rad
+        self.motor_rad = np.zeros(n)
         self.temperature_c = np.full(n, AMBIENT_C)
-        self._model, self._data = model, model.createData()
         self._acting = tuple(e for e in effects if not isinstance(e, Lag))
         self._rows = motor_rows(spec.ratio)
-        self._gain = np.array([a.gain_nm_per_a for a in axes])
-        self._viscous = np.array([a.viscous_nm_s_rad for a in axes] + [p.viscous_nm_s_rad for p in passive] + added)
+        self._gain = np.array([a.gain_nm_per_a for a in spec.axes])
+        self._viscous = np.zeros(total)
+        self._viscous[: self._joints] = [joint.viscous_nm_s_rad for joint in with_friction]
         # The paper's offset is on the motor's side of eq. 1, so it acts against the joint.
-        self._torque = np.array([-a.offset_nm for a in axes] + [0.0] * len(passive) + added)
+        self._torque = np.zeros(total)
+        self._torque[:n] = [-a.offset_nm for a in spec.axes]
         self._free_bound = np.zeros(m)
-        self._free_bound[: self._joints] = [a.coulomb_nm for a in axes] + [p.coulomb_nm for p in passive]
-        np.add.at(self._free_bound, self._mechanics.own_row, [a.motor_coulomb_nm for a in axes])
-        self._brake_nm = np.array([BRAKE_FACTOR * abs(a.gain_nm_per_a) * a.peak_current_a for a in axes])
+        self._free_bound[: self._joints] = [joint.coulomb_nm for joint in with_friction]
+        np.add.at(self._free_bound, self._mechanics.own_row, [a.motor_coulomb_nm for a in spec.axes])
+        self._brake_nm = np.array([BRAKE_FACTOR * abs(a.gain_nm_per_a) * a.peak_current_a for a in spec.axes])
         self._bound = self._free_bound.copy()
         self._moment = Moment(
             time_s=0.0,
@@ -176,8 +193,9 @@ class Plant:
         )
         self._impulse = np.zeros(m)
         self._resting = np.zeros(total, dtype=np.bool_)
-        self._basis = np.zeros((self._joints, n if self.mechanism is None else self.mechanism.mobility))
+        self._basis = np.eye(self._joints, mobility)
         self._settle()
+        turn_rotors(self._mechanics.rotor_direction, self.position_rad, self.motor_rad)
         self.disturbance_nm = np.zeros(n)
         self._disturbance = _disturbance(spec, self._mechanics.step_s)
         self._refuse_stiff(flexible, spec)
@@ -195,15 +213,15 @@ class Plant:
         """
         if not flexible:
             return
-        step_s, n = self._mechanics.step_s, len(spec.axes)
-        bare = link_model(spec.urdf, spec.gravity_m_s2, None, spec.platform)
+        step_s = self._mechanics.step_s
+        bare = link_model(replace(spec, payload=None))
+        postures = [self.position_rad[: self._joints]]
         if self.mechanism is None:
-            basis, postures = np.eye(n), tuple(np.transpose(self.postures(spec.start_rad, POSTURES)))
-        else:
-            basis, postures = self._basis, (self.position_rad[: self._joints],)
+            postures = list(np.transpose(self.postures(spec.start_rad, POSTURES)))
+        basis = self._basis
         masses = [basis.T @ self._mass(bare, bare.createData(), position) @ basis for position in postures]
         for drive in flexible:
-            row = drive.row @ basis[:n]
+            row = drive.row @ basis[: len(spec.axes)]
             links = min(1.0 / float(row @ np.linalg.solve(mass, row)) for mass in masses)
             motor = spec.axes[drive.axis].motor_inertia_kg_m2
             stiff = (2.0 * drive.damping_nm_s_per_rad + drive.stiffness_nm_per_rad * step_s) * step_s
@@ -213,14 +231,14 @@ class Plant:
                     f"motor inertia of {motor:g} kg m² and {links:.3g} kg m² behind it; lower stiffness or damping"
                 )
 
-    def set_brakes(self, closed: NDArray[np.bool_]) -> None:
+    def set_brakes(self, closed: BoolArray) -> None:
         """Close or open the brake of each motor, shape (n,)."""
         self._bound[:] = self._free_bound
         np.add.at(self._bound, self._mechanics.own_row, np.where(closed, self._brake_nm, 0.0))
 
     def mount(self, spec: CellSpec) -> None:
         """Replace the payload by that of another description of the same cell; the state is kept."""
-        self._model = link_model(spec.urdf, spec.gravity_m_s2, spec.payload, spec.platform)
+        self._model = link_model(spec)
         self._data = self._model.createData()
 
     def postures(self, start_rad: FloatArray, count: int) -> tuple[FloatArray, ...]:
@@ -229,7 +247,8 @@ class Plant:
         They are spread over one revolution from the start of a revolute joint, or over the travel of a prismatic one.
         """
         angles = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
-        lower, upper = self._model.lowerPositionLimit, self._model.upperPositionLimit
+        lower = self._model.lowerPositionLimit
+        upper = self._model.upperPositionLimit
         # Pinocchio has a joint type for each sliding axis, as JointModelPX, or JointModelPrismaticUnaligned.
         sliding = [str(joint.shortname()).startswith("JointModelP") for joint in self._model.joints[1:]]
         return tuple(
@@ -243,16 +262,15 @@ class Plant:
         Redundant drives cannot rest alone: with A = P G theirs is (A⁺ᵀ Gᵀ M G A⁺)ᵢᵢ / (A A⁺)ᵢᵢ, the share of motor i by
         least squares in the motion that turns it most. A closed chain has the position of its last step alone.
         """
-        if self.mechanism is not None:
-            n = len(self._gain)
-            links = self._mass(self._model, self._data, self.position_rad[: self._joints])
-            motors = self._rows @ self._basis[:n]
-            to_speed = np.linalg.pinv(motors)
-            shared = to_speed.T @ self._basis.T @ links @ self._basis @ to_speed
-            return np.asarray(np.diag(shared) / np.diag(motors @ to_speed) + self._mechanics.motor_inertia)
-        to_joint = np.linalg.inv(self._rows)
-        links = self._mass(self._model, self._data, position_rad)
-        return np.asarray(np.diag(to_joint.T @ links @ to_joint) + self._mechanics.motor_inertia)
+        if self.mechanism is None:
+            to_joint = np.linalg.inv(self._rows)
+            links = self._mass(self._model, self._data, position_rad)
+            return np.asarray(np.diag(to_joint.T @ links @ to_joint) + self._mechanics.motor_inertia)
+        links = self._mass(self._model, self._data, self.position_rad[: self._joints])
+        motors = self._rows @ self._basis[: len(self._gain)]
+        to_speed = np.linalg.pinv(motors)
+        shared = to_speed.T @ self._basis.T @ links @ self._basis @ to_speed
+        return np.asarray(np.diag(shared) / np.diag(motors @ to_speed) + self._mechanics.motor_inertia)
 
     def step(self, current_a: FloatArray) -> None:
         """Advance by one substep with the motor currents, shape (m,).
@@ -274,24 +292,29 @@ class Plant:
         if self._disturbance is not None:
             self.disturbance_nm = self._disturbance.advance()
             moment.motor_torque_nm += self.disturbance_nm
-        residual = self._advance() if self.mechanism is None else self._advance_closed(self.mechanism)
+        residual = self._advance()
         if not residual <= TOLERANCE_RAD_S:
             raise FrictionUnsolved(
                 f"dry friction at {self.time_s:.6f} s: residual {residual:.3g} rad/s, expected at most "
                 f"{TOLERANCE_RAD_S:.3g}; check the inertias and friction of the cell for values that differ by many "
                 "orders of magnitude"
             )
-        if self.mechanism is not None and not self._resting.all():
+        if not self._resting.all():
             self._settle()
+        turn_rotors(self._mechanics.rotor_direction, self.position_rad, self.motor_rad)
         self.time_s += self._mechanics.step_s
 
     def _advance(self) -> float:
-        n, moment = self._joints, self._moment
-        position = self.position_rad[:n]
-        return advance(
+        n = self._joints
+        position = np.empty(n)
+        velocity = np.empty(n)
+        position[self._order] = self.position_rad[:n]
+        velocity[self._order] = self.velocity_rad_s[:n]
+        moment = self._moment
+        step = (
             self._constants,
-            np.ascontiguousarray(pin.crba(self._model, self._data, position)),
-            pin.nonLinearEffects(self._model, self._data, position, self.velocity_rad_s[:n]),
+            self._mass(self._model, self._data, self.position_rad[:n]),
+            pin.nonLinearEffects(self._model, self._data, position, velocity)[self._order],
             moment.viscous_nm_s_rad,
             moment.motor_torque_nm,
             moment.torque_nm,
@@ -300,42 +323,16 @@ class Plant:
             self.position_rad,
             self.velocity_rad_s,
             self.load_torque_nm,
-            self.motor_rad,
         )
-
-    def _advance_closed(self, mechanism: Mechanism) -> float:
-        n, moment = self._joints, self._moment
-        position, velocity = np.empty(n), np.empty(n)
-        position[mechanism.order], velocity[mechanism.order] = self.position_rad[:n], self.velocity_rad_s[:n]
-        return advance_closed(
-            self._constants,
-            mechanism.order,
-            self._basis,
-            np.ascontiguousarray(pin.crba(self._model, self._data, position)),
-            pin.nonLinearEffects(self._model, self._data, position, velocity),
-            moment.viscous_nm_s_rad,
-            moment.motor_torque_nm,
-            moment.torque_nm,
-            moment.bound_nm * self._mechanics.step_s,
-            self._impulse,
-            self.position_rad,
-            self.velocity_rad_s,
-            self.load_torque_nm,
-            self._resting,
-        )
+        if self.mechanism is None:
+            return advance(*step)
+        return advance_closed(*step, self._basis, self._resting)
 
     def _settle(self) -> None:
         """Return the joints of a closed chain to its closures; nothing is done for a serial robot."""
         if self.mechanism is None:
             return
-        open_by, pivot = settle(
-            self.mechanism.constants,
-            self._mechanics.rotor_direction,
-            self._resting,
-            self.position_rad,
-            self._basis,
-            self.motor_rad,
-        )
+        open_by, pivot = settle(self.mechanism.constants, self._resting, self.position_rad, self._basis)
         if not (open_by <= OPEN and pivot >= SINGULAR):
             raise ClosureLost(
                 f"closures at {self.time_s:.6f} s: open by {open_by:.3g} m or rad, smallest pivot {pivot:.3g} of the "
@@ -345,10 +342,9 @@ class Plant:
 
     def _mass(self, model: pin.Model, data: pin.Data, position_rad: FloatArray) -> FloatArray:
         """Return the mass matrix of the links in the order of the plant's joints, shape (n, n)."""
-        order = np.arange(self._joints) if self.mechanism is None else self.mechanism.order
-        position = np.empty(len(order))
-        position[order] = position_rad
-        return np.array(pin.crba(model, data, position))[np.ix_(order, order)]
+        position = np.empty(self._joints)
+        position[self._order] = position_rad
+        return np.ascontiguousarray(pin.crba(model, data, position)[self._order][:, self._order])
 
 
 def _disturbance(spec: CellSpec, step_s: float) -> ColouredNoise | None:
@@ -361,17 +357,15 @@ def _disturbance(spec: CellSpec, step_s: float) -> ColouredNoise | None:
     return ColouredNoise(random_streams(spec.seed, len(spec.axes), DISTURBANCE), sigma_nm, correlation_s, step_s)
 
 
-def link_model(
-    urdf: str, gravity_m_s2: tuple[float, float, float], payload: Body | None, platform: str | None = None
-) -> pin.Model:
-    """Return the links of a URDF, with a payload fixed to the last joint or to the link `platform`.
+def link_model(spec: CellSpec) -> pin.Model:
+    """Return the links of a cell, with its payload fixed to the last joint or to the link `platform`.
 
     Raises:
         SpecInvalid: the text is no URDF, a joint is neither revolute nor prismatic with limits, or there is no such
             link.
     """
     try:
-        model = pin.buildModelFromXML(urdf)
+        model = pin.buildModelFromXML(spec.urdf)
     except (ValueError, RuntimeError) as error:
         raise SpecInvalid(f"the URDF of the plant cannot be read: {error}") from error
     if model.nq != model.nv or model.nv != model.njoints - 1:
@@ -379,14 +373,15 @@ def link_model(
             f"the URDF has {model.njoints - 1} joints with {model.nq} coordinates and {model.nv} degrees of freedom; "
             "expected revolute or prismatic joints alone (a continuous joint is written as revolute with wide limits)"
         )
-    model.gravity.linear = np.asarray(gravity_m_s2, dtype=np.float64)
+    model.gravity.linear = np.asarray(spec.gravity_m_s2, dtype=np.float64)
+    payload = spec.payload
     if payload is not None:
         xx, xy, xz, yy, yz, zz = payload.inertia_kg_m2
         inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         body = pin.Inertia(payload.mass_kg, np.asarray(payload.centre_m, dtype=np.float64), inertia)
-        if platform is None:
+        if spec.platform is None:
             model.appendBodyToJoint(model.njoints - 1, body, pin.SE3.Identity())
         else:
-            frame = link_frame(model, platform)
+            frame = link_frame(model, spec.platform)
             model.appendBodyToJoint(frame.parentJoint, body, frame.placement)
     return model

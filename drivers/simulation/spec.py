@@ -20,6 +20,8 @@ from drivers.errors import DriverError
 from drivers.simulation.faults import FaultSpec
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 Positive = Annotated[float, Gt(0)]
 ToggleBit = Literal[8, 14, 15]
 NotNegative = Annotated[float, Ge(0)]

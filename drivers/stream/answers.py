@@ -83,7 +83,8 @@ class Answers:
 
     def begin(self) -> None:
         """Begin a cycle."""
-        self._still_owed, self._answered_slots = self._owed_slots, 0
+        self._still_owed = self._owed_slots
+        self._answered_slots = 0
         self._before.clear()
 
     @property

@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterator, Sequence
 
 import can
 
+from drivers.canopen.bus import base_frame, is_plain
 from drivers.canopen.link import SYNC_COB_ID, Link
 from drivers.canopen.sdo import Clock
 from drivers.canopen.socketcan import CapturedMessage
 from drivers.errors import BusError, DriverError
-from drivers.messages import EventSink
+from drivers.messages import CellEvent, EventKind, EventSink
 
 LARGEST_LAG_NS = 1_000_000_000  #: Largest delay of the reader behind the bus; older data cannot protect moving axes
 LOOK_EVERY = 64  #: Frames between two looks at the clock while frames are waiting: each is a system call
@@ -21,11 +22,6 @@ LOOK_EVERY = 64  #: Frames between two looks at the clock while frames are waiti
 def nothing_to_send(_: int) -> Sequence[can.Message]:
     """Return no frames: see `CycleBus.spare`."""
     return ()
-
-
-def is_plain(message: can.Message) -> bool:
-    """Return whether a frame is a data frame with a base identifier, as all of CANopen are."""
-    return not (message.is_error_frame or message.is_extended_id or message.is_remote_frame)
 
 
 def is_sync(message: can.Message) -> bool:
@@ -45,7 +41,6 @@ class CycleBus:
         link: its bus is open once the stream begins.
         clock: monotonic [ns].
         start_ns: time of the first SYNC in the samples [ns since 1970].
-        faults: receives what must stop a recording.
         emit: receives events.
         between: processes a frame that is read before the next SYNC, and so answers none that is open.
     """
@@ -55,13 +50,14 @@ class CycleBus:
         link: Link,
         clock: Clock,
         start_ns: int,
-        faults: deque[DriverError],
         emit: EventSink,
         between: Callable[[can.Message], None],
     ) -> None:
         self.link = link
         self.clock = clock
-        self.faults = faults
+        self.faults: deque[DriverError] = (
+            deque()
+        )  #: What must stop a recording and was not raised yet, the oldest first
         self.emit = emit
         self.between = between
         self.cycles = 0  #: SYNCs sent, or followed
@@ -75,7 +71,7 @@ class CycleBus:
         self.spare: Callable[[int], Sequence[can.Message]] = nothing_to_send
         self._start_ns = start_ns
         self._first_sync_ns = 0
-        self._sync = can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False)
+        self._sync = base_frame(SYNC_COB_ID)
         self._take_batched: Callable[[], can.Message | None] | None = None
         self._unlooked = 0
         self._reported_late = False
@@ -83,6 +79,10 @@ class CycleBus:
     def begin(self) -> None:
         """Find how the open bus is read."""
         self._take_batched = getattr(self.link.bus, "take", None)
+
+    def report(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
+        """Emit an event of an axis, or of the whole cell, at the time of the last SYNC."""
+        self.emit(CellEvent(self.time_ns, axis, kind, code, text))
 
     def stamp(self, at_ns: int) -> None:
         """Take over the time of a SYNC by the clock [ns] as that of its cycle."""

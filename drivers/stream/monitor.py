@@ -14,11 +14,11 @@ from enum import Enum
 
 import can
 
-from drivers.canopen.bus import bus_errors
-from drivers.canopen.link import EMCY, HEARTBEAT, SYNC_COB_ID, Link
+from drivers.canopen.bus import bus_errors, is_plain
+from drivers.canopen.link import SYNC_COB_ID, Link
 from drivers.canopen.pdo import feedback_entries
 from drivers.canopen.sdo import SDO_ANSWER, SDO_REQUEST, upload_answer, upload_request
-from drivers.canopen.split_bus import SplitAddress
+from drivers.canopen.split_bus import FROM_NODES, SplitAddress
 from drivers.messages import CellEvent, Sample
 from drivers.profiles.profile import Axis, ObjectEntry
 from drivers.stream.answers import slots_of
@@ -27,8 +27,6 @@ QUIET_S = 2.0  #: Silence of other masters after which the axes are read by SDO
 ANSWER_S = 0.3  #: Time allowed for an answer; CiA 301 sets no limit, and drives answer within milliseconds
 ABANDONED_S = 1.0  #: A request without an answer for so long is lost, and the axis is asked anew
 READING_S = 0.1  #: Time between two SDO readings of an axis: six axes then load a bus of 1 Mbit/s by some 5 %
-SENT_BY_NODES = frozenset((EMCY, 0x180, 0x280, 0x380, 0x480, SDO_ANSWER, HEARTBEAT))
-"""COB-IDs of what a node sends, without its node id (CiA 301, predefined connection set)."""
 
 
 class ReadingSource(Enum):
@@ -112,7 +110,8 @@ class _AxisWatch:
             None if self.delay_ns is None else self.delay_ns * 1e-9,
             tuple(self.refused[column] for column in sorted(self.refused)),
         )
-        self.readings, self.delay_ns = 0, None
+        self.readings = 0
+        self.delay_ns = None
         return reading
 
     def hear(self, cob_id: int, data: bytes) -> None:
@@ -164,7 +163,8 @@ class _AxisWatch:
 
     def drop(self) -> None:
         """Wait for no answer any more."""
-        self.asked_ns, self.asked = None, -1
+        self.asked_ns = None
+        self.asked = -1
 
 
 class CellMonitor:
@@ -190,7 +190,9 @@ class CellMonitor:
         """
         self.period_ns: int | None = None
         """Period of SYNC; SYNCs that this program missed then leave a gap in the samples' cycles. None counts SYNCs."""
-        self._link, self._on_sample, self._offset_ns = link, on_sample, wall_minus_monotonic_ns
+        self._link = link
+        self._on_sample = on_sample
+        self._offset_ns = wall_minus_monotonic_ns
         self._taken = taken
         self._axes = tuple(_AxisWatch(axis) for axis in axes)
         self._by_cob_id = {cob_id: axis for axis in self._axes for cob_id in axis.slots}
@@ -228,7 +230,8 @@ class CellMonitor:
         axes = tuple(axis.take(self._link.nmt.get(axis.node_id), self._since_ns, now_ns) for axis in self._axes)
         self._since_ns = now_ns
         frames = tuple(tuple(self._frames[bus, length] for length in range(9)) for bus in range(len(self._buses)))
-        sync_hz, self._syncs = self._syncs / lasted_s, 0
+        sync_hz = self._syncs / lasted_s
+        self._syncs = 0
         self._frames.clear()
         events = self._link.take_events(now_ns + self._offset_ns, tuple(self._by_node))
         return CellReading(self.source, lasted_s, axes, sync_hz, frames, events)
@@ -253,12 +256,12 @@ class CellMonitor:
     def _hear(self, message: can.Message) -> None:
         bus = 0 if self._split is None else self._buses.index(str(message.channel))
         self._frames[bus, len(message.data)] += 1
-        if message.is_error_frame or message.is_extended_id or message.is_remote_frame:
+        if not is_plain(message):
             self._link.dispatch(message)
             return
         identifier = message.arbitration_id
         axis = self._by_node.get(identifier & 0x7F)
-        if axis is not None and identifier & ~0x7F in SENT_BY_NODES:
+        if axis is not None and identifier & ~0x7F in FROM_NODES:
             axis.heard_ns = self._link.clock()
         if identifier == SYNC_COB_ID:
             self._syncs += 1
@@ -286,7 +289,8 @@ class CellMonitor:
 
     def _sample_overheard(self, stamp_s: float) -> None:
         """Complete the sample of the SYNC before this one, which has the given time stamp."""
-        before, self._sync = self._sync, (self._link.clock(), stamp_s)
+        before = self._sync
+        self._sync = (self._link.clock(), stamp_s)
         if before is None:
             return
         self._emit(before[0], [axis.seen != axis.slots.keys() for axis in self._axes])

@@ -11,14 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
 
 import can
 
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.scale import ScaleReading
-from drivers.canopen.sdo import NO_SUCH_OBJECT, UploadAnswer, upload_answer, upload_request
+from drivers.canopen.sdo import NO_SUCH_OBJECT, upload_answer, upload_request
 from drivers.errors import BusError, ObjectAccessError
-from drivers.messages import CellEvent, EventKind, Quantity, SlowReading
+from drivers.messages import EventKind, Quantity, SlowReading
 from drivers.profiles.profile import Axis, ObjectEntry
 from drivers.stream.stream import SyncStream
 
@@ -27,21 +29,16 @@ PERIOD_NS = {Quantity.TORQUE: 200_000_000, Quantity.TEMPERATURE: 1_000_000_000}
 GIVEN_UP_NS = 250_000_000  #: Time after which an answer is lost: the SDO servers of drives need some milliseconds
 
 
+@dataclass(eq=False, slots=True)
 class _Source:
     """One object of one drive."""
 
-    def __init__(
-        self, polling: Polling, axis: int, node_id: int, entry: ObjectEntry, quantity: Quantity, per_unit: float
-    ) -> None:
-        self.axis, self.node_id, self.entry = axis, node_id, entry
-        self.quantity, self.per_unit = quantity, per_unit
-        self.due_ns = 0
-        self._polling = polling
-
-    def receive(self, data: bytearray) -> None:
-        """Take an SDO answer of the node, if it is the one that is awaited."""
-        if (answer := upload_answer(bytes(data), self.entry)) is not None:
-            self._polling.answer(self, answer)
+    axis: int
+    node_id: int
+    entry: ObjectEntry
+    quantity: Quantity
+    per_unit: float
+    due_ns: int = 0
 
 
 class Polling:
@@ -53,7 +50,8 @@ class Polling:
     """
 
     def __init__(self, network: CanopenNetwork, *, beside_stream: bool = True) -> None:
-        self._network, self._beside_stream = network, beside_stream
+        self._network = network
+        self._beside_stream = beside_stream
         self._stream: SyncStream | None = None
         self._keep: Callable[[SlowReading], None] = lambda _: None
         self._asked: _Source | None = None
@@ -72,7 +70,7 @@ class Polling:
         for number, (axis, scale) in enumerate(zip(network.axes, network.scales(), strict=True)):
             for quantity, (entry, per_unit) in slow_objects(axis, scale).items():
                 try:
-                    network.link.objects(axis.node_id).read(entry)
+                    network.objects(axis).read(entry)
                 except ObjectAccessError as error:
                     if error.abort_code is None or error.abort_code in NO_SUCH_OBJECT:
                         why = "" if error.abort_code is not None else f" that can be read ({error.reason})"
@@ -84,9 +82,9 @@ class Polling:
                         f"{axis.name}: the drive refused its {quantity.value} in {entry} at first "
                         f"({error.reason}); it is asked again in the run"
                     )
-                source = _Source(polling, number, axis.node_id, entry, quantity, per_unit)
+                source = _Source(number, axis.node_id, entry, quantity, per_unit)
                 polling._sources.append(source)
-                network.link.listen(axis.node_id, source)
+                network.link.listen(axis.node_id, partial(polling._take, source))
         return polling
 
     @property
@@ -106,7 +104,8 @@ class Polling:
         Args:
             time_ns: on the clock of the samples [ns].
         """
-        self._asked, found = None, []
+        self._asked = None
+        found = []
         for source in self._sources:
             if source.quantity is Quantity.TEMPERATURE:
                 with suppress(ObjectAccessError, BusError):
@@ -117,7 +116,9 @@ class Polling:
     def begin(self, stream: SyncStream, keep: Callable[[SlowReading], None]) -> None:
         """Pass readings on from now on, made beside a stream until it stops the axes, if the bus has room."""
         if self._beside_stream:
-            self._stream, self._keep, stream.spare = stream, keep, self._request
+            self._stream = stream
+            self._keep = keep
+            stream.bus.spare = self._request
 
     def _request(self, now_ns: int) -> Sequence[can.Message]:
         """Return the request that is due; none while another one waits for its answer."""
@@ -128,12 +129,14 @@ class Polling:
         if source is None or source.due_ns > now_ns:
             return ()
         source.due_ns = now_ns + PERIOD_NS[source.quantity]  # from now on: after a pause nothing is caught up
-        self._asked, self._asked_ns = source, now_ns
+        self._asked = source
+        self._asked_ns = now_ns
         return (upload_request(source.node_id, source.entry),)
 
-    def answer(self, source: _Source, answer: UploadAnswer) -> None:
+    def _take(self, source: _Source, data: bytearray) -> None:
         """Keep the value of an answer to the request on its way; other answers are the business of others."""
-        if source is not self._asked or self._stream is None:
+        answer = upload_answer(bytes(data), source.entry)
+        if answer is None or source is not self._asked or self._stream is None:
             return
         self._asked = None
         if answer.value is not None:
@@ -149,11 +152,12 @@ class Polling:
     def _drop(self, source: _Source, why: str) -> None:
         """Ask no more for an object, and say so in the log and in the remarks."""
         self._sources.remove(source)
-        name, entry = self._network.axes[source.axis].name, source.entry
+        name = self._network.axes[source.axis].name
+        entry = source.entry
         text = f"{name}: the {source.quantity.value} in {entry} {why}; it is not logged"
         self._remarks.append(text)
         if self._stream is not None:
-            self._stream.emit(CellEvent(self._stream.time_ns, source.axis, EventKind.CAPTURE, entry.index, text))
+            self._stream.bus.report(source.axis, EventKind.CAPTURE, entry.index, text)
 
 
 def slow_objects(axis: Axis, scale: ScaleReading) -> dict[Quantity, tuple[ObjectEntry, float]]:

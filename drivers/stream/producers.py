@@ -15,19 +15,18 @@ import socket
 import struct
 from contextlib import AbstractContextManager
 from math import ceil
-from types import TracebackType
 
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.capture import FRAME
 from drivers.canopen.link import SYNC_COB_ID
 from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.sdo import Clock, download_request
+from drivers.canopen.sdo import download_request
 from drivers.errors import WHILE, BusError, DriverError
 from drivers.profiles.profile import ObjectEntry
-from drivers.stream.sync import FollowedSync
+from drivers.stream.sync import Producer
 
-SYNC_COB_ID_OBJECT = ObjectEntry(0x1005, 0, 32, signed=False)
-CYCLE_PERIOD = ObjectEntry(0x1006, 0, 32, signed=False)
+SYNC_COB_ID_OBJECT = ObjectEntry(0x1005, 0, 32)
+CYCLE_PERIOD = ObjectEntry(0x1006, 0, 32)
 """Period [us]; a producer sends no SYNC while it is 0 (CiA 301)."""
 PRODUCES = 1 << 30
 LEASE_S = 0.4  #: Time for which the kernel goes on alone; less than the 0.5 s of the amplifiers' own watch
@@ -36,7 +35,10 @@ RENEWAL_S = 0.025  #: Time between two renewals
 STEERING_S = 0.25  #: Time between two corrections of the kernel's interval
 LARGEST_CORRECTION = 0.2
 """Fraction of the period; a kernel that is later than that produces time stamps which are refused."""
-_TX_SETUP, _SET_TIMER, _SET_AND_START_TIMER = 1, 0x1, 0x3  # linux/can/bcm.h
+# linux/can/bcm.h
+_TX_SETUP = 1
+_SET_TIMER = 0x1
+_SET_AND_START_TIMER = 0x3
 # struct bcm_msg_head: opcode, flags, count, two intervals of (s, us), identifier, number of frames; then can_frame.
 _HEAD = struct.Struct("@3I4l2I0q")
 
@@ -59,7 +61,7 @@ def setup_message(flags: int, interval_us: int) -> bytes:
     return head + FRAME.pack(SYNC_COB_ID, 0, bytes(8))
 
 
-class KernelProducer(AbstractContextManager["KernelProducer"]):
+class KernelProducer(Producer, AbstractContextManager["KernelProducer"]):
     """SYNC by the kernel's broadcast manager (CAN_BCM), whose timer needs no process to wake up.
 
     It ends with the process that started it, and `LEASE_S` after that process has seen its last SYNC: a recorder that
@@ -68,11 +70,11 @@ class KernelProducer(AbstractContextManager["KernelProducer"]):
     shortens the interval.
     """
 
-    name = "the kernel"
+    in_kernel = True
 
     def __init__(self, network: CanopenNetwork, period_us: int) -> None:
+        super().__init__("the kernel", period_us)
         self._link = network.link
-        self._period_us = period_us
         self._socket: socket.socket | None = None
         self._interval_us = period_us
         self._window = max(8, round(STEERING_S * 1e6 / period_us))
@@ -102,19 +104,6 @@ class KernelProducer(AbstractContextManager["KernelProducer"]):
             reason = f"SYNC by the kernel: {os.strerror(error.errno or 0)} {name}; modprobe can-bcm?"
             raise BusError(str(address), reason) from error
 
-    def pacing(self, timeout_s: float, start_ns: int, clock: Clock) -> FollowedSync:
-        """Return the pacing of a stream that follows this producer and steers it; see `FollowedSync`."""
-        return FollowedSync(
-            1000 * self._period_us,
-            self.name,
-            in_kernel=True,
-            timeout_s=timeout_s,
-            seen=self.seen,
-            stop=self.pause,
-            start_ns=start_ns,
-            clock=clock,
-        )
-
     def seen(self, monotonic_ns: int, periods: int) -> None:
         """Process a SYNC and its periods since the one before, 0 for the first; keeps average period and phase."""
         if self._socket is not None and not 0 <= monotonic_ns - self._renewed_ns < RENEWAL_S * 1e9:
@@ -122,15 +111,18 @@ class KernelProducer(AbstractContextManager["KernelProducer"]):
             self._renewed_ns = monotonic_ns
             self._socket.send(setup_message(_SET_TIMER, self._interval_us))
         if periods == 0:
-            self._begun_ns, self._phase_ns, self._periods = monotonic_ns, 0, 0
+            self._begun_ns = monotonic_ns
+            self._phase_ns = 0
+            self._periods = 0
             return
         self._periods += periods
         if self._periods < self._window or self._socket is None:
             return
-        late_ns = monotonic_ns - self._begun_ns - 1000 * self._period_us * self._periods
+        late_ns = monotonic_ns - self._begun_ns - 1000 * self.period_us * self._periods
         self._phase_ns += late_ns
-        interval_us = steered_us(self._period_us, self._interval_us, late_ns, self._phase_ns, self._periods)
-        self._begun_ns, self._periods = monotonic_ns, 0
+        interval_us = steered_us(self.period_us, self._interval_us, late_ns, self._phase_ns, self._periods)
+        self._begun_ns = monotonic_ns
+        self._periods = 0
         if interval_us != self._interval_us:
             self._interval_us = interval_us
             self._socket.send(setup_message(_SET_TIMER, interval_us))
@@ -147,20 +139,17 @@ class KernelProducer(AbstractContextManager["KernelProducer"]):
         self._link.sync_producer = None
 
 
-class DriveProducer(AbstractContextManager["DriveProducer"]):
+class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
     """SYNC by a drive of the cell, `axis` by its index: objects 1005h (bit 30) and 1006h, which are restored."""
 
     def __init__(self, network: CanopenNetwork, axis: int, period_us: int) -> None:
-        self.name = network.axes[axis].name
+        super().__init__(network.axes[axis].name, period_us)
         self._network = network
         self._node_id = network.node_ids[axis]
-        self._period_us = period_us
         self._before: tuple[int, int] | None = None
         self._produces = False
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         try:
             if error is not None:
                 self._network.begin_closing()
@@ -180,20 +169,9 @@ class DriveProducer(AbstractContextManager["DriveProducer"]):
         self._network.link.sync_producer = self.name
         # CiA 301: the period may be refused while the drive produces, so production begins last and ends first.
         access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID)
-        access.write(CYCLE_PERIOD, self._period_us)
+        access.write(CYCLE_PERIOD, self.period_us)
         access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID | PRODUCES)
         self._produces = True
-
-    def pacing(self, timeout_s: float, start_ns: int, clock: Clock) -> FollowedSync:
-        """Return the pacing of a stream that follows this drive, which keeps its period by itself."""
-        return FollowedSync(
-            1000 * self._period_us,
-            self.name,
-            timeout_s=timeout_s,
-            stop=self.pause,
-            start_ns=start_ns,
-            clock=clock,
-        )
 
     def pause(self) -> None:
         """Tell the drive to stop, without waiting for its answer; `stop` restores its objects."""
@@ -203,7 +181,9 @@ class DriveProducer(AbstractContextManager["DriveProducer"]):
 
     def stop(self) -> None:
         """Restore both objects, if started and if the drive still answers."""
-        before, self._before, self._produces = self._before, None, False
+        before = self._before
+        self._before = None
+        self._produces = False
         try:
             if before is not None and self._node_id not in self._network.link.silent:
                 access = self._network.link.objects(self._node_id)

@@ -8,17 +8,17 @@ that has arrived was read. Which answer belongs to which SYNC is decided in answ
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 
 import can
 
-from drivers.canopen.bus import bus_errors
+from drivers.canopen.bus import bus_errors, is_plain
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.socketcan import Losses, lags_behind, losses_of, remarks_of
 from drivers.errors import BusError, DriveFault, NodeMisplaced, SampleLost, node_label
-from drivers.messages import CellEvent, EventKind, EventSink, Sample
+from drivers.messages import EventKind, EventSink, Sample
 from drivers.stream.answers import Answers, Slot, StreamStatistics
-from drivers.stream.cycles import CycleBus, Cycles, is_plain
+from drivers.stream.cycles import CycleBus, Cycles
 from drivers.stream.sync import PATIENCE_S, Pacing
 from drivers.stream.watch import Watch
 
@@ -51,61 +51,41 @@ class SyncStream:
     ) -> None:
         self.network = network
         self.pacing = pacing
-        self.emit = on_event  #: Receives the events
         self._link = network.link
         self._answers = Answers(network.axes, network.pdos, certain=pacing.waits_for_answers)
         self._counts = self._answers.counts
-        self._watch = Watch(network, on_event, real_time=not pacing.waits_for_answers)
-        self._bus = CycleBus(
+        #: What its cycles run on: frames to send with the next SYNC, and whether an axis answered the last one.
+        self.bus = CycleBus(
             network.link,
             pacing.clock,
             pacing.start_ns,
-            faults=self._watch.faults,
             emit=on_event,
             between=self._process_between_cycles,
         )
-        self._cycles: Cycles = pacing.cycles(self._bus)
+        self._watch = Watch(network, self.bus, real_time=not pacing.waits_for_answers)
+        self._cycles: Cycles = pacing.cycles(self.bus)
         self._last_wrong_length: dict[int, int] = {}  # cycle, by COB-ID
         self._read_on = False  # since the last cycle
         self._base = Losses()  # before the first SYNC
         self._counted = Losses()
-        self._losses = Losses()
         self._incomplete_cycles = 0
         self._silent_cycles = 0
 
     @property
     def time_ns(self) -> int:
         """Time of the last SYNC [ns since 1970]; the pacing's start before the first one."""
-        return self._bus.time_ns
-
-    @property
-    def silent(self) -> bool:
-        """Whether no axis answered the last SYNC."""
-        return self._bus.silent
-
-    @property
-    def outgoing(self) -> list[can.Message]:
-        """Frames to send right before the next SYNC, which triggers synchronous RPDOs; a caller adds its own."""
-        return self._bus.outgoing
-
-    @property
-    def spare(self) -> Callable[[int], Sequence[can.Message]]:
-        """Source of frames that may wait, for a cycle without others to send; receives the last SYNC's time [ns]."""
-        return self._bus.spare
-
-    @spare.setter
-    def spare(self, source: Callable[[int], Sequence[can.Message]]) -> None:
-        self._bus.spare = source
+        return self.bus.time_ns
 
     @property
     def statistics(self) -> StreamStatistics:
         """Counts up to now."""
+        losses = self._counted.since(self._base)
         return StreamStatistics(
-            cycles=self._bus.cycles,
-            skipped_periods=self._bus.skipped,
-            kernel_dropped=self._losses.kernel,
-            interface_dropped=self._losses.interface,
-            backlog_dropped=self._losses.backlog,
+            cycles=self.bus.cycles,
+            skipped_periods=self.bus.skipped,
+            kernel_dropped=losses.kernel,
+            interface_dropped=losses.interface,
+            backlog_dropped=losses.backlog,
             **self._counts,
         )
 
@@ -118,8 +98,8 @@ class SyncStream:
 
     def check(self) -> None:
         """Raise the oldest fault that was not raised yet."""
-        if self._watch.faults:
-            raise self._watch.faults.popleft()
+        if self.bus.faults:
+            raise self.bus.faults.popleft()
 
     def advance(self) -> Sample:
         """Run one cycle even with faults, as stopping the axes needs; `__next__` raises them later.
@@ -131,24 +111,24 @@ class SyncStream:
         self._read_on = False
         try:
             with bus_errors(self._link.address):
-                if self._bus.cycles == 0:
+                if self.bus.cycles == 0:
                     self._begin()
                 while (instead := self._cycles.open()) is not None:
                     self._cycles = instead
                 self._collect()
         except (BusError, NodeMisplaced) as error:
-            self.emit(CellEvent(self.time_ns, None, EventKind.BUS_LOST, 0, str(error)))
+            self.bus.report(None, EventKind.BUS_LOST, 0, str(error))
             raise
         return self._finish_cycle()
 
     def _begin(self) -> None:
         """Discard the frames from before the first SYNC; losses before it do not count."""
-        self._bus.begin()
+        self.bus.begin()
         self._cycles = self._cycles.begin()
         self._base = losses_of(self._link.bus)
         self._counted = self._base
         for remark in remarks_of(self._link.bus):
-            self.emit(CellEvent(self.time_ns, None, EventKind.CAPTURE, 0, remark))
+            self.bus.report(None, EventKind.CAPTURE, 0, remark)
 
     def _slot_of(self, message: can.Message) -> Slot | None:
         """Return the slot of a TPDO of an axis; None for every other frame."""
@@ -172,26 +152,26 @@ class SyncStream:
                 if not answers.any:
                     cycles.note_first_answer()
                 answers.take(message.arbitration_id, slot, message.data)
-        self._bus.silent = not answers.any
-        if self._bus.silent:
+        self.bus.silent = not answers.any
+        if self.bus.silent:
             self._silent_cycles += 1
         else:
             self._silent_cycles = 0
-            self._bus.answered_ns = self._bus.clock()
+            self.bus.answered_ns = self.bus.clock()
 
     def _note_length(self, slot: Slot, identifier: int, found: int) -> None:
         """Report a PDO of wrong length: the first may have been corrupted, one with the next SYNC too is a fault."""
         self._counts["wrong_length"] += 1
         axis = self.network.axes[slot.axis]
         reason = f"PDO {identifier:03X}h has {found} bytes, its mapping has {slot.length}"
-        cycle = self._bus.cycles
+        cycle = self.bus.cycles
         last = self._last_wrong_length.get(identifier)
         if last is None or last < cycle - 1:
             text = f"{node_label(axis)}: {reason}"
-            self.emit(CellEvent(self.time_ns, slot.axis, EventKind.PDO_LENGTH, identifier, text))
+            self.bus.report(slot.axis, EventKind.PDO_LENGTH, identifier, text)
         elif last == cycle - 1:
             remedy = "did another program change the mapping, or does another device use this COB-ID?"
-            self._watch.faults.append(DriveFault(axis, reason, remedy=remedy))
+            self.bus.faults.append(DriveFault(axis, reason, remedy=remedy))
         self._last_wrong_length[identifier] = cycle
 
     def read_on(self, seconds: float, lag_s: float = 0.0) -> None:
@@ -215,11 +195,11 @@ class SyncStream:
         with bus_errors(self._link.address):
             self._read_late(seconds, lag_s, counted=counted)
         self._note_losses()
-        self._watch.note_events(self.time_ns)
+        self._watch.note_events()
 
     def _read_late(self, seconds: float, lag_s: float, *, counted: bool) -> None:
         """Read what comes after the last cycle; `counted` says whether answers count."""
-        clock = self._bus.clock
+        clock = self.bus.clock
         bus = self._link.bus
         answers = self._answers
         cycles = self._cycles
@@ -253,7 +233,7 @@ class SyncStream:
         slot = self._slot_of(message)
         if slot is None:
             self._process_other(message)
-        elif self._bus.cycles == 0:
+        elif self.bus.cycles == 0:
             self._counts["foreign"] += 1
         else:
             self._answers.take_between(slot)
@@ -262,12 +242,11 @@ class SyncStream:
         if self._link.dispatch(message) or not 0x180 <= message.arbitration_id < 0x580:
             return
         ours = not message.is_extended_id and message.arbitration_id & 0x7F in self.network.node_ids
-        self._counts["surplus" if ours and self._bus.cycles else "foreign"] += 1
+        self._counts["surplus" if ours and self.bus.cycles else "foreign"] += 1
 
     def _finish_cycle(self) -> Sample:
-        time_ns = self.time_ns
         # A skipped period has a number too, so that a gap is visible in the samples.
-        cycle = self._bus.cycles - 1 + self._bus.skipped
+        cycle = self.bus.cycles - 1 + self.bus.skipped
         missing = self._answers.end()
         if missing:
             self._incomplete_cycles += 1
@@ -280,8 +259,8 @@ class SyncStream:
         position = tuple(values[:axes])
         current = tuple(values[axes : 2 * axes])
         statuswords = tuple(values[2 * axes :])
-        self._watch.cycle(time_ns, self._bus.clock(), statuswords, missing)
-        return Sample(cycle, time_ns, position, current, statuswords, missing)
+        self._watch.cycle(statuswords, missing)
+        return Sample(cycle, self.time_ns, position, current, statuswords, missing)
 
     def _report_missing(self, cycle: int, missing: int) -> None:
         """Report the axes without a complete answer, bit i for axis i; too many such cycles in a row are a fault."""
@@ -289,16 +268,16 @@ class SyncStream:
         names = [node_label(self.network.axes[axis]) for axis in absent]
         for axis, name in zip(absent, names, strict=True):
             text = f"no complete answer from {name} to cycle {cycle}"
-            self.emit(CellEvent(self.time_ns, axis, EventKind.SAMPLE_LOST, cycle, text))
+            self.bus.report(axis, EventKind.SAMPLE_LOST, cycle, text)
         if self._incomplete_cycles <= MAX_MISSING_CYCLES:
             return
         silent_s = None  # doubtful answers are answers
-        if self.silent:
+        if self.bus.silent:
             # A reader that is late takes many cycles at once; those waited for no answer by the clock.
-            by_clock_ns = self._bus.clock() - self._bus.answered_ns
+            by_clock_ns = self.bus.clock() - self.bus.answered_ns
             by_cycles_ns = self._silent_cycles * self.pacing.period_ns
             silent_s = max(by_clock_ns, by_cycles_ns) * 1e-9
-        self._watch.faults.append(SampleLost(cycle, absent, names, silent_s))
+        self.bus.faults.append(SampleLost(cycle, absent, names, silent_s))
 
     def _note_losses(self) -> None:
         """Report frames that this machine lost; their content is unknown."""
@@ -307,7 +286,6 @@ class SyncStream:
             return
         new = counted.since(self._counted)
         self._counted = counted
-        self._losses = counted.since(self._base)
         for count, where in (
             (new.kernel, "in the kernel's receive buffer, which was full"),
             (new.interface, "by the interface, before the receive buffer"),
@@ -315,4 +293,4 @@ class SyncStream:
         ):
             if count:
                 text = f"{count} frames dropped {where}"
-                self.emit(CellEvent(self.time_ns, None, EventKind.FRAMES_DROPPED, count, text))
+                self.bus.report(None, EventKind.FRAMES_DROPPED, count, text)

@@ -13,7 +13,6 @@ from __future__ import annotations
 import time
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -23,7 +22,7 @@ from drivers.canopen.link import SYNC_COB_ID
 from drivers.canopen.sdo import Clock
 from drivers.canopen.socketcan import CapturedMessage, lags_behind, read_until_ns
 from drivers.errors import BusError
-from drivers.messages import CellEvent, EventKind
+from drivers.messages import EventKind
 from drivers.stream.cycles import LARGEST_LAG_NS, CycleBus, Cycles, arrived_ns, is_sync
 
 SHORTENED, STRAGGLING = 16, 4
@@ -72,6 +71,26 @@ class TimedSync:
         return TimedCycles(bus, self.period_ns)
 
 
+class Producer:
+    """Sends SYNC on our behalf; this one keeps its period by itself, and goes on after the last cycle."""
+
+    in_kernel = False  #: Whether it is this machine's kernel; a SYNC from the wire is then another device's
+
+    def __init__(self, name: str, period_us: int) -> None:
+        self.name = name  #: For messages
+        self.period_us = period_us
+
+    def pacing(self, timeout_s: float, start_ns: int, clock: Clock) -> FollowedSync:
+        """Return the pacing of a stream that follows this producer; see `FollowedSync`."""
+        return FollowedSync(1000 * self.period_us, self, timeout_s, start_ns, clock)
+
+    def seen(self, monotonic_ns: int, periods: int) -> None:
+        """Process a SYNC by its time [ns], and its periods since the one before, 0 for the first."""
+
+    def pause(self) -> None:
+        """Stop sending, without waiting for an answer."""
+
+
 @dataclass(frozen=True, slots=True)
 class FollowedSync:
     """Follow the SYNC of a producer that we started: each SYNC that is seen begins a cycle.
@@ -80,15 +99,10 @@ class FollowedSync:
     """
 
     period_ns: int  #: of the producer [ns]
-    producer: str  #: its name, for messages
-    in_kernel: bool = False  #: the producer is this machine's kernel; a SYNC from the wire is then another device's
+    producer: Producer  #: is paused after the last cycle
     #: Time without a SYNC after which the producer counts as dead; the stream then sends SYNC itself, because the axes
     #: are stopped by frames that act on SYNC.
     timeout_s: float = 0.1
-    #: Called with the monotonic time of each SYNC [ns], and the number of periods since the one before, where the
-    #: producer must be steered.
-    seen: Callable[[int, int], None] | None = None
-    stop: Callable[[], None] | None = None  #: stops the producer after the last cycle, without waiting for an answer
     start_ns: int = 0  #: wall time of the first SYNC [ns since 1970]
     clock: Clock = time.monotonic_ns  #: monotonic [ns]; the time since the first SYNC is added to start_ns
     waits_for_answers: ClassVar[bool] = False  #: see `LockstepSync`
@@ -334,12 +348,11 @@ class FollowedCycles(_CyclesByOrder):
             bus.skipped += periods - 1
             if self._rate.too_fast(since_ns):
                 bus.link.note_foreign(SYNC_COB_ID)
-        if pacing.in_kernel and isinstance(sync, CapturedMessage) and not sync.local:
+        if pacing.producer.in_kernel and isinstance(sync, CapturedMessage) and not sync.local:
             bus.link.note_foreign(SYNC_COB_ID)
         now_ns = bus.clock()
         bus.too_late(now_ns - at_ns)
-        if pacing.seen is not None:
-            pacing.seen(at_ns, periods)
+        pacing.producer.seen(at_ns, periods)
         self._last_sync_ns = at_ns
         bus.stamp(at_ns)
         bus.cycles += 1
@@ -355,8 +368,8 @@ class FollowedCycles(_CyclesByOrder):
         """Report the dead producer, and send SYNC from now on, because the axes must be stopped."""
         bus = self.bus
         pacing = self._pacing
-        reason = f"no SYNC from {pacing.producer} for {pacing.timeout_s:g} s"
-        bus.emit(CellEvent(bus.time_ns, None, EventKind.SYNC_LOST, bus.cycles, reason))
+        reason = f"no SYNC from {pacing.producer.name} for {pacing.timeout_s:g} s"
+        bus.report(None, EventKind.SYNC_LOST, bus.cycles, reason)
         bus.faults.append(BusError(str(bus.link.address), reason))
         due_ns = bus.clock()
         if bus.cycles:
@@ -399,8 +412,7 @@ class FollowedCycles(_CyclesByOrder):
         return is_sync(message)
 
     def stop(self) -> None:
-        if self._pacing.stop is not None:
-            self._pacing.stop()
+        self._pacing.producer.pause()
 
 
 class SyncRate:

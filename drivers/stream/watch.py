@@ -6,7 +6,6 @@ ways: neither position nor current of a moving axis changes by one count, or an 
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -14,11 +13,12 @@ import numpy as np
 from drivers.canopen.link import LSS, NmtState, command_name, nmt_name
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.sdo import SDO_REQUEST
-from drivers.errors import BusBusy, DriveFault, DriverError, node_label
-from drivers.messages import CellEvent, EventKind, EventSink, Sample
+from drivers.errors import BusBusy, DriveFault, node_label
+from drivers.messages import EventKind, Sample
 from drivers.move import Move
 from drivers.profiles.cia402 import STATE_BITS, STATUS_FAULT, STATUS_FOLLOWING_ERROR, State, decode
 from drivers.profiles.profile import Axis
+from drivers.stream.cycles import CycleBus
 
 FROZEN_S = 0.05
 """Duration of exactly equal values, in the time of the samples. A loop that fights friction changes its current at
@@ -99,15 +99,14 @@ class Watch:
 
     Args:
         network: of the drives.
-        on_event: receives what they report.
+        bus: receives what they report, and the faults.
         real_time: whether the drives' time is that of the clock; in lockstep their heartbeats may come faster.
     """
 
-    def __init__(self, network: CanopenNetwork, on_event: EventSink, *, real_time: bool) -> None:
-        self.faults: deque[DriverError] = deque()  #: Not raised yet, in the order in which they were seen
+    def __init__(self, network: CanopenNetwork, bus: CycleBus, *, real_time: bool) -> None:
         self._network = network
         self._link = network.link
-        self._on_event = on_event
+        self._bus = bus
         self._statuswords = (0,) * len(network.axes)
         self._unheard = (1 << len(network.axes)) - 1
         self._begun = False
@@ -119,11 +118,12 @@ class Watch:
         self._limited_since_ns: dict[int, int] = {}
         self._toggle_bits = ToggleBits(network.axes)
 
-    def cycle(self, time_ns: int, clock_ns: int, statuswords: tuple[int, ...], missing: int) -> None:
-        """Process one cycle: its time in the samples and by the clock, statuswords, and bit i for a missing axis i."""
-        self.note_events(time_ns)  # first: an EMCY has the cause, the statusword only the state
+    def cycle(self, statuswords: tuple[int, ...], missing: int) -> None:
+        """Process one cycle: its statuswords, and bit i for a missing axis i."""
+        time_ns = self._bus.time_ns
+        self.note_events()  # first: an EMCY has the cause, the statusword only the state
         if self._unheard or statuswords != self._statuswords:
-            self._note_statuswords(time_ns, statuswords, missing)
+            self._note_statuswords(statuswords, missing)
         for axis, since_ns in tuple(self._limited_since_ns.items()):
             word = self._statuswords[axis]
             if decode(word) is not State.OPERATION_ENABLED:
@@ -132,20 +132,22 @@ class Watch:
                 del self._limited_since_ns[axis]
                 node = self._network.axes[axis]
                 text = f"{node.name}: a limit has been active for {active_ns * 1e-9:.3f} s"
-                self._on_event(CellEvent(time_ns, axis, EventKind.LIMIT, word, text))
+                self._bus.report(axis, EventKind.LIMIT, word, text)
                 reason = f"a limit has been active for {LIMIT_S:g} s, statusword {word:#06x}"
                 remedy = "check limit switches, position, speed and current limits, or use slower moves"
-                self.faults.append(DriveFault(node, reason, word, remedy=remedy))
+                self._bus.faults.append(DriveFault(node, reason, word, remedy=remedy))
         for axis, bit, stale in self._toggle_bits.stale(time_ns, statuswords, missing):
-            self._on_event(CellEvent(time_ns, axis, EventKind.FROZEN, bit, str(stale)))
-            self.faults.append(stale)
+            self._bus.report(axis, EventKind.FROZEN, bit, str(stale))
+            self._bus.faults.append(stale)
+        clock_ns = self._bus.clock()
         if clock_ns >= self._next_heartbeat_check_ns and self._allowed_silence_ns > 0:
             self._next_heartbeat_check_ns = clock_ns + self._allowed_silence_ns // 8
             self._check_heartbeats(time_ns, clock_ns)
         self._begun = True
 
-    def _note_statuswords(self, time_ns: int, statuswords: tuple[int, ...], missing: int) -> None:
-        before, self._statuswords = self._statuswords, statuswords
+    def _note_statuswords(self, statuswords: tuple[int, ...], missing: int) -> None:
+        before = self._statuswords
+        self._statuswords = statuswords
         for axis, word in enumerate(statuswords):
             first = bool(self._unheard >> axis & 1)
             if first and missing >> axis & 1:
@@ -158,47 +160,47 @@ class Watch:
             if changed & _WATCHED_BITS:
                 state = decode(word)
                 text = f"{node.name}: {state}, statusword {word:04X}h"
-                self._on_event(CellEvent(time_ns, axis, EventKind.STATE, word, text))
+                self._bus.report(axis, EventKind.STATE, word, text)
                 if not first and changed & STATUS_FAULT and state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
-                    self.faults.append(DriveFault(node, str(state), word))
+                    self._bus.faults.append(DriveFault(node, str(state), word))
                 if not first and changed & word & STATUS_FOLLOWING_ERROR:
-                    self._on_event(CellEvent(time_ns, axis, EventKind.FOLLOWING_ERROR, word, text))
-                    self.faults.append(DriveFault(node, "following error", word))
+                    self._bus.report(axis, EventKind.FOLLOWING_ERROR, word, text)
+                    self._bus.faults.append(DriveFault(node, "following error", word))
             if saturation is not None and (word ^ (0 if first else before[axis])) >> saturation & 1:
                 active = "a limit is active" if word >> saturation & 1 else "the limit is no longer active"
-                self._on_event(CellEvent(time_ns, axis, EventKind.LIMIT, word, f"{node.name}: {active}"))
+                self._bus.report(axis, EventKind.LIMIT, word, f"{node.name}: {active}")
                 if word >> saturation & 1:
-                    self._limited_since_ns[axis] = time_ns
+                    self._limited_since_ns[axis] = self._bus.time_ns
                 else:
                     self._limited_since_ns.pop(axis, None)
 
-    def note_events(self, time_ns: int) -> None:
-        """Report the events of the nodes since the last cycle, at a time of the samples."""
-        for event in self._link.take_events(time_ns, self._network.node_ids):
-            self._on_event(event)
+    def note_events(self) -> None:
+        """Report the events of the nodes since the last cycle."""
+        for event in self._link.take_events(self._bus.time_ns, self._network.node_ids):
+            self._bus.emit(event)
             if event.kind is EventKind.BUS_BUSY and self._link.is_own(event.code):
-                self.faults.append(BusBusy.by_own_id(self._link.address, event.code))
+                self._bus.faults.append(BusBusy.by_own_id(self._link.address, event.code))
             elif event.kind is EventKind.BUS_BUSY and (
                 event.code < SDO_REQUEST or event.code in LSS or event.code in self._link.written
             ):
                 # A reader only disturbs, and is reported; a device that commands or writes could move the robot.
                 seen = self._link.written.get(event.code) or command_name(event.code, self._link.names)
-                self.faults.append(BusBusy.by_master(self._link.address, seen))
+                self._bus.faults.append(BusBusy.by_master(self._link.address, seen))
             if event.axis is None:
                 continue
             node = self._network.axes[event.axis]
             if event.kind is EventKind.EMCY and self._begun:
                 reason = event.text.removeprefix(f"{node_label(node)}: ")
-                self.faults.append(DriveFault(node, reason, emcy_code=event.code))
+                self._bus.faults.append(DriveFault(node, reason, emcy_code=event.code))
             elif event.kind is EventKind.NMT and event.code != NmtState.OPERATIONAL and self._begun:
-                self.faults.append(DriveFault(node, f"left OPERATIONAL, is {nmt_name(event.code)}"))
+                self._bus.faults.append(DriveFault(node, f"left OPERATIONAL, is {nmt_name(event.code)}"))
 
     def _check_node_id(self, axis: int, node: Axis) -> None:
         """Report a second device with the node id of an axis."""
         if shared := self._link.shared_id(node.node_id, self._network.heartbeat_ms):
             self._shared.add(node.node_id)
             remedy = "two devices have this node id: give one of them another"
-            self.faults.append(DriveFault(node, shared, remedy=remedy))
+            self._bus.faults.append(DriveFault(node, shared, remedy=remedy))
 
     def _check_heartbeats(self, time_ns: int, clock_ns: int) -> None:
         """Report nodes that are silent by the clock *and* in the time of the samples.
@@ -220,6 +222,6 @@ class Watch:
             if silent_ns > self._allowed_silence_ns:
                 reason = f"no heartbeat for {silent_ns * 1e-9:.3f} s"
                 text = f"{node_label(node)}: {reason}"
-                self._on_event(CellEvent(time_ns, axis, EventKind.HEARTBEAT_LOST, node_id, text))
-                self.faults.append(DriveFault(node, reason))
+                self._bus.report(axis, EventKind.HEARTBEAT_LOST, node_id, text)
+                self._bus.faults.append(DriveFault(node, reason))
                 self._heard_at[node_id] = (heard_ns, clock_ns, time_ns)

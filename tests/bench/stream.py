@@ -44,7 +44,7 @@ from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.socketcan import SocketcanBus, open_socketcan
 from drivers.profiles.profile import Axis
 from drivers.stream.stream import SyncStream
-from drivers.stream.sync import FollowedSync
+from drivers.stream.sync import FollowedSync, Producer
 from tests.bench.stream_sender import FRAMES_A_CYCLE, LAST, NODES
 from tests.daq.logs import demo_content
 from tests.drivers.scripted import PROFILE
@@ -180,12 +180,13 @@ def one_run(period_us: int, cycles: int, beside: Beside, stops_s: Sequence[float
     stamps, waits = np.zeros(cycles + 1, dtype=np.int64), np.zeros(cycles + 1, dtype=np.int64)
     count = wrong = 0
 
-    def seen(monotonic_ns: int, _periods: int) -> None:
-        nonlocal count
-        stamps[count], waits[count] = monotonic_ns, time.monotonic_ns() - monotonic_ns
-        count += 1
+    class Sender(Producer):
+        def seen(self, monotonic_ns: int, periods: int) -> None:
+            nonlocal count
+            stamps[count], waits[count] = monotonic_ns, time.monotonic_ns() - monotonic_ns
+            count += 1
 
-    pacing = FollowedSync(1000 * (period_us or 1000), "the sender", timeout_s=PATIENCE_S, seen=seen)
+    pacing = FollowedSync(1000 * (period_us or 1000), Sender("the sender", period_us), timeout_s=PATIENCE_S)
     # No node beats here: 0 is no supervision of heartbeats.
     with (
         tempfile.TemporaryDirectory() as folder,

@@ -18,9 +18,9 @@ from canopen.objectdictionary import ODVariable
 
 from daq.config.drive import drive_from_text
 from daq.environment import shipped_configurations
-from drivers.canopen.needs import Profiles
 from drivers.canopen.network import Bounds, CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
+from drivers.canopen.setup import Profiles
 from drivers.move import Move
 from drivers.profiles.profile import Axis, DriveProfile
 from tests.daq.config.data_sheet import data_sheet

@@ -26,12 +26,11 @@ from daq.log.conversion import SiScaling, moves, scaling
 from daq.log.metadata import AxisReadback, Readback
 from daq.workflow.plan import Plan
 from daq.workflow.record import motor_limits, motor_moves
-from drivers.canopen.needs import MODE_OF_OPERATION
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.pdo import SETPOINT_PDOS, Direction, records, wanted_pdos, write_pdo_record
 from drivers.canopen.sdo import ObjectAccess
-from drivers.canopen.setup import PROFILE_POSITION_MODE
-from drivers.messages import CellEvent, Sample
+from drivers.canopen.setup import MODE_OF_OPERATION, PROFILE_POSITION_MODE
+from drivers.messages import CellEvent, EventKind, Sample
 from drivers.motion.execute import execute
 from drivers.move import MotionPermission
 from drivers.profiles.profile import ObjectEntry
@@ -166,6 +165,7 @@ class DirectStream:
         if cell.sync is None or cell.sync.period_us != spec.sync_period_us:
             raise ValueError(f"cell {cell.name}: its sync period is not the simulated one, {spec.sync_period_us} us")
         self.pacing = LockstepSync(spec.sync_period_us * 1000)
+        self.bus = self
         self.silent = False
         self.events: list[CellEvent] = []
         self.time_ns = 0
@@ -210,9 +210,9 @@ class DirectStream:
     def read_on(self, seconds: float, lag_s: float = 0.0) -> None:
         """Nothing comes behind the last cycle."""
 
-    def emit(self, event: CellEvent) -> None:
+    def report(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
         """Keep an event of the walk's."""
-        self.events.append(event)
+        self.events.append(CellEvent(self.time_ns, axis, kind, code, text))
 
     def advance(self) -> Sample:
         """One SYNC period, in the order of drivers.simulation.cell.SimulatedCell."""

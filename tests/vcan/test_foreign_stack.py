@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 
 from drivers.canopen.bus import BusAddress
-from drivers.canopen.needs import HEARTBEAT_TIME, MODE_OF_OPERATION
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.pdo import STATUSWORD, feedback_entries, read_pdo_record
 from drivers.canopen.pdo import Direction as PdoDirection
+from drivers.canopen.setup import HEARTBEAT_TIME, MODE_OF_OPERATION
 from drivers.profiles.cia402 import State, decode
 from drivers.profiles.profile import Axis, Identity
 from drivers.stream.stream import SyncStream

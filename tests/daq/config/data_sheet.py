@@ -13,8 +13,8 @@ from canopen.objectdictionary import ObjectDictionary, ODVariable
 from canopen.objectdictionary.datatypes import INTEGER_TYPES, SIGNED_TYPES
 from canopen.objectdictionary.eds import import_eds
 
-from drivers.canopen.needs import needs_of
-from drivers.canopen.pdo import MOTION_PROFILE, PROFILE_DECELERATION, Direction, wanted_pdos
+from drivers.canopen.pdo import COMMAND, MOTION_PROFILE, PROFILE_DECELERATION, STATUSWORD, Direction, wanted_pdos
+from drivers.canopen.setup import needs_of
 from drivers.profiles.profile import Axis, DriveProfile, ObjectEntry
 
 LARGEST_BYTES = 4 * 2**20
@@ -55,7 +55,7 @@ def disagreements(profile: DriveProfile, sheet: ObjectDictionary) -> tuple[str, 
         read.append(profile.torque)
     if profile.save is not None:
         read.append(profile.save.command)
-    mapped = {need.entry for need in needs if need.mapped}
+    mapped = {profile.position, profile.current, STATUSWORD, *COMMAND, *MOTION_PROFILE} - {PROFILE_DECELERATION}
     lacks_deceleration = sheet.get_variable(PROFILE_DECELERATION.index, 0) is None
     if not lacks_deceleration:
         mapped.add(PROFILE_DECELERATION)

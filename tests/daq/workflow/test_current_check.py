@@ -22,10 +22,7 @@ from ident.model.model import DriveTrain
 def readings(cell: Cell, factor: float = 1.0) -> list[ScaleReading]:
     """Readings of drives whose torque constants are the cell's, times a factor; each motor has 2 A."""
     constants = [abs(a.nameplate_gain / n) for a, n in zip(cell.axes, DriveTrain(cell.ratio).reduction, strict=True)]
-    return [
-        ScaleReading(number, "", "generic-cia402", 0.002, {}, 2.0, 2.0 * factor * constant, ())
-        for number, constant in enumerate(constants, start=1)
-    ]
+    return [ScaleReading(0.002, {}, 2.0, 2.0 * factor * constant, ()) for constant in constants]
 
 
 @pytest.mark.parametrize("name", ["demo", "gantry", "seven-axis"])

@@ -71,7 +71,7 @@ def test_the_stream_can_stop_the_sync_that_it_follows(
     monkeypatch.setattr(type(sender), "start", lambda _: None)
     pacing = _pacing(cell, 0, Clocks(), sender)
     assert isinstance(pacing, FollowedSync)
-    assert pacing.stop == sender.pause
+    assert pacing.producer is sender
 
 
 @pytest.mark.parametrize("name", [field.name for field in fields(StreamStatistics)])

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canopen.pdo import SETPOINT_PDOS, Direction, pack, record_struct, records, word
+from drivers.canopen.pdo import SETPOINT_PDOS, Direction, pack, record_payload, records, word
 from drivers.profiles.profile import ObjectEntry
 
 entries = st.builds(
@@ -29,7 +29,7 @@ def test_everything_is_packed_once_and_fits(objects: list[ObjectEntry]) -> None:
             assert sum(entry.bits for entry in earlier) + pdo[0].bits > 64
 
 
-@given(st.lists(entries, min_size=1, max_size=6), st.data())
+@given(st.lists(entries, min_size=1, max_size=6, unique_by=word), st.data())
 def test_layout_decodes_what_a_drive_would_send(objects: list[ObjectEntry], data: st.DataObject) -> None:
     for pdo in pack(objects):
         values = [
@@ -44,7 +44,10 @@ def test_layout_decodes_what_a_drive_would_send(objects: list[ObjectEntry], data
             value.to_bytes(entry.bits // 8, "little", signed=entry.signed)
             for value, entry in zip(values, pdo, strict=True)
         )
-        assert list(record_struct(pdo).unpack(payload)) == values
+        (record,) = records(Direction.TPDO, 1, (pdo,))
+        layout, carried = record_payload(record, pdo)
+        assert carried == pdo
+        assert list(layout.unpack(payload)) == values
 
 
 def test_what_cannot_be_packed_is_refused() -> None:

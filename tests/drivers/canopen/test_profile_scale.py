@@ -31,7 +31,7 @@ def drive() -> Iterator[tuple[ObjectAccess, ScriptedNode]]:
 
 
 def reading(current_a: float | None, torque_nm: float | None) -> ScaleReading:
-    return ScaleReading(3, "", "generic", 0.002, {}, current_a, torque_nm, ())
+    return ScaleReading(0.002, {}, current_a, torque_nm, ())
 
 
 def test_a_drive_reports_its_ampere_and_its_motor() -> None:

@@ -43,7 +43,7 @@ def extra_torque_nm(
         after.append(plant.velocity_rad_s.copy())
     spec = clean_cell()
     rows = motor_rows(spec.ratio)
-    model = link_model(spec.urdf, spec.gravity_m_s2, None)
+    model = link_model(replace(spec, payload=None))
     viscous = np.diag([axis.viscous_nm_s_rad for axis in spec.axes])
     motor = [axis.motor_inertia_kg_m2 + STEP_S * axis.motor_viscous_nm_s_rad for axis in spec.axes]
     inertia = pin.crba(model, model.createData(), posture) + rows.T @ np.diag(motor) @ rows + STEP_S * viscous
@@ -99,7 +99,7 @@ def test_load_friction_knows_the_payload() -> None:
     for payload in (None, "disc"):
         plant = Plant(clean_cell(payload, (UndeclaredEffect("load-friction", 1, {"coefficient": 0.1}),)))
         plant.step(np.zeros(6))
-        model = link_model(clean_cell(payload).urdf, (0.0, 0.0, -9.81), clean_cell(payload).payload)
+        model = link_model(clean_cell(payload))
         weight = pin.computeGeneralizedGravity(model, model.createData(), clean_cell().start_rad)
         np.testing.assert_allclose(plant.load_torque_nm, weight, atol=1e-9)
         torque[payload] = plant.load_torque_nm[1]

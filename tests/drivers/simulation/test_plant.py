@@ -19,7 +19,7 @@ OPEN = np.zeros(6, dtype=np.bool_)
 
 def links(spec: CellSpec) -> tuple[pin.Model, pin.Data]:
     """The links alone, as Pinocchio has them."""
-    model = link_model(spec.urdf, spec.gravity_m_s2, spec.payload)
+    model = link_model(spec)
     return model, model.createData()
 
 

@@ -18,7 +18,7 @@ from drivers.errors import BusError, DriverError, SampleLost
 from drivers.messages import Sample
 from drivers.stream.answers import StreamStatistics
 from drivers.stream.stream import MAX_MISSING_CYCLES, SyncStream
-from drivers.stream.sync import FollowedSync, TimedSync
+from drivers.stream.sync import FollowedSync, Producer, TimedSync
 from tests.drivers.scripted import PERIOD_NS, FakeClock, cell
 
 CYCLES = 12
@@ -119,7 +119,9 @@ def run(
         bus = SplitBus(SplitAddress(tuple(parts)), ends, lambda: clock.now_ns * 1e-9)
     network.link._bus = bus
     network.link.sync_producer = "J1" if producer else None
-    followed = FollowedSync(PERIOD_NS, "J1", timeout_s=0.1, stop=ends[0].pause, clock=clock)
+    j1 = Producer("J1", PERIOD_NS // 1000)
+    j1.pause = ends[0].pause  # type: ignore[method-assign]
+    followed = FollowedSync(PERIOD_NS, j1, timeout_s=0.1, clock=clock)
     stream = SyncStream(network, followed if producer else TimedSync(PERIOD_NS, 0, clock))
     samples = [stream.advance() for _ in range(CYCLES)]
     if to_the_end:

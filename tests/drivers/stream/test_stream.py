@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from drivers.canopen.socketcan import CapturedMessage, Losses
 from drivers.errors import BusBusy, BusError, DriveFault, DriverError, SampleLost
 from drivers.messages import CellEvent, EventKind
+from drivers.stream import sync
 from drivers.stream.answers import StreamStatistics
 from drivers.stream.producers import steered_us
 from drivers.stream.stream import SyncStream
@@ -320,7 +321,7 @@ def test_every_dropped_frame_is_exactly_one_bit(dropped: set[tuple[int, int]]) -
         bus.tamper = lambda m: (m,)
 
 
-class Producer:
+class Producer(sync.Producer):
     """Sends SYNC on the scripted bus, whether the stream reads or not; each axis' position is its number.
 
     Attributes:
@@ -329,6 +330,7 @@ class Producer:
     """
 
     def __init__(self, bus: ScriptedBus) -> None:
+        super().__init__("J1", PERIOD_NS // 1000)
         self._bus = bus
         self.pulses = 0
         self.at_ns = bus.clock.now_ns
@@ -361,7 +363,7 @@ def followed_stream() -> Iterator[Followed]:
         network.prepare()
         network.link.sync_producer = "J1"
         producer = Producer(bus)
-        pacing = FollowedSync(PERIOD_NS, "J1", timeout_s=0.01, seen=producer.seen, start_ns=77, clock=bus.clock)
+        pacing = FollowedSync(PERIOD_NS, producer, timeout_s=0.01, start_ns=77, clock=bus.clock)
         stream = SyncStream(network, pacing, events.append)
         receive = bus.recv
 
@@ -457,7 +459,7 @@ def test_what_is_to_be_sent_goes_out_at_once(followed: Followed) -> None:
     stream, bus, producer, _ = followed
     next(stream)
     frame = can.Message(arbitration_id=0x201, is_extended_id=False, data=bytes(6))
-    stream.outgoing.append(frame)
+    stream.bus.outgoing.append(frame)
     producer.pulse()
     next(stream)
     assert bus.sent[-1] is frame
@@ -651,7 +653,8 @@ def test_jitter_is_no_second_producer(late_ns: list[int]) -> None:
 
 def test_the_kernels_sync_never_comes_from_the_wire(followed: Followed) -> None:
     stream, _, producer, _ = followed
-    pacing = FollowedSync(PERIOD_NS, "the kernel", in_kernel=True, timeout_s=0.01, clock=stream.pacing.clock)
+    producer.in_kernel = True
+    pacing = FollowedSync(PERIOD_NS, producer, timeout_s=0.01, clock=stream.pacing.clock)
     stream = SyncStream(stream.network, pacing)
     next(stream)
     producer.pulse(local=False)

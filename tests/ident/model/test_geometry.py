@@ -98,7 +98,7 @@ def _model(spec: CellSpec) -> Model:
 
 def _standard(model: Model, spec: CellSpec) -> FloatArray:
     """Parameters of the links as Pinocchio reads them: m, m c and the inertia about the joint's origin."""
-    tree = link_model(spec.urdf, spec.gravity_m_s2, None, spec.platform)
+    tree = link_model(replace(spec, payload=None))
     standard = np.zeros(len(model.columns))
     for joint, columns in zip(model.robot.joints, model.link_columns, strict=True):
         m, mx, my, mz, xx, xy, yy, xz, yz, zz = tree.inertias[tree.getJointId(joint.name)].toDynamicParameters()
@@ -118,7 +118,7 @@ def _axes_motion(model: Model, samples: int) -> Motion:
 
 def _simulated_torque(spec: CellSpec, motion: Motion, zero_rad: FloatArray) -> FloatArray:
     """Torque of the motors, shape (m, k): the simulator's closures, differences in time, and Pinocchio's RNEA."""
-    tree = link_model(spec.urdf, spec.gravity_m_s2, None, spec.platform)
+    tree = link_model(replace(spec, payload=None))
     mechanism = SimulatedMechanism(tree, spec)
     data = tree.createData()
     motors = len(spec.motors)
