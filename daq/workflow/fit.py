@@ -18,7 +18,6 @@ from daq.environment import software
 from daq.errors import EffectsRefuted, LogRepeated, LogsDiffer, UsageError
 from daq.log.conversion import load_run
 from daq.log.reader import LossyLogs
-from daq.workflow.corrections import Corrections
 from daq.workflow.declared_effects import (
     BOOTSTRAP_SEED,
     declared_effects,
@@ -26,11 +25,18 @@ from daq.workflow.declared_effects import (
     with_declared_again,
     with_effects_of_cell,
 )
-from daq.workflow.description import check_diagnoses, correction_diagnoses, geometry_beside, is_checked
-from daq.workflow.diagnoses import Recordings, diagnose_fit, named_causes
-from daq.workflow.geometry_diagnoses import encoder_misfit_of
+from daq.workflow.diagnoses import (
+    Recordings,
+    check_diagnoses,
+    correction_diagnoses,
+    diagnose_fit,
+    encoder_misfit_of,
+    geometry_beside,
+    is_checked,
+    named_causes,
+)
 from daq.workflow.remaining_corrections import with_described
-from daq.workflow.validate import diagnose_log
+from daq.workflow.validate import Corrections, diagnose_log
 from ident.arrays import FloatArray
 from ident.calibration import Calibration, PayloadMass, Source
 from ident.calibration import calibration_of as identified_calibration

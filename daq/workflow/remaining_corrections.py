@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from daq.config.cell import Cell, model_of
-from daq.workflow.geometry_diagnoses import calibrated_model
+from daq.workflow.diagnoses import calibrated_model
 from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration
 from ident.effects.dictionary import GEOMETRY

@@ -6,9 +6,10 @@ Several calibrations are compared on runs that they may never have seen (paper �
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,9 @@ from daq.config.cell import Cell
 from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationUnreadable, LogsDiffer
 from daq.log.conversion import load_run
-from daq.workflow.corrections import Corrections
-from daq.workflow.diagnoses import diagnose_run, not_repeated
+from daq.workflow.diagnoses import drift_diagnosis, with_verbs
 from daq.workflow.remaining_corrections import CORRECTIONS, on_cell
-from daq.workflow.validation import DataUse, Validation
-from ident.arrays import FloatArray
+from ident.arrays import BoolArray, FloatArray
 from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
@@ -30,11 +29,18 @@ from ident.data.run import Run
 from ident.effects.friction import TemperatureFriction
 from ident.effects.geometry_corrections import corrected_model
 from ident.effects.signals import REFERENCE_C
+from ident.equations.instants import read_instants
 from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.rows import row_filter, row_masks
+from ident.equations.system import System
 from ident.errors import DataUnfit, Diagnosis, IdentificationError
+from ident.estimators.diagnosis import axis_error_diagnoses, exchanged_channels, scale_diagnoses
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.estimators.least_squares import wls
+from ident.estimators.payload_diagnosis import payload_diagnoses
+from ident.estimators.refusals import idle_joints
+from ident.estimators.turned_geometry import GEOMETRY, find_turned_geometry
+from ident.geometry_drift import geometry_drift
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
 from ident.prediction import (
@@ -43,10 +49,50 @@ from ident.prediction import (
     measured_torque,
     mounted_parameters,
     predict_torque,
+    standard_parameters,
 )
 from ident.weighing import RowsToWeigh, rows_to_weigh, weigh_rows
 
 _LOG = logging.getLogger("drivegain")
+
+
+class DataUse(Enum):
+    """Whether a calibration has met a log, by the log's digest."""
+
+    FIT = "seen by the fit"
+    HOLDOUT = "held out"
+    NEW = "not seen"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Validation:
+    """One run under a calibration; arrays are joint-first, decimated rows last."""
+
+    log: Path  #: where the run was read
+    run: str  #: its name
+    digest: str  #: of the log (sha256, hex)
+    data_use: DataUse  #: whether the fit has seen it
+    same_configuration: bool  #: the log carries the cell configuration that the calibration was made with
+    partial: bool  #: the log was salvaged from a recording that never finished
+    time_s: FloatArray  #: of each row, since the start of the run, shape (r,)
+    measured_nm: FloatArray  #: V g with the calibration's gains, shape (n, r)
+    predicted_nm: FloatArray  #: what the calibration says the joints need, shape (n, r)
+    use: BoolArray  #: rows of each joint that count, shape (n, r)
+
+    @property
+    def error(self) -> RelativeError:
+        """‖ρ‖/‖Y‖ of each axis and in total [%]."""
+        return relative_error(self.measured_nm, self.predicted_nm, self.use)
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether the fit has used the run and judged it, all of its runs together."""
+        return self.data_use is DataUse.FIT and self.same_configuration
+
+    @property
+    def rows(self) -> int:
+        """Equations that count, of all joints."""
+        return int(np.count_nonzero(self.use))
 
 
 def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None = None) -> tuple[Validation, ...]:
@@ -412,3 +458,100 @@ def _masses(
 
 def _gains(calibration: Calibration) -> FloatArray:
     return np.array([gain.value for gain in calibration.gains])
+
+
+def diagnose_run(
+    calibration: Calibration,
+    validation: Validation,
+    model: Model,
+    run: Run,
+    standard: System,
+    conditioning: Conditioning,
+) -> tuple[Diagnosis, ...]:
+    """Judge a run that the fit of a calibration has not seen: scale and sign of its currents, its payload, its errors.
+
+    Args:
+        calibration: of the cell.
+        validation: what it predicts of the run, and what was measured.
+        model: of the cell.
+        run: as it was read.
+        standard: equations of this run alone, in standard parameters (`reduce_runs`).
+        conditioning: the filters.
+    """
+    if any(one.name in GEOMETRY for one in calibration.diagnoses):
+        return ()  # it predicts in a wrong geometry
+    runs = (run.name,)
+    axes = [gain.axis for gain in calibration.gains]
+    use = validation.use
+    carried = replace(run, payload=as_calibrated(calibration, run.payload, run.name))
+    data = differentiate(carried, model.drive_train, conditioning)
+    left_nm = validation.measured_nm - validation.predicted_nm
+    moved = geometry_drift(calibration, model, data, conditioning, left_nm, use)
+    if moved is not None:
+        return (drift_diagnosis(moved, model, axes, runs),)
+    size = _rms(validation.measured_nm, use)
+    left = _rms(left_nm, use)
+    idle = idle_joints(model, size, left)
+    used = use & ~idle[:, None]
+    found = list(scale_diagnoses(validation.measured_nm, validation.predicted_nm, used, axes, runs))
+    if run.payload is not None and not found:
+        found += _payload_diagnoses(calibration, run.payload, standard)
+    errors = list(map(with_verbs, axis_error_diagnoses(size, left, idle, axes, runs)))
+    if not errors and not any(one.name == "current-reversed" for one in found):
+        return tuple(found)
+    turned = find_turned_geometry(model, read_instants(model, (run,), conditioning), _gains(calibration))
+    if turned is not None:
+        return (turned.diagnosis(axes, runs),)
+    exchanged = exchanged_channels(model, (run,), conditioning, axes) if errors else None
+    if exchanged is not None:
+        return (replace(exchanged, runs=runs),)
+    return tuple(found or errors)
+
+
+def _rms(torque_nm: FloatArray, use: BoolArray) -> FloatArray:
+    """Root mean square of each axis over its rows that count, shape (m,); zero without any."""
+    rows = np.maximum(use.sum(axis=1), 1)
+    return np.asarray(np.sqrt(np.sum(torque_nm**2, axis=1, where=use) / rows))
+
+
+def _payload_diagnoses(calibration: Calibration, payload: Payload, standard: System) -> Iterator[Diagnosis]:
+    """Compare the payload of a run with that of its mounting in the calibration."""
+    mounted = mounted_parameters(calibration, payload.mounting)
+    unknown = tuple(
+        index
+        for index, parameter in enumerate(LINK_PARAMETERS)
+        if parameter not in payload.known and parameter in mounted
+    )
+    of_payload = [mounted[LINK_PARAMETERS[index]].value for index in unknown]
+    values = np.concatenate((standard_parameters(calibration, standard.model), of_payload))
+    return payload_diagnoses(regrouped(standard, standard.base, (unknown,)), _gains(calibration), values)
+
+
+def not_repeated(stored: Iterable[Diagnosis], fresh: Iterable[Diagnosis]) -> Iterator[Diagnosis]:
+    """Yield stored diagnoses, less those that were made again of each of their runs."""
+    again: set[tuple[str, str, tuple[str, ...]]] = set()
+    for one in fresh:
+        again.update((one.name, run, one.axes) for run in one.runs)
+    for one in stored:
+        of_runs = {(one.name, run, one.axes) for run in one.runs}
+        if not of_runs or not of_runs <= again:
+            yield one
+
+
+class Corrections:
+    """The corrections that were said; logs that carry one description share one line."""
+
+    def __init__(self) -> None:
+        self._said: set[tuple[str, ...]] = set()
+
+    def note(self, log: Path, run: Run) -> None:
+        """Say what the given description corrects in a log, unless an earlier log of the command had the same."""
+        recording = run.recording
+        if recording is None or not recording.corrected or recording.corrected in self._said:
+            return
+        self._said.add(recording.corrected)
+        _LOG.warning(
+            "%s: the given description of the cell replaces the one in the log; they differ in %s",
+            log,
+            ", ".join(recording.corrected),
+        )

@@ -42,7 +42,7 @@ from daq.report.log import log_lines
 from daq.report.text import WholeTable
 from daq.workflow.live_prediction import RecentCurrent
 from daq.workflow.monitor import CellPrediction, WatchedCell
-from daq.workflow.validation import DataUse
+from daq.workflow.validate import DataUse
 from daq.writeback.judgement import NOTHING
 from daq.writeback.request import GainChange
 from drivers.stream.monitor import AxisReading, CellReading, ReadingSource
