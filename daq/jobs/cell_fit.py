@@ -32,8 +32,7 @@ from daq.errors import (
 )
 from daq.files import judge_target, read_regular, replace_file
 from daq.jobs.fleet_survey import CellLogs, StoredLog, at_hand, fingerprint
-from daq.workflow.declared_effects import BOOTSTRAP_SEED
-from daq.workflow.fit import calibration_of, check_holdout, close_loop, fit
+from daq.workflow.fit import BOOTSTRAP_SEED, calibration_of, check_holdout, close_loop, fit
 from drivers.errors import DriverError
 from ident.calibration import Gain
 from ident.errors import IdentificationError

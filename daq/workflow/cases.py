@@ -12,9 +12,8 @@ import numpy as np
 from daq.config.cell import Cell, model_of
 from daq.errors import ConfigurationInconsistent
 from daq.workflow.choices import Known
-from daq.workflow.declared_effects import refuse_effects
-from daq.workflow.diagnoses import named_causes
-from daq.workflow.fit import Fit, Reading, calibration_of, judged
+from daq.workflow.diagnoses import named_causes, nameplate_of
+from daq.workflow.fit import Fit, Reading, calibration_of, judged, refuse_effects
 from ident.calibration import Calibration, Parameter, Source, factor_of
 from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.system import System, require_distinct
@@ -105,8 +104,7 @@ def fit_case(
     payloads = tuple(payload_as(payload, logs.cell, known) for payload in logs.used.payloads)
     system = regrouped(replace(logs.used, payloads=payloads))
     require_distinct(system, gains=not gains_fixed)
-    nameplate = np.array([axis.nameplate_gain for axis in logs.cell.axes])
-    estimate = estimate_with(method, system, nameplate if gains_fixed else None)
+    estimate = estimate_with(method, system, nameplate_of(logs.cell) if gains_fixed else None)
     rest = None
     if logs.unseen.runs:
         unseen = replace(logs.unseen, payloads=payloads)

@@ -30,6 +30,33 @@ from ident.planning.excitation import (
 )
 from ident.planning.gain_verdict import ExtraMoves
 
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointLimits:
+    """Limits of the joints of a cell [rad; m of a prismatic joint], shape (n,) each."""
+
+    lower: FloatArray  #: least positions
+    upper: FloatArray  #: largest positions
+    velocity: FloatArray  #: per second
+    acceleration: FloatArray  #: per second squared
+
+    @classmethod
+    def of(cls, cell: Cell) -> JointLimits:
+        """Return the limits that a cell declares."""
+        limits = [axis.limits for axis in cell.axes]
+        return cls(
+            lower=np.array([one.position[0] for one in limits]),
+            upper=np.array([one.position[1] for one in limits]),
+            velocity=np.array([one.velocity for one in limits]),
+            acceleration=np.array([one.acceleration for one in limits]),
+        )
+
+    def targets(self) -> tuple[FloatArray, FloatArray]:
+        """Return the least and the largest targets of a plan, which keep a margin from the limits."""
+        margin = POSITION_MARGIN * (self.upper - self.lower)
+        return self.lower + margin, self.upper - margin
+
+
 LINK_RADIUS = 0.08
 """Radius of a guessed link, as a share of the length of the joint chain: 6 cm for an arm of the TX-40's size."""
 POSTURES = 400
@@ -84,8 +111,8 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     )
     confined = tuple(index for index, capsule in enumerate(capsules) if capsule.link == last)
     everything = Scene(capsules, candidates, declared.obstacles, declared.workspace, confined, declared.minimum_m)
-    lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
-    postures = np.random.default_rng(0).uniform(lower, upper, (POSTURES, len(lower)))
+    limits = JointLimits.of(cell)
+    postures = np.random.default_rng(0).uniform(limits.lower, limits.upper, (POSTURES, len(cell.axes)))
     apart = Checker(robot, everything).apart(postures) > ALWAYS
     pairs = tuple(pair for pair, kept in zip(candidates, apart, strict=True) if kept)
     together = tuple(
@@ -194,9 +221,8 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     mounted = found[0]
     model = model_of(cell)
     expected = nominal_payload(model.robot, mounted.drawn)
-    velocity = np.array([axis.limits.velocity for axis in cell.axes])
-    acceleration = np.array([axis.limits.acceleration for axis in cell.axes])
-    fast_motion = _fast_motion(cell, Checker(model.robot, NOTHING), velocity, acceleration)
+    limits = JointLimits.of(cell)
+    fast_motion = _fast_motion(limits, Checker(model.robot, NOTHING))
     links, from_urdf = nominal_links(model.robot, cell.urdf)
     loaded = links.copy()
     loaded[model.robot.carrier] += expected.parameters
@@ -206,7 +232,7 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     expectation = Expectation(
         model=model,
         gains=gains,
-        parameters=nominal_parameters(model, links, torque, velocity, acceleration),
+        parameters=nominal_parameters(model, links, torque, limits.velocity, limits.acceleration),
         payloads=(expected,),
         noise_a=effective_noise(noise, LAG_ONE),
     )
@@ -230,16 +256,15 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
 NOTHING = Scene((), (), (), None, (), 0.0)  #: Without bodies, a checker knows what closures allow
 
 
-def _fast_motion(cell: Cell, checker: Checker, velocity: FloatArray, acceleration: FloatArray) -> Motion:
+def _fast_motion(limits: JointLimits, checker: Checker) -> Motion:
     """Random moves as fast as the limits allow: which parameters there are does not depend on a plan's seed."""
     rng = np.random.default_rng(0)
-    lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
-    targets = rng.uniform(lower, upper, (40, len(lower)))
+    targets = rng.uniform(limits.lower, limits.upper, (40, len(limits.lower)))
     if checker.robot.closures:
-        targets = _allowed(checker, rng, lower, upper, len(targets))
+        targets = _allowed(checker, rng, limits.lower, limits.upper, len(targets))
     parts = []
     for start, end in pairwise(targets):
-        path = synchronised(start, end, velocity, acceleration)
+        path = synchronised(start, end, limits.velocity, limits.acceleration)
         parts.append(path.at(np.linspace(0.02, 0.98, 24) * path.duration_s))
     return Motion(*(np.concatenate([part[kind] for part in parts]) for kind in range(3)))
 
@@ -283,8 +308,9 @@ class PlannedMove:
 
 def path_of(cell: Cell, start_rad: FloatArray, move: PlannedMove) -> Trapezoid:
     """The joint trapezoid of a move from the robot's position."""
-    velocity = np.array([axis.limits.velocity for axis in cell.axes]) * move.velocity
-    acceleration = np.array([axis.limits.acceleration for axis in cell.axes]) * move.acceleration
+    limits = JointLimits.of(cell)
+    velocity = limits.velocity * move.velocity
+    acceleration = limits.acceleration * move.acceleration
     return synchronised(start_rad, np.array(move.target_rad), velocity, acceleration)
 
 
@@ -313,29 +339,22 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     slow with it stretched, and fast together with a neighbour; and of all axes together.
     """
     cell, checker = experiment.cell, experiment.scene.checker
-    lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
-    velocity = np.array([axis.limits.velocity for axis in cell.axes])
-    acceleration = np.array([axis.limits.acceleration for axis in cell.axes])
-    margin = POSITION_MARGIN * (upper - lower)
-    low, high = lower + margin, upper - margin
+    limits = JointLimits.of(cell)
+    low, high = limits.targets()
     sampled = np.random.default_rng(0).uniform(low, high, (EXTRA_POSTURES, len(low)))
     if checker.robot.closures:
         sampled = _allowed(checker, np.random.default_rng(0), low, high, EXTRA_POSTURES // 15)
     clear = sampled[checker.margins(sampled) > 0.0]
     found: list[ExtraMoves] = []
-    chain = bool(checker.robot.closures)
+    ends_of = _swing_of_chain if checker.robot.closures else _swing
 
     def swing(words: str, postures: FloatArray, moved: list[int], speed: float = 1.0) -> None:
         """There and back in the first few postures in which that is clear."""
         paths: list[Trapezoid] = []
         for posture in postures:
-            ends = (
-                _swing_of_chain(checker, posture, moved, low, high)
-                if chain
-                else _swing(checker, posture, moved, low, high)
-            )
+            ends = ends_of(checker, posture, moved, low, high)
             if ends is not None:
-                there = synchronised(*ends, velocity * speed, acceleration)
+                there = synchronised(*ends, limits.velocity * speed, limits.acceleration)
                 paths += [there, Trapezoid(there.end, there.start, there.duration_s, there.ramp_s)]
             if len(paths) >= 6:
                 break

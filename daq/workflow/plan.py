@@ -18,9 +18,9 @@ from daq.config.cell import Cell, JointUnit
 from daq.errors import UsageError
 from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_CONDITION_OF_CHAIN, LARGEST_STD_PERCENT
 from daq.workflow.experiment import (
-    POSITION_MARGIN,
     RUNS,
     Experiment,
+    JointLimits,
     PlannedMove,
     experiment_duration_s,
     experiment_of,
@@ -103,9 +103,7 @@ class Search:
         self._duration_s = duration_s
         self._speed = speed
         self._largest_condition = largest_condition
-        limits = np.array([axis.limits.position for axis in self._cell.axes])
-        margin = POSITION_MARGIN * (limits[:, 1] - limits[:, 0])
-        self._low, self._high = limits[:, 0] + margin, limits[:, 1] - margin
+        self._low, self._high = JointLimits.of(self._cell).targets()
 
     def random_moves(self) -> Draft:
         """Clear random moves that fill the duration.
