@@ -7,8 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import JsonOption, Verb, judged_output, print_json
+from daq.cli.terminal import check_output, one_of, print_view, status, write_output
+from daq.cli.verb import JsonOption, Verb, output_option, print_json
+from daq.environment import software
 from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
+from daq.files import replace_file
+from ident.errors import ModelContradicted
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
@@ -24,7 +28,7 @@ def export_verb() -> None:
 
 def export_log_verb(
     log: Annotated[Path, typer.Argument(help="A log (.mcap).")],
-    out: Annotated[Path, typer.Option("--out", help="Table to write; must not exist.", callback=judged_output)],
+    out: Annotated[Path, output_option("--out", "Table to write; must not exist.")],
     csv: Annotated[bool, typer.Option("--csv", help="Comma-separated text.")] = False,
     parquet: Annotated[bool, typer.Option("--parquet", help="Apache Parquet, needs drivegain[parquet].")] = False,
     json: JsonOption = False,
@@ -33,7 +37,6 @@ def export_log_verb(
 
     The log itself opens in Foxglove and PlotJuggler (configs/viewers).
     """
-    from daq.cli.terminal import one_of, print_view, status
     from daq.log.export import TableFormat, export_log
     from daq.report.log import table_report
 
@@ -58,9 +61,7 @@ def _warn(log: Path, partial: bool, valid: bool, reason: str) -> None:
 
 def export_bag_verb(
     log: Annotated[Path, typer.Argument(help="A log (.mcap).")],
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder to write (rosbag2); must not exist.", callback=judged_output)
-    ],
+    out: Annotated[Path, output_option("--out", "Folder to write (rosbag2); must not exist.")],
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration of the cell; its gains give the effort of the joint states.")
     ] = None,
@@ -70,7 +71,6 @@ def export_bag_verb(
 
     Joint states are at the full rate, with the names of the URDF's joints; effort only with --calibration.
     """
-    from daq.cli.terminal import print_view, status
     from daq.documents.calibration_file import load_calibration
     from daq.log.bag_writer import export_bag
     from daq.report.log import bag_report
@@ -87,7 +87,7 @@ def export_bag_verb(
 
 def export_urdf_verb(
     cell: Annotated[Path, typer.Argument(help="Cell file: URDF, gravity, drive train, limits; none with --urdf.")],
-    out: Annotated[Path, typer.Option("--out", help="URDF to write.", callback=judged_output)],
+    out: Annotated[Path, output_option("--out", "URDF to write.")],
     calibration: Annotated[Path | None, typer.Argument(help="calibration.yaml written by `drivegain fit`.")] = None,
     urdf: Annotated[
         Path | None,
@@ -101,16 +101,13 @@ def export_urdf_verb(
     physical bodies (pip install 'drivegain[physical]'); the change of torque is reported. Serial robots only: closed
     chains are refused.
     """
-    from daq.cli.terminal import check_output, print_view, status
     from daq.config.cell_file import URDF, bundle
     from daq.config.yaml_file import read_yaml_bytes
     from daq.documents.calibration_file import load_calibration
-    from daq.environment import software
     from daq.report.urdf_views import urdf_report, urdf_view
     from daq.workflow.fit import DOUBTFUL_PERCENT
     from daq.workflow.remaining_corrections import on_cell
     from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, require_solver, update_urdf
-    from ident.errors import ModelContradicted
 
     if (calibration is None) == (urdf is None):
         raise UsageError(
@@ -210,8 +207,6 @@ def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
     """Write the URDF whole or not at all, after reading it back as a robot with these links."""
     import numpy as np
 
-    from daq.cli.terminal import write_output
-    from daq.files import replace_file
     from ident.physical.physical import urdf_links
 
     def check(content: bytes) -> None:

@@ -13,7 +13,7 @@ import typer
 
 from daq.cli.apply import applier
 from daq.cli.terminal import check_replaceable, output_console, say_written, write_output
-from daq.cli.verb import JsonOption, Verb, judged_output, print_json
+from daq.cli.verb import JsonOption, Verb, output_option, print_json
 from daq.errors import (
     AuditUnusable,
     ConfigurationInconsistent,
@@ -23,6 +23,7 @@ from daq.errors import (
     UsageError,
     evidence,
 )
+from daq.files import replace_file
 from daq.report.text import printable
 
 if TYPE_CHECKING:
@@ -40,12 +41,8 @@ _PICTURES = {".png": "PNG\r\n", ".svg": "<?xml"}  #: Suffixes of pictures, and t
 def history_verb(
     cell: Annotated[Path, typer.Argument(help="Cell file; it says where its history is.")],
     axis: Annotated[str | None, typer.Option("--axis", help="One axis: every calibration of its gain.")] = None,
-    plot: Annotated[
-        Path | None, typer.Option("--plot", help="Picture to write, .png or .svg.", callback=judged_output)
-    ] = None,
-    csv: Annotated[
-        Path | None, typer.Option("--csv", help="Table to write, for a spreadsheet.", callback=judged_output)
-    ] = None,
+    plot: Annotated[Path | None, output_option("--plot", "Picture to write, .png or .svg.")] = None,
+    csv: Annotated[Path | None, output_option("--csv", "Table to write, for a spreadsheet.")] = None,
     add: Annotated[Path | None, typer.Option("--add", help="Enter a calibration by hand.")] = None,
     acknowledge: Annotated[
         str | None, typer.Option("--acknowledge", metavar="AXIS", help="A change is explained; begin a baseline.")
@@ -292,7 +289,6 @@ def _named(all_series: tuple[Series, ...], axis: str, cell: Cell) -> Series:
 
 
 def _write_files(chosen: tuple[Series, ...], cell: Cell, picture: Path | None, csv: Path | None) -> None:
-    from daq.files import replace_file
     from daq.report.history import csv_text, plot_history
 
     drawn = [series for series in chosen if series.points]

@@ -8,17 +8,17 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.verb import JsonOption, Verb, judged_output, print_json
+from daq.cli.terminal import WRITTEN, output_console, print_view, progress_bar
+from daq.cli.verb import JsonOption, Verb, output_option, print_json
+from daq.environment import software
 from daq.errors import DaqError, LogForeign
+from daq.report.text import printable
 
-NewLogOption = Annotated[
-    Path, typer.Option("--out", help="Log to write (.mcap); must not exist.", callback=judged_output)
-]
+NewLogOption = Annotated[Path, output_option("--out", "Log to write (.mcap); must not exist.")]
 
 
 def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: JsonOption = False) -> None:
     """Show what is in a log: role and payload, duration, losses, moves, validity."""
-    from daq.cli.terminal import output_console, print_view
     from daq.documents.calibration_file import load_calibration
     from daq.report.document import json_tree
     from daq.report.log import info_report, log_lines
@@ -47,11 +47,8 @@ def import_files(
     json: JsonOption = False,
 ) -> None:
     """Convert CSV files, MATLAB files or ROS 2 bags of another controller to a log."""
-    from daq.cli.terminal import WRITTEN
-    from daq.environment import software
     from daq.log.importing import import_recording
     from daq.report.log import import_report, timing_text
-    from daq.report.text import printable
 
     imported = import_recording(description, data, out, software=software(), cell_path=cell)
     WRITTEN.append(out)
@@ -78,10 +75,8 @@ def salvage_verb(
 
     `fit` accepts a valid partial log and says so; `apply` refuses the result.
     """
-    from daq.cli.terminal import WRITTEN, progress_bar
     from daq.log.salvage import salvage
     from daq.report.log import salvage_report
-    from daq.report.text import printable
 
     with progress_bar("salvaging") as report_progress:
         saved = salvage(log, out, lambda samples: report_progress(samples, 0, "samples"))

@@ -10,6 +10,7 @@ import typer
 
 from daq.cli.record import mounted
 from daq.cli.scan import no_answer
+from daq.cli.terminal import interruptible
 from daq.cli.verb import CellArgument, JsonOption, Verb, print_json
 
 
@@ -31,7 +32,6 @@ def monitor_verb(
     from rich.console import Console
     from rich.live import Live
 
-    from daq.cli.terminal import interruptible
     from daq.config.cell_buses import cell_address, drive_axes
     from daq.config.cell_file import load_cell
     from daq.documents.calibration_file import load_calibration

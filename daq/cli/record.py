@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CellArgument, JsonOption, Verb, judged_output, print_json, say_next, taking
-from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError
+from daq.cli.terminal import interruptible, progress_bar, say_last
+from daq.cli.verb import CellArgument, JsonOption, Verb, output_option, print_json, say_next, taking
+from daq.environment import login
+from daq.errors import DaqError, DiskSpaceShort, ExitCode, OutputFailed, UsageError
 from daq.files import is_taken
 from drivers.errors import POWERED, DriverError, SampleLost, all_notes, error_chain
 
@@ -27,7 +29,7 @@ class RecordOptions:
 
     cell: CellArgument
     plan: Annotated[Path, typer.Argument(help="Plan written by `drivegain plan`.")]
-    out: Annotated[Path, typer.Option("--out", help="Log to write (.mcap); must not exist.", callback=judged_output)]
+    out: Annotated[Path, output_option("--out", "Log to write (.mcap); must not exist.")]
     enable_motion: Annotated[
         bool,
         typer.Option(
@@ -54,9 +56,7 @@ def record_verb(options: RecordOptions) -> None:
     11 where it does not.
     A run with losses is kept, marked invalid, and ends with exit code 4; `fit` refuses it.
     """
-    from daq.cli.terminal import interruptible, progress_bar, say_last
     from daq.config.cell_file import load_cell
-    from daq.environment import login
     from daq.log.feed import Feed
     from daq.report.log import record_report
     from daq.workflow.bus_lock import bus_lock
@@ -157,7 +157,6 @@ def _say_next(cell: Path, declared: Cell, plan: Path, out: Path, carried: Payloa
 
 def _is_unloaded(log: Path, declared: Cell) -> bool:
     """Whether a log is a valid run of this cell without load."""
-    from daq.errors import DaqError
     from daq.report.log import info_report
 
     try:

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from daq.cli.terminal import check_output, print_view, status, write_output
 from daq.cli.verb import (
     CalibrationArgument,
     CellOption,
     JsonOption,
     Verb,
     cells_in,
-    judged_output,
+    output_option,
     print_json,
     say_correct_first,
     say_next,
 )
-from daq.errors import CalibrationMissing
+from daq.errors import CalibrationMissing, DaqError
+from daq.files import replace_file
 
 if TYPE_CHECKING:
     from ident.calibration import Calibration
@@ -30,17 +34,13 @@ TABLES = "drivegain-validation-tables"  #: Format of the page of tables
 def validate_verb(
     calibration: CalibrationArgument,
     logs: Annotated[list[Path], typer.Argument(help="Logs of the same cell.")],
-    pictures: Annotated[
-        Path | None, typer.Option(help="Folder for pictures of the torques.", callback=judged_output)
-    ] = None,
+    pictures: Annotated[Path | None, output_option("--pictures", "Folder for pictures of the torques.")] = None,
     beside: Annotated[
         list[Path] | None, typer.Option(help="Another calibration, or a folder of them (`fit --cases`); repeatable.")
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder for tables.md: the same in the form of the paper's Tables 5 to 8.", callback=judged_output
-        ),
+        output_option("--out", "Folder for tables.md: the same in the form of the paper's Tables 5 to 8."),
     ] = None,
     cell: CellOption = None,
     json: JsonOption = False,
@@ -51,9 +51,7 @@ def validate_verb(
     with --beside every calibration side by side. With unloaded logs among the others, the payload mass does not depend
     on the calibration's robot parameters.
     """
-    from daq.cli.terminal import check_output, print_view, status, write_output
     from daq.config.cell_file import load_cell
-    from daq.files import replace_file
     from daq.report.paper_tables import paper_page
     from daq.report.validation import draw_validations, validate_report, validation_tables, validation_view
     from daq.workflow.validate import cross_validate
@@ -90,10 +88,8 @@ def cell_of(calibration: Calibration, logs: list[Path]) -> Path:
     Several files may describe a cell of that name, as the shipped one and a copy of it. The one with the content that
     the logs of the fit carry is meant.
     """
-    from contextlib import suppress
 
     from daq.config.cell_file import load_cell
-    from daq.errors import DaqError
 
     folders = dict.fromkeys([Path(), *(log.parent for log in logs)])
     found = {os.path.realpath(path): path for folder in folders for path in cells_in(folder, calibration.cell)}
@@ -109,7 +105,6 @@ def cell_of(calibration: Calibration, logs: list[Path]) -> Path:
 
 def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]:
     """Load calibrations by label, the one to validate first; a file that is named twice counts once."""
-    from collections import Counter
 
     from daq.documents.calibration_file import load_calibration
 

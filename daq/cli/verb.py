@@ -42,7 +42,7 @@ RequestT = TypeVar("RequestT")
 def judged_output(path: Path | None) -> Path | None:
     """Refuse, as the command line is parsed, a place to write to that another user has chosen, and a device or pipe.
 
-    The callback of every option and argument that names a file or folder to write; it returns the path as it was given.
+    The callback of every option (`output_option`) and argument that names a file or folder to write; it returns the path as it was given.
 
     Raises:
         UsageError: as `judge_target`.
@@ -59,6 +59,11 @@ def judged_output(path: Path | None) -> Path | None:
             remedy="choose another name, or name the place itself",
         ) from error
     return path
+
+
+def output_option(name: str, about: str) -> Any:
+    """Option that names a file or folder to write."""
+    return typer.Option(name, help=about, callback=judged_output)
 
 
 def taking(request: type[RequestT]) -> Callable[[Callable[[RequestT], None]], Callable[..., None]]:

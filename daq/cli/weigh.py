@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.verb import CalibrationArgument, CellOption, JsonOption, Verb, judged_output, print_json
+from daq.cli.terminal import print_view, status, write_output
+from daq.cli.verb import CalibrationArgument, CellOption, JsonOption, Verb, output_option, print_json
 
 
 def weigh_verb(
@@ -25,7 +26,6 @@ def weigh_verb(
     of its joints; with --bare it is found again together with the body, which takes more moves and trusts the
     calibration's gains alone. Says which of the ten parameters these moves identify, and which moves would help.
     """
-    from daq.cli.terminal import print_view, status
     from daq.config.cell_file import load_cell
     from daq.documents.calibration_file import load_calibration
     from daq.report.weighing_views import weigh_report, weighed_view
@@ -49,9 +49,7 @@ def contact_verb(
     quiet: Annotated[
         list[Path] | None, typer.Option("--quiet", help="Log of such motion without contact; repeatable.")
     ] = None,
-    pictures: Annotated[
-        Path | None, typer.Option(help="Folder for a picture of the torques.", callback=judged_output)
-    ] = None,
+    pictures: Annotated[Path | None, output_option("--pictures", "Folder for a picture of the torques.")] = None,
     cell: CellOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -60,7 +58,6 @@ def contact_verb(
     The threshold gives less than one false alarm in an hour of motion, extrapolated from the quiet logs, or, without
     any, from the quiet part of the log itself. A payload must be one that the calibration knows.
     """
-    from daq.cli.terminal import print_view, status, write_output
     from daq.config.cell_file import load_cell
     from daq.documents.calibration_file import load_calibration
     from daq.report.weighing_views import contact_report, contact_view, draw_contact
