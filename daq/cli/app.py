@@ -60,8 +60,8 @@ BY_JOB = {
     Job.EXPERT: (
         Listed("import", "daq.cli.logs:IMPORT", "Convert CSV, MATLAB or ROS 2 files to a log."),
         Listed("export", "daq.cli.export:EXPORT", "Write a calibration or a log for other programs."),
-        Listed("weigh", "daq.cli.weigh:WEIGH", "Weigh the body on the flange with a calibration."),
-        Listed("contact", "daq.cli.weigh:CONTACT", "Find external torques, with a threshold for alarms."),
+        Listed("weigh", "daq.cli.validate:WEIGH", "Weigh the body on the flange with a calibration."),
+        Listed("contact", "daq.cli.validate:CONTACT", "Find external torques, with a threshold for alarms."),
         Listed("simulate", "daq.cli.simulate:SIMULATE", "Run a simulated cell on a bus, to try the other verbs."),
     ),
 }

@@ -112,24 +112,24 @@ def apply_verb(options: ApplyOptions) -> None:
     )
     audit = audit_of(declared, (options.cell, options.calibration, options.to))
     undo = f"drivegain rollback {shlex.quote(str(options.cell))}"
+    opening: AbstractContextManager[Target[Any]]
+    interrupts: AbstractContextManager[Any]
+    whole: AbstractContextManager[None]
     if options.drives:
         at_most_one(drives=True, to=options.to)
+        undo += " --drives"
+        opening = drives_on_the_bus(declared, saving)
+        interrupts = nullcontext()  # `drives_on_the_bus` handles them
+        whole = nullcontext()
+    else:
+        if options.to is not None:
+            undo += f" --to {shlex.quote(str(options.to))}"
+        opening = nullcontext(FileTarget.of(declared, options.to))
+        interrupts = interruptible()
+        whole = delay_signals()
+    with interrupts:
         apply_to(
-            drives_on_the_bus(declared, saving),
-            declared,
-            request,
-            actor=actor,
-            audit=audit,
-            undo=f"{undo} --drives",
-            yes=options.yes,
-            json=options.json,
-        )
-        return
-    if options.to is not None:
-        undo += f" --to {shlex.quote(str(options.to))}"
-    with interruptible():
-        apply_to(
-            nullcontext(FileTarget.of(declared, options.to)),
+            opening,
             declared,
             request,
             actor=actor,
@@ -137,7 +137,7 @@ def apply_verb(options: ApplyOptions) -> None:
             undo=undo,
             yes=options.yes,
             json=options.json,
-            whole=delay_signals(),
+            whole=whole,
         )
 
 

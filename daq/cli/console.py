@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from contextlib import ExitStack, suppress
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from daq.cli.verb import CellArgument, Verb
-from daq.errors import ConfigurationMissing, UsageError
+from daq.environment import require_packages
+from daq.errors import UsageError
 
 
 def console_verb(
@@ -34,9 +34,9 @@ def console_verb(
     The page reads only, but for a stop button, which does what Ctrl-C does to `record` and `recalibrate` and is no
     safety function. It never opens the bus, and cannot delay a recording. Ctrl-C ends the page alone.
     """
-    _require("the web server", "console", "starlette", "uvicorn")
+    require_packages("the console", "the web server", "console", "starlette", "uvicorn")
     if foxglove is not None:
-        _require("the stream's server", "foxglove", "foxglove")
+        require_packages("the console", "the stream's server", "foxglove", "foxglove")
     from daq.config.cell_file import load_cell
     from daq.console.live import Live
     from daq.console.results import Results
@@ -75,17 +75,6 @@ def console_verb(
         port, token = listener.getsockname()[1], new_token()
         typer.echo(f"Open http://127.0.0.1:{port}/{token}/ in a browser on this computer; Ctrl-C ends the page.")
         server_of(Page(declared, live, results, *beside), token, port).run(sockets=[listener])
-
-
-def _require(purpose: str, extra: str, *packages: str) -> None:
-    missing = [package for package in packages if find_spec(package) is None]
-    if missing:
-        raise ConfigurationMissing(
-            "the console",
-            found=f"no package {' and '.join(missing)}",
-            expected=f"{purpose} of the optional extra `{extra}`",
-            remedy=f"pip install 'drivegain[{extra}]'",
-        )
 
 
 CONSOLE = Verb("console", console_verb, "drivegain console CELL --calibration calibration.yaml")

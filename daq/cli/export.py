@@ -9,7 +9,7 @@ import typer
 
 from daq.cli.terminal import check_output, one_of, print_view, status, write_output
 from daq.cli.verb import JsonOption, Verb, output_option, print_json
-from daq.environment import software
+from daq.environment import require_packages, software
 from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
 from daq.files import replace_file
 from ident.errors import ModelContradicted
@@ -107,7 +107,7 @@ def export_urdf_verb(
     from daq.report.urdf_views import urdf_report, urdf_view
     from daq.workflow.fit import DOUBTFUL_PERCENT
     from daq.workflow.remaining_corrections import on_cell
-    from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, require_solver, update_urdf
+    from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, update_urdf
 
     if (calibration is None) == (urdf is None):
         raise UsageError(
@@ -147,7 +147,7 @@ def export_urdf_verb(
         content = declared.urdf.encode()  # held joints are fixed in it
     else:
         model, limits, same = *_plain(content.decode("utf-8")), None
-    require_solver()
+    require_packages("physical parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel")
     text = content.decode("utf-8")
     with status("finding the nearest physical robot"):
         robot = physical_robot(known, model, limits, text)

@@ -27,6 +27,7 @@ from daq.cli.verb import (
     CellOption,
     JsonOption,
     Verb,
+    corrected_cell,
     output_option,
     print_json,
     say_correct_first,
@@ -39,7 +40,6 @@ from daq.workflow.choices import Known
 from ident.estimators.method import Method
 
 if TYPE_CHECKING:
-    from daq.config.cell import Cell
     from daq.log.reader import LossyLogs
     from daq.workflow.cases import CaseFit
     from daq.workflow.fit import Fit
@@ -161,13 +161,6 @@ def _check_places(request: FitRequest | ResidualRequest) -> None:
     check_report(request.report, request.out)
 
 
-def _cell_of(request: FitRequest | ResidualRequest) -> Cell | None:
-    """Load the corrected cell file; None where the one in the logs is used."""
-    from daq.config.cell_file import load_cell
-
-    return None if request.cell is None else load_cell(request.cell)
-
-
 def _holdout_words(request: FitRequest | ResidualRequest) -> list[object]:
     """Return the held-out logs as words of a command."""
     return [word for log in request.holdout or () for word in ("--holdout", log)]
@@ -187,7 +180,7 @@ def _fit(request: FitRequest) -> CaseFit:
     from ident.estimators.refusals import require_plausible
 
     holdout = request.holdout or ()
-    cell = _cell_of(request)
+    cell = corrected_cell(request.cell)
     if request.known is Known.MASS:
         fitted = fit(
             request.logs,
@@ -237,7 +230,7 @@ def _fit_cases(request: FitRequest, folder: Path) -> None:
         report=request.report,
         pictures=request.pictures,
     )
-    cell = _cell_of(request)
+    cell = corrected_cell(request.cell)
     holdout = request.holdout or ()
     inputs = (*request.logs, *holdout)
     created = datetime.now(UTC)
@@ -355,7 +348,7 @@ def _search(request: ResidualRequest, report_step: Callable[[str], None]) -> Fit
         holdout=request.holdout or (),
         method=Method.ML,
         gains_fixed=request.gains is Gains.FIXED,
-        cell=_cell_of(request),
+        cell=corrected_cell(request.cell),
         lossy=_losses_of(request),
         keep_rows=True,
         channels_as_wired=request.channels_as_wired,

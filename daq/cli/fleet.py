@@ -45,8 +45,7 @@ def fleet_verb(
     """
 
     from daq.jobs.cell_fit import Loop, open_cache
-    from daq.jobs.fleet import fit_fleet, worker_pool
-    from daq.jobs.fleet_report import FIRST_COLUMNS, fleet_csv, fleet_report, fleet_view
+    from daq.jobs.fleet import FIRST_COLUMNS, fit_fleet, fleet_csv, fleet_report, fleet_view, worker_pool
     from daq.jobs.fleet_survey import list_logs
 
     loop = Loop.CLOSED if residual else Loop.OPEN

@@ -28,6 +28,7 @@ from daq.report.text import printable
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
+    from daq.ledger.fold import History
     from daq.ledger.ledger import Ledger, Verification
     from daq.ledger.watch import Series
 
@@ -66,8 +67,7 @@ def history_verb(
     false.
     """
     from daq.config.cell_file import load_cell
-    from daq.ledger.ledger import MAY_LACK, Ledger, read_history
-    from daq.ledger.watch import watch
+    from daq.ledger.ledger import MAY_LACK, Ledger
     from daq.report.history import (
         describe_actions,
         history_report,
@@ -96,14 +96,10 @@ def history_verb(
     _migrate(ledger, who, now, forced=migrate)
     if add is not None:
         _add(ledger, add, who, now)
-    checked = _verified(ledger) if verify else None
-    history = read_history(ledger) if checked is None else checked.history
-    all_series = watch(history.entries, history.acknowledgements)
+    checked, history, all_series = _read(ledger, verify)
     if acknowledge is not None:
         _acknowledge(ledger, _named(all_series, acknowledge, declared), who, why, since, now)
-        checked = _verified(ledger) if verify else None
-        history = read_history(ledger) if checked is None else checked.history
-        all_series = watch(history.entries, history.acknowledgements)
+        checked, history, all_series = _read(ledger, verify)
     if checked is None and history.may_lack:
         _LOG.warning(MAY_LACK)
     chosen = all_series if axis is None else (_named(all_series, axis, declared),)
@@ -126,6 +122,16 @@ def history_verb(
         say_written(console, plot, csv)
     if checked is not None:
         _require(ledger, checked)
+
+
+def _read(ledger: Ledger, verify: bool) -> tuple[Verification | None, History, tuple[Series, ...]]:
+    """Read the history and the chart of each gain, from a verification if that is wanted."""
+    from daq.ledger.ledger import read_history
+    from daq.ledger.watch import watch
+
+    checked = _verified(ledger) if verify else None
+    history = read_history(ledger) if checked is None else checked.history
+    return checked, history, watch(history.entries, history.acknowledgements)
 
 
 def _verified(ledger: Ledger) -> Verification:

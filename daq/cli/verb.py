@@ -26,6 +26,7 @@ from daq.errors import UsageError
 from daq.files import judge_target
 
 if TYPE_CHECKING:
+    from daq.config.cell import Cell
     from daq.report.document import Report
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
@@ -42,7 +43,8 @@ RequestT = TypeVar("RequestT")
 def judged_output(path: Path | None) -> Path | None:
     """Refuse, as the command line is parsed, a place to write to that another user has chosen, and a device or pipe.
 
-    The callback of every option (`output_option`) and argument that names a file or folder to write; it returns the path as it was given.
+    The callback of every option (`output_option`) and argument that names a file or folder to write; it returns the
+    path as it was given.
 
     Raises:
         UsageError: as `judge_target`.
@@ -64,6 +66,13 @@ def judged_output(path: Path | None) -> Path | None:
 def output_option(name: str, about: str) -> Any:
     """Option that names a file or folder to write."""
     return typer.Option(name, help=about, callback=judged_output)
+
+
+def corrected_cell(path: Path | None) -> Cell | None:
+    """Load the cell file of `--cell`; None where the description in the logs is used."""
+    from daq.config.cell_file import load_cell
+
+    return None if path is None else load_cell(path)
 
 
 def taking(request: type[RequestT]) -> Callable[[Callable[[RequestT], None]], Callable[..., None]]:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
+from types import FrameType
 
 from daq.config.cell import Cell
 from daq.config.recalibration import Recalibration
 from daq.documents.session_state import Outcome, WatchedGain
-from daq.errors import ExitCode
+from daq.errors import ExitCode, TimeBoundReached
 from daq.files import sha256_of
 from daq.jobs import session as sessions
 from daq.jobs.context import JobContext, Tools, before_motion, require_clock, section_of, target_of
@@ -20,7 +23,6 @@ from daq.jobs.journal import Journal, Level
 from daq.jobs.recording import basis_of, calibration_of_session, fit_session, record_runs, verified_runs
 from daq.jobs.reporting import Conclusion, audit_entry, report_failure, report_success
 from daq.jobs.session import Session
-from daq.jobs.time_bound import time_bound
 from daq.ledger.audit import AuditAction
 from daq.ledger.ledger import MAY_LACK, enter_calibration, read_history
 from daq.ledger.watch import alarm_text, watch
@@ -170,3 +172,50 @@ def _resumed_or_new(section: Recalibration, cell: Cell, now: datetime, journal: 
         problem="",
         ended=None,
     )
+
+
+AGAIN_S = 1.0  #: After an alarm that came while the axes were being stopped for another reason
+
+
+@contextmanager
+def time_bound(minutes: float) -> Iterator[SignalBlocker]:
+    """Raise TimeBoundReached in the block when its time is up; yields a function that defers it during a stop.
+
+    There is no alarm outside the main thread, where Python handles no signals.
+
+    Raises:
+        TimeBoundReached: in the block.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield nullcontext
+        return
+    stopping = 0
+
+    def up(_number: int, _frame: FrameType | None) -> None:
+        if stopping:
+            signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
+            return
+        raise TimeBoundReached(
+            "the job",
+            found=f"more than {minutes:g} min since it began",
+            expected="its end within max_duration_min",
+            remedy="the axes were commanded to stop; the next job resumes the session; raise max_duration_min, or "
+            "see what takes so long in its log",
+        )
+
+    @contextmanager
+    def block_signals() -> Iterator[None]:
+        nonlocal stopping
+        stopping += 1
+        try:
+            yield
+        finally:
+            stopping -= 1
+
+    before = signal.signal(signal.SIGALRM, up)
+    signal.setitimer(signal.ITIMER_REAL, 60.0 * minutes)
+    try:
+        yield block_signals
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 
 import numpy as np
 
 from daq.config.cell import Cell
-from daq.errors import ConfigurationMissing, ControllerUnfit, SchemaMismatch
+from daq.errors import ControllerUnfit, SchemaMismatch
 from daq.formats.xml_document import Element, parse
 from daq.workflow.experiment import JointLimits
 from ident.arrays import FloatArray
@@ -55,22 +54,6 @@ class PhysicalRobot:
     prior: InertiaPrior  #: what was believed of the links beforehand
     #: Of base parameters, largest first; none where the identified ones are those of a possible robot.
     shifts: tuple[Shift, ...]
-
-
-def require_solver() -> None:
-    """Say at once that the solver is missing, before anything is computed.
-
-    Raises:
-        ConfigurationMissing: with the extra to install.
-    """
-    missing = [package for package in ("cvxpy", "clarabel") if find_spec(package) is None]
-    if missing:
-        raise ConfigurationMissing(
-            "physical parameters",
-            found=f"no package {' and '.join(missing)}",
-            expected="the semidefinite solver of the optional extra `physical`",
-            remedy="pip install 'drivegain[physical]'",
-        )
 
 
 def physical_robot(calibration: Calibration, model: Model, limits: FloatArray, urdf: str) -> PhysicalRobot:
