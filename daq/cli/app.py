@@ -185,7 +185,8 @@ def _usage_failed(error: Any, json_wanted: bool) -> int:
     if param is not None:
         shown = param.name.upper() if param.param_type_name == "argument" else max(param.opts, key=len)
         found = found.replace(f"'{param.display_name_raw}'", f"'{shown}'", 1)
-    remedy, usage = f"`{error.ctx.command_path} --help` explains it", error.ctx.get_usage()
+    remedy = f"`{error.ctx.command_path} --help` explains it"
+    usage = error.ctx.get_usage()
     # A value of the wrong type: the message of typer's validation does not repeat it.
     given = [one["input"] for one in getattr(error.__cause__, "errors", list)()]
     if len(given) == 1 and isinstance(given[0], str):
@@ -210,7 +211,8 @@ def _output_failed(error: OSError, json_wanted: bool) -> int:
     except OSError:
         # The interpreter flushes stdout again at its end, and would complain.
         with suppress(OSError):
-            null, wanted = os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+            null = os.open(os.devnull, os.O_WRONLY)
+            wanted = sys.stdout.fileno()
             os.dup2(null, wanted)
             os.close(null)
     return ExitCode.UNEXPECTED

@@ -189,7 +189,8 @@ def _show_outcome(proposal: Proposal[E], written: Written | None, audit: Path | 
     from daq.writeback.gates.gate import Gate
 
     console = output_console()
-    edit, target = proposal.edit, proposal.target
+    edit = proposal.edit
+    target = proposal.target
     if proposal.refusals:
         # The review of a changed base is all that is missing, and this dry run is that review.
         if not yes and {refusal.gate for refusal in proposal.refusals} == {Gate.BASE}:
@@ -421,7 +422,8 @@ def drives_on_the_bus(declared: Cell, saving: Saving) -> Iterator[DriveTarget]:
     from daq.writeback.drive_target import DriveTarget
     from drivers.canopen.network import CanopenNetwork
 
-    address, axes = cell_address(declared), drive_axes(declared)
+    address = cell_address(declared)
+    axes = drive_axes(declared)
     try:
         with (
             bus_lock(declared),

@@ -72,7 +72,8 @@ def console_verb(
                 expected="a free port on 127.0.0.1",
                 remedy="end the other program, or choose another port",
             ) from error
-        port, token = listener.getsockname()[1], new_token()
+        port = listener.getsockname()[1]
+        token = new_token()
         typer.echo(f"Open http://127.0.0.1:{port}/{token}/ in a browser on this computer; Ctrl-C ends the page.")
         server_of(Page(declared, live, results, *beside), token, port).run(sockets=[listener])
 

@@ -116,7 +116,8 @@ def export_urdf_verb(
             expected="CELL CALIBRATION, or CALIBRATION --urdf FILE for a robot without a cell file",
             remedy="give the cell file, then the calibration; or leave the cell file out",
         )
-    given, calibration = urdf or cell, calibration or cell
+    given = urdf or cell
+    calibration = calibration or cell
     check_output(out, (calibration, given), FORMAT)
     known = load_calibration(calibration)
     left = known.relative_error_percent.total

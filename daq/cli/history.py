@@ -92,7 +92,8 @@ def history_verb(
             expected="them with --acknowledge AXIS",
             remedy="name the axis whose change is explained",
         )
-    now, who = datetime.now(UTC), str(applier(by if acknowledge is not None else None))
+    now = datetime.now(UTC)
+    who = str(applier(by if acknowledge is not None else None))
     _migrate(ledger, who, now, forced=migrate)
     if add is not None:
         _add(ledger, add, who, now)

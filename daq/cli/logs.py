@@ -28,7 +28,8 @@ def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: Json
     except LogForeign as error:
         with suppress(DaqError):
             load_calibration(log)
-            error.found, error.remedy = "a calibration", f"`drivegain report {log}` reads it"
+            error.found = "a calibration"
+            error.remedy = f"`drivegain report {log}` reads it"
         raise
     if json:
         print_json(report)
@@ -52,7 +53,8 @@ def import_files(
 
     imported = import_recording(description, data, out, software=software(), cell_path=cell)
     WRITTEN.append(out)
-    statistics, timing = imported.statistics, imported.timing
+    statistics = imported.statistics
+    timing = imported.timing
     if json:
         print_json(import_report(out, imported))
         return

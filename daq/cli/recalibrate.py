@@ -112,7 +112,8 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
 RECALIBRATE = Verb("recalibrate", recalibrate_verb, "drivegain recalibrate press-4/cells/press-4.yaml --dry-run")
 
 
-_SYSTEM, _OF_USER = Path("/etc/systemd/system"), Path(".config/systemd/user")
+_SYSTEM = Path("/etc/systemd/system")
+_OF_USER = Path(".config/systemd/user")
 
 
 def install_units(
@@ -135,7 +136,8 @@ def install_units(
     from daq.jobs.units import Installation, cell_option, cron_line, next_commands, units_of
 
     declared = load_cell(cell)
-    section, _ = section_of(declared), target_of(declared)
+    section = section_of(declared)
+    target_of(declared)  # refuses a cell without a controller file
     place = cell.resolve()
     try:
         owner = place.owner()
@@ -208,11 +210,14 @@ def require_own_unit(path: Path, option: str = "") -> None:
         text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else None
     if text is None and not path.exists():
         return
-    found, expected = "", ""
+    found = ""
+    expected = ""
     if text is None or not text.startswith(MARK):
-        found, expected = "a unit that drivegain did not write", "one of an earlier `install-units`"
+        found = "a unit that drivegain did not write"
+        expected = "one of an earlier `install-units`"
     elif option not in text:
-        found, expected = "the unit of another cell file", f"one with {option}"
+        found = "the unit of another cell file"
+        expected = f"one with {option}"
     if found:
         remedy = "name another folder with --to, or move it away; remove it if the cell file has moved"
         raise UsageError(str(path), found=found, expected=f"no such file, or {expected}", remedy=remedy)

@@ -150,7 +150,8 @@ def _say_next(cell: Path, declared: Cell, plan: Path, out: Path, carried: Payloa
             weighed = ("--payload", declared.payloads[0].payload.name, "--mass", "KG")
             say_next("drivegain", "record", cell, plan, "--out", "loaded.mcap", *weighed, "--enable-motion")
         return
-    others, calibration = [path for path in out.parent.glob("*.mcap") if path != out], out.with_name("calibration.yaml")
+    others = [path for path in out.parent.glob("*.mcap") if path != out]
+    calibration = out.with_name("calibration.yaml")
     if len(others) == 1 and not calibration.exists() and _is_unloaded(others[0], declared):
         say_next("drivegain", "fit", *others, out, "--out", calibration)
 
@@ -193,7 +194,8 @@ def _free(out: Path) -> Path:
 
 def _next_command(part: Path) -> str:
     aside = part.with_name(part.name + ".kept")
-    one, other = shlex.quote(str(part)), shlex.quote(str(aside))
+    one = shlex.quote(str(part))
+    other = shlex.quote(str(aside))
     saved = shlex.quote(str(part.with_name(part.name.replace(".mcap.part", "") + "-partial.mcap")))
     return (
         f"`drivegain salvage {one} --out {saved}` saves what is in it; to record under this name, remove it "

@@ -98,7 +98,8 @@ def simulate(
         try:
             cell = SimulatedCell(spec, end, mounted=mounted)
         except SpecInvalid as error:
-            expected, remedy = "a cell that can be built", "correct it, or the URDF that it names"
+            expected = "a cell that can be built"
+            remedy = "correct it, or the URDF that it names"
             raise ConfigurationInconsistent(str(truth), found=str(error), expected=expected, remedy=remedy) from error
         what = payload or "none" if payload_from is None else f"as {payload_from} says"
         faulty = len(spec.faults) or "no"
@@ -120,7 +121,9 @@ class MountedFile:
     def __init__(
         self, path: Path, load: Callable[[str | None], CellSpec], complain: Callable[[UsageError], None]
     ) -> None:
-        self._path, self._load, self._complain = path, load, complain
+        self._path = path
+        self._load = load
+        self._complain = complain
         self._name: str | None = None
         self._spec: CellSpec | None = None
 
@@ -181,7 +184,8 @@ def how_to_reach(parts: Sequence[BusPart], period_us: int) -> str:
     several = len(parts) > 1
     buses = ""
     for part in parts:
-        address, indent = part.address, "    " if several else "  "
+        address = part.address
+        indent = "    " if several else "  "
         keys = {"interface": address.interface, "channel": address.channel}
         if address.interface == "socketcand":
             keys |= {"host": address.host, "port": str(address.port)}
@@ -239,7 +243,8 @@ def demo_view(outcome: DemoOutcome) -> Iterator[RenderableType]:
     from daq.report.gains import gain_table
     from daq.report.residual import before_after_table, summary, turns_view
 
-    fitted, truth = outcome.fitted, outcome.truth
+    fitted = outcome.fitted
+    truth = outcome.truth
     yield scan_table(scanned_nodes(outcome.cell, outcome.nodes, outcome.cell.buses[0].name))
     yield ""
     yield from turns_view(fitted)

@@ -319,7 +319,8 @@ def interruptible(
     @contextmanager
     def block_signals() -> Iterator[Callable[[], bool]]:
         nonlocal blocked_until_s
-        earlier_s, blocked_until_s = blocked_until_s, max(blocked_until_s, clock() + GRACE_S)
+        earlier_s = blocked_until_s
+        blocked_until_s = max(blocked_until_s, clock() + GRACE_S)
         try:
             yield lambda: signals_seen > 1
         finally:

@@ -292,7 +292,8 @@ def cells_in(folder: Path, name: str | None = None) -> Iterator[Path]:
 
 def continued(command: str, width: int, indent: str = "") -> list[str]:
     r"""Break a command at its spaces into lines that a shell reads as one, each but the last with ` \` at its end."""
-    lines, line = [], indent
+    lines = []
+    line = indent
     # An option stays with its value.
     for word in re.findall(r"--?\S+(?: [^-\s]\S*)?|\S+", command):
         longer = f"{line}{word}" if not line.strip() else f"{line} {word}"

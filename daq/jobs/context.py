@@ -338,7 +338,8 @@ def before_motion(context: JobContext, *, take_over: bool = True) -> None:
         DiskSpaceShort, HistoryUnreadable, AuditUnusable, NotReleased, DriverError: nothing has moved.
         OutputFailed: the session's folder is gone.
     """
-    section, tools = context.section, context.tools
+    section = context.section
+    tools = context.tools
     with writing(section.folder):
         free_mb = tools.free(section.folder) / 1e6
     if free_mb < section.min_free_mb:

@@ -28,7 +28,8 @@ from daq.writeback.target import Proposal, Written
 from ident.calibration import Calibration
 
 CHANGED_SINCE_START = "The controller's file was written or rolled back since the session began: an operator decides."
-PROPOSAL, DIFF = "proposal.json", "proposal.diff"
+PROPOSAL = "proposal.json"
+DIFF = "proposal.diff"
 
 
 def decide_outcome(context: JobContext, session: Session, calibration: Calibration, history: History) -> Session:
@@ -38,7 +39,8 @@ def decide_outcome(context: JobContext, session: Session, calibration: Calibrati
         CalibrationRefused: a check failed; the controller's file is unchanged, and the session is over.
         AuditUnusable, OutputFailed: see `daq.writeback.target`.
     """
-    path, now = session.folder / CALIBRATION, context.tools.now()
+    path = session.folder / CALIBRATION
+    now = context.tools.now()
     digest = sha256_of(path) or ""
     before = session.state.target
     if before is not None and before.base_sha256 != before.after_sha256 == sha256_of(context.target.file):
@@ -50,7 +52,8 @@ def decide_outcome(context: JobContext, session: Session, calibration: Calibrati
     proposal = context.tools.propose(FileTarget.of(context.cell), request)
     edit = proposal.edit
     decision = decision_of(proposal, known_of(history, str(resolve_links(context.target.file)), digest, edit.changes))
-    differs, touched = any(gain.differs for gain in decision.gains), _written_since(context, session)
+    differs = any(gain.differs for gain in decision.gains)
+    touched = _written_since(context, session)
     if differs and touched:
         decision = decision.model_copy(update={"remark": f"{decision.remark} {CHANGED_SINCE_START}"})
     context.journal.say(Level.NOTICE, "compared with the gains in the controller", words=decision.remark)

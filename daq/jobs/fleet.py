@@ -86,7 +86,8 @@ def _threads(workers: int) -> Iterator[WorkerPool]:
 
 @contextmanager
 def _processes(workers: int) -> Iterator[WorkerPool]:
-    distributed, dask = _distributed(), import_module("dask")
+    distributed = _distributed()
+    dask = import_module("dask")
     # On this machine alone: who reaches a scheduler can run anything on its workers. Its dashboard is left out;
     # its HTTP server cannot be, and takes a free port: on the usual one it would warn of any other cluster.
     with (
@@ -301,9 +302,11 @@ def fleet_view(rows: Sequence[FleetRow]) -> Iterator[RenderableType]:
     table.add_column("s", justify="right", no_wrap=True)
     for row in rows:
         if isinstance(row.result, Failure):
-            cells, style = (printable(f"{row.result.kind}: {row.result.text}"), "", "", ""), "bold red"
+            cells = (printable(f"{row.result.kind}: {row.result.text}"), "", "", "")
+            style = "bold red"
         else:
-            cells, style = _summary_cells(row.result), None
+            cells = _summary_cells(row.result)
+            style = None
         shown = (*cells[:3], *(cells[3:] if effects else ()), f"{row.seconds:.2f}")
         table.add_row(*map(Text, (printable(row.cell), *shown)), style=style)
     yield table

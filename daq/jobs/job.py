@@ -47,7 +47,8 @@ def recalibrate(
         DaqError, DriverError, IdentificationError: the error that ended the session; the axes were stopped, the
             controller's file is unchanged, and audit, state, metrics and summary report it.
     """
-    section, target = section_of(cell), target_of(cell)
+    section = section_of(cell)
+    target = target_of(cell)
     if (early := _not_due(section, cell, tools.now())) is not None:
         journal.say(Level.INFO, "not due", remark=early.remark)
         return early
@@ -91,7 +92,8 @@ def preview(
     Raises:
         the errors of `recalibrate` up to the first motion.
     """
-    section, target = section_of(cell), target_of(cell)
+    section = section_of(cell)
+    target = target_of(cell)
     now = tools.now()
     if (early := _not_due(section, cell, now)) is not None:
         return Preview((), early.remark)

@@ -20,7 +20,9 @@ from daq.documents.session_state import SessionState
 from daq.errors import ConfigurationInconsistent, writing
 from daq.files import read_regular, replace_file
 
-STATE, CALIBRATION, REPORT = "state.json", "calibration.yaml", "report"
+STATE = "state.json"
+CALIBRATION = "calibration.yaml"
+REPORT = "report"
 LARGEST_STATE_BYTES = 4 << 20  # a job writes a few kilobytes
 _STAMP = "%Y%m%dT%H%M%SZ"
 _NAME = re.compile(r"[0-9]{8}T[0-9]{6}Z(?:-[0-9]{2})?")

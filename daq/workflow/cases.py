@@ -83,7 +83,8 @@ def reduce_logs(
     """
     reading = Reading.of(logs, cell)
     refuse_effects(reading.cell, "--known, --cases")
-    model, conditioning = model_of(reading.cell), reading.cell.conditioning
+    model = model_of(reading.cell)
+    conditioning = reading.cell.conditioning
     used = reduce_runs(model, reading.runs(logs, "fit"), conditioning, instruments=instruments)
     rest = each_run(reading.runs(holdout, "holdout"), used.payloads)
     unseen = reduce_runs(model, rest, conditioning, payloads=used.payloads)
@@ -182,7 +183,8 @@ def calibration_of_case(case: CaseFit, created: datetime) -> Calibration:
     )
     kept = tuple(parameter for parameter in calibration.parameters if parameter.name not in removed)
     condition = calibration.condition if case.essential is None else case.essential.estimate.condition
-    covariance, gains = calibration.covariance, len(calibration.gains)
+    covariance = calibration.covariance
+    gains = len(calibration.gains)
     factor = None
     if covariance is not None:
         names = [parameter.name for parameter in calibration.parameters]

@@ -99,7 +99,9 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     last = robot.carrier
     if not any(capsule.link == last for capsule in capsules):
         # Around a steel body of that mass, from where it is mounted to three of its sides away.
-        side, axis, at = side_of_cube(mass_kg), robot.joints[last].axis, robot.mounting_m
+        side = side_of_cube(mass_kg)
+        axis = robot.joints[last].axis
+        at = robot.mounting_m
         capsules = (*capsules, Capsule("payload", last, _point(at + side * axis), _point(at + 2.0 * side * axis), side))
     links = [capsule.link for capsule in capsules]
     parents = [robot.joints[link].parent if link != BASE else None for link in links]
@@ -249,7 +251,8 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     filter_ = decimator(RATE_HZ, cell.conditioning.decimation_cutoff_hz)
     weight = np.cumsum(np.abs(filter_.taps)) / np.abs(filter_.taps).sum()
     inside = int(np.searchsorted(weight, cell.conditioning.standstill_share))
-    period, edge = filter_.factor / RATE_HZ, max(filter_.half - inside, 0) / RATE_HZ
+    period = filter_.factor / RATE_HZ
+    edge = max(filter_.half - inside, 0) / RATE_HZ
     return Experiment(cell, design, scene, mounted, period, edge, remarks)
 
 
@@ -338,7 +341,8 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     For every axis: fast with the arm stretched, fast with it folded (as the payload's link is seen from that axis),
     slow with it stretched, and fast together with a neighbour; and of all axes together.
     """
-    cell, checker = experiment.cell, experiment.scene.checker
+    cell = experiment.cell
+    checker = experiment.scene.checker
     limits = JointLimits.of(cell)
     low, high = limits.targets()
     sampled = np.random.default_rng(0).uniform(low, high, (EXTRA_POSTURES, len(low)))
@@ -377,7 +381,8 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
         if robot.joints[joint].kind is not JointKind.PRISMATIC:
             way = np.cross(at.rotation[joint + 1] @ robot.joints[joint].axis, way)
         lever = np.linalg.norm(way, axis=1)
-        stretched, folded = clear[np.argsort(-lever, kind="stable")], clear[np.argsort(lever, kind="stable")]
+        stretched = clear[np.argsort(-lever, kind="stable")]
+        folded = clear[np.argsort(lever, kind="stable")]
         swing(f"fast moves of {name} with the arm stretched", stretched, [axis])
         swing(f"fast moves of {name} with the arm folded", folded, [axis])
         swing(f"slow moves of {name} with the arm stretched", stretched, [axis], SLOW)
@@ -394,8 +399,10 @@ def _swing(
     """Both ends of the longest clear swing of some axes about the middle of their range; None where there is none."""
     for stroke in STROKES:
         inwards = 0.5 * (1.0 - stroke) * (high - low)
-        start, end = posture.copy(), posture.copy()
-        start[moved], end[moved] = (low + inwards)[moved], (high - inwards)[moved]
+        start = posture.copy()
+        end = posture.copy()
+        start[moved] = (low + inwards)[moved]
+        end[moved] = (high - inwards)[moved]
         if checker.obstruction(start, end) is None:
             return start, end
     return None

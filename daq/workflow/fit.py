@@ -168,7 +168,8 @@ class Reading:
         """
         for log in logs:
             if log in self._first:
-                run, cell = self._first.pop(log), self.cell
+                run = self._first.pop(log)
+                cell = self.cell
             else:
                 run, cell = self._read(log)
             if cell.digest != self.cell.digest:
@@ -599,7 +600,8 @@ def declared_effects(cell: Cell) -> tuple[PlacedEffect, ...]:
     Raises:
         ConfigurationInconsistent: there is no such effect, or it has no such setting, on this axis.
     """
-    robot, placed = model_of(cell).robot, []
+    robot = model_of(cell).robot
+    placed = []
     for declared in cell.effects:
         found = place_effect(declared.name, declared.axis, declared.settings, robot)
         if isinstance(found, Fault):

@@ -73,7 +73,8 @@ def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Fin
 def _said(process: subprocess.Popen[bytes], timeout_s: float) -> bytes:
     """The end of what a program says until it has ended; the rest of it is read, and not kept."""
     assert process.stdout is not None
-    ends_s, said = time.monotonic() + timeout_s, b""
+    ends_s = time.monotonic() + timeout_s
+    said = b""
     with selectors.DefaultSelector() as output:
         output.register(process.stdout, selectors.EVENT_READ)
         while (left_s := ends_s - time.monotonic()) > 0:
@@ -127,7 +128,8 @@ def _require_file(file: Path, interlock: Interlock, now: Callable[[], datetime])
     try:
         with open_regular(file) as stream:
             # Of the file that is open: a gateway may put another in its place meanwhile.
-            found, asked = os.fstat(stream.fileno()), now()
+            found = os.fstat(stream.fileno())
+            asked = now()
             head = stream.read(_LOOK_BYTES)
     except OSError as error:
         raise _held(subject, (error.strerror or type(error).__name__).lower(), expected) from error

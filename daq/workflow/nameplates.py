@@ -33,7 +33,8 @@ def check_controller(cell_file: Path, cell: Cell) -> None:
     Raises:
         ConfigurationInconsistent: one is more than NAMEPLATE_RATIO times the other.
     """
-    controller, file = cell.controller, cell.controller_path
+    controller = cell.controller
+    file = cell.controller_path
     if controller is None or file is None:
         return
     try:

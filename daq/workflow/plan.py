@@ -121,8 +121,10 @@ class Search:
         raise _unfit(self._cell, self._duration_s, found, "at least 5, better 30", "allow a longer run")
 
     def _filled(self) -> tuple[list[PlannedMove], list[Trapezoid]]:
-        moves, paths = [self._clear_start()], list[Trapezoid]()
-        left, retreats = self._duration_s - DWELL_S, 0
+        moves = [self._clear_start()]
+        paths = list[Trapezoid]()
+        left = self._duration_s - DWELL_S
+        retreats = 0
         while True:
             move = self._clear_move(np.array(moves[-1].target_rad))
             if move is not None:
@@ -153,7 +155,9 @@ class Search:
             for candidate in self._drafts(draft, [self._proposal(draft.moves) for _ in range(count)]):
                 value, found = self._judge(candidate, best)
                 if value < best:
-                    chosen, best, worst = candidate, value, found
+                    chosen = candidate
+                    best = value
+                    worst = found
             draft = chosen
             done += count
             progress(done, worst)
@@ -172,10 +176,14 @@ class Search:
         return value, found
 
     def _proposal(self, moves: tuple[PlannedMove, ...]) -> tuple[PlannedMove, ...]:
-        rng, low, high = self._rng, self._low, self._high
+        rng = self._rng
+        low = self._low
+        high = self._high
         kind = KINDS[int(rng.choice(len(KINDS), p=CHANCES))]
         index, other = (int(number) for number in rng.integers(len(moves), size=2))
-        before, old, after = moves[:index], moves[index], moves[index + 1 :]
+        before = moves[:index]
+        old = moves[index]
+        after = moves[index + 1 :]
         random = self._random_move()
         match kind:
             case Kind.ANEW:
@@ -233,7 +241,8 @@ class Search:
 
     def _clear_start(self) -> PlannedMove:
         for _ in range(MAX_TRIES):
-            move, checker = self._random_move(), self._experiment.scene.checker
+            move = self._random_move()
+            checker = self._experiment.scene.checker
             if checker.robot.closures:
                 near = towards(checker, checker.home, np.array(move.target_rad), self._low, self._high)
                 move = replace(move, target_rad=self._written(near))
@@ -244,7 +253,8 @@ class Search:
     def _clear_move(self, start: FloatArray) -> PlannedMove | None:
         for _ in range(MAX_TRIES):
             move = self._random_move()
-            checker, target = self._experiment.scene.checker, np.array(move.target_rad)
+            checker = self._experiment.scene.checker
+            target = np.array(move.target_rad)
             if checker.robot.closures:  # a way to a far target often leaves the workspace
                 target = towards(checker, start, target, self._low, self._high)
                 move = replace(move, target_rad=self._written(target))
@@ -333,7 +343,8 @@ def plan(
     search = Search(experiment, np.random.default_rng(seed), duration_s, speed, largest_condition)
     draft = search.improve(search.random_moves(), exchanges, lambda done, found: progress(done, float(np.max(found))))
     information = np.sum(experiment.informations(draft.paths), axis=0)
-    predicted, found = experiment.design.std_percent(information), experiment.design.condition(information)
+    predicted = experiment.design.std_percent(information)
+    found = experiment.design.condition(information)
     worst = int(np.argmax(predicted))
     remedy = "allow a longer run, more exchanges, wider joint limits or higher speed"
     if not found <= largest_condition:

@@ -147,7 +147,8 @@ def conditioning_of(calibration: Calibration) -> Conditioning:
             expected=f"a list standstill_rad_s and numbers {', '.join(sorted(expected.keys() - {'standstill_rad_s'}))}",
             remedy="fit the logs again with this drivegain",
         )
-    order, speeds = round(found.pop("position_order")), tuple(found.pop("standstill_rad_s"))
+    order = round(found.pop("position_order"))
+    speeds = tuple(found.pop("standstill_rad_s"))
     return Conditioning(**found, position_order=order, standstill_rad_s=speeds)
 
 
@@ -329,7 +330,10 @@ def cross_validate(
                 expected=f"that of {first}: {calibrations[first].filter}",
                 remedy="a relative error can be compared under one filter only: fit both with one cell file",
             )
-    runs, bare, loaded, validations = [], [], [], []
+    runs = []
+    bare = []
+    loaded = []
+    validations = []
     diagnoses: list[Diagnosis] = []
     corrections = Corrections()
     for log in logs:
@@ -349,13 +353,11 @@ def cross_validate(
                 found[label] = predicted(own, conditioning, own_model, log, run, described.digest)
         if first in found:
             validations.append(found[first])
-        condition, standard = None, None
+        condition = None
+        standard = None
         with suppress(IdentificationError):
-            corrected = corrected_model(model, corrections_of(first_own))
-            standard = reduce_runs(corrected, (run,), conditioning)
-            # A payload without columns of its own is part of the link that carries it.
-            system = regrouped(standard, payload_columns=((),) * len(standard.payloads))
-            condition = wls(system, _gains(calibrations[first])).condition
+            standard = _standard_system(first_own, model, run, conditioning)
+            condition = _condition(calibrations[first], standard)
         if standard is not None and first in found and not found[first].is_judged:
             diagnoses += diagnose_run(first_own, found[first], model, run, standard, conditioning)
         if run.payload is not None:
@@ -399,6 +401,19 @@ def cross_validate(
     )
 
 
+def _standard_system(calibration: Calibration, model: Model, run: Run, conditioning: Conditioning) -> System:
+    """Equations of one run in standard parameters, of the description as the calibration corrects it."""
+    corrected = corrected_model(model, corrections_of(calibration))
+    return reduce_runs(corrected, (run,), conditioning)
+
+
+def _condition(calibration: Calibration, standard: System) -> float:
+    """Condition of the weighted observation matrix of a run."""
+    # A payload without columns of its own is part of the link that carries it.
+    system = regrouped(standard, payload_columns=((),) * len(standard.payloads))
+    return wls(system, _gains(calibration)).condition
+
+
 def diagnose_log(calibration: Calibration, log: Path, run: Run, described: Cell) -> tuple[Diagnosis, ...]:
     """Judge a log that the fit of a calibration has not seen, as `cross_validate` does.
 
@@ -414,8 +429,7 @@ def diagnose_log(calibration: Calibration, log: Path, run: Run, described: Cell)
     conditioning = conditioning_of(calibration)
     validation = predicted(calibration, conditioning, model, log, run, described.digest)
     with suppress(IdentificationError):
-        corrected = corrected_model(model, corrections_of(calibration))
-        standard = reduce_runs(corrected, (run,), conditioning)
+        standard = _standard_system(calibration, model, run, conditioning)
         return diagnose_run(calibration, validation, model, run, standard, conditioning)
     return ()
 

@@ -25,8 +25,10 @@ def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
     by σ of the fit / predicted σ: a plan predicts ratios of σ well, but not the noise level.
     """
     found = fitted.identification
-    estimate, system = found.estimate, found.system
-    independent, first = list(system.base.independent), len(system.columns)
+    estimate = found.estimate
+    system = found.system
+    independent = list(system.base.independent)
+    first = len(system.columns)
     standard = np.zeros(len(found.model.columns))
     standard[independent] = estimate.parameters[: len(independent)]
     payloads = []
