@@ -45,7 +45,7 @@ BY_JOB = {
     ),
     Job.LOOK: (
         Listed("monitor", "daq.cli.monitor:MONITOR", "Show the state of the axes; nothing is changed."),
-        Listed("console", "daq.cli.console:CONSOLE", "Show the cell live on a page, with a stop button."),
+        Listed("console", "daq.cli.monitor:CONSOLE", "Show the cell live on a page, with a stop button."),
         Listed("info", "daq.cli.logs:INFO", "Show what is in a log."),
         Listed("history", "daq.cli.history:HISTORY", "Show the calibrations of a cell and any drift."),
         Listed("explain-emcy", "daq.cli.scan:EXPLAIN_EMCY", "Explain an error code of an amplifier."),
@@ -59,7 +59,7 @@ BY_JOB = {
     ),
     Job.EXPERT: (
         Listed("import", "daq.cli.logs:IMPORT", "Convert CSV, MATLAB or ROS 2 files to a log."),
-        Listed("export", "daq.cli.export:EXPORT", "Write a calibration or a log for other programs."),
+        Listed("export", "daq.cli.logs:EXPORT", "Write a calibration or a log for other programs."),
         Listed("weigh", "daq.cli.validate:WEIGH", "Weigh the body on the flange with a calibration."),
         Listed("contact", "daq.cli.validate:CONTACT", "Find external torques, with a threshold for alarms."),
         Listed("simulate", "daq.cli.simulate:SIMULATE", "Run a simulated cell on a bus, to try the other verbs."),

@@ -47,8 +47,7 @@ def plan_verb(
     from daq.report.plan_preview import MARK, preview_page
     from daq.workflow.experiment import RUNS, experiment_of, extra_moves, paths_of
     from daq.workflow.nameplates import check_controller
-    from daq.workflow.plan import plan
-    from daq.workflow.plan_file import load_plan, save_plan
+    from daq.workflow.plan import load_plan, plan, save_plan
     from ident.planning.gain_verdict import verdicts
 
     check_output(out, (cell,), "drivegain-plan")

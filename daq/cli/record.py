@@ -60,8 +60,7 @@ def record_verb(options: RecordOptions) -> None:
     from daq.log.feed import Feed
     from daq.report.log import record_report
     from daq.workflow.bus_lock import bus_lock
-    from daq.workflow.plan import slowed
-    from daq.workflow.plan_file import load_plan
+    from daq.workflow.plan import load_plan, slowed
     from daq.workflow.record import RecordingRequest, record
     from daq.workflow.safeguards import check_entered_mass
 

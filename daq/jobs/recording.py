@@ -36,8 +36,7 @@ from daq.report.fit import start_of
 from daq.report.residual import summary
 from daq.workflow.fit import check_holdout
 from daq.workflow.interlock import Runner, release_check
-from daq.workflow.plan import Plan
-from daq.workflow.plan_file import load_plan, save_plan
+from daq.workflow.plan import Plan, load_plan, save_plan
 from daq.workflow.record import Recorded, RecordingRequest
 from ident.calibration import Calibration
 from ident.errors import IdentificationError

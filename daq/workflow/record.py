@@ -30,8 +30,7 @@ from daq.log.writer import LogContent, LogWriter
 from daq.workflow.experiment import JointLimits, path_of
 from daq.workflow.interlock import release_check
 from daq.workflow.nameplates import check_nameplates, nameplate_warnings
-from daq.workflow.plan import Plan
-from daq.workflow.plan_file import check_approach, check_way
+from daq.workflow.plan import Plan, check_approach, check_way
 from daq.workflow.safeguards import (
     DiskRoom,
     FreeBytes,

@@ -277,8 +277,7 @@ def test_without_the_solver_the_extra_is_named(
 
 def test_nothing_brings_the_solver_along_at_start_up() -> None:
     code = (
-        "import sys, daq.cli.app, daq.cli.export, ident.physical.physical;"
-        "print({'cvxpy', 'clarabel'} & set(sys.modules))"
+        "import sys, daq.cli.app, daq.cli.logs, ident.physical.physical;print({'cvxpy', 'clarabel'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
