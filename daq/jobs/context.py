@@ -172,20 +172,6 @@ class Fitter(Protocol):
         """As `daq.workflow.fit.fit`."""
 
 
-class LoopCloser(Protocol):
-    """Adds the effects that a fit lacks."""
-
-    def __call__(self, start: Fit, seed: int, progress: Callable[[str], None]) -> Fit:
-        """As `daq.workflow.fit.close_loop`."""
-
-
-class Proposer(Protocol):
-    """Plans a write to a controller's file."""
-
-    def __call__(self, target: FileTarget, request: Request) -> Proposal[FileEdit]:
-        """As `daq.writeback.target.propose`."""
-
-
 class ChangeWriter(Protocol):
     """Writes what was planned."""
 
@@ -203,10 +189,10 @@ class Tools:
     plan: Planner = plan
     record: Recorder = record
     fit: Fitter = fit
-    close_loop: LoopCloser = close_loop
+    close_loop: Callable[[Fit, int, Callable[[str], None]], Fit] = close_loop
     calibration: Callable[[Fit, datetime], Calibration] = calibration_of
     account: Callable[[Evidence, Sequence[Step]], Account] = account
-    propose: Proposer = propose
+    propose: Callable[[FileTarget, Request], Proposal[FileEdit]] = propose
     apply: ChangeWriter = apply
     run: Runner = run_command  #: runs a command of the cell
     free: FreeBytes = free_bytes  #: free bytes of a folder's disk

@@ -394,25 +394,38 @@ def _line(row: FleetRow) -> dict[str, Any]:
 
 def _fleet_cell(row: FleetRow) -> FleetCell:
     result = row.result
-    failure = result if isinstance(result, Failure) else None
-    summary = result if isinstance(result, Summary) else None
+    about: dict[str, Any] = {
+        "cell": spelled_bytes(row.cell),
+        "configuration_sha256": row.configuration_sha256 or None,
+        "configurations": row.configurations,
+        "fit": list(map(spelled_bytes, row.fit)),
+        "holdout": list(map(spelled_bytes, row.holdout)),
+        "seconds": row.seconds,
+        "kept": row.kept,
+        "calibration": None if row.file is None else spelled_bytes(str(row.file)),
+    }
+    if isinstance(result, Failure):
+        return FleetCell(
+            **about,
+            gains=[],
+            worst=None,
+            error_percent=None,
+            error_on=None,
+            effects=[],
+            partial=None,
+            exit_code=result.exit_code,
+            error=FleetFailure(kind=result.kind, text=spelled_bytes(result.text)),
+        )
     return FleetCell(
-        cell=spelled_bytes(row.cell),
-        configuration_sha256=row.configuration_sha256 or None,
-        configurations=row.configurations,
-        fit=[spelled_bytes(name) for name in row.fit],
-        holdout=[spelled_bytes(name) for name in row.holdout],
-        gains=[] if summary is None else [_fleet_gain(gain) for gain in summary.gains],
-        worst=None if summary is None else _fleet_gain(summary.worst),
-        error_percent=None if summary is None else summary.error_percent,
-        error_on=None if summary is None else _measured_on(summary),
-        effects=[] if summary is None else [FleetEffect(name=name, axis=axis) for name, axis in summary.effects],
-        partial=None if summary is None else summary.partial,
-        seconds=row.seconds,
-        kept=row.kept,
-        calibration=None if row.file is None else spelled_bytes(str(row.file)),
-        exit_code=0 if failure is None else failure.exit_code,
-        error=None if failure is None else FleetFailure(kind=failure.kind, text=spelled_bytes(failure.text)),
+        **about,
+        gains=list(map(_fleet_gain, result.gains)),
+        worst=_fleet_gain(result.worst),
+        error_percent=result.error_percent,
+        error_on=_measured_on(result),
+        effects=[FleetEffect(name=name, axis=axis) for name, axis in result.effects],
+        partial=result.partial,
+        exit_code=0,
+        error=None,
     )
 
 

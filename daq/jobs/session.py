@@ -17,7 +17,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from daq.documents.session_state import SessionState
-from daq.errors import ConfigurationInconsistent, writing
+from daq.errors import ConfigurationInconsistent, reason_of, writing
 from daq.files import read_regular, replace_file
 
 STATE = "state.json"
@@ -85,7 +85,7 @@ def _listing(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise ConfigurationInconsistent(
             str(folder),
-            found=(error.strerror or type(error).__name__).lower(),
+            found=reason_of(error),
             expected="the folder of a cell's sessions",
             remedy="correct `recalibration.folder` of the cell file, or move that file away",
         ) from error

@@ -12,7 +12,7 @@ import numpy as np
 from daq.config.cell import Cell, model_of
 from daq.errors import ConfigurationInconsistent
 from daq.workflow.choices import Known
-from daq.workflow.diagnoses import named_causes, nameplate_of
+from daq.workflow.diagnoses import fixed_gains_of, named_causes, nameplate_of
 from daq.workflow.fit import Fit, Reading, calibration_of, judged, refuse_effects
 from ident.calibration import Calibration, Parameter, Source, factor_of
 from ident.equations.reduction import reduce_runs, regrouped
@@ -140,7 +140,7 @@ def essential_fit(fitted: Fit, ratio: float) -> CaseFit:
     refuse_effects(fitted.cell, "--essential")
     before = fitted.identification
     estimate = before.estimate
-    fixed = estimate.gains if estimate.gains_fixed else None
+    fixed = fixed_gains_of(estimate)
     found = essential(before.system, lambda system: estimate_with(estimate.method, system, fixed), ratio)
     after = replace(fitted, identification=replace(before, estimate=found.whole))
     return CaseFit(after, before.system.payloads, found)

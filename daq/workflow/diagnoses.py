@@ -42,6 +42,7 @@ from ident.discovery.geometry_check import GeometryCheck, check_geometry
 from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import LatePosition, ZeroOffset, is_correction, turned_gravity
 from ident.equations.instants import Instants, read_instants
+from ident.equations.system import System
 from ident.errors import (
     ChannelsExchanged,
     Diagnosis,
@@ -58,7 +59,7 @@ from ident.estimators.diagnosis import (
     exchanged_channels,
     unsigned_channels,
 )
-from ident.estimators.estimate import Identification
+from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.geometry_estimate import GeometryEstimate, GeometryFinding
 from ident.estimators.identify import estimate_with
 from ident.estimators.method import Method
@@ -450,13 +451,23 @@ def geometry_beside(evidence: Evidence, seed: int) -> GeometryCheck | None:
         seed: of the bootstrap.
     """
     if evidence.estimate.method is not Method.ML:
-        fixed = evidence.estimate.gains if evidence.estimate.gains_fixed else None
-        by_ml = estimate_with(Method.ML, evidence.training.system(), fixed)
-        evidence = replace(evidence, estimate=by_ml)
+        evidence = replace(evidence, estimate=by_likelihood(evidence.estimate, evidence.training.system()))
     try:
         return check_geometry(evidence, np.random.default_rng(seed))
     except TooFewMoves:
         return None
+
+
+def fixed_gains_of(estimate: Estimate) -> FloatArray | None:
+    """Return the gains that an estimate held fixed, shape (n,); None where it found them."""
+    return estimate.gains if estimate.gains_fixed else None
+
+
+def by_likelihood(estimate: Estimate, system: System) -> Estimate:
+    """Return the estimate of a system by ``ml``, in whose terms candidates are judged, or itself if it is by ``ml``."""
+    if estimate.method is Method.ML:
+        return estimate
+    return estimate_with(Method.ML, system, fixed_gains_of(estimate))
 
 
 def check_diagnoses(check: GeometryCheck, cell: Cell, model: Model) -> tuple[Diagnosis, ...]:

@@ -192,11 +192,11 @@ class Experiment:
         """Rows of each motor that count; the same rule as ident/equations/rows.py, for moves from rest to rest."""
         train = self.design.expectation.model.drive_train
         # On a trapezoid a joint is slowest at the ends of a row's window.
-        early, late = (np.abs(path.at(time_s + shift)[1].T) for shift in (-self.edge_s, self.edge_s))
+        early = path.at(time_s - self.edge_s)[1].T
+        late = path.at(time_s + self.edge_s)[1].T
         standstill = np.array(self.cell.conditioning.standstill_rad_s or (0.0,) * len(early))[:, None]
-        moving = (np.minimum(early, late) > standstill) if standstill.any() else np.minimum(early, late) > 0.0
-        slowest = np.minimum(*(np.abs(train.direction @ path.at(time_s + s)[1].T) for s in (-self.edge_s, self.edge_s)))
-        turned = slowest > standstill
+        moving = np.minimum(np.abs(early), np.abs(late)) > standstill
+        turned = np.minimum(np.abs(train.direction @ early), np.abs(train.direction @ late)) > standstill
         needed = (np.abs(train.to_motor) > 0) | (np.abs(train.direction) > 0)
         use = np.stack([moving[needed[motor]].all(axis=0) & turned[motor] for motor in range(len(moving))])
         return use.all(axis=0) & use if self.design.expectation.model.is_redundant else use

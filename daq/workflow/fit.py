@@ -22,10 +22,12 @@ from daq.log.conversion import load_run
 from daq.log.reader import LossyLogs
 from daq.workflow.diagnoses import (
     Recordings,
+    by_likelihood,
     check_diagnoses,
     correction_diagnoses,
     diagnose_fit,
     encoder_misfit_of,
+    fixed_gains_of,
     geometry_beside,
     is_checked,
     named_causes,
@@ -431,10 +433,9 @@ def close_loop(
     if 0 < len(cold) < len(evidence.fit_runs):
         _LOG.warning("%s without temperatures: %s is not looked for", ", ".join(cold), TemperatureFriction.name)
     before = start.identification
-    if before.estimate.method is not Method.ML:
-        fixed = before.estimate.gains if before.estimate.gains_fixed else None
-        before = replace(before, estimate=estimate_with(Method.ML, before.system, fixed))
-        by_ml = before.estimate
+    by_ml = by_likelihood(before.estimate, before.system)
+    if by_ml is not before.estimate:
+        before = replace(before, estimate=by_ml)
         evidence = with_declared_again(evidence, by_ml) if known else replace(evidence, estimate=by_ml)
     rng = np.random.default_rng(seed)
     places = start.cell.place_names
@@ -476,7 +477,7 @@ def with_corrected_geometry(start: Fit) -> Fit:
         cell.conditioning,
         holdout=(start.read(log)[0] for log in start.holdout),
         method=described.method,
-        fixed_gains=described.gains if described.gains_fixed else None,
+        fixed_gains=fixed_gains_of(described),
         keep_rows=True,
         judge=not effects,
         axes=cell.axis_names,
@@ -644,8 +645,7 @@ def with_effects_of_cell(
     if not effects:
         return ()
     estimate = start.estimate
-    fixed = estimate.gains if estimate.gains_fixed else None
-    by_ml = estimate if estimate.method is Method.ML else estimate_with(Method.ML, start.system, fixed)
+    by_ml = by_likelihood(estimate, start.system)
     steps = with_declared(
         replace(gather(start), estimate=by_ml), effects, np.random.default_rng(BOOTSTRAP_SEED), axes=axes
     )

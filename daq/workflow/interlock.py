@@ -16,7 +16,7 @@ from pathlib import Path
 
 from daq.config.cell import Cell
 from daq.config.recalibration import Command, Interlock
-from daq.errors import NotReleased
+from daq.errors import NotReleased, reason_of
 from daq.files import open_regular
 
 MAX_OUTPUT_CHARACTERS = 400  #: Characters of what a program said that are shown
@@ -55,7 +55,7 @@ def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Fin
             start_new_session=True,
         )
     except OSError as error:
-        return Finished(None, f"{command.command[0]}: {(error.strerror or type(error).__name__).lower()}")
+        return Finished(None, f"{command.command[0]}: {reason_of(error)}")
     with process:
         try:
             said = _said(process, command.timeout_s)
@@ -132,7 +132,7 @@ def _require_file(file: Path, interlock: Interlock, now: Callable[[], datetime])
             asked = now()
             head = stream.read(_LOOK_BYTES)
     except OSError as error:
-        raise _held(subject, (error.strerror or type(error).__name__).lower(), expected) from error
+        raise _held(subject, reason_of(error), expected) from error
     says = head.decode("utf-8", errors="replace").partition("\n")[0].strip()
     if says != interlock.says:
         raise _held(subject, repr(says[:80]), expected)

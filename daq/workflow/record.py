@@ -464,26 +464,27 @@ def recovery_move(
     Raises:
         MotionRefused: an axis is outside and the cell does not allow the return, or it is too long or not clear.
     """
-    beyond = [
-        max(limit.position_min_counts - start, start - limit.position_max_counts, 0)
-        for start, limit in zip(start_counts, limits, strict=True)
-    ]
-    if not any(beyond):
+    outside: list[str] = []
+    target: list[int] = []
+    largest_share = 0.0
+    for name, start, limit in zip(cell.axis_names, start_counts, limits, strict=True):
+        low = limit.position_min_counts
+        high = limit.position_max_counts
+        beyond = max(low - start, start - high, 0)
+        if not beyond:
+            target.append(start)
+            continue
+        share = beyond / max(high - low, 1)
+        largest_share = max(largest_share, share)
+        outside.append(f"{name} at {start} counts, {beyond} ({100.0 * share:.2g} % of its range) beyond its limits")
+        inside = INSIDE * (high - low)
+        target.append(round(np.clip(start, low + inside, high - inside)))
+    if not outside:
         return None
-    ranges = [limit.position_max_counts - limit.position_min_counts for limit in limits]
-    found = "; ".join(
-        f"{name} at {start} counts, {count} ({100.0 * count / max(span, 1):.2g} % of its range) beyond its limits"
-        for name, start, count, span in zip(cell.axis_names, start_counts, beyond, ranges, strict=True)
-        if count
-    )
-    _require_allowed(cell, found, max(count / max(span, 1) for count, span in zip(beyond, ranges, strict=True)))
-    target = tuple(
-        round(np.clip(start, limit.position_min_counts + INSIDE * span, limit.position_max_counts - INSIDE * span))
-        if count
-        else start
-        for start, limit, count, span in zip(start_counts, limits, beyond, ranges, strict=True)
-    )
-    here, there = (scale.joint_position(np.array(counts)) for counts in (start_counts, target))
+    found = "; ".join(outside)
+    _require_allowed(cell, found, largest_share)
+    here = scale.joint_position(np.array(start_counts))
+    there = scale.joint_position(np.array(target))
     check_way(cell, here, there, "the slow return within the limits")
     slow = tuple(
         AxisLimits(
@@ -494,7 +495,7 @@ def recovery_move(
         )
         for start, limit in zip(start_counts, limits, strict=True)
     )
-    return synchronised_move(start_counts, target, slow), slow, f"{found}; it was brought back slowly"
+    return synchronised_move(start_counts, tuple(target), slow), slow, f"{found}; it was brought back slowly"
 
 
 def bring_back(
