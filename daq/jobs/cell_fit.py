@@ -184,8 +184,10 @@ class CalibrationCache:
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return None  # unreadable: made anew
         summary, seconds = found
-        numbers = [number for gain in summary.gains for number in (gain.value, gain.std, gain.nameplate)]
-        return found if all(map(math.isfinite, (*numbers, summary.error_percent, seconds))) else None
+        numbers = [summary.error_percent, seconds]
+        for gain in summary.gains:
+            numbers += (gain.value, gain.std, gain.nameplate)
+        return found if all(map(math.isfinite, numbers)) else None
 
     def store(self, cell: CellLogs, fitted: FleetFit) -> Path:
         """Store a calibration; after a kill at any point, the cache is whole or the entry is made anew.

@@ -199,7 +199,8 @@ def fit_fleet(
     rows: list[FleetRow] = []
 
     def row_of(cell: CellLogs, result: Summary | Failure, seconds: float) -> FleetRow:
-        fit, holdout = (tuple(seen.log.name for seen in logs) for logs in (cell.fit, cell.holdout))
+        fit = tuple(seen.log.name for seen in cell.fit)
+        holdout = tuple(seen.log.name for seen in cell.holdout)
         return FleetRow(cell.cell, cell.configuration_sha256, fit, holdout, result, seconds, configurations[cell.cell])
 
     missing = []

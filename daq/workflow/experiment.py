@@ -174,7 +174,7 @@ class Experiment:
         period = self.row_s * thinning
         times = [np.arange(0.5 * period, path.duration_s, period) for path in paths]
         parts = [path.at(time) for path, time in zip(paths, times, strict=True)]
-        motion = Motion(*(np.concatenate([part[kind] for part in parts]) for kind in range(3)))
+        motion = _joined(parts)
         use = np.concatenate([self._use(path, time) for path, time in zip(paths, times, strict=True)], axis=1)
         ends = np.cumsum([len(time) for time in times])
         slices = tuple(slice(end - len(time), end) for end, time in zip(ends.tolist(), times, strict=True))
@@ -269,7 +269,12 @@ def _fast_motion(limits: JointLimits, checker: Checker) -> Motion:
     for start, end in pairwise(targets):
         path = synchronised(start, end, limits.velocity, limits.acceleration)
         parts.append(path.at(np.linspace(0.02, 0.98, 24) * path.duration_s))
-    return Motion(*(np.concatenate([part[kind] for part in parts]) for kind in range(3)))
+    return _joined(parts)
+
+
+def _joined(parts: Sequence[tuple[FloatArray, ...]]) -> Motion:
+    """Join motions of positions, velocities and accelerations, one after the other."""
+    return Motion(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _allowed(

@@ -116,8 +116,12 @@ class Fit:
         """The rows behind the identification, without effects; the logs are read again unless it has kept them."""
         if self.identification.gathered is not None:
             return gather(self.identification)
-        used, unseen = ((load_run(log, self.cell, self.lossy)[0] for log in logs) for logs in (self.logs, self.holdout))
-        return gather(self.identification, used, unseen)
+        return gather(self.identification, self.runs(self.logs), self.runs(self.holdout))
+
+    def runs(self, logs: Sequence[Path]) -> Iterator[Run]:
+        """Read logs again, one after the other, with the description that the fit used."""
+        for log in logs:
+            yield load_run(log, self.cell, self.lossy)[0]
 
 
 BOOTSTRAP_SEED = 0  #: Fixes the verdict of a significance test; no decision depends on it for declared effects
@@ -398,7 +402,7 @@ def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: 
     found = fitted.identification
     return try_estimators(
         found.model,
-        lambda: (load_run(log, fitted.cell, fitted.lossy)[0] for log in fitted.logs),
+        lambda: fitted.runs(fitted.logs),
         found.conditioning,
         progress,
     )

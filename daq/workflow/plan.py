@@ -243,10 +243,11 @@ class Search:
         known |= {
             way: (path, information) for (way, path), information in zip(fresh.items(), informations, strict=True)
         }
-        return [
-            Draft(moves, tuple(known[way][0] for way in ways), tuple(known[way][1] for way in ways))
-            for moves, ways in kept
-        ]
+        drafts = []
+        for moves, ways in kept:
+            paths, of_paths = zip(*(known[way] for way in ways), strict=True)
+            drafts.append(Draft(moves, paths, of_paths))
+        return drafts
 
     def _clear_start(self) -> PlannedMove:
         for _ in range(MAX_TRIES):

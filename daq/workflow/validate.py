@@ -440,11 +440,8 @@ def _masses(
     first = next(iter(calibrations.values()))
     nameplate = [gain.nameplate for gain in first.gains]
     sets = dict(calibrations)
-    if (
-        isinstance(rows, RowsToWeigh)
-        and rows.bare
-        and all([gain.value for gain in one.gains] != nameplate for one in sets.values())
-    ):
+    has_nameplate = any(_gains(one).tolist() == nameplate for one in sets.values())
+    if isinstance(rows, RowsToWeigh) and rows.bare and not has_nameplate:
         entered = tuple(replace(gain, value=gain.nameplate, std=0.0) for gain in first.gains)
         sets = {MANUFACTURER: replace(first, gains=entered, covariance_factor=None), **sets}
     masses: dict[str, Mass | str] = {}

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from daq.errors import ConfigurationError
-from daq.log.conversion import load_run
 from daq.workflow.experiment import LAG_ONE, experiment_of, extra_moves
 from daq.workflow.fit import Fit
 from ident.data.dataset import differentiate
@@ -64,8 +63,7 @@ def needed_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
 def _excitations(fitted: Fit) -> Iterator[tuple[Excitation, tuple[int | None, ...]]]:
     found = fitted.identification
     mountings = [payload.mounting for payload in found.system.payloads]
-    for log in fitted.logs:
-        run, _ = load_run(log, fitted.cell, fitted.lossy)
+    for run in fitted.runs(fitted.logs):
         data = differentiate(run, found.model.drive_train, found.conditioning)
         mounted = None if run.payload is None else mountings.index(run.payload.mounting)
         yield recorded(found.model, data, found.conditioning), (mounted,)
