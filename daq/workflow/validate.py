@@ -109,7 +109,7 @@ def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None =
         CalibrationUnreadable: the calibration does not say its filter.
         IdentificationError: the calibration cannot speak of this run: unknown mounting, effect or parameter.
     """
-    conditioning = conditioning_of(calibration)
+    conditioning_of(calibration)  # refuses a calibration without a filter before any log is read
     validations: list[Validation] = []
     corrections = Corrections()
     for log in logs:
@@ -117,8 +117,7 @@ def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None =
         corrections.note(log, run)
         check_cell(calibration, log, described)
         warn_without_temperature(calibration, run.name, run.temperature_c)
-        own, model = on_cell(calibration, described)
-        validations.append(predicted(own, conditioning, model, log, run, described.digest))
+        validations.append(predicted(calibration, described, log, run))
     return tuple(validations)
 
 
@@ -179,15 +178,22 @@ def unpredictable(calibration: Calibration, payload: Payload | None) -> str:
     return ""
 
 
-def predicted(
-    calibration: Calibration, conditioning: Conditioning, model: Model, log: Path, run: Run, configuration_sha256: str
-) -> Validation:
+def predicted(calibration: Calibration, described: Cell, log: Path, run: Run) -> Validation:
     """One run under one calibration.
 
+    Args:
+        calibration: of the cell.
+        described: the cell, as the log or another description has it.
+        log: where the run was read.
+        run: as it was read.
+
     Raises:
+        CalibrationUnreadable: the calibration does not say its filter.
         IdentificationError: the calibration cannot speak of this run.
     """
-    warn_of_corrections(calibration, run.name, configuration_sha256)
+    conditioning = conditioning_of(calibration)
+    calibration, model = on_cell(calibration, described)
+    warn_of_corrections(calibration, run.name, described.digest)
     run = replace(run, payload=as_calibrated(calibration, run.payload, run.name))
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
@@ -199,7 +205,7 @@ def predicted(
         run=run.name,
         digest=run.digest,
         data_use=data_use(calibration, run),
-        same_configuration=configuration_sha256 == calibration.configuration_sha256,
+        same_configuration=described.digest == calibration.configuration_sha256,
         partial=run.partial,
         time_s=data.time_s[filter_.centres(len(data.time_s))] - data.time_s[0],
         measured_nm=filter_(measured_torque(calibration, model, data.current_a, data.motion()).T),
@@ -349,8 +355,7 @@ def cross_validate(
             if reason:
                 reasons.setdefault(reason, []).append(label)
             else:
-                own, own_model = on_cell(calibration, described)
-                found[label] = predicted(own, conditioning, own_model, log, run, described.digest)
+                found[label] = predicted(calibration, described, log, run)
         if first in found:
             validations.append(found[first])
         condition = None
@@ -425,9 +430,9 @@ def diagnose_log(calibration: Calibration, log: Path, run: Run, described: Cell)
     """
     if unpredictable(calibration, run.payload):
         return ()
+    validation = predicted(calibration, described, log, run)
     calibration, model = on_cell(calibration, described)
     conditioning = conditioning_of(calibration)
-    validation = predicted(calibration, conditioning, model, log, run, described.digest)
     with suppress(IdentificationError):
         standard = _standard_system(calibration, model, run, conditioning)
         return diagnose_run(calibration, validation, model, run, standard, conditioning)
