@@ -200,8 +200,8 @@ def export_urdf_verb(
     from daq.documents.calibration_file import load_calibration
     from daq.report.urdf_views import urdf_report, urdf_view
     from daq.workflow.fit import DOUBTFUL_PERCENT
-    from daq.workflow.remaining_corrections import on_cell
     from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, update_urdf
+    from daq.workflow.validate import on_cell
 
     if (calibration is None) == (urdf is None):
         raise UsageError(

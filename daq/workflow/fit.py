@@ -33,8 +33,7 @@ from daq.workflow.diagnoses import (
     named_causes,
     nameplate_of,
 )
-from daq.workflow.remaining_corrections import with_described
-from daq.workflow.validate import Corrections, diagnose_log
+from daq.workflow.validate import Corrections, diagnose_log, with_described
 from ident.arrays import FloatArray
 from ident.calibration import Calibration, Source
 from ident.calibration import calibration_of as identified_calibration

@@ -23,8 +23,7 @@ import numpy as np
 from daq.config.cell import Cell
 from daq.errors import DaqError
 from daq.log.feed import RunFacts
-from daq.workflow.remaining_corrections import on_cell
-from daq.workflow.validate import check_cell, conditioning_of, unpredictable, warn_without_temperature
+from daq.workflow.validate import check_cell, conditioning_of, on_cell, unpredictable, warn_without_temperature
 from ident.arrays import FloatArray, IntArray
 from ident.calibration import Calibration
 from ident.data.conditioning import central_differences, decimator, low_pass
