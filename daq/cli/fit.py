@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from enum import Enum
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -399,7 +399,7 @@ def check_report(folder: Path | None, out: Path | None = None) -> None:
         )
     with writing(folder):
         make_folder(folder)
-        with TemporaryFile(dir=folder):
+        with tempfile.TemporaryFile(dir=folder):
             pass
     for name, mark in MARKS.items():
         check_replaceable(folder / name, mark, "report of `drivegain residual`")

@@ -11,7 +11,7 @@ from rich.table import Table
 from daq.report.fit_schemas import OwnTorque
 from daq.report.picture import BLUE, GREEN, GREY, legend_below, render, single
 from daq.report.text import SHOWN_SIGMAS, plain_table, terminal_text
-from daq.workflow.diagnoses import misfit_text
+from daq.workflow.geometry_diagnoses import misfit_text
 from ident.calibration import Calibration, EncoderMisfit, Gain, GeometryCorrection, PayloadMass
 from ident.data.torque_channel import TorqueSlope
 from ident.errors import Diagnosis

@@ -26,13 +26,13 @@ from daq.workflow.diagnoses import (
     check_diagnoses,
     correction_diagnoses,
     diagnose_fit,
-    encoder_misfit_of,
     fixed_gains_of,
     geometry_beside,
     is_checked,
     named_causes,
     nameplate_of,
 )
+from daq.workflow.geometry_diagnoses import encoder_misfit_of
 from daq.workflow.validate import Corrections, diagnose_log, with_described
 from ident.arrays import FloatArray
 from ident.calibration import Calibration, Source

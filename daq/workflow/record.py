@@ -220,7 +220,7 @@ def record(
             log.readings(polling.temperatures(stream.time_ns))
             reason = (
                 _stopped(short, kept, len(moves))
-                or losses_of(stream.statistics)
+                or stream_losses(stream.statistics)
                 or kept.motion.reason(cell, readback, rate_hz)
             )
             log.conclude(not reason, reason, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns())
@@ -569,7 +569,7 @@ def _stopped(short: DiskSpaceShort | None, kept: Kept, moves: int) -> str:
     return "" if short is None else f"stopped after {kept.done} of {moves} moves: {short.found}"
 
 
-def losses_of(statistics: StreamStatistics) -> str:
+def stream_losses(statistics: StreamStatistics) -> str:
     """Return the losses of a run, each of which makes it invalid; empty without a lost or unexplained frame."""
     return loss_reason(
         {

@@ -19,7 +19,8 @@ from daq.config.cell import Cell, model_of
 from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationUnreadable, LogsDiffer
 from daq.log.conversion import load_run
-from daq.workflow.diagnoses import calibrated_model, drift_diagnosis, with_verbs
+from daq.workflow.diagnoses import drift_diagnosis, with_verbs
+from daq.workflow.geometry_diagnoses import calibrated_model
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import AcceptedEffect, Calibration
 from ident.data.conditioning import Conditioning

@@ -19,8 +19,8 @@ from daq.log.reader import LossyLogs
 from daq.report.certificate import certificate_report, certify, without_controller
 from daq.report.document import json_tree
 from daq.workflow import fit as fitting
-from daq.workflow.diagnoses import calibrated_model, encoder_misfit_of, geometry_diagnoses
 from daq.workflow.fit import Fit, calibration_of, fit, with_corrected_geometry
+from daq.workflow.geometry_diagnoses import calibrated_model, encoder_misfit_of, geometry_diagnoses
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.discovery.evidence import gather, with_effects

@@ -1,0 +1,204 @@
+"""The geometry of a cell whose robot has more encoders than degrees of freedom: what is said of it, and what is kept.
+
+`ident.estimators.geometry_estimate` finds which numbers of the description the encoders contradict. `fit` names them
+and keeps to the description; `residual` identifies with the corrected numbers, and a calibration says which they are,
+so that `validate` and `weigh` predict with the same geometry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from daq.config.cell import Cell, model_of
+from ident.calibration import Calibration, EncoderMisfit, GeometryCorrection
+from ident.errors import Diagnosis, ModelError
+from ident.model.geometry import GeometryChange, GeometryKind, GeometryParameter, described_length
+from ident.model.geometry_derivatives import model_with_geometry
+from ident.model.model import Model
+from ident.model.robot import JointKind
+
+if TYPE_CHECKING:  # who predicts with a calibration estimates no geometry
+    from ident.estimators.geometry_estimate import GeometryEstimate, GeometryFinding
+
+NAMES = {GeometryKind.ZERO: "zero-off", GeometryKind.LENGTH: "length-off"}  #: Diagnoses of one wrong number
+SEVERAL = "geometry-off"  #: Diagnosis of several, and of a misfit without an explanation
+ANGLE = "rad"  #: Unit of misfits of a robot without prismatic axes
+_SHOWN_ALTERNATIVES = 3
+
+
+def geometry_diagnoses(finding: GeometryFinding | None, cell: Cell, *, applied: bool) -> Iterator[Diagnosis]:
+    """Name the numbers of the description that the encoders contradict.
+
+    Args:
+        finding: None for a robot without redundant encoders.
+        cell: as it is described.
+        applied: the gains are those of the corrected geometry.
+    """
+    if finding is None or not finding.is_significant:
+        return
+    unit = _misfit_unit(model_of(cell))
+    misfit = f"encoders that miss the loops by {misfit_text(finding.misfit, unit)}"
+    expected = f"{misfit_text(finding.misfit_left, unit)}, as with zeros and lengths that fit them"
+    used = "the gains are those of the corrected geometry"
+    if not applied:
+        used = "the gains are those of the described geometry: `drivegain residual` identifies with the corrected one"
+    if not finding.corrections:
+        yield Diagnosis(
+            name=SEVERAL,
+            runs=(),
+            axes=(),
+            found=f"{misfit}, which no three zeros or lengths explain",
+            expected=expected,
+            remedy="measure zeros and lengths, and correct cell file and URDF; the gains are those of the described",
+        )
+        return
+    texts = [_correction_text(one, cell) for one in finding.corrections]
+    remedies = [_remedy(one, cell) for one in finding.corrections]
+    several = len(finding.corrections) > 1
+    ambiguous = ""
+    if finding.alternatives:
+        others = [_explanation_text(other, cell) for other in finding.alternatives[:_SHOWN_ALTERNATIVES]]
+        ambiguous = f" (not distinguishable from {'; '.join(others)})"
+    yield Diagnosis(
+        name=SEVERAL if several else NAMES[finding.corrections[0].parameter.kind],
+        runs=(),
+        axes=tuple(_axes_of(finding.corrections, cell)),
+        found=f"{misfit}, which {' and '.join(texts)} {'explain together' if several else 'explains alone'}{ambiguous}",
+        expected=expected,
+        remedy=f"{', and '.join(remedies)}; {used}",
+    )
+
+
+def _misfit_unit(model: Model) -> str:
+    """Unit of misfits: that of the axes, or a share of the robot's size too."""
+    kinds = {joint.kind for joint in model.robot.axes}
+    return ANGLE if kinds == {JointKind.REVOLUTE} else "rad or robot size"
+
+
+def misfit_text(misfit: float, unit: str) -> str:
+    """Write a misfit [unit] in thousandths."""
+    return f"{1e3 * misfit:.2g} {'mrad' if unit == ANGLE else f'thousandths ({unit})'}"
+
+
+def _axes_of(corrections: Sequence[GeometryEstimate], cell: Cell) -> Iterator[str]:
+    """Axes of the zeros among corrections."""
+    for one in corrections:
+        if one.parameter.kind is GeometryKind.ZERO:
+            yield cell.axes[_axis_of(one.parameter, model_of(cell))].name
+
+
+def _axis_of(parameter: GeometryParameter, model: Model) -> int:
+    """Axis of a zero.
+
+    Raises:
+        ModelError: no axis has a joint of this name.
+    """
+    names = [joint.name for joint in model.robot.axes]
+    if parameter.joint not in names:
+        raise ModelError(
+            f"a zero of joint {parameter.joint!r} was corrected, and no axis of the robot has it: "
+            f"{', '.join(names)}; give the cell file of the fit, or calibrate anew"
+        )
+    return names.index(parameter.joint)
+
+
+def _explanation_text(corrections: Sequence[GeometryEstimate], cell: Cell) -> str:
+    return " and ".join(_correction_text(one, cell) for one in corrections)
+
+
+def _correction_text(one: GeometryEstimate, cell: Cell) -> str:
+    """Say how far a number is off: `a zero of M2 that is off by -0.102 ± 0.003 deg`."""
+    if one.parameter.kind is GeometryKind.ZERO:
+        axis = cell.axes[_axis_of(one.parameter, model_of(cell))]
+        size = _size_text(-one.change, one.std, axis.unit.si)
+        return f"a zero of {axis.name} that is off by {size} {axis.unit.name}"
+    longer = "longer" if one.change > 0.0 else "shorter"
+    size = _size_text(abs(one.change), one.std, 1e-3, sign="")
+    return f"a {one.parameter.name} that is {size} mm {longer} than described"
+
+
+def _size_text(value: float, std: float, unit_si: float, sign: str = "+") -> str:
+    """Write a size with σ, to a figure that a description can hold."""
+    shown_std = max(std / unit_si, 5e-5)
+    return f"{value / unit_si:{sign}.4f} ± {shown_std:.4f}"
+
+
+def _remedy(one: GeometryEstimate, cell: Cell) -> str:
+    if one.parameter.kind is GeometryKind.ZERO:
+        axis = cell.axes[_axis_of(one.parameter, model_of(cell))]
+        amount = f"{one.change / axis.unit.si:+.4f}"
+        return (
+            f"add {amount} {axis.unit.name} to `zero_offset_{axis.unit.name}` of {axis.name} in the cell file, or "
+            "correct the zero in the controller"
+        )
+    length_m = described_length(model_of(cell).robot, one.parameter)
+    right = f"{1e3 * (length_m + one.change):.3f} mm in place of {1e3 * length_m:.3f} mm"
+    return f"correct the {one.parameter.name} in the URDF: {right}"
+
+
+# What a calibration keeps
+
+
+def encoder_misfit_of(finding: GeometryFinding | None, cell: Cell, *, applied: bool) -> EncoderMisfit | None:
+    """Make what a calibration keeps of a finding; arguments as for `geometry_diagnoses`."""
+    if finding is None:
+        return None
+    model = model_of(cell)
+    return EncoderMisfit(
+        described=_rounded(finding.misfit),
+        left=_rounded(finding.misfit_left),
+        unit=_misfit_unit(model),
+        significant=finding.is_significant,
+        corrections=tuple(_kept(one, cell, model) for one in finding.corrections),
+        applied=applied,
+        alternatives=tuple(_explanation_text(other, cell) for other in finding.alternatives),
+        unobservable=finding.unobservable,
+    )
+
+
+def _kept(one: GeometryEstimate, cell: Cell, model: Model) -> GeometryCorrection:
+    parameter = one.parameter
+    if parameter.kind is GeometryKind.ZERO:
+        axis = _axis_of(parameter, model)
+        described = float(cell.axes[axis].zero_offset_rad)
+        unit = "rad" if model.robot.axes[axis].kind is JointKind.REVOLUTE else "m"
+    else:
+        described = described_length(model.robot, parameter)
+        unit = "m"
+    return GeometryCorrection(
+        kind=parameter.kind.value,
+        joint=parameter.joint,
+        end=parameter.end,
+        described=described,
+        change=one.change,
+        std=one.std,
+        unit=unit,
+    )
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")
+
+
+def calibrated_model(calibration: Calibration, cell: Cell) -> Model:
+    """Build the model with which a calibration predicts: that of the cell, with the geometry of its fit.
+
+    The corrected numbers hold, whatever the cell says now: one that was corrected meanwhile is not corrected twice.
+
+    Raises:
+        ModelError: the robot is described otherwise than at the fit.
+    """
+    model = model_of(cell)
+    kept = calibration.encoder_misfit
+    if kept is None or not kept.applied:
+        return model
+    changes: list[GeometryChange] = []
+    for one in kept.corrections:
+        parameter = GeometryParameter(GeometryKind(one.kind), one.joint, one.end)
+        if parameter.kind is GeometryKind.ZERO:
+            now = cell.axes[_axis_of(parameter, model)].zero_offset_rad
+        else:
+            now = described_length(model.robot, parameter)
+        changes.append(GeometryChange(parameter, one.described + one.change - now))
+    return model_with_geometry(model, changes)
