@@ -45,7 +45,8 @@ if TYPE_CHECKING:
     from daq.workflow.fit import Fit
     from ident.calibration import Calibration
 
-CALIBRATION, TABLES = "drivegain-calibration", "drivegain-fit-tables"  #: Formats of the files that `fit` writes
+CALIBRATION = "drivegain-calibration"  #: Format of the calibrations that `fit` writes
+TABLES = "drivegain-fit-tables"  #: Format of its page of tables
 
 
 class Gains(Enum):

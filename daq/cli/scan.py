@@ -59,7 +59,7 @@ def scan_verb(
             misfits |= scanned.misfits
             causes |= scanned.causes
     readings = [scales.get(name) for name in declared.axis_names]
-    mistyped = list[str]()
+    mistyped: list[str] = []
     try:
         check_nameplates(cell, declared, readings)
     except ConfigurationInconsistent as error:

@@ -166,7 +166,7 @@ class Predictor:
         found = self._predict()
         # The next window begins so that its first whole row follows the last one of this.
         done = found.cycle[-1] + self._filter.factor - self._cycle - 1 - self._margin
-        self._cycle = self._cycle + done
+        self._cycle += done
         self._position = self._position[done:]
         self._current = self._current[done:]
         return found

@@ -131,7 +131,7 @@ class Search:
 
     def _filled(self) -> tuple[list[PlannedMove], list[Trapezoid]]:
         moves = [self._clear_start()]
-        paths = list[Trapezoid]()
+        paths: list[Trapezoid] = []
         left = self._duration_s - DWELL_S
         retreats = 0
         while True:

@@ -55,9 +55,8 @@ from ident.model.bodies import Payload
 LOCKSTEP_TIMEOUT_S = 3.0  #: Time for all answers to a SYNC; a simulated cell on a busy machine may be that late
 GUARD_MS = {declared.PacingMode.TIMED: 500, declared.PacingMode.LOCKSTEP: 5000}
 """Silence of the recorder after which the amplifiers stop; in lockstep nothing moves while the recorder is late."""
-SYNC_SILENCE_S = 0.1
-SYNC_SILENCE_PERIODS = 3
-"""Silence of the SYNC producer [s, periods; the longer counts] after which this program sends SYNC to stop the axes."""
+SYNC_SILENCE_S = 0.1  #: Silence of the SYNC producer after which this program sends SYNC to stop the axes
+SYNC_SILENCE_PERIODS = 3  #: The same in periods; the longer counts
 ALLOWANCE_S = 10.0
 """Time added to moves and dwells for enabling, hand-shakes, settling and the stop; a good run takes less."""
 LATE_LOSSES_S = 0.25
