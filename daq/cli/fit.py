@@ -164,7 +164,10 @@ def _check_places(request: FitRequest | ResidualRequest) -> None:
 
 def _holdout_words(request: FitRequest | ResidualRequest) -> list[object]:
     """Return the held-out logs as words of a command."""
-    return [word for log in request.holdout or () for word in ("--holdout", log)]
+    words: list[object] = []
+    for log in request.holdout or ():
+        words += ("--holdout", log)
+    return words
 
 
 def _losses_of(request: FitRequest | ResidualRequest) -> LossyLogs:

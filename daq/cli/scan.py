@@ -64,7 +64,9 @@ def scan_verb(
         check_nameplates(cell, declared, readings)
     except ConfigurationInconsistent as error:
         mistyped.append(str(error))
-    listed = [node for name, nodes in found.items() for node in scanned_nodes(declared, nodes, name, misfits)]
+    listed = []
+    for name, nodes in found.items():
+        listed += scanned_nodes(declared, nodes, name, misfits)
     report = scan_report(declared, listed, causes, mistyped, nameplate_warnings(declared, readings))
     if json:
         print_json(report)
