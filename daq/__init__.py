@@ -60,8 +60,8 @@ if TYPE_CHECKING:
     from daq.workflow.fit import close_loop as close_loop
     from daq.workflow.fit import fit as fit
     from daq.workflow.fit import fit_logs as fit_logs
+    from daq.workflow.validate import Validation as Validation
     from daq.workflow.validate import validate as validate
-    from daq.workflow.validation import Validation as Validation
     from daq.writeback.drive_target import DriveTarget as DriveTarget
     from daq.writeback.file_target import FileTarget as FileTarget
     from daq.writeback.request import Request as Request

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pwd
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from pathlib import Path
 
 from daq.errors import ConfigurationMissing
@@ -27,6 +28,22 @@ def shipped_configurations() -> Path:
         expected="one of them",
         remedy="install drivegain again",
     )
+
+
+def require_packages(subject: str, purpose: str, extra: str, *packages: str) -> None:
+    """Check that the packages of an optional extra are installed, before any work.
+
+    Raises:
+        ConfigurationMissing: names the extra to install.
+    """
+    missing = [package for package in packages if find_spec(package) is None]
+    if missing:
+        raise ConfigurationMissing(
+            subject,
+            found=f"no package {' and '.join(missing)}",
+            expected=f"{purpose} of the optional extra `{extra}`",
+            remedy=f"pip install 'drivegain[{extra}]'",
+        )
 
 
 def software() -> str:

@@ -238,10 +238,15 @@ class OutputFailed(DaqError):
         """Make the error for a file that was replaced whole or not at all."""
         return cls(
             str(path),
-            found=(error.strerror or type(error).__name__).lower(),
+            found=reason_of(error),
             expected="a folder that can be written, with room",
             remedy="it is as it was; free space or rights, or choose another folder",
         )
+
+
+def reason_of(error: OSError) -> str:
+    """Return what the system says of a refusal, in small letters."""
+    return (error.strerror or type(error).__name__).lower()
 
 
 @contextmanager

@@ -45,7 +45,7 @@ BY_JOB = {
     ),
     Job.LOOK: (
         Listed("monitor", "daq.cli.monitor:MONITOR", "Show the state of the axes; nothing is changed."),
-        Listed("console", "daq.cli.console:CONSOLE", "Show the cell live on a page, with a stop button."),
+        Listed("console", "daq.cli.monitor:CONSOLE", "Show the cell live on a page, with a stop button."),
         Listed("info", "daq.cli.logs:INFO", "Show what is in a log."),
         Listed("history", "daq.cli.history:HISTORY", "Show the calibrations of a cell and any drift."),
         Listed("explain-emcy", "daq.cli.scan:EXPLAIN_EMCY", "Explain an error code of an amplifier."),
@@ -59,9 +59,9 @@ BY_JOB = {
     ),
     Job.EXPERT: (
         Listed("import", "daq.cli.logs:IMPORT", "Convert CSV, MATLAB or ROS 2 files to a log."),
-        Listed("export", "daq.cli.export:EXPORT", "Write a calibration or a log for other programs."),
-        Listed("weigh", "daq.cli.weigh:WEIGH", "Weigh the body on the flange with a calibration."),
-        Listed("contact", "daq.cli.weigh:CONTACT", "Find external torques, with a threshold for alarms."),
+        Listed("export", "daq.cli.logs:EXPORT", "Write a calibration or a log for other programs."),
+        Listed("weigh", "daq.cli.validate:WEIGH", "Weigh the body on the flange with a calibration."),
+        Listed("contact", "daq.cli.validate:CONTACT", "Find external torques, with a threshold for alarms."),
         Listed("simulate", "daq.cli.simulate:SIMULATE", "Run a simulated cell on a bus, to try the other verbs."),
     ),
 }
@@ -185,7 +185,8 @@ def _usage_failed(error: Any, json_wanted: bool) -> int:
     if param is not None:
         shown = param.name.upper() if param.param_type_name == "argument" else max(param.opts, key=len)
         found = found.replace(f"'{param.display_name_raw}'", f"'{shown}'", 1)
-    remedy, usage = f"`{error.ctx.command_path} --help` explains it", error.ctx.get_usage()
+    remedy = f"`{error.ctx.command_path} --help` explains it"
+    usage = error.ctx.get_usage()
     # A value of the wrong type: the message of typer's validation does not repeat it.
     given = [one["input"] for one in getattr(error.__cause__, "errors", list)()]
     if len(given) == 1 and isinstance(given[0], str):
@@ -210,7 +211,8 @@ def _output_failed(error: OSError, json_wanted: bool) -> int:
     except OSError:
         # The interpreter flushes stdout again at its end, and would complain.
         with suppress(OSError):
-            null, wanted = os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+            null = os.open(os.devnull, os.O_WRONLY)
+            wanted = sys.stdout.fileno()
             os.dup2(null, wanted)
             os.close(null)
     return ExitCode.UNEXPECTED

@@ -112,24 +112,24 @@ def apply_verb(options: ApplyOptions) -> None:
     )
     audit = audit_of(declared, (options.cell, options.calibration, options.to))
     undo = f"drivegain rollback {shlex.quote(str(options.cell))}"
+    opening: AbstractContextManager[Target[Any]]
+    interrupts: AbstractContextManager[Any]
+    whole: AbstractContextManager[None]
     if options.drives:
         at_most_one(drives=True, to=options.to)
+        undo += " --drives"
+        opening = drives_on_the_bus(declared, saving)
+        interrupts = nullcontext()  # `drives_on_the_bus` handles them
+        whole = nullcontext()
+    else:
+        if options.to is not None:
+            undo += f" --to {shlex.quote(str(options.to))}"
+        opening = nullcontext(FileTarget.of(declared, options.to))
+        interrupts = interruptible()
+        whole = delay_signals()
+    with interrupts:
         apply_to(
-            drives_on_the_bus(declared, saving),
-            declared,
-            request,
-            actor=actor,
-            audit=audit,
-            undo=f"{undo} --drives",
-            yes=options.yes,
-            json=options.json,
-        )
-        return
-    if options.to is not None:
-        undo += f" --to {shlex.quote(str(options.to))}"
-    with interruptible():
-        apply_to(
-            nullcontext(FileTarget.of(declared, options.to)),
+            opening,
             declared,
             request,
             actor=actor,
@@ -137,7 +137,7 @@ def apply_verb(options: ApplyOptions) -> None:
             undo=undo,
             yes=options.yes,
             json=options.json,
-            whole=delay_signals(),
+            whole=whole,
         )
 
 
@@ -189,7 +189,8 @@ def _show_outcome(proposal: Proposal[E], written: Written | None, audit: Path | 
     from daq.writeback.gates.gate import Gate
 
     console = output_console()
-    edit, target = proposal.edit, proposal.target
+    edit = proposal.edit
+    target = proposal.target
     if proposal.refusals:
         # The review of a changed base is all that is missing, and this dry run is that review.
         if not yes and {refusal.gate for refusal in proposal.refusals} == {Gate.BASE}:
@@ -421,7 +422,8 @@ def drives_on_the_bus(declared: Cell, saving: Saving) -> Iterator[DriveTarget]:
     from daq.writeback.drive_target import DriveTarget
     from drivers.canopen.network import CanopenNetwork
 
-    address, axes = cell_address(declared), drive_axes(declared)
+    address = cell_address(declared)
+    axes = drive_axes(declared)
     try:
         with (
             bus_lock(declared),

@@ -2,26 +2,51 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CellOption, JsonOption, Verb, judged_output, print_json, say_correct_first, say_next, taking
+from daq.cli.terminal import (
+    at_most_one,
+    check_folder,
+    check_output,
+    check_replaceable,
+    make_folder,
+    print_view,
+    require_different,
+    status,
+    write_output,
+)
+from daq.cli.verb import (
+    CellOption,
+    JsonOption,
+    Verb,
+    corrected_cell,
+    output_option,
+    print_json,
+    say_correct_first,
+    say_next,
+    taking,
+)
+from daq.errors import OutputFailed, UsageError, writing
+from daq.files import replace_file
 from daq.workflow.choices import Known
 from ident.estimators.method import Method
 
 if TYPE_CHECKING:
-    from daq.config.cell import Cell
     from daq.log.reader import LossyLogs
     from daq.workflow.cases import CaseFit
     from daq.workflow.fit import Fit
     from ident.calibration import Calibration
 
-CALIBRATION, TABLES = "drivegain-calibration", "drivegain-fit-tables"  #: Formats of the files that `fit` writes
+CALIBRATION = "drivegain-calibration"  #: Format of the calibrations that `fit` writes
+TABLES = "drivegain-fit-tables"  #: Format of its page of tables
 
 
 class Gains(Enum):
@@ -35,12 +60,8 @@ LogsArgument = Annotated[list[Path], typer.Argument(help="Logs: without load, an
 HoldoutOption = Annotated[
     list[Path] | None, typer.Option("--holdout", help="Held-out log, for the final error; repeatable.")
 ]
-OutOption = Annotated[
-    Path | None, typer.Option("--out", help="Calibration file to write (calibration.yaml).", callback=judged_output)
-]
-PicturesOption = Annotated[
-    Path | None, typer.Option("--pictures", help="Folder for pictures; it is created.", callback=judged_output)
-]
+OutOption = Annotated[Path | None, output_option("--out", "Calibration file to write (calibration.yaml).")]
+PicturesOption = Annotated[Path | None, output_option("--pictures", "Folder for pictures; it is created.")]
 AcceptLossesOption = Annotated[
     bool,
     typer.Option("--accept-losses", help="Use logs with lost frames, less those samples; `apply` refuses the result."),
@@ -56,9 +77,7 @@ EssentialOption = Annotated[
 ]
 CasesOption = Annotated[
     Path | None,
-    typer.Option(
-        "--cases", help="Folder for the paper's cases 1 to 4, the nameplate gains and ml.", callback=judged_output
-    ),
+    output_option("--cases", "Folder for the paper's cases 1 to 4, the nameplate gains and ml."),
 ]
 CompareOption = Annotated[
     bool,
@@ -84,9 +103,7 @@ class FitRequest:
     compare: CompareOption = False
     holdout: HoldoutOption = None
     out: OutOption = None
-    report: Annotated[
-        Path | None, typer.Option("--report", help="Folder for report.html, the certificate.", callback=judged_output)
-    ] = None
+    report: Annotated[Path | None, output_option("--report", "Folder for report.html, the certificate.")] = None
     pictures: PicturesOption = None
     cell: CellOption = None
     accept_losses: AcceptLossesOption = False
@@ -102,9 +119,7 @@ class FitRequest:
 @taking(FitRequest)
 def fit_verb(request: FitRequest) -> None:
     """Identify all drive gains and dynamic parameters from runs without load and with a weighed payload."""
-    from datetime import UTC, datetime
 
-    from daq.cli.terminal import print_view, status
     from daq.report.fit import fit_report, fit_view
     from daq.workflow.cases import calibration_of_case
     from daq.workflow.fit import compare_estimators
@@ -139,7 +154,6 @@ def fit_verb(request: FitRequest) -> None:
 
 def _check_places(request: FitRequest | ResidualRequest) -> None:
     """Refuse places of the output that cannot be written, before any long work."""
-    from daq.cli.terminal import check_folder, check_output, require_different
 
     check_folder(request.out)
     inputs = (*request.logs, *(request.holdout or ()), request.cell)
@@ -148,16 +162,12 @@ def _check_places(request: FitRequest | ResidualRequest) -> None:
     check_report(request.report, request.out)
 
 
-def _cell_of(request: FitRequest | ResidualRequest) -> Cell | None:
-    """Load the corrected cell file; None where the one in the logs is used."""
-    from daq.config.cell_file import load_cell
-
-    return None if request.cell is None else load_cell(request.cell)
-
-
 def _holdout_words(request: FitRequest | ResidualRequest) -> list[object]:
     """Return the held-out logs as words of a command."""
-    return [word for log in request.holdout or () for word in ("--holdout", log)]
+    words: list[object] = []
+    for log in request.holdout or ():
+        words += ("--holdout", log)
+    return words
 
 
 def _losses_of(request: FitRequest | ResidualRequest) -> LossyLogs:
@@ -168,14 +178,13 @@ def _losses_of(request: FitRequest | ResidualRequest) -> LossyLogs:
 
 def _fit(request: FitRequest) -> CaseFit:
     """Fit the logs with what is known of the payload, and keep the essential parameters alone if that is wanted."""
-    from dataclasses import replace
 
     from daq.workflow.cases import CaseFit, essential_fit, fit_case, reduce_logs
     from daq.workflow.fit import fit
     from ident.estimators.refusals import require_plausible
 
     holdout = request.holdout or ()
-    cell = _cell_of(request)
+    cell = corrected_cell(request.cell)
     if request.known is Known.MASS:
         fitted = fit(
             request.logs,
@@ -210,11 +219,8 @@ def say_after_fit(calibration: Calibration, arguments: Sequence[object], out: Pa
 
 def _fit_cases(request: FitRequest, folder: Path) -> None:
     """Fit the paper's cases and ours, write a calibration of each, and tabulate them as Tables 1 to 4."""
-    from datetime import UTC, datetime
 
-    from daq.cli.terminal import at_most_one, check_output, print_view, status, write_output
     from daq.documents.calibration_file import save_calibration
-    from daq.files import replace_file
     from daq.report.fit import cases_report, cases_view
     from daq.report.paper_tables import case_tables, paper_page
     from daq.workflow.cases import CASES, calibration_of_case, fit_case, reduce_logs
@@ -228,7 +234,7 @@ def _fit_cases(request: FitRequest, folder: Path) -> None:
         report=request.report,
         pictures=request.pictures,
     )
-    cell = _cell_of(request)
+    cell = corrected_cell(request.cell)
     holdout = request.holdout or ()
     inputs = (*request.logs, *holdout)
     created = datetime.now(UTC)
@@ -270,9 +276,7 @@ class ResidualRequest:
     holdout: HoldoutOption = None
     seed: Annotated[int, typer.Option(help="Seed of the significance test, which fixes its verdict.", min=0)] = 0
     out: OutOption = None
-    report: Annotated[
-        Path | None, typer.Option("--report", help="Folder for report.html and residual.json.", callback=judged_output)
-    ] = None
+    report: Annotated[Path | None, output_option("--report", "Folder for report.html and residual.json.")] = None
     pictures: PicturesOption = None
     leave_out_runs: Annotated[
         bool, typer.Option("--leave-out-runs", help="Also predict each run from a fit of the others: slow.")
@@ -304,10 +308,7 @@ class ResidualRequest:
 @taking(ResidualRequest)
 def residual_verb(request: ResidualRequest) -> None:
     """Fit, then detect the effect that explains the residual, add it, refit everything, and repeat."""
-    from datetime import UTC, datetime
 
-    from daq.cli.terminal import print_view, status, write_output
-    from daq.errors import OutputFailed
     from daq.report.fit import start_of
     from daq.report.residual import residual_view
     from daq.report.residual_document import residual_report
@@ -344,7 +345,6 @@ def residual_verb(request: ResidualRequest) -> None:
 
 def _search(request: ResidualRequest, report_step: Callable[[str], None]) -> Fit:
     """Fit the logs, and add the effects that the model lacks."""
-    from dataclasses import replace
 
     from daq.workflow.fit import Undecided, close_loop, fit
 
@@ -353,7 +353,7 @@ def _search(request: ResidualRequest, report_step: Callable[[str], None]) -> Fit
         holdout=request.holdout or (),
         method=Method.ML,
         gains_fixed=request.gains is Gains.FIXED,
-        cell=_cell_of(request),
+        cell=corrected_cell(request.cell),
         lossy=_losses_of(request),
         keep_rows=True,
         channels_as_wired=request.channels_as_wired,
@@ -390,10 +390,7 @@ def check_report(folder: Path | None, out: Path | None = None) -> None:
 
     A folder in which nothing is written in the end is removed again.
     """
-    from tempfile import TemporaryFile
 
-    from daq.cli.terminal import check_replaceable, make_folder
-    from daq.errors import UsageError, writing
     from daq.report.residual_page import MARKS
 
     if folder is None:
@@ -407,7 +404,7 @@ def check_report(folder: Path | None, out: Path | None = None) -> None:
         )
     with writing(folder):
         make_folder(folder)
-        with TemporaryFile(dir=folder):
+        with tempfile.TemporaryFile(dir=folder):
             pass
     for name, mark in MARKS.items():
         check_replaceable(folder / name, mark, "report of `drivegain residual`")
@@ -422,8 +419,6 @@ RESIDUAL = Verb(
 
 def _save_certificate(fitted: Fit, calibration: Calibration, folder: Path) -> None:
     """Write the certificate of a fit as the page of its report."""
-    from daq.cli.terminal import write_output
-    from daq.files import replace_file
     from daq.report.certificate import certify
     from daq.report.certificate_page import certificate_page
     from daq.report.residual_page import PAGE, beside_nameplate
@@ -434,7 +429,6 @@ def _save_certificate(fitted: Fit, calibration: Calibration, folder: Path) -> No
 
 
 def _save(fitted: Fit, calibration: Calibration, out: Path | None, pictures: Path | None) -> None:
-    from daq.cli.terminal import write_output
     from daq.documents.calibration_file import save_calibration
     from daq.report.plots import draw_fit
 

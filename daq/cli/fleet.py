@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from daq.cli.verb import JsonOption, Verb, judged_output, print_json
+from daq.cli.terminal import check_replaceable, print_view, progress_bar, write_output
+from daq.cli.verb import JsonOption, Verb, output_option, print_json
 from daq.errors import ExitCode, OutputFailed
+from daq.files import replace_file
 
 
 def fleet_verb(
@@ -27,14 +30,11 @@ def fleet_verb(
     residual: Annotated[bool, typer.Option("--residual", help="Also detect missing effects: slow.")] = False,
     out: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder for a calibration of each cell; a cell is not fitted again from the same logs.",
-            callback=judged_output,
-        ),
+        output_option("--out", "Folder for a calibration of each cell; a cell is not fitted again from the same logs."),
     ] = None,
     csv: Annotated[
         Path | None,
-        typer.Option("--csv", help="File for the table; an earlier table is replaced.", callback=judged_output),
+        output_option("--csv", "File for the table; an earlier table is replaced."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -43,13 +43,9 @@ def fleet_verb(
     Cell and payload are read from the logs. Where a cell has a second run with the same payload, the newest is held
     out. The exit code is 4 if any cell could not be fitted.
     """
-    from datetime import UTC, datetime
 
-    from daq.cli.terminal import check_replaceable, print_view, progress_bar, write_output
-    from daq.files import replace_file
     from daq.jobs.cell_fit import Loop, open_cache
-    from daq.jobs.fleet import fit_fleet, worker_pool
-    from daq.jobs.fleet_report import FIRST_COLUMNS, fleet_csv, fleet_report, fleet_view
+    from daq.jobs.fleet import FIRST_COLUMNS, fit_fleet, fleet_csv, fleet_report, fleet_view, worker_pool
     from daq.jobs.fleet_survey import list_logs
 
     loop = Loop.CLOSED if residual else Loop.OPEN

@@ -13,7 +13,7 @@ import typer
 
 from daq.cli.apply import applier
 from daq.cli.terminal import check_replaceable, output_console, say_written, write_output
-from daq.cli.verb import JsonOption, Verb, judged_output, print_json
+from daq.cli.verb import JsonOption, Verb, output_option, print_json
 from daq.errors import (
     AuditUnusable,
     ConfigurationInconsistent,
@@ -23,10 +23,12 @@ from daq.errors import (
     UsageError,
     evidence,
 )
+from daq.files import replace_file
 from daq.report.text import printable
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
+    from daq.ledger.fold import History
     from daq.ledger.ledger import Ledger, Verification
     from daq.ledger.watch import Series
 
@@ -40,12 +42,8 @@ _PICTURES = {".png": "PNG\r\n", ".svg": "<?xml"}  #: Suffixes of pictures, and t
 def history_verb(
     cell: Annotated[Path, typer.Argument(help="Cell file; it says where its history is.")],
     axis: Annotated[str | None, typer.Option("--axis", help="One axis: every calibration of its gain.")] = None,
-    plot: Annotated[
-        Path | None, typer.Option("--plot", help="Picture to write, .png or .svg.", callback=judged_output)
-    ] = None,
-    csv: Annotated[
-        Path | None, typer.Option("--csv", help="Table to write, for a spreadsheet.", callback=judged_output)
-    ] = None,
+    plot: Annotated[Path | None, output_option("--plot", "Picture to write, .png or .svg.")] = None,
+    csv: Annotated[Path | None, output_option("--csv", "Table to write, for a spreadsheet.")] = None,
     add: Annotated[Path | None, typer.Option("--add", help="Enter a calibration by hand.")] = None,
     acknowledge: Annotated[
         str | None, typer.Option("--acknowledge", metavar="AXIS", help="A change is explained; begin a baseline.")
@@ -69,8 +67,7 @@ def history_verb(
     false.
     """
     from daq.config.cell_file import load_cell
-    from daq.ledger.ledger import MAY_LACK, Ledger, read_history
-    from daq.ledger.watch import watch
+    from daq.ledger.ledger import MAY_LACK, Ledger
     from daq.report.history import (
         describe_actions,
         history_report,
@@ -95,18 +92,15 @@ def history_verb(
             expected="them with --acknowledge AXIS",
             remedy="name the axis whose change is explained",
         )
-    now, who = datetime.now(UTC), str(applier(by if acknowledge is not None else None))
+    now = datetime.now(UTC)
+    who = str(applier(by if acknowledge is not None else None))
     _migrate(ledger, who, now, forced=migrate)
     if add is not None:
         _add(ledger, add, who, now)
-    checked = _verified(ledger) if verify else None
-    history = read_history(ledger) if checked is None else checked.history
-    all_series = watch(history.entries, history.acknowledgements)
+    checked, history, all_series = _read(ledger, verify)
     if acknowledge is not None:
         _acknowledge(ledger, _named(all_series, acknowledge, declared), who, why, since, now)
-        checked = _verified(ledger) if verify else None
-        history = read_history(ledger) if checked is None else checked.history
-        all_series = watch(history.entries, history.acknowledgements)
+        checked, history, all_series = _read(ledger, verify)
     if checked is None and history.may_lack:
         _LOG.warning(MAY_LACK)
     chosen = all_series if axis is None else (_named(all_series, axis, declared),)
@@ -129,6 +123,16 @@ def history_verb(
         say_written(console, plot, csv)
     if checked is not None:
         _require(ledger, checked)
+
+
+def _read(ledger: Ledger, verify: bool) -> tuple[Verification | None, History, tuple[Series, ...]]:
+    """Read the history and the chart of each gain, from a verification if that is wanted."""
+    from daq.ledger.ledger import read_history
+    from daq.ledger.watch import watch
+
+    checked = _verified(ledger) if verify else None
+    history = read_history(ledger) if checked is None else checked.history
+    return checked, history, watch(history.entries, history.acknowledgements)
 
 
 def _verified(ledger: Ledger) -> Verification:
@@ -292,7 +296,6 @@ def _named(all_series: tuple[Series, ...], axis: str, cell: Cell) -> Series:
 
 
 def _write_files(chosen: tuple[Series, ...], cell: Cell, picture: Path | None, csv: Path | None) -> None:
-    from daq.files import replace_file
     from daq.report.history import csv_text, plot_history
 
     drawn = [series for series in chosen if series.points]

@@ -11,14 +11,16 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.verb import CellArgument, JsonOption, Verb, judged_output, print_json, say_next
+from daq.cli.terminal import check_folder, check_output, check_replaceable, progress_bar, write_output
+from daq.cli.verb import CellArgument, JsonOption, Verb, output_option, print_json, say_next
 from daq.errors import UsageError
+from daq.files import replace_file
 from daq.workflow.choices import EXCHANGES, LARGEST_STD_PERCENT
 
 
 def plan_verb(
     cell: CellArgument,
-    out: Annotated[Path, typer.Option("--out", help="Plan to write (YAML).", callback=judged_output)],
+    out: Annotated[Path, output_option("--out", "Plan to write (YAML).")],
     seed: Annotated[int, typer.Option(help="The same seed gives the same plan.", min=0)] = 1,
     duration: Annotated[float, typer.Option(help="Duration of the run [s].", min=5.0, max=3600.0)] = 40.0,
     payload: Annotated[str | None, typer.Option(help="Payload that will be mounted; the cell's first one.")] = None,
@@ -30,7 +32,7 @@ def plan_verb(
         float | None, typer.Option(help="Largest condition number; 3500, of a closed chain 1e5.", min=1.0)
     ] = None,
     preview: Annotated[
-        Path | None, typer.Option(help="Page to write (HTML): the arm moves through the plan.", callback=judged_output)
+        Path | None, output_option("--preview", "Page to write (HTML): the arm moves through the plan.")
     ] = None,
     sigma: Annotated[float, typer.Option(help="Largest σ predicted for a gain [%].", min=0.01)] = LARGEST_STD_PERCENT,
     json: JsonOption = False,
@@ -40,15 +42,12 @@ def plan_verb(
     The moves keep the joint limits and the cell's workspace, and keep clear of the arm itself. The prediction is for
     these moves made once without load and once with the payload.
     """
-    from daq.cli.terminal import check_folder, check_output, check_replaceable, progress_bar, write_output
     from daq.config.cell_file import load_cell
-    from daq.files import replace_file
     from daq.report.plan import plan_report, plan_text
     from daq.report.plan_preview import MARK, preview_page
     from daq.workflow.experiment import RUNS, experiment_of, extra_moves, paths_of
     from daq.workflow.nameplates import check_controller
-    from daq.workflow.plan import plan
-    from daq.workflow.plan_file import load_plan, save_plan
+    from daq.workflow.plan import load_plan, plan, save_plan
     from ident.planning.gain_verdict import verdicts
 
     check_output(out, (cell,), "drivegain-plan")

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import os
 import shlex
+import shutil
 import sys
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from daq.advice import for_command_line
-from daq.cli.verb import JsonOption, Verb, judged_output, print_json
-from daq.errors import DaqError, ExitCode, UsageError, exit_code
+from daq.cli.terminal import interruptible
+from daq.cli.verb import JsonOption, Verb, output_option, print_json
+from daq.environment import login
+from daq.errors import DaqError, ExitCode, UsageError, exit_code, writing
+from daq.files import replace_file
+from daq.report.text import printable
 from drivers.errors import DriverError, all_notes, stop_notes
 from ident.errors import IdentificationError
 
@@ -35,8 +44,6 @@ def recalibrate_verb(
     due; 10 a change waits for approval; 11 the interlock does not release the robot; 12 the bus is taken; 13 out of
     time; 14 held for another reason; others as for every verb.
     """
-    import os
-    from datetime import UTC, datetime
 
     from daq.jobs.journal import Form, Journal, Level, form_of
 
@@ -61,13 +68,8 @@ def recalibrate_verb(
 
 
 def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> None:
-    from dataclasses import replace
-    from datetime import UTC, datetime
-    from functools import partial
 
-    from daq.cli.terminal import interruptible
     from daq.config.cell_file import load_cell
-    from daq.environment import login
     from daq.jobs.context import Tools
     from daq.jobs.job import preview, recalibrate
     from daq.jobs.reporting import conclusion_report, text
@@ -76,7 +78,6 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
     from daq.report.certificate import compare
     from daq.report.job_schemas import DryRunReport
     from daq.report.residual_page import save_report
-    from daq.report.text import printable
     from daq.workflow.record import record
     from daq.writeback.request import Request
 
@@ -111,14 +112,15 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
 RECALIBRATE = Verb("recalibrate", recalibrate_verb, "drivegain recalibrate press-4/cells/press-4.yaml --dry-run")
 
 
-_SYSTEM, _OF_USER = Path("/etc/systemd/system"), Path(".config/systemd/user")
+_SYSTEM = Path("/etc/systemd/system")
+_OF_USER = Path(".config/systemd/user")
 
 
 def install_units(
     cell: Annotated[Path, typer.Argument(help="Cell file with `recalibration`.")],
     to: Annotated[
         Path | None,
-        typer.Option("--to", help="Folder of the units, by default that of systemd.", callback=judged_output),
+        output_option("--to", "Folder of the units, by default that of systemd."),
     ] = None,
     user: Annotated[bool, typer.Option("--user", help="Install units of this user, not of the system.")] = False,
     schedule: Annotated[str, typer.Option(help="weekly, daily, or as 'Sun 03:00' (systemd.time).")] = "weekly",
@@ -130,13 +132,12 @@ def install_units(
     The timer does not catch up on a missed date, and the job checks the interlock before every motion.
     """
     from daq.config.cell_file import load_cell
-    from daq.errors import writing
-    from daq.files import replace_file
     from daq.jobs.context import section_of, target_of
     from daq.jobs.units import Installation, cell_option, cron_line, next_commands, units_of
 
     declared = load_cell(cell)
-    section, _ = section_of(declared), target_of(declared)
+    section = section_of(declared)
+    target_of(declared)  # refuses a cell without a controller file
     place = cell.resolve()
     try:
         owner = place.owner()
@@ -167,7 +168,6 @@ def install_units(
 
 def program() -> Path:
     """Return the path of the command that the timer calls."""
-    import shutil
 
     beside = Path(sys.executable).parent / "drivegain"
     found = beside if beside.exists() else shutil.which("drivegain")
@@ -183,7 +183,6 @@ def program() -> Path:
 
 def check_schedule(schedule: str) -> None:
     """Check a calendar expression with systemd, where this computer has it."""
-    import shutil
     import subprocess
 
     found = "" if schedule.strip() and schedule.isprintable() else "an empty or unprintable text"
@@ -204,7 +203,6 @@ def check_schedule(schedule: str) -> None:
 
 def require_own_unit(path: Path, option: str = "") -> None:
     """Refuse to replace a file that this verb did not write, or a unit without the option of this cell."""
-    from daq.errors import writing
     from daq.jobs.units import MARK
 
     with writing(path):
@@ -212,11 +210,14 @@ def require_own_unit(path: Path, option: str = "") -> None:
         text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else None
     if text is None and not path.exists():
         return
-    found, expected = "", ""
+    found = ""
+    expected = ""
     if text is None or not text.startswith(MARK):
-        found, expected = "a unit that drivegain did not write", "one of an earlier `install-units`"
+        found = "a unit that drivegain did not write"
+        expected = "one of an earlier `install-units`"
     elif option not in text:
-        found, expected = "the unit of another cell file", f"one with {option}"
+        found = "the unit of another cell file"
+        expected = f"one with {option}"
     if found:
         remedy = "name another folder with --to, or move it away; remove it if the cell file has moved"
         raise UsageError(str(path), found=found, expected=f"no such file, or {expected}", remedy=remedy)

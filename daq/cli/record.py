@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CellArgument, JsonOption, Verb, judged_output, print_json, say_next, taking
-from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError
+from daq.cli.terminal import interruptible, progress_bar, say_last
+from daq.cli.verb import CellArgument, JsonOption, Verb, output_option, print_json, say_next, taking
+from daq.environment import login
+from daq.errors import DaqError, DiskSpaceShort, ExitCode, OutputFailed, UsageError
 from daq.files import is_taken
 from drivers.errors import POWERED, DriverError, SampleLost, all_notes, error_chain
 
@@ -27,7 +29,7 @@ class RecordOptions:
 
     cell: CellArgument
     plan: Annotated[Path, typer.Argument(help="Plan written by `drivegain plan`.")]
-    out: Annotated[Path, typer.Option("--out", help="Log to write (.mcap); must not exist.", callback=judged_output)]
+    out: Annotated[Path, output_option("--out", "Log to write (.mcap); must not exist.")]
     enable_motion: Annotated[
         bool,
         typer.Option(
@@ -54,14 +56,11 @@ def record_verb(options: RecordOptions) -> None:
     11 where it does not.
     A run with losses is kept, marked invalid, and ends with exit code 4; `fit` refuses it.
     """
-    from daq.cli.terminal import interruptible, progress_bar, say_last
     from daq.config.cell_file import load_cell
-    from daq.environment import login
     from daq.log.feed import Feed
     from daq.report.log import record_report
     from daq.workflow.bus_lock import bus_lock
-    from daq.workflow.plan import slowed
-    from daq.workflow.plan_file import load_plan
+    from daq.workflow.plan import load_plan, slowed
     from daq.workflow.record import RecordingRequest, record
     from daq.workflow.safeguards import check_entered_mass
 
@@ -150,14 +149,14 @@ def _say_next(cell: Path, declared: Cell, plan: Path, out: Path, carried: Payloa
             weighed = ("--payload", declared.payloads[0].payload.name, "--mass", "KG")
             say_next("drivegain", "record", cell, plan, "--out", "loaded.mcap", *weighed, "--enable-motion")
         return
-    others, calibration = [path for path in out.parent.glob("*.mcap") if path != out], out.with_name("calibration.yaml")
+    others = [path for path in out.parent.glob("*.mcap") if path != out]
+    calibration = out.with_name("calibration.yaml")
     if len(others) == 1 and not calibration.exists() and _is_unloaded(others[0], declared):
         say_next("drivegain", "fit", *others, out, "--out", calibration)
 
 
 def _is_unloaded(log: Path, declared: Cell) -> bool:
     """Whether a log is a valid run of this cell without load."""
-    from daq.errors import DaqError
     from daq.report.log import info_report
 
     try:
@@ -194,7 +193,8 @@ def _free(out: Path) -> Path:
 
 def _next_command(part: Path) -> str:
     aside = part.with_name(part.name + ".kept")
-    one, other = shlex.quote(str(part)), shlex.quote(str(aside))
+    one = shlex.quote(str(part))
+    other = shlex.quote(str(aside))
     saved = shlex.quote(str(part.with_name(part.name.replace(".mcap.part", "") + "-partial.mcap")))
     return (
         f"`drivegain salvage {one} --out {saved}` saves what is in it; to record under this name, remove it "

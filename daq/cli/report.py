@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import shlex
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from daq.cli.verb import CalibrationArgument, JsonOption, Verb, judged_output, print_json
+from daq.cli.terminal import check_folder, check_replaceable, print_view, write_output
+from daq.cli.verb import CalibrationArgument, JsonOption, Verb, output_option, print_json
+from daq.files import replace_file
 
 
 def report_verb(
     calibration: CalibrationArgument,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", help="Page to write; by default beside the calibration, as .html.", callback=judged_output
-        ),
+        output_option("--out", "Page to write; by default beside the calibration, as .html."),
     ] = None,
     cell: Annotated[
         Path | None, typer.Option("--cell", help="Cell file: compare with the gains in its controller.")
@@ -30,12 +31,9 @@ def report_verb(
     It shows each gain beside the one in the controller with the limits, the error on held-out runs, the effects, what
     would be written where, and one verdict. Nothing is written to the controller.
     """
-    from datetime import UTC, datetime
 
-    from daq.cli.terminal import check_folder, check_replaceable, print_view, write_output
     from daq.config.cell_file import load_cell
     from daq.documents.calibration_file import decode_calibration, load_calibration, read_calibration_bytes
-    from daq.files import replace_file
     from daq.report.certificate import certificate_report, certify, compare, without_controller
     from daq.report.certificate_page import certificate_page
     from daq.report.html import MARK

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from daq.cli.terminal import print_view
 from daq.cli.verb import CellArgument, JsonOption, Verb, print_json, say_next
-from daq.errors import UsageError
+from daq.errors import ConfigurationInconsistent, UsageError, VirtualBusEmpty
+from drivers.errors import DriverError, NodeMissing
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
@@ -37,10 +39,8 @@ def scan_verb(
     --reset-faults; find out why an axis is in fault before you reset it. While a recording or
     another master uses the bus, nothing is sent: exit code 12 or 5.
     """
-    from daq.cli.terminal import print_view
     from daq.config.cell_buses import bus_parts, drive_axes
     from daq.config.cell_file import load_cell
-    from daq.errors import ConfigurationInconsistent
     from daq.report.bus_views import scan_report, scan_view, scanned_nodes
     from daq.workflow.bus_lock import bus_lock
     from daq.workflow.nameplates import check_nameplates, nameplate_warnings
@@ -59,12 +59,14 @@ def scan_verb(
             misfits |= scanned.misfits
             causes |= scanned.causes
     readings = [scales.get(name) for name in declared.axis_names]
-    mistyped = list[str]()
+    mistyped: list[str] = []
     try:
         check_nameplates(cell, declared, readings)
     except ConfigurationInconsistent as error:
         mistyped.append(str(error))
-    listed = [node for name, nodes in found.items() for node in scanned_nodes(declared, nodes, name, misfits)]
+    listed = []
+    for name, nodes in found.items():
+        listed += scanned_nodes(declared, nodes, name, misfits)
     report = scan_report(declared, listed, causes, mistyped, nameplate_warnings(declared, readings))
     if json:
         print_json(report)
@@ -125,8 +127,6 @@ def _scan_bus(
 def no_answer(cell: Cell, missing: Sequence[Axis], answered: tuple[int, ...], wait_s: float) -> Exception:
     """Error for axes that did not answer: amplifiers without power, or a simulated cell that was not started."""
     from daq.cli.simulate import SHIPPED
-    from daq.errors import VirtualBusEmpty
-    from drivers.errors import NodeMissing
 
     if answered or any(bus.interface != "virtual" for bus in cell.buses):
         return NodeMissing(missing, answered, wait_s)
@@ -143,7 +143,6 @@ def no_answer(cell: Cell, missing: Sequence[Axis], answered: tuple[int, ...], wa
 def _scale_of(network: CanopenNetwork, axis: Axis) -> ScaleReading | None:
     """Read the scale of a drive's current; None where it cannot be read, which `record` reports."""
     from drivers.canopen.scale import read_scale
-    from drivers.errors import DriverError
 
     try:
         return read_scale(network.link.objects(axis.node_id), axis.profile)
@@ -155,7 +154,6 @@ def _misfit_of(network: CanopenNetwork, axis: Axis) -> str:
     """Describe the objects of its profile that a drive lacks; empty where it has them, or does not answer."""
     from daq.config.drive import shipped_profiles
     from drivers.canopen.setup import misfit
-    from drivers.errors import DriverError
 
     try:
         return misfit(network.link.objects(axis.node_id), axis.profile, shipped_profiles)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from daq.cli.verb import CalibrationArgument, JsonOption, Verb, judged_output, print_json
+from daq.cli.terminal import print_view
+from daq.cli.verb import CalibrationArgument, JsonOption, Verb, output_option, print_json
 from daq.errors import UsageError
 
 
@@ -21,14 +23,11 @@ def sign_verb() -> None:
 
 def sign_key_verb(
     name: Annotated[str, typer.Option("--name", help="Name of the person, as in the cell file.")],
-    folder: Annotated[
-        Path, typer.Option("--folder", help="Folder for NAME.key and NAME.pub.", callback=judged_output)
-    ] = Path(),
+    folder: Annotated[Path, output_option("--folder", "Folder for NAME.key and NAME.pub.")] = Path(),
     no_password: Annotated[bool, typer.Option("--no-password", help="Only its file's permissions protect it.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Make a key pair: NAME.key is secret and stays with the person, the public key goes into the cell file."""
-    from daq.cli.terminal import print_view
     from daq.report.job_schemas import KeyReport
     from daq.writeback.signature import generate
 
@@ -59,9 +58,7 @@ def sign_calibration_verb(
     json: JsonOption = False,
 ) -> None:
     """Show a calibration and write your signature beside it; changing the file makes the signature invalid."""
-    from datetime import UTC, datetime
 
-    from daq.cli.terminal import print_view
     from daq.documents.calibration_file import load_calibration
     from daq.report.gains import gain_table
     from daq.report.job_schemas import SignatureReport
@@ -84,7 +81,6 @@ def sign_check_verb(
     json: JsonOption = False,
 ) -> None:
     """Show which of the cell's signers have signed a calibration; an invalid signature is exit code 3."""
-    from daq.cli.terminal import print_view
     from daq.config.cell_file import load_cell
     from daq.report.job_schemas import SignersReport
     from daq.writeback.signature import signers_of

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import signal
+import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import JsonOption, Verb, judged_output, print_json
-from daq.errors import UsageError
-from daq.files import read_regular
+from daq.cli.terminal import at_most_one, interruptible, output_console, print_view, show_steps, write_output
+from daq.cli.verb import JsonOption, Verb, output_option, print_json
+from daq.errors import ConfigurationInconsistent, UsageError
+from daq.files import read_regular, replace_file
+from daq.report.text import Sentence
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -49,12 +56,7 @@ def simulate(
     It prints the bus settings for the cell file; the other verbs then run in a second terminal. Each shipped one but
     clean, which is the demo without its hidden effect, has a cell file of its name.
     """
-    import signal
-    from contextlib import ExitStack
-    from dataclasses import replace
-    from functools import partial
 
-    from daq.cli.terminal import at_most_one, interruptible
     from daq.simulation.simulation_file import load_scenario, load_simulation, require_simulator, shipped_simulation
     from daq.workflow.bus_lock import require_untaken
     from drivers.canopen.bus import BusAddress, bus_errors, open_bus
@@ -62,7 +64,6 @@ def simulate(
     from drivers.simulation.hub import Hub
 
     require_simulator()
-    from daq.errors import ConfigurationInconsistent
     from drivers.simulation.cell import SimulatedCell
     from drivers.simulation.spec import SpecInvalid
 
@@ -97,7 +98,8 @@ def simulate(
         try:
             cell = SimulatedCell(spec, end, mounted=mounted)
         except SpecInvalid as error:
-            expected, remedy = "a cell that can be built", "correct it, or the URDF that it names"
+            expected = "a cell that can be built"
+            remedy = "correct it, or the URDF that it names"
             raise ConfigurationInconsistent(str(truth), found=str(error), expected=expected, remedy=remedy) from error
         what = payload or "none" if payload_from is None else f"as {payload_from} says"
         faulty = len(spec.faults) or "no"
@@ -119,7 +121,9 @@ class MountedFile:
     def __init__(
         self, path: Path, load: Callable[[str | None], CellSpec], complain: Callable[[UsageError], None]
     ) -> None:
-        self._path, self._load, self._complain = path, load, complain
+        self._path = path
+        self._load = load
+        self._complain = complain
         self._name: str | None = None
         self._spec: CellSpec | None = None
 
@@ -180,7 +184,8 @@ def how_to_reach(parts: Sequence[BusPart], period_us: int) -> str:
     several = len(parts) > 1
     buses = ""
     for part in parts:
-        address, indent = part.address, "    " if several else "  "
+        address = part.address
+        indent = "    " if several else "  "
         keys = {"interface": address.interface, "channel": address.channel}
         if address.interface == "socketcand":
             keys |= {"host": address.host, "port": str(address.port)}
@@ -202,18 +207,14 @@ SIMULATE = Verb("simulate", simulate, "drivegain simulate demo --payload disc --
 
 
 def demo(
-    out: Annotated[Path, typer.Option("--out", help="Folder to fill.", callback=judged_output)] = Path("out/demo"),
+    out: Annotated[Path, output_option("--out", "Folder to fill.")] = Path("out/demo"),
     simulation: Annotated[Path | None, typer.Option(help="Another simulation file than the shipped one.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of plans and noise.", min=0)] = 1,
     duration: Annotated[float, typer.Option(help="Duration of each of the five runs [s].", min=10.0, max=600.0)] = 40.0,
     json: JsonOption = False,
 ) -> None:
     """Calibrate a simulated six-axis cell: scan, plan, record, identify, add effects, write a copy of its file."""
-    import time
-    from datetime import UTC, datetime
 
-    from daq.cli.terminal import output_console, print_view, show_steps, write_output
-    from daq.files import replace_file
     from daq.report.document import json_text
     from daq.report.proposal import show_proposal
     from daq.simulation.demo import ProgressReporter, Settings, demo_report, demonstrate
@@ -241,9 +242,9 @@ def demo_view(outcome: DemoOutcome) -> Iterator[RenderableType]:
     from daq.report.bus_views import scan_table, scanned_nodes
     from daq.report.gains import gain_table
     from daq.report.residual import before_after_table, summary, turns_view
-    from daq.report.text import Sentence
 
-    fitted, truth = outcome.fitted, outcome.truth
+    fitted = outcome.fitted
+    truth = outcome.truth
     yield scan_table(scanned_nodes(outcome.cell, outcome.nodes, outcome.cell.buses[0].name))
     yield ""
     yield from turns_view(fitted)

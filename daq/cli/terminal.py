@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import typer
 from rich.console import Console, RenderableType
@@ -168,42 +168,34 @@ def say_last(text: str) -> None:
         typer.echo(text, err=True)
 
 
-class Stepper(Protocol):
-    """Progress of steps that follow each other."""
+class Stepper:
+    """Progress of steps that follow each other: a line for each as it ends, whole and at once, for a file or pipe."""
+
+    def __init__(self) -> None:
+        self._title = ""
+        self._began_s = 0.0
 
     def step(self, title: str) -> None:
         """End the current step and begin the next."""
+        self.end()
+        self._title = title
+        self._began_s = time.monotonic()
 
     def progress(self, done: int, total: int, remark: str) -> None:
-        """Report progress within the step; a total of 0 is unknown."""
+        """Report progress within the step, which a line that cannot be taken back does not; a total of 0 is unknown."""
 
     def end(self) -> None:
         """End the current step."""
-
-
-class _PrintedLines:
-    """A line for each step as it ends, whole and at once, for a file or pipe."""
-
-    def __init__(self) -> None:
-        self._title, self._began_s = "", 0.0
-
-    def step(self, title: str) -> None:
-        self.end()
-        self._title, self._began_s = title, time.monotonic()
-
-    def progress(self, done: int, total: int, remark: str) -> None:
-        """Show nothing: a line cannot be taken back."""
-
-    def end(self) -> None:
         if self._title:
             typer.echo(f"{terminal_text(self._title)} ({time.monotonic() - self._began_s:.0f} s)", err=True)
         self._title = ""
 
 
-class _Bars:
+class _Bars(Stepper):
     """Progress bars."""
 
     def __init__(self, bars: Progress) -> None:
+        super().__init__()
         self._bars = bars
         self._task: TaskID | None = None
 
@@ -227,7 +219,7 @@ def show_steps() -> Iterator[Stepper]:
     """Show progress on stderr, in a terminal as bars; the last step is ended unless an error is raised."""
     console = Console(stderr=True)
     if not console.is_terminal:
-        lines = _PrintedLines()
+        lines = Stepper()
         yield lines
         lines.end()
         return
@@ -282,12 +274,8 @@ def delay_signals() -> Iterator[None]:
         yield
         return
     came: list[int] = []
-    before = {one: signal.signal(one, lambda number, _: came.append(number)) for one in SIGNALS}
-    try:
+    with _handled_by(lambda number, _: came.append(number), SIGNALS):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
     if came:
         raise KeyboardInterrupt
 
@@ -331,15 +319,23 @@ def interruptible(
     @contextmanager
     def block_signals() -> Iterator[Callable[[], bool]]:
         nonlocal blocked_until_s
-        earlier_s, blocked_until_s = blocked_until_s, max(blocked_until_s, clock() + GRACE_S)
+        earlier_s = blocked_until_s
+        blocked_until_s = max(blocked_until_s, clock() + GRACE_S)
         try:
             yield lambda: signals_seen > 1
         finally:
             blocked_until_s = earlier_s
 
-    before = [(number, signal.signal(number, interrupt)) for number in signals]
-    try:
+    with _handled_by(interrupt, signals):
         yield block_signals
+
+
+@contextmanager
+def _handled_by(handler: Callable[[int, FrameType | None], None], signals: Iterable[signal.Signals]) -> Iterator[None]:
+    """Handle signals within the block by a function."""
+    before = [(number, signal.signal(number, handler)) for number in signals]
+    try:
+        yield
     finally:
-        for number, handler in before:
-            signal.signal(number, handler)
+        for number, earlier in before:
+            signal.signal(number, earlier)

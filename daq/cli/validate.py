@@ -1,25 +1,30 @@
-"""`drivegain validate`: predict the torque of other logs with a calibration, alone or beside other calibrations."""
+"""`drivegain validate`, `weigh` and `contact`: what a calibration says of logs that its fit has not seen."""
 
 from __future__ import annotations
 
 import os
+from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from daq.cli.terminal import check_output, print_view, status, write_output
 from daq.cli.verb import (
     CalibrationArgument,
     CellOption,
     JsonOption,
     Verb,
     cells_in,
-    judged_output,
+    corrected_cell,
+    output_option,
     print_json,
     say_correct_first,
     say_next,
 )
-from daq.errors import CalibrationMissing
+from daq.errors import CalibrationMissing, DaqError
+from daq.files import replace_file
 
 if TYPE_CHECKING:
     from ident.calibration import Calibration
@@ -30,17 +35,13 @@ TABLES = "drivegain-validation-tables"  #: Format of the page of tables
 def validate_verb(
     calibration: CalibrationArgument,
     logs: Annotated[list[Path], typer.Argument(help="Logs of the same cell.")],
-    pictures: Annotated[
-        Path | None, typer.Option(help="Folder for pictures of the torques.", callback=judged_output)
-    ] = None,
+    pictures: Annotated[Path | None, output_option("--pictures", "Folder for pictures of the torques.")] = None,
     beside: Annotated[
         list[Path] | None, typer.Option(help="Another calibration, or a folder of them (`fit --cases`); repeatable.")
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder for tables.md: the same in the form of the paper's Tables 5 to 8.", callback=judged_output
-        ),
+        output_option("--out", "Folder for tables.md: the same in the form of the paper's Tables 5 to 8."),
     ] = None,
     cell: CellOption = None,
     json: JsonOption = False,
@@ -51,9 +52,6 @@ def validate_verb(
     with --beside every calibration side by side. With unloaded logs among the others, the payload mass does not depend
     on the calibration's robot parameters.
     """
-    from daq.cli.terminal import check_output, print_view, status, write_output
-    from daq.config.cell_file import load_cell
-    from daq.files import replace_file
     from daq.report.paper_tables import paper_page
     from daq.report.validation import draw_validations, validate_report, validation_tables, validation_view
     from daq.workflow.validate import cross_validate
@@ -65,7 +63,7 @@ def validate_verb(
     with status("predicting"):
         calibrations = load_beside(calibration, beside or [])
         known = next(iter(calibrations.values()))
-        found = cross_validate(calibrations, logs, None if cell is None else load_cell(cell))
+        found = cross_validate(calibrations, logs, corrected_cell(cell))
         if pictures is not None:
             with write_output(pictures):
                 drawn = draw_validations(known, found.validations, pictures)
@@ -90,10 +88,8 @@ def cell_of(calibration: Calibration, logs: list[Path]) -> Path:
     Several files may describe a cell of that name, as the shipped one and a copy of it. The one with the content that
     the logs of the fit carry is meant.
     """
-    from contextlib import suppress
 
     from daq.config.cell_file import load_cell
-    from daq.errors import DaqError
 
     folders = dict.fromkeys([Path(), *(log.parent for log in logs)])
     found = {os.path.realpath(path): path for folder in folders for path in cells_in(folder, calibration.cell)}
@@ -109,7 +105,6 @@ def cell_of(calibration: Calibration, logs: list[Path]) -> Path:
 
 def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]:
     """Load calibrations by label, the one to validate first; a file that is named twice counts once."""
-    from collections import Counter
 
     from daq.documents.calibration_file import load_calibration
 
@@ -130,3 +125,69 @@ def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]
 
 
 VALIDATE = Verb("validate", validate_verb, "drivegain validate calibration.yaml held-out.mcap --pictures pictures")
+
+
+def weigh_verb(
+    calibration: CalibrationArgument,
+    logs: Annotated[list[Path], typer.Argument(help="Logs with the body, mounted one way.")],
+    bare: Annotated[
+        list[Path] | None, typer.Option("--bare", help="Log of the same robot without load; repeatable.")
+    ] = None,
+    cell: CellOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Weigh the body on the flange: mass, centre of mass and inertia, each with its σ.
+
+    The effects of the calibration are in the model. Without --bare the robot is the calibration's, except the friction
+    of its joints; with --bare it is found again together with the body, which takes more moves and trusts the
+    calibration's gains alone. Says which of the ten parameters these moves identify, and which moves would help.
+    """
+    from daq.documents.calibration_file import load_calibration
+    from daq.report.weighing_views import weigh_report, weighed_view
+    from daq.workflow.weigh import weigh_logs
+
+    with status("weighing"):
+        found = weigh_logs(load_calibration(calibration), logs, bare=bare or (), cell=corrected_cell(cell))
+    if json:
+        print_json(weigh_report(found))
+    else:
+        print_view(weighed_view(found))
+
+
+WEIGH = Verb("weigh", weigh_verb, "drivegain weigh calibration.yaml held-out.mcap --bare unloaded.mcap")
+
+
+def contact_verb(
+    calibration: CalibrationArgument,
+    log: Annotated[Path, typer.Argument(help="Log to examine.")],
+    quiet: Annotated[
+        list[Path] | None, typer.Option("--quiet", help="Log of such motion without contact; repeatable.")
+    ] = None,
+    pictures: Annotated[Path | None, output_option("--pictures", "Folder for a picture of the torques.")] = None,
+    cell: CellOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Compute the external torque of each axis, its prediction band, and a threshold for contact.
+
+    The threshold gives less than one false alarm in an hour of motion, extrapolated from the quiet logs, or, without
+    any, from the quiet part of the log itself. A payload must be one that the calibration knows.
+    """
+    from daq.documents.calibration_file import load_calibration
+    from daq.report.weighing_views import contact_report, contact_view, draw_contact
+    from daq.workflow.weigh import contact_in
+
+    picture = None
+    with status("predicting"):
+        known = load_calibration(calibration)
+        found, described = contact_in(known, log, quiet=quiet or (), cell=corrected_cell(cell))
+        if pictures is not None:
+            with write_output(pictures):
+                pictures.mkdir(parents=True, exist_ok=True)
+                picture = draw_contact(found, described, log, pictures)
+    if json:
+        print_json(contact_report(found, described, log, picture))
+    else:
+        print_view(contact_view(found, described), picture)
+
+
+CONTACT = Verb("contact", contact_verb, "drivegain contact calibration.yaml loaded.mcap --quiet held-out.mcap")

@@ -26,6 +26,7 @@ from daq.errors import UsageError
 from daq.files import judge_target
 
 if TYPE_CHECKING:
+    from daq.config.cell import Cell
     from daq.report.document import Report
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
@@ -42,7 +43,8 @@ RequestT = TypeVar("RequestT")
 def judged_output(path: Path | None) -> Path | None:
     """Refuse, as the command line is parsed, a place to write to that another user has chosen, and a device or pipe.
 
-    The callback of every option and argument that names a file or folder to write; it returns the path as it was given.
+    The callback of every option (`output_option`) and argument that names a file or folder to write; it returns the
+    path as it was given.
 
     Raises:
         UsageError: as `judge_target`.
@@ -59,6 +61,18 @@ def judged_output(path: Path | None) -> Path | None:
             remedy="choose another name, or name the place itself",
         ) from error
     return path
+
+
+def output_option(name: str, about: str) -> Any:
+    """Option that names a file or folder to write."""
+    return typer.Option(name, help=about, callback=judged_output)
+
+
+def corrected_cell(path: Path | None) -> Cell | None:
+    """Load the cell file of `--cell`; None where the description in the logs is used."""
+    from daq.config.cell_file import load_cell
+
+    return None if path is None else load_cell(path)
 
 
 def taking(request: type[RequestT]) -> Callable[[Callable[[RequestT], None]], Callable[..., None]]:
@@ -130,9 +144,7 @@ class Listed:
     def load(self) -> Verb:
         """Import the verb."""
         module, _, name = self.place.partition(":")
-        verb = getattr(importlib.import_module(module), name)
-        if not isinstance(verb, Verb):
-            raise TypeError(f"{self.place} is no Verb")
+        verb: Verb = getattr(importlib.import_module(module), name)
         return verb
 
 
@@ -278,7 +290,8 @@ def cells_in(folder: Path, name: str | None = None) -> Iterator[Path]:
 
 def continued(command: str, width: int, indent: str = "") -> list[str]:
     r"""Break a command at its spaces into lines that a shell reads as one, each but the last with ` \` at its end."""
-    lines, line = [], indent
+    lines = []
+    line = indent
     # An option stays with its value.
     for word in re.findall(r"--?\S+(?: [^-\s]\S*)?|\S+", command):
         longer = f"{line}{word}" if not line.strip() else f"{line} {word}"

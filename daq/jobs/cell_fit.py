@@ -32,8 +32,7 @@ from daq.errors import (
 )
 from daq.files import judge_target, read_regular, replace_file
 from daq.jobs.fleet_survey import CellLogs, StoredLog, at_hand, fingerprint
-from daq.workflow.declared_effects import BOOTSTRAP_SEED
-from daq.workflow.fit import calibration_of, check_holdout, close_loop, fit
+from daq.workflow.fit import BOOTSTRAP_SEED, calibration_of, check_holdout, close_loop, fit
 from drivers.errors import DriverError
 from ident.calibration import Gain
 from ident.errors import IdentificationError
@@ -185,8 +184,10 @@ class CalibrationCache:
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return None  # unreadable: made anew
         summary, seconds = found
-        numbers = [number for gain in summary.gains for number in (gain.value, gain.std, gain.nameplate)]
-        return found if all(map(math.isfinite, (*numbers, summary.error_percent, seconds))) else None
+        numbers = [summary.error_percent, seconds]
+        for gain in summary.gains:
+            numbers += (gain.value, gain.std, gain.nameplate)
+        return found if all(map(math.isfinite, numbers)) else None
 
     def store(self, cell: CellLogs, fitted: FleetFit) -> Path:
         """Store a calibration; after a kill at any point, the cache is whole or the entry is made anew.

@@ -1,4 +1,7 @@
-"""Context of a recalibration job, and the checks before it begins and before it moves anything."""
+"""Context of a recalibration job, and the checks before it begins and before it moves anything.
+
+The last of them takes over the drives that a killed recorder has left with power.
+"""
 
 from __future__ import annotations
 
@@ -15,27 +18,130 @@ from daq.config.controller import Controller
 from daq.config.policy import HistoryPlace
 from daq.config.recalibration import Recalibration
 from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, writing
-from daq.jobs.drives import check_drives
 from daq.jobs.journal import Journal, Level
 from daq.jobs.session import Session
 from daq.ledger.ledger import Ledger, read_history
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.interlock import Runner, release_check, run_command
 from daq.workflow.plan import Plan, plan
-from daq.workflow.record import Recorded, RecordingRequest, record
+from daq.workflow.record import Recorded, RecordingRequest, network_of, record
 from daq.workflow.safeguards import FreeBytes, agree, free_bytes
 from daq.writeback.file_access import resolve_links
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.request import Request
 from daq.writeback.target import Proposal, Written, apply, propose
-from drivers.canopen.network import SignalBlocker
-from drivers.errors import MotionRefused
+from drivers.canopen.network import CanopenNetwork, SignalBlocker
+from drivers.canopen.setup import read_consumers
+from drivers.errors import DriveFault, MotionRefused, StateRefused
+from drivers.motion.execute import DEFAULT_BOUNDS
+from drivers.profiles.cia402 import POWERLESS, Goal, State, decode
+from drivers.profiles.profile import Axis
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account, account
 from ident.discovery.evidence import Evidence
 from ident.discovery.loop import Step
 
 CLOCK_SLACK = timedelta(minutes=1)  #: A time service sets a clock back by less
+
+
+# A killed recorder cannot remove the power. Its drives watch its heartbeat (1016h) and quick stop when it stays away,
+# so a job waits for that. Most drives then remove the power themselves. Those that stay in QUICK STOP ACTIVE (605Ah = 5
+# to 8) or SWITCHED ON lose it here, at standstill, with the interlock closed. A drive that watches no killed recorder
+# belongs to another controller: it is left alone.
+
+FAULTS = (State.FAULT, State.FAULT_REACTION_ACTIVE)
+LEFT = (State.QUICK_STOP_ACTIVE, State.SWITCHED_ON)  #: States of power without a motion that a killed recorder leaves
+IDLE = (*POWERLESS, State.READY_TO_SWITCH_ON)  #: Without power in the motor, and without a request for it
+STOP_S = 15.0  #: For the quick stop after a guard has expired; a simulated cell on a busy machine may be that slow
+ASK_S = 0.1  #: Between two questions for the states
+STANDSTILL_S = 0.2  #: Between two readings of a position that must agree
+OTHERS = (
+    "nothing was changed: end the other controller; if a recorder was killed there, `drivegain record` takes the drive "
+    "over, or switch it off and on"
+)
+
+Powered = tuple[tuple[Axis, int], ...]  #: Axes with power, and their statuswords
+
+
+def check_drives(cell: Cell, block_signals: SignalBlocker, take_over: bool) -> None:
+    """Check identity and state of every drive; nothing moves.
+
+    Args:
+        cell: whose drives these are.
+        block_signals: as in `network_of`.
+        take_over: remove the power of drives that a killed recorder left with it; else nothing is changed.
+
+    Raises:
+        DriveFault: one has a fault; to reset it is a person's decision.
+        StateRefused: one has power already: another controller drives this robot, or it moves.
+        BusBusy: another master commands the bus; nothing was sent.
+        DriverError: a drive does not answer, is another one than declared, or the bus has gone.
+    """
+    with network_of(cell, block_signals) as network:
+        network.require_quiet()  # a recorder on another computer is not excluded by the lock of the bus
+        network.check_identities()
+        left = _with_power(network)
+        if not left:
+            return
+        _require_ours(network, left)
+        left = _wait(network, left)
+        _require_stopped(network, left)
+        if take_over:
+            for axis, _ in left:
+                network.disable(axis, Goal.SWITCH_ON_DISABLED)
+
+
+def _with_power(network: CanopenNetwork) -> Powered:
+    """Return the axes with power.
+
+    Raises:
+        DriveFault: an axis has a fault.
+    """
+    found = tuple(zip(network.axes, network.statuswords(), strict=True))
+    for axis, statusword in found:
+        if (state := decode(statusword)) in FAULTS:
+            raise DriveFault(axis, f"{state} before the job began; find its cause, then reset it", statusword)
+    return tuple((axis, statusword) for axis, statusword in found if decode(statusword) not in IDLE)
+
+
+def _require_ours(network: CanopenNetwork, left: Powered) -> None:
+    """Refuse axes that do not watch a recorder which is gone."""
+    network.require_quiet()  # also hears the heartbeat of a recorder that is still there
+    for axis, statusword in left:
+        entries = read_consumers(network.link.objects(axis.node_id)) or ()
+        if not any(network.was_ours(value) for _, value in entries):
+            raise _refused(axis, statusword, OTHERS)
+
+
+def _wait(network: CanopenNetwork, left: Powered) -> Powered:
+    """Let the guards expire and the axes stop by themselves; return those that have power all the same."""
+    clock = network.link.clock
+    end_ns = clock() + network.guard_ms * 10**6 + round(STOP_S * 1e9)
+    while left and clock() < end_ns:
+        network.link.wait(ASK_S)
+        left = _with_power(network)
+    return left
+
+
+def _require_stopped(network: CanopenNetwork, left: Powered) -> None:
+    """Refuse axes that are in another state than a killed recorder leaves, or move."""
+    axes = [axis for axis, _ in left]
+    before = _positions(network, axes)
+    network.link.wait(STANDSTILL_S if left else 0.0)
+    for (axis, statusword), here, there in zip(left, before, _positions(network, axes), strict=True):
+        if decode(statusword) not in LEFT:
+            raise _refused(axis, statusword, OTHERS)
+        if abs(there - here) > DEFAULT_BOUNDS.standstill_counts:
+            moves = f"it moves by {abs(there - here)} counts in {STANDSTILL_S:g} s: press the emergency stop"
+            raise _refused(axis, statusword, moves)
+
+
+def _positions(network: CanopenNetwork, axes: Sequence[Axis]) -> tuple[int, ...]:
+    return tuple(network.link.objects(axis.node_id).read(axis.profile.position) for axis in axes)
+
+
+def _refused(axis: Axis, statusword: int, remedy: str) -> StateRefused:
+    return StateRefused(axis, "no power before a job begins", str(decode(statusword)), statusword, remedy=remedy)
 
 
 class Planner(Protocol):
@@ -66,20 +172,6 @@ class Fitter(Protocol):
         """As `daq.workflow.fit.fit`."""
 
 
-class LoopCloser(Protocol):
-    """Adds the effects that a fit lacks."""
-
-    def __call__(self, start: Fit, seed: int, progress: Callable[[str], None]) -> Fit:
-        """As `daq.workflow.fit.close_loop`."""
-
-
-class Proposer(Protocol):
-    """Plans a write to a controller's file."""
-
-    def __call__(self, target: FileTarget, request: Request) -> Proposal[FileEdit]:
-        """As `daq.writeback.target.propose`."""
-
-
 class ChangeWriter(Protocol):
     """Writes what was planned."""
 
@@ -97,10 +189,10 @@ class Tools:
     plan: Planner = plan
     record: Recorder = record
     fit: Fitter = fit
-    close_loop: LoopCloser = close_loop
+    close_loop: Callable[[Fit, int, Callable[[str], None]], Fit] = close_loop
     calibration: Callable[[Fit, datetime], Calibration] = calibration_of
     account: Callable[[Evidence, Sequence[Step]], Account] = account
-    propose: Proposer = propose
+    propose: Callable[[FileTarget, Request], Proposal[FileEdit]] = propose
     apply: ChangeWriter = apply
     run: Runner = run_command  #: runs a command of the cell
     free: FreeBytes = free_bytes  #: free bytes of a folder's disk
@@ -232,7 +324,8 @@ def before_motion(context: JobContext, *, take_over: bool = True) -> None:
         DiskSpaceShort, HistoryUnreadable, AuditUnusable, NotReleased, DriverError: nothing has moved.
         OutputFailed: the session's folder is gone.
     """
-    section, tools = context.section, context.tools
+    section = context.section
+    tools = context.tools
     with writing(section.folder):
         free_mb = tools.free(section.folder) / 1e6
     if free_mb < section.min_free_mb:

@@ -36,8 +36,7 @@ from daq.report.fit import start_of
 from daq.report.residual import summary
 from daq.workflow.fit import check_holdout
 from daq.workflow.interlock import Runner, release_check
-from daq.workflow.plan import Plan
-from daq.workflow.plan_file import load_plan, save_plan
+from daq.workflow.plan import Plan, load_plan, save_plan
 from daq.workflow.record import Recorded, RecordingRequest
 from ident.calibration import Calibration
 from ident.errors import IdentificationError
@@ -82,7 +81,8 @@ def record_runs(context: JobContext, session: Session) -> Session:
         run_context.journal.say(Level.INFO, "mounted", payload=planned.payload or "none")
         if not warm:
             # The moves of the run, recorded under the same supervision; the log is dropped.
-            plan, out = plans[planned.name], log_of(session, WARM_UP)
+            plan = plans[planned.name]
+            out = log_of(session, WARM_UP)
             passes = math.ceil(60.0 * context.section.warm_up_min / plan.duration_s)
             for number in range(1, passes + 1):
                 said = context.within(WARM_UP).journal
@@ -119,7 +119,8 @@ def _plan(context: JobContext, session: Session, planned: PlannedRun) -> Plan:
     if planned.plan_file is not None:
         return load_plan(planned.plan_file, context.cell)
     assert planned.plan is not None  # the schema requires one of the two
-    seed, duration_s = planned.plan.seed, planned.plan.duration_s
+    seed = planned.plan.seed
+    duration_s = planned.plan.duration_s
     path = session.folder / f"plan-{seed}-{duration_s:g}s.yaml"
     if path.exists():
         with suppress(ConfigurationError):  # what was damaged is made again
@@ -133,7 +134,8 @@ def _plan(context: JobContext, session: Session, planned: PlannedRun) -> Plan:
 def _record_valid(context: JobContext, session: Session, planned: PlannedRun, plan: Plan) -> RecordedRun:
     """Record a run, again if the recording is invalid."""
     out = log_of(session, planned.name)
-    lost, missing = 0, (0,) * len(context.cell.axes)
+    lost = 0
+    missing = (0,) * len(context.cell.axes)
     for attempt in range(1, context.section.retries + 2):
         _set_aside(out, context.journal)
         context.journal.say(Level.INFO, "recording", attempt=attempt, seconds=plan.duration_s)
@@ -241,7 +243,8 @@ def fit_session(context: JobContext, session: Session) -> tuple[Session, Calibra
         session.update(outcome=Outcome.UNFIT)
         raise
     calibration = context.tools.calibration(closed, context.tools.now())
-    path, report = session.folder / CALIBRATION, session.folder / REPORT
+    path = session.folder / CALIBRATION
+    report = session.folder / REPORT
     with writing(path):
         save_calibration(calibration, path)
         report.mkdir(exist_ok=True)
@@ -254,7 +257,8 @@ def fit_session(context: JobContext, session: Session) -> tuple[Session, Calibra
 
 def calibration_of_session(session: Session) -> Calibration | None:
     """Calibration of a session; None where there is none, or where it was made from other logs."""
-    path, fitted = session.folder / CALIBRATION, session.state.fitted
+    path = session.folder / CALIBRATION
+    fitted = session.state.fitted
     if fitted is None or sha256_of(path) != fitted.calibration_sha256:
         return None
     try:

@@ -27,7 +27,8 @@ from daq.report.job_schemas import JobReport, RefusedJob
 from drivers.errors import stop_notes
 from ident.calibration import Calibration
 
-SUMMARY_TEXT, SUMMARY_JSON = "summary.txt", "summary.json"
+SUMMARY_TEXT = "summary.txt"
+SUMMARY_JSON = "summary.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,9 +201,11 @@ def text(conclusion: Conclusion, cell_file: Path) -> str:
 
 def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
     """List the next steps for the operator, a line each."""
-    session, outcome = conclusion.session, conclusion.outcome
+    session = conclusion.session
+    outcome = conclusion.outcome
     if outcome is Outcome.PROPOSED and session is not None and session.state.target is not None:
-        calibration, cell = shlex.quote(str(session.folder / CALIBRATION)), shlex.quote(str(cell_file.absolute()))
+        calibration = shlex.quote(str(session.folder / CALIBRATION))
+        cell = shlex.quote(str(cell_file.absolute()))
         sign = f"let a second person sign it: drivegain sign calibration {calibration} --key KEY --name NAME"
         return [
             *([sign] if session.state.target.unsigned else []),
@@ -239,7 +242,8 @@ def write_metrics(
     shown = conclusion.session
     calibration = None if shown is None else calibration_of_session(shown)
     if calibration is None and good is not None:
-        shown, calibration = good, calibration_of_session(good)
+        shown = good
+        calibration = calibration_of_session(good)
     registry = CollectorRegistry()
 
     def gauge(name: str, text: str, *labels: str) -> Gauge:

@@ -17,10 +17,12 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from daq.documents.session_state import SessionState
-from daq.errors import ConfigurationInconsistent, writing
+from daq.errors import ConfigurationInconsistent, reason_of, writing
 from daq.files import read_regular, replace_file
 
-STATE, CALIBRATION, REPORT = "state.json", "calibration.yaml", "report"
+STATE = "state.json"
+CALIBRATION = "calibration.yaml"
+REPORT = "report"
 LARGEST_STATE_BYTES = 4 << 20  # a job writes a few kilobytes
 _STAMP = "%Y%m%dT%H%M%SZ"
 _NAME = re.compile(r"[0-9]{8}T[0-9]{6}Z(?:-[0-9]{2})?")
@@ -83,7 +85,7 @@ def _listing(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise ConfigurationInconsistent(
             str(folder),
-            found=(error.strerror or type(error).__name__).lower(),
+            found=reason_of(error),
             expected="the folder of a cell's sessions",
             remedy="correct `recalibration.folder` of the cell file, or move that file away",
         ) from error

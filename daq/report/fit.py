@@ -25,7 +25,7 @@ from daq.report.gains import (
 )
 from daq.report.text import Sentence, percent_text, plain_table
 from daq.workflow.cases import CASES, CaseFit
-from daq.workflow.description import hidden_zeros_text
+from daq.workflow.diagnoses import hidden_zeros_text
 from daq.workflow.fit import DOUBTFUL_PERCENT, Fit
 from daq.workflow.nameplates import actual_current_note
 from daq.workflow.verdicts import needed_verdicts

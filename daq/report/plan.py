@@ -12,8 +12,7 @@ import numpy as np
 from daq.config.cell import Cell, joint_unit
 from daq.report.document import Figure, Report
 from daq.workflow.experiment import Experiment
-from daq.workflow.plan import Plan
-from daq.workflow.plan_file import LONGEST_S
+from daq.workflow.plan import LONGEST_S, Plan
 from ident.planning.gain_verdict import GOOD_PERCENT, GainVerdict, Identifiability, Visibility
 
 

@@ -11,8 +11,8 @@ from rich.text import Text
 from daq.report.document import Figure, Report
 from daq.report.fit import Errors
 from daq.report.text import plain_table, printable, terminal_text
-from daq.workflow.remaining_corrections import CORRECTIONS
 from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
+from daq.workflow.validate import CORRECTIONS
 from ident.calibration import Calibration
 from ident.physical.physical import MARGIN
 

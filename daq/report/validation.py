@@ -18,8 +18,7 @@ from daq.report.plots import plot_torques
 from daq.report.svg import sheet
 from daq.report.text import Sentence, percent_text, plain_table, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
-from daq.workflow.validate import CrossValidation, Mass, WeighedRun, conditioning_of, together
-from daq.workflow.validation import DataUse, Validation
+from daq.workflow.validate import CrossValidation, DataUse, Mass, Validation, WeighedRun, conditioning_of, together
 from ident.calibration import Calibration, PayloadMass
 
 

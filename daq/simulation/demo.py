@@ -26,8 +26,7 @@ from daq.report.plots import draw_fit
 from daq.report.residual_page import save_report
 from daq.simulation.simulation_file import load_simulation, require_simulator
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
-from daq.workflow.plan import Plan, plan
-from daq.workflow.plan_file import save_plan
+from daq.workflow.plan import Plan, plan, save_plan
 from daq.workflow.record import Recorded, RecordingRequest, network_of, record
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.request import Request

@@ -12,9 +12,8 @@ import numpy as np
 from daq.config.cell import Cell, model_of
 from daq.errors import ConfigurationInconsistent
 from daq.workflow.choices import Known
-from daq.workflow.declared_effects import refuse_effects
-from daq.workflow.diagnoses import named_causes
-from daq.workflow.fit import Fit, Reading, calibration_of, judged
+from daq.workflow.diagnoses import fixed_gains_of, named_causes, nameplate_of
+from daq.workflow.fit import Fit, Reading, calibration_of, judged, refuse_effects
 from ident.calibration import Calibration, Parameter, Source, factor_of
 from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.system import System, require_distinct
@@ -84,7 +83,8 @@ def reduce_logs(
     """
     reading = Reading.of(logs, cell)
     refuse_effects(reading.cell, "--known, --cases")
-    model, conditioning = model_of(reading.cell), reading.cell.conditioning
+    model = model_of(reading.cell)
+    conditioning = reading.cell.conditioning
     used = reduce_runs(model, reading.runs(logs, "fit"), conditioning, instruments=instruments)
     rest = each_run(reading.runs(holdout, "holdout"), used.payloads)
     unseen = reduce_runs(model, rest, conditioning, payloads=used.payloads)
@@ -105,8 +105,7 @@ def fit_case(
     payloads = tuple(payload_as(payload, logs.cell, known) for payload in logs.used.payloads)
     system = regrouped(replace(logs.used, payloads=payloads))
     require_distinct(system, gains=not gains_fixed)
-    nameplate = np.array([axis.nameplate_gain for axis in logs.cell.axes])
-    estimate = estimate_with(method, system, nameplate if gains_fixed else None)
+    estimate = estimate_with(method, system, nameplate_of(logs.cell) if gains_fixed else None)
     rest = None
     if logs.unseen.runs:
         unseen = replace(logs.unseen, payloads=payloads)
@@ -141,7 +140,7 @@ def essential_fit(fitted: Fit, ratio: float) -> CaseFit:
     refuse_effects(fitted.cell, "--essential")
     before = fitted.identification
     estimate = before.estimate
-    fixed = estimate.gains if estimate.gains_fixed else None
+    fixed = fixed_gains_of(estimate)
     found = essential(before.system, lambda system: estimate_with(estimate.method, system, fixed), ratio)
     after = replace(fitted, identification=replace(before, estimate=found.whole))
     return CaseFit(after, before.system.payloads, found)
@@ -184,7 +183,8 @@ def calibration_of_case(case: CaseFit, created: datetime) -> Calibration:
     )
     kept = tuple(parameter for parameter in calibration.parameters if parameter.name not in removed)
     condition = calibration.condition if case.essential is None else case.essential.estimate.condition
-    covariance, gains = calibration.covariance, len(calibration.gains)
+    covariance = calibration.covariance
+    gains = len(calibration.gains)
     factor = None
     if covariance is not None:
         names = [parameter.name for parameter in calibration.parameters]

@@ -1,7 +1,8 @@
 """One judgement of recordings for `fit`, `residual`, `validate`, `report` and `daq.fit_logs`.
 
-`diagnose_fit` judges the logs of a fit, and `diagnose_run` a log that a calibration has not seen: a held-out one, or
-one that is validated. A calibration keeps what was said of its fit, so its report and its validation say the same.
+`diagnose_fit` judges the logs of a fit, and `diagnose_run` of `daq.workflow.validate` a log that a calibration has not
+seen: a held-out one, or one that is validated. A calibration keeps what was said of its fit, so its report and its
+validation say the same.
 
 The order of the judgements, causes before their traces:
 
@@ -16,34 +17,31 @@ The order of the judgements, causes before their traces:
 5. Currents without a sign and exchanged ones, where 4. named a trace of them, or the gains are fixed.
 6. Zeros and lengths that the encoders contradict (`daq.workflow.geometry_diagnoses`), where there are more of them than
    degrees of freedom: found before any torque is looked at, and named first.
-7. Small mistakes of the description (`daq.workflow.description`): zeros, mounting and late positions, by torque. They
-   are named before 4. to 6., and where they are, no exchange of currents is looked for (`daq.workflow.fit.judged`).
+7. Small mistakes of the description (`check_diagnoses`): zeros, mounting and late positions, by torque. They are named
+   before 4. to 6., and where they are, no exchange of currents is looked for (`daq.workflow.fit.judged`).
 8. Each held-out log; first whether the geometry has changed since the fit (`ident.geometry_drift`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.advice import for_command_line
 from daq.config.cell import Cell, model_of, robot_of
-from daq.workflow.description import drift_diagnosis
 from daq.workflow.geometry_diagnoses import geometry_diagnoses
-from daq.workflow.validation import Validation
-from ident.arrays import BoolArray, FloatArray
-from ident.calibration import Calibration
-from ident.data.conditioning import Conditioning
-from ident.data.dataset import differentiate
+from ident.arrays import FloatArray
 from ident.data.run import Run
+from ident.discovery.evidence import Evidence, coefficients_of
+from ident.discovery.geometry_check import GeometryCheck, check_geometry
+from ident.effects.effect import PlacedEffect
+from ident.effects.geometry_corrections import LatePosition, ZeroOffset, is_correction, turned_gravity
 from ident.equations.instants import Instants, read_instants
-from ident.equations.reduction import regrouped
 from ident.equations.system import System
 from ident.errors import (
     ChannelsExchanged,
@@ -53,26 +51,22 @@ from ident.errors import (
     ModelContradicted,
     NotConverged,
     PayloadUnseen,
+    TooFewMoves,
 )
 from ident.estimators.diagnosis import (
-    axis_error_diagnoses,
     diagnose,
     exchanged_channels,
-    scale_diagnoses,
     unsigned_channels,
 )
-from ident.estimators.estimate import Identification
-from ident.estimators.payload_diagnosis import payload_diagnoses
-from ident.estimators.refusals import idle_joints
-from ident.estimators.turned_geometry import GEOMETRY, find_turned_geometry, is_confirmed
-from ident.geometry_drift import geometry_drift
-from ident.model.bodies import LINK_PARAMETERS, Payload
+from ident.estimators.estimate import Estimate, Identification
+from ident.estimators.geometry_estimate import GeometryFinding
+from ident.estimators.identify import estimate_with
+from ident.estimators.method import Method
+from ident.estimators.turned_geometry import find_turned_geometry, is_confirmed
+from ident.geometry_drift import GeometryDrift
 from ident.model.model import Model
+from ident.model.robot import JointKind
 from ident.model.urdf import read_urdf
-from ident.prediction import as_calibrated, mounted_parameters, standard_parameters
-
-if TYPE_CHECKING:  # which asks for these diagnoses
-    from ident.estimators.geometry_estimate import GeometryFinding
 
 ReadLog = Callable[[Path], tuple[Run, Cell]]  #: Reads a log, and the description of its cell
 
@@ -126,7 +120,7 @@ def diagnose_fit(
     effort_limit = read_urdf(cell.urdf).effort_limit[list(robot_of(cell).axis_joints)]
     # Each held-out run is judged alone, as in a validation.
     named = diagnose(replace(found, holdout=None), cell.axis_names, nameplate, effort_limit)
-    diagnoses = tuple(map(_for_command_line, named))
+    diagnoses = tuple(map(with_verbs, named))
     suspect = any(one.name in TRACES_OF_CURRENTS for one in diagnoses)
     if suspect or found.estimate.gains_fixed:
         require_right_currents(recordings, each=suspect)
@@ -138,89 +132,9 @@ def nameplate_of(cell: Cell) -> FloatArray:
     return np.array([axis.nameplate_gain for axis in cell.axes])
 
 
-def diagnose_run(
-    calibration: Calibration,
-    validation: Validation,
-    model: Model,
-    run: Run,
-    standard: System,
-    conditioning: Conditioning,
-) -> tuple[Diagnosis, ...]:
-    """Judge a run that the fit of a calibration has not seen: scale and sign of its currents, its payload, its errors.
-
-    Args:
-        calibration: of the cell.
-        validation: what it predicts of the run, and what was measured.
-        model: of the cell.
-        run: as it was read.
-        standard: equations of this run alone, in standard parameters (`reduce_runs`).
-        conditioning: the filters.
-    """
-    if any(one.name in GEOMETRY for one in calibration.diagnoses):
-        return ()  # it predicts in a wrong geometry
-    runs = (run.name,)
-    axes = [gain.axis for gain in calibration.gains]
-    use = validation.use
-    carried = replace(run, payload=as_calibrated(calibration, run.payload, run.name))
-    data = differentiate(carried, model.drive_train, conditioning)
-    left_nm = validation.measured_nm - validation.predicted_nm
-    moved = geometry_drift(calibration, model, data, conditioning, left_nm, use)
-    if moved is not None:
-        return (drift_diagnosis(moved, model, axes, runs),)
-    size = _rms(validation.measured_nm, use)
-    left = _rms(left_nm, use)
-    idle = idle_joints(model, size, left)
-    used = use & ~idle[:, None]
-    found = list(scale_diagnoses(validation.measured_nm, validation.predicted_nm, used, axes, runs))
-    if run.payload is not None and not found:
-        found += _payload_diagnoses(calibration, run.payload, standard)
-    errors = list(map(_for_command_line, axis_error_diagnoses(size, left, idle, axes, runs)))
-    if not errors and not any(one.name == "current-reversed" for one in found):
-        return tuple(found)
-    gains = np.array([gain.value for gain in calibration.gains])
-    turned = find_turned_geometry(model, read_instants(model, (run,), conditioning), gains)
-    if turned is not None:
-        return (turned.diagnosis(axes, runs),)
-    exchanged = exchanged_channels(model, (run,), conditioning, axes) if errors else None
-    if exchanged is not None:
-        return (replace(exchanged, runs=runs),)
-    return tuple(found or errors)
-
-
-def _for_command_line(diagnosis: Diagnosis) -> Diagnosis:
+def with_verbs(diagnosis: Diagnosis) -> Diagnosis:
     """The same diagnosis with a remedy that names verbs and options."""
     return replace(diagnosis, remedy=for_command_line(diagnosis.remedy))
-
-
-def _rms(torque_nm: FloatArray, use: BoolArray) -> FloatArray:
-    """Root mean square of each axis over its rows that count, shape (m,); zero without any."""
-    rows = np.maximum(use.sum(axis=1), 1)
-    return np.asarray(np.sqrt(np.sum(torque_nm**2, axis=1, where=use) / rows))
-
-
-def _payload_diagnoses(calibration: Calibration, payload: Payload, standard: System) -> Iterator[Diagnosis]:
-    """Compare the payload of a run with that of its mounting in the calibration."""
-    mounted = mounted_parameters(calibration, payload.mounting)
-    unknown = tuple(
-        index
-        for index, parameter in enumerate(LINK_PARAMETERS)
-        if parameter not in payload.known and parameter in mounted
-    )
-    of_payload = [mounted[LINK_PARAMETERS[index]].value for index in unknown]
-    values = np.concatenate((standard_parameters(calibration, standard.model), of_payload))
-    gains = np.array([gain.value for gain in calibration.gains])
-    return payload_diagnoses(regrouped(standard, standard.base, (unknown,)), gains, values)
-
-
-def not_repeated(stored: Iterable[Diagnosis], fresh: Iterable[Diagnosis]) -> Iterator[Diagnosis]:
-    """Yield stored diagnoses, less those that were made again of each of their runs."""
-    again: set[tuple[str, str, tuple[str, ...]]] = set()
-    for one in fresh:
-        again.update((one.name, run, one.axes) for run in one.runs)
-    for one in stored:
-        of_runs = {(one.name, run, one.axes) for run in one.runs}
-        if not of_runs or not of_runs <= again:
-            yield one
 
 
 # Causes in the logs
@@ -325,3 +239,198 @@ def _exchange_in(logs: Sequence[Path], read: ReadLog) -> Diagnosis | None:
     first, declared = read(logs[0])
     runs = chain((first,), (read(log)[0] for log in logs[1:]))
     return exchanged_channels(model_of(declared), runs, declared.conditioning, declared.axis_names)
+
+
+# The description beside the torques
+
+CHECKED_BYTES = 150_000_000
+"""Largest size of all logs of a fit whose rows are kept for the test: some ten minutes of six axes at 1 kHz."""
+
+
+def is_checked(logs: Sequence[Path]) -> bool:
+    """Whether logs are small enough to keep their rows."""
+    return sum(log.stat().st_size for log in logs if log.is_file()) <= CHECKED_BYTES
+
+
+def geometry_beside(evidence: Evidence, seed: int) -> GeometryCheck | None:
+    """Test the geometry beside a fit by any estimator; None with too few moves.
+
+    Args:
+        evidence: the rows behind the fit.
+        seed: of the bootstrap.
+    """
+    if evidence.estimate.method is not Method.ML:
+        evidence = replace(evidence, estimate=by_likelihood(evidence.estimate, evidence.training.system()))
+    try:
+        return check_geometry(evidence, np.random.default_rng(seed))
+    except TooFewMoves:
+        return None
+
+
+def fixed_gains_of(estimate: Estimate) -> FloatArray | None:
+    """Return the gains that an estimate held fixed, shape (n,); None where it found them."""
+    return estimate.gains if estimate.gains_fixed else None
+
+
+def by_likelihood(estimate: Estimate, system: System) -> Estimate:
+    """Return the estimate of a system by ``ml``, in whose terms candidates are judged, or itself if it is by ``ml``."""
+    if estimate.method is Method.ML:
+        return estimate
+    return estimate_with(Method.ML, system, fixed_gains_of(estimate))
+
+
+def check_diagnoses(check: GeometryCheck, cell: Cell, model: Model) -> tuple[Diagnosis, ...]:
+    """Diagnoses of a check beside a fit.
+
+    Args:
+        check: of the fit.
+        cell: whose description it is.
+        model: as declared.
+    """
+    found = check.mistake
+    if found is None:
+        return ()
+    placed = PlacedEffect(found.effect, found.axis)
+    return (_correction_diagnosis(placed, found.coefficients, found.deviations, cell, model),)
+
+
+def correction_diagnoses(evidence: Evidence, cell: Cell) -> tuple[Diagnosis, ...]:
+    """Diagnoses of the corrections that a search has made.
+
+    Args:
+        evidence: with its effects.
+        cell: whose description it is.
+    """
+    if evidence.uncorrected is None:
+        return ()
+    found: list[Diagnosis] = []
+    for placed in evidence.effects:
+        if is_correction(placed):
+            values, deviations = coefficients_of(evidence.estimate, placed)
+            found.append(_correction_diagnosis(placed, values, deviations, cell, evidence.uncorrected.model))
+    return tuple(found)
+
+
+def drift_diagnosis(drift: GeometryDrift, model: Model, axes: Sequence[str], runs: Sequence[str]) -> Diagnosis:
+    """Diagnosis of a geometry that has changed since a calibration.
+
+    Args:
+        drift: by a run that the fit has not seen.
+        model: as declared.
+        axes: names of its axes.
+        runs: name of the run.
+    """
+    placed = drift.placed
+    name = axes[placed.axis]
+    share = f"it explains {100.0 * drift.share:.0f} % of what the error is larger than in the fit"
+    match placed.effect:
+        case ZeroOffset():
+            offset = _offset_text(placed.axis, drift.values, drift.deviations, model)
+            return Diagnosis(
+                name="zero-off",
+                runs=tuple(runs),
+                axes=(name,),
+                found=f"the zero of {name} off by {offset} since the calibration; {share}",
+                expected="the zero of the calibration",
+                remedy="reference the axis again, or calibrate anew",
+            )
+        case LatePosition():
+            size = f"{1e3 * drift.values[0]:+.2f} ± {1e3 * drift.deviations[0]:.2f} ms"
+            return Diagnosis(
+                name="position-late",
+                runs=tuple(runs),
+                axes=(name,),
+                found=f"the position of {name} late by {size} more than in the calibration; {share}",
+                expected="positions and currents of one moment",
+                remedy="look for what delays this encoder alone",
+            )
+        case _:
+            return Diagnosis(
+                name="gravity-tilted",
+                runs=tuple(runs),
+                axes=(),
+                found=f"gravity turned by {_turn_text(drift.values, drift.deviations)} since the calibration; {share}",
+                expected="the mounting of the calibration",
+                remedy="level the base as it was, or correct `gravity_m_s2` in the cell file and calibrate anew",
+            )
+
+
+def _correction_diagnosis(
+    placed: PlacedEffect, values: FloatArray, deviations: FloatArray, cell: Cell, model: Model
+) -> Diagnosis:
+    """Diagnosis of one correction."""
+    name = cell.place_names[placed.axis]
+    match placed.effect:
+        case ZeroOffset():
+            _, scale, key = _zero_unit(model, placed.axis)
+            entered = scale * (cell.axes[placed.axis].zero_offset_rad + values[0])
+            return Diagnosis(
+                name="zero-off",
+                runs=(),
+                axes=(name,),
+                found=f"the zero of {name} off by {_offset_text(placed.axis, values, deviations, model)}",
+                expected="positions whose zero is that of the URDF",
+                remedy=f"correct `{key}` of {name} in the cell file to {entered:.2f}, or the zero in the "
+                "controller, and fit again",
+            )
+        case LatePosition():
+            delay = f"{1e3 * abs(values[0]):.2f} ± {1e3 * deviations[0]:.2f} ms"
+            late = "late" if values[0] > 0.0 else "early"
+            return Diagnosis(
+                name="position-late",
+                runs=(),
+                axes=(name,),
+                found=f"the position of {name} {late} by {delay}",
+                expected="positions and currents of one moment",
+                remedy="look for what delays this encoder alone: a filter, a slower channel, another time stamp "
+                "than that of the other axes",
+            )
+        case _:
+            declared = model.robot.gravity_m_s2
+            turned = vector_text(turned_gravity(declared, values.tolist()))
+            return Diagnosis(
+                name="gravity-tilted",
+                runs=(),
+                axes=(),
+                found=f"gravity along {turned}, turned by {_turn_text(values, deviations)}",
+                expected=f"{vector_text(declared)}, as the cell file says",
+                remedy=f"write `gravity_m_s2: {turned}` in the cell file, or level the base and record again; then "
+                "fit again",
+            )
+
+
+def _zero_unit(model: Model, axis: int) -> tuple[str, float, str]:
+    """Unit of an axis' zero, how many of it are in a radian or metre, and the key of the cell file."""
+    if model.robot.axes[axis].kind is JointKind.PRISMATIC:
+        return "mm", 1e3, "zero_offset_mm"
+    return "°", float(np.degrees(1.0)), "zero_offset_deg"
+
+
+def _offset_text(axis: int, values: FloatArray, deviations: FloatArray, model: Model) -> str:
+    """Size of a zero offset with σ."""
+    unit, scale, _ = _zero_unit(model, axis)
+    return f"{scale * values[0]:+.2f} ± {scale * deviations[0]:.2f} {unit}"
+
+
+def _turn_text(values: FloatArray, deviations: FloatArray) -> str:
+    """Angle of a turn of gravity with σ."""
+    angle = float(np.linalg.norm(values))
+    std = float(np.linalg.norm(values * deviations)) / max(angle, 1e-12)
+    return f"{np.degrees(angle):.2f} ± {np.degrees(std):.2f}°"
+
+
+def vector_text(vector: FloatArray) -> str:
+    """A vector as a cell file has it: `[0.00, 0.34, -9.80]`."""
+    return f"[{', '.join(f'{entry:.2f}' for entry in vector)}]"
+
+
+def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str]) -> str:
+    """Which zeros the data cannot show; empty where they show all, or were not asked."""
+    if check is None or not check.hidden_zeros:
+        return ""
+    names = [axes[axis] for axis in check.hidden_zeros]
+    subject = "The zeros of" if len(names) > 1 else "The zero of"
+    return (
+        f"{subject} {' and '.join(names)} cannot be seen here: about a vertical axis, or behind the last joint, "
+        "another zero makes nearly the same torques."
+    )

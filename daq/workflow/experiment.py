@@ -30,6 +30,33 @@ from ident.planning.excitation import (
 )
 from ident.planning.gain_verdict import ExtraMoves
 
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointLimits:
+    """Limits of the joints of a cell [rad; m of a prismatic joint], shape (n,) each."""
+
+    lower: FloatArray  #: least positions
+    upper: FloatArray  #: largest positions
+    velocity: FloatArray  #: per second
+    acceleration: FloatArray  #: per second squared
+
+    @classmethod
+    def of(cls, cell: Cell) -> JointLimits:
+        """Return the limits that a cell declares."""
+        limits = [axis.limits for axis in cell.axes]
+        return cls(
+            lower=np.array([one.position[0] for one in limits]),
+            upper=np.array([one.position[1] for one in limits]),
+            velocity=np.array([one.velocity for one in limits]),
+            acceleration=np.array([one.acceleration for one in limits]),
+        )
+
+    def targets(self) -> tuple[FloatArray, FloatArray]:
+        """Return the least and the largest targets of a plan, which keep a margin from the limits."""
+        margin = POSITION_MARGIN * (self.upper - self.lower)
+        return self.lower + margin, self.upper - margin
+
+
 LINK_RADIUS = 0.08
 """Radius of a guessed link, as a share of the length of the joint chain: 6 cm for an arm of the TX-40's size."""
 POSTURES = 400
@@ -72,7 +99,9 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     last = robot.carrier
     if not any(capsule.link == last for capsule in capsules):
         # Around a steel body of that mass, from where it is mounted to three of its sides away.
-        side, axis, at = side_of_cube(mass_kg), robot.joints[last].axis, robot.mounting_m
+        side = side_of_cube(mass_kg)
+        axis = robot.joints[last].axis
+        at = robot.mounting_m
         capsules = (*capsules, Capsule("payload", last, _point(at + side * axis), _point(at + 2.0 * side * axis), side))
     links = [capsule.link for capsule in capsules]
     parents = [robot.joints[link].parent if link != BASE else None for link in links]
@@ -84,8 +113,8 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     )
     confined = tuple(index for index, capsule in enumerate(capsules) if capsule.link == last)
     everything = Scene(capsules, candidates, declared.obstacles, declared.workspace, confined, declared.minimum_m)
-    lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
-    postures = np.random.default_rng(0).uniform(lower, upper, (POSTURES, len(lower)))
+    limits = JointLimits.of(cell)
+    postures = np.random.default_rng(0).uniform(limits.lower, limits.upper, (POSTURES, len(cell.axes)))
     apart = Checker(robot, everything).apart(postures) > ALWAYS
     pairs = tuple(pair for pair, kept in zip(candidates, apart, strict=True) if kept)
     together = tuple(
@@ -145,7 +174,7 @@ class Experiment:
         period = self.row_s * thinning
         times = [np.arange(0.5 * period, path.duration_s, period) for path in paths]
         parts = [path.at(time) for path, time in zip(paths, times, strict=True)]
-        motion = Motion(*(np.concatenate([part[kind] for part in parts]) for kind in range(3)))
+        motion = _joined(parts)
         use = np.concatenate([self._use(path, time) for path, time in zip(paths, times, strict=True)], axis=1)
         ends = np.cumsum([len(time) for time in times])
         slices = tuple(slice(end - len(time), end) for end, time in zip(ends.tolist(), times, strict=True))
@@ -163,11 +192,11 @@ class Experiment:
         """Rows of each motor that count; the same rule as ident/equations/rows.py, for moves from rest to rest."""
         train = self.design.expectation.model.drive_train
         # On a trapezoid a joint is slowest at the ends of a row's window.
-        early, late = (np.abs(path.at(time_s + shift)[1].T) for shift in (-self.edge_s, self.edge_s))
+        early = path.at(time_s - self.edge_s)[1].T
+        late = path.at(time_s + self.edge_s)[1].T
         standstill = np.array(self.cell.conditioning.standstill_rad_s or (0.0,) * len(early))[:, None]
-        moving = (np.minimum(early, late) > standstill) if standstill.any() else np.minimum(early, late) > 0.0
-        slowest = np.minimum(*(np.abs(train.direction @ path.at(time_s + s)[1].T) for s in (-self.edge_s, self.edge_s)))
-        turned = slowest > standstill
+        moving = np.minimum(np.abs(early), np.abs(late)) > standstill
+        turned = np.minimum(np.abs(train.direction @ early), np.abs(train.direction @ late)) > standstill
         needed = (np.abs(train.to_motor) > 0) | (np.abs(train.direction) > 0)
         use = np.stack([moving[needed[motor]].all(axis=0) & turned[motor] for motor in range(len(moving))])
         return use.all(axis=0) & use if self.design.expectation.model.is_redundant else use
@@ -194,9 +223,8 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     mounted = found[0]
     model = model_of(cell)
     expected = nominal_payload(model.robot, mounted.drawn)
-    velocity = np.array([axis.limits.velocity for axis in cell.axes])
-    acceleration = np.array([axis.limits.acceleration for axis in cell.axes])
-    fast_motion = _fast_motion(cell, Checker(model.robot, NOTHING), velocity, acceleration)
+    limits = JointLimits.of(cell)
+    fast_motion = _fast_motion(limits, Checker(model.robot, NOTHING))
     links, from_urdf = nominal_links(model.robot, cell.urdf)
     loaded = links.copy()
     loaded[model.robot.carrier] += expected.parameters
@@ -206,7 +234,7 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     expectation = Expectation(
         model=model,
         gains=gains,
-        parameters=nominal_parameters(model, links, torque, velocity, acceleration),
+        parameters=nominal_parameters(model, links, torque, limits.velocity, limits.acceleration),
         payloads=(expected,),
         noise_a=effective_noise(noise, LAG_ONE),
     )
@@ -223,25 +251,30 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     filter_ = decimator(RATE_HZ, cell.conditioning.decimation_cutoff_hz)
     weight = np.cumsum(np.abs(filter_.taps)) / np.abs(filter_.taps).sum()
     inside = int(np.searchsorted(weight, cell.conditioning.standstill_share))
-    period, edge = filter_.factor / RATE_HZ, max(filter_.half - inside, 0) / RATE_HZ
+    period = filter_.factor / RATE_HZ
+    edge = max(filter_.half - inside, 0) / RATE_HZ
     return Experiment(cell, design, scene, mounted, period, edge, remarks)
 
 
 NOTHING = Scene((), (), (), None, (), 0.0)  #: Without bodies, a checker knows what closures allow
 
 
-def _fast_motion(cell: Cell, checker: Checker, velocity: FloatArray, acceleration: FloatArray) -> Motion:
+def _fast_motion(limits: JointLimits, checker: Checker) -> Motion:
     """Random moves as fast as the limits allow: which parameters there are does not depend on a plan's seed."""
     rng = np.random.default_rng(0)
-    lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
-    targets = rng.uniform(lower, upper, (40, len(lower)))
+    targets = rng.uniform(limits.lower, limits.upper, (40, len(limits.lower)))
     if checker.robot.closures:
-        targets = _allowed(checker, rng, lower, upper, len(targets))
+        targets = _allowed(checker, rng, limits.lower, limits.upper, len(targets))
     parts = []
     for start, end in pairwise(targets):
-        path = synchronised(start, end, velocity, acceleration)
+        path = synchronised(start, end, limits.velocity, limits.acceleration)
         parts.append(path.at(np.linspace(0.02, 0.98, 24) * path.duration_s))
-    return Motion(*(np.concatenate([part[kind] for part in parts]) for kind in range(3)))
+    return _joined(parts)
+
+
+def _joined(parts: Sequence[tuple[FloatArray, ...]]) -> Motion:
+    """Join motions of positions, velocities and accelerations, one after the other."""
+    return Motion(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _allowed(
@@ -283,8 +316,9 @@ class PlannedMove:
 
 def path_of(cell: Cell, start_rad: FloatArray, move: PlannedMove) -> Trapezoid:
     """The joint trapezoid of a move from the robot's position."""
-    velocity = np.array([axis.limits.velocity for axis in cell.axes]) * move.velocity
-    acceleration = np.array([axis.limits.acceleration for axis in cell.axes]) * move.acceleration
+    limits = JointLimits.of(cell)
+    velocity = limits.velocity * move.velocity
+    acceleration = limits.acceleration * move.acceleration
     return synchronised(start_rad, np.array(move.target_rad), velocity, acceleration)
 
 
@@ -312,30 +346,24 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     For every axis: fast with the arm stretched, fast with it folded (as the payload's link is seen from that axis),
     slow with it stretched, and fast together with a neighbour; and of all axes together.
     """
-    cell, checker = experiment.cell, experiment.scene.checker
-    lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
-    velocity = np.array([axis.limits.velocity for axis in cell.axes])
-    acceleration = np.array([axis.limits.acceleration for axis in cell.axes])
-    margin = POSITION_MARGIN * (upper - lower)
-    low, high = lower + margin, upper - margin
+    cell = experiment.cell
+    checker = experiment.scene.checker
+    limits = JointLimits.of(cell)
+    low, high = limits.targets()
     sampled = np.random.default_rng(0).uniform(low, high, (EXTRA_POSTURES, len(low)))
     if checker.robot.closures:
         sampled = _allowed(checker, np.random.default_rng(0), low, high, EXTRA_POSTURES // 15)
     clear = sampled[checker.margins(sampled) > 0.0]
     found: list[ExtraMoves] = []
-    chain = bool(checker.robot.closures)
+    ends_of = _swing_of_chain if checker.robot.closures else _swing
 
     def swing(words: str, postures: FloatArray, moved: list[int], speed: float = 1.0) -> None:
         """There and back in the first few postures in which that is clear."""
         paths: list[Trapezoid] = []
         for posture in postures:
-            ends = (
-                _swing_of_chain(checker, posture, moved, low, high)
-                if chain
-                else _swing(checker, posture, moved, low, high)
-            )
+            ends = ends_of(checker, posture, moved, low, high)
             if ends is not None:
-                there = synchronised(*ends, velocity * speed, acceleration)
+                there = synchronised(*ends, limits.velocity * speed, limits.acceleration)
                 paths += [there, Trapezoid(there.end, there.start, there.duration_s, there.ramp_s)]
             if len(paths) >= 6:
                 break
@@ -358,7 +386,8 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
         if robot.joints[joint].kind is not JointKind.PRISMATIC:
             way = np.cross(at.rotation[joint + 1] @ robot.joints[joint].axis, way)
         lever = np.linalg.norm(way, axis=1)
-        stretched, folded = clear[np.argsort(-lever, kind="stable")], clear[np.argsort(lever, kind="stable")]
+        stretched = clear[np.argsort(-lever, kind="stable")]
+        folded = clear[np.argsort(lever, kind="stable")]
         swing(f"fast moves of {name} with the arm stretched", stretched, [axis])
         swing(f"fast moves of {name} with the arm folded", folded, [axis])
         swing(f"slow moves of {name} with the arm stretched", stretched, [axis], SLOW)
@@ -375,8 +404,10 @@ def _swing(
     """Both ends of the longest clear swing of some axes about the middle of their range; None where there is none."""
     for stroke in STROKES:
         inwards = 0.5 * (1.0 - stroke) * (high - low)
-        start, end = posture.copy(), posture.copy()
-        start[moved], end[moved] = (low + inwards)[moved], (high - inwards)[moved]
+        start = posture.copy()
+        end = posture.copy()
+        start[moved] = (low + inwards)[moved]
+        end[moved] = (high - inwards)[moved]
         if checker.obstruction(start, end) is None:
             return start, end
     return None

@@ -13,36 +13,40 @@ from pathlib import Path
 import numpy as np
 
 from daq.config.cell import Cell, model_of
+from daq.config.effects import place_effect
 from daq.config.policy import DEFAULT_APPLY_POLICY
+from daq.config.yaml_file import Fault
 from daq.environment import software
-from daq.errors import EffectsRefuted, LogRepeated, LogsDiffer, UsageError
+from daq.errors import ConfigurationInconsistent, EffectsRefuted, LogRepeated, LogsDiffer, UsageError
 from daq.log.conversion import load_run
 from daq.log.reader import LossyLogs
-from daq.workflow.corrections import Corrections
-from daq.workflow.declared_effects import (
-    BOOTSTRAP_SEED,
-    declared_effects,
-    refuse_effects,
-    with_declared_again,
-    with_effects_of_cell,
+from daq.workflow.diagnoses import (
+    Recordings,
+    by_likelihood,
+    check_diagnoses,
+    correction_diagnoses,
+    diagnose_fit,
+    fixed_gains_of,
+    geometry_beside,
+    is_checked,
+    named_causes,
+    nameplate_of,
 )
-from daq.workflow.description import check_diagnoses, correction_diagnoses, geometry_beside, is_checked
-from daq.workflow.diagnoses import Recordings, diagnose_fit, named_causes
 from daq.workflow.geometry_diagnoses import encoder_misfit_of
-from daq.workflow.remaining_corrections import with_described
-from daq.workflow.validate import diagnose_log
+from daq.workflow.validate import Corrections, diagnose_log, with_described
 from ident.arrays import FloatArray
-from ident.calibration import Calibration, PayloadMass, Source
+from ident.calibration import Calibration, Source
 from ident.calibration import calibration_of as identified_calibration
 from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
 from ident.discovery.acceptance import accept_on_holdout
 from ident.discovery.before_after import error_on, holdout_change
-from ident.discovery.declared import impossible_declared
-from ident.discovery.evidence import Evidence, gather, without_effects
+from ident.discovery.declared import impossible_declared, with_declared
+from ident.discovery.evidence import Evidence, gather, with_effects, without_effects
 from ident.discovery.geometry_check import GeometryCheck
 from ident.discovery.geometry_covariance import evidence_with_geometry, geometry_covariance, with_geometry_covariance
 from ident.discovery.loop import Step, find_effects
+from ident.effects.effect import PlacedEffect
 from ident.effects.friction import TemperatureFriction
 from ident.errors import Diagnosis, EffectImpossible, IdentificationError, PayloadUnseen
 from ident.estimators.comparison import EstimatorComparison, try_estimators
@@ -51,6 +55,7 @@ from ident.estimators.geometry_estimate import GeometryFinding, Positions, estim
 from ident.estimators.identify import estimate_with, identify
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
+from ident.estimators.refusals import require_plausible
 from ident.estimators.turned_geometry import GEOMETRY
 from ident.model.geometry_derivatives import model_with_geometry
 from ident.model.model import Model
@@ -110,8 +115,15 @@ class Fit:
         """The rows behind the identification, without effects; the logs are read again unless it has kept them."""
         if self.identification.gathered is not None:
             return gather(self.identification)
-        used, unseen = ((load_run(log, self.cell, self.lossy)[0] for log in logs) for logs in (self.logs, self.holdout))
-        return gather(self.identification, used, unseen)
+        return gather(self.identification, self.runs(self.logs), self.runs(self.holdout))
+
+    def runs(self, logs: Sequence[Path]) -> Iterator[Run]:
+        """Read logs again, one after the other, with the description that the fit used."""
+        for log in logs:
+            yield load_run(log, self.cell, self.lossy)[0]
+
+
+BOOTSTRAP_SEED = 0  #: Fixes the verdict of a significance test; no decision depends on it for declared effects
 
 
 class Undecided(Enum):
@@ -161,7 +173,8 @@ class Reading:
         """
         for log in logs:
             if log in self._first:
-                run, cell = self._first.pop(log), self.cell
+                run = self._first.pop(log)
+                cell = self.cell
             else:
                 run, cell = self._read(log)
             if cell.digest != self.cell.digest:
@@ -267,7 +280,6 @@ def fit(
     def attempt(used: Sequence[Path], unseen: Sequence[Path], method: Method) -> Fit:
         reading = Reading.of(used, cell, lossy)
         declared = reading.cell
-        nameplate = np.array([axis.nameplate_gain for axis in declared.axes])
         effects = declared_effects(declared)
         if method is Method.IV:
             refuse_effects(declared, "--method iv")
@@ -278,12 +290,12 @@ def fit(
             declared.conditioning,
             holdout=reading.runs(unseen, "holdout"),
             method=method,
-            fixed_gains=nameplate if gains_fixed else None,
+            fixed_gains=nameplate_of(declared) if gains_fixed else None,
             keep_rows=keep_rows or bool(effects) or is_checked((*used, *unseen)),
             judge=not effects,
             axes=declared.axis_names,
         )
-        steps = with_effects_of_cell(result, effects, declared.place_names) if effects else ()
+        steps = with_effects_of_cell(result, effects, declared.place_names)
         last = steps[-1].after.identification if steps else result
         paper = None if gains_fixed else tls(last.system)
         return Fit(
@@ -389,7 +401,7 @@ def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: 
     found = fitted.identification
     return try_estimators(
         found.model,
-        lambda: (load_run(log, fitted.cell, fitted.lossy)[0] for log in fitted.logs),
+        lambda: fitted.runs(fitted.logs),
         found.conditioning,
         progress,
     )
@@ -424,10 +436,9 @@ def close_loop(
     if 0 < len(cold) < len(evidence.fit_runs):
         _LOG.warning("%s without temperatures: %s is not looked for", ", ".join(cold), TemperatureFriction.name)
     before = start.identification
-    if before.estimate.method is not Method.ML:
-        fixed = before.estimate.gains if before.estimate.gains_fixed else None
-        before = replace(before, estimate=estimate_with(Method.ML, before.system, fixed))
-        by_ml = before.estimate
+    by_ml = by_likelihood(before.estimate, before.system)
+    if by_ml is not before.estimate:
+        before = replace(before, estimate=by_ml)
         evidence = with_declared_again(evidence, by_ml) if known else replace(evidence, estimate=by_ml)
     rng = np.random.default_rng(seed)
     places = start.cell.place_names
@@ -469,14 +480,14 @@ def with_corrected_geometry(start: Fit) -> Fit:
         cell.conditioning,
         holdout=(start.read(log)[0] for log in start.holdout),
         method=described.method,
-        fixed_gains=described.gains if described.gains_fixed else None,
+        fixed_gains=fixed_gains_of(described),
         keep_rows=True,
         judge=not effects,
         axes=cell.axis_names,
     )
     covariance = geometry_covariance(result, model, finding)
     result = with_geometry_covariance(result, covariance)
-    steps = with_effects_of_cell(result, effects, cell.place_names) if effects else ()
+    steps = with_effects_of_cell(result, effects, cell.place_names)
     last = steps[-1].after.identification if steps else result
     return replace(
         start,
@@ -529,9 +540,11 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
         created: when, with its time zone.
     """
     predicting = _calibration(fitted)
+    tolerance_kg = {payload.name: payload.mass_tolerance_kg for payload in fitted.cell.payloads}
+    influences = (one.weighed_to(tolerance_kg.get(one.payload, 0.0)) for one in predicting.payload_mass)
     return replace(
         predicting,
-        payload_mass=_with_tolerances(predicting.payload_mass, fitted.cell),
+        payload_mass=tuple(influences),
         created=created.isoformat(timespec="seconds"),
         software=software(),
         nameplate_holdout_error_percent=_nameplate_error(fitted),
@@ -559,12 +572,6 @@ def _calibration(fitted: Fit) -> Calibration:
     )
 
 
-def _with_tolerances(influences: Sequence[PayloadMass], cell: Cell) -> tuple[PayloadMass, ...]:
-    """Add the tolerance of each weighing, from the cell."""
-    declared = {payload.name: payload.mass_tolerance_kg for payload in cell.payloads}
-    return tuple(one.weighed_to(declared.get(one.payload, 0.0)) for one in influences)
-
-
 def _nameplate_error(fitted: Fit) -> RelativeError | None:
     """Hold-out error with the nameplate's gains: same model, effects included, parameters refitted.
 
@@ -575,10 +582,9 @@ def _nameplate_error(fitted: Fit) -> RelativeError | None:
     unseen = final.holdout
     if unseen is None or final.estimate.gains_fixed:
         return None
-    nameplate = np.array([axis.nameplate_gain for axis in fitted.cell.axes])
     method = Method.ML if final.estimate.method is Method.TLS else final.estimate.method  # tls corrects gains
     try:
-        held = estimate_with(method, final.system, nameplate)
+        held = estimate_with(method, final.system, nameplate_of(fitted.cell))
     except (IdentificationError, np.linalg.LinAlgError):
         return None
     axes = held.relative_error(unseen).axes
@@ -587,3 +593,75 @@ def _nameplate_error(fitted: Fit) -> RelativeError | None:
     moved = size > 0.0
     left = np.where(moved, (np.array(axes) / 100.0) ** 2 * size, 0.0)
     return RelativeError(axes, of_squares(size, left).total)
+
+
+# Effects that a cell file declares: a counterbalance that the robot is known to have needs no search.
+
+
+def declared_effects(cell: Cell) -> tuple[PlacedEffect, ...]:
+    """Return the effects that a cell declares, where no setting is given with those of the dictionary's first member.
+
+    Raises:
+        ConfigurationInconsistent: there is no such effect, or it has no such setting, on this axis.
+    """
+    robot = model_of(cell).robot
+    placed = []
+    for declared in cell.effects:
+        found = place_effect(declared.name, declared.axis, declared.settings, robot)
+        if isinstance(found, Fault):
+            raise ConfigurationInconsistent(
+                f"effects of cell {cell.name!r}: {declared.name} on {cell.place_names[declared.axis]}",
+                found=found.found,
+                expected=found.expected,
+                remedy="correct the cell file",
+            )
+        placed.append(found)
+    return tuple(placed)
+
+
+def refuse_effects(cell: Cell, option: str) -> None:
+    """Refuse a way of fitting that leaves out what the cell declares.
+
+    Raises:
+        UsageError: the cell declares effects.
+    """
+    if cell.effects:
+        names = ", ".join(f"{effect.name} on {cell.place_names[effect.axis]}" for effect in cell.effects)
+        raise UsageError(
+            option,
+            found=f"a cell that declares effects: {names}",
+            expected="a cell without effects: this way of fitting leaves them out",
+            remedy="fit without the option, or name a cell file without `effects` with --cell",
+        )
+
+
+def with_effects_of_cell(
+    start: Identification, effects: tuple[PlacedEffect, ...], axes: Sequence[str]
+) -> tuple[Step, ...]:
+    """Add the effects that a cell declares; settings are fitted by ``ml``, then all by the method that was asked for.
+
+    There is no step without effects.
+
+    Raises:
+        IdentificationError: a refit failed, or the model with the effects contradicts the data.
+    """
+    if not effects:
+        return ()
+    estimate = start.estimate
+    by_ml = by_likelihood(estimate, start.system)
+    steps = with_declared(
+        replace(gather(start), estimate=by_ml), effects, np.random.default_rng(BOOTSTRAP_SEED), axes=axes
+    )
+    after = steps[-1].after
+    if estimate.method is not Method.ML:
+        after = with_declared_again(after, estimate)
+        steps = (*steps[:-1], replace(steps[-1], after=after))
+    error = after.estimate.relative_error(after.identification.system)
+    require_plausible(after.estimate, error, axes[: len(estimate.gains)])
+    return steps
+
+
+def with_declared_again(evidence: Evidence, estimate: Estimate) -> Evidence:
+    """Fit the same data and effects by the estimator, and with the gains, of an estimate without effects."""
+    refitted = with_effects(without_effects(evidence, estimate), evidence.effects)
+    return replace(refitted, declared=evidence.declared)

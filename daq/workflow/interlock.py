@@ -16,7 +16,7 @@ from pathlib import Path
 
 from daq.config.cell import Cell
 from daq.config.recalibration import Command, Interlock
-from daq.errors import NotReleased
+from daq.errors import NotReleased, reason_of
 from daq.files import open_regular
 
 MAX_OUTPUT_CHARACTERS = 400  #: Characters of what a program said that are shown
@@ -55,7 +55,7 @@ def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Fin
             start_new_session=True,
         )
     except OSError as error:
-        return Finished(None, f"{command.command[0]}: {(error.strerror or type(error).__name__).lower()}")
+        return Finished(None, f"{command.command[0]}: {reason_of(error)}")
     with process:
         try:
             said = _said(process, command.timeout_s)
@@ -73,7 +73,8 @@ def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Fin
 def _said(process: subprocess.Popen[bytes], timeout_s: float) -> bytes:
     """The end of what a program says until it has ended; the rest of it is read, and not kept."""
     assert process.stdout is not None
-    ends_s, said = time.monotonic() + timeout_s, b""
+    ends_s = time.monotonic() + timeout_s
+    said = b""
     with selectors.DefaultSelector() as output:
         output.register(process.stdout, selectors.EVENT_READ)
         while (left_s := ends_s - time.monotonic()) > 0:
@@ -127,10 +128,11 @@ def _require_file(file: Path, interlock: Interlock, now: Callable[[], datetime])
     try:
         with open_regular(file) as stream:
             # Of the file that is open: a gateway may put another in its place meanwhile.
-            found, asked = os.fstat(stream.fileno()), now()
+            found = os.fstat(stream.fileno())
+            asked = now()
             head = stream.read(_LOOK_BYTES)
     except OSError as error:
-        raise _held(subject, (error.strerror or type(error).__name__).lower(), expected) from error
+        raise _held(subject, reason_of(error), expected) from error
     says = head.decode("utf-8", errors="replace").partition("\n")[0].strip()
     if says != interlock.says:
         raise _held(subject, repr(says[:80]), expected)

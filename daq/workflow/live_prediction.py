@@ -23,8 +23,7 @@ import numpy as np
 from daq.config.cell import Cell
 from daq.errors import DaqError
 from daq.log.feed import RunFacts
-from daq.workflow.remaining_corrections import on_cell
-from daq.workflow.validate import check_cell, conditioning_of, unpredictable, warn_without_temperature
+from daq.workflow.validate import check_cell, conditioning_of, on_cell, unpredictable, warn_without_temperature
 from ident.arrays import FloatArray, IntArray
 from ident.calibration import Calibration
 from ident.data.conditioning import central_differences, decimator, low_pass
@@ -69,7 +68,8 @@ class Recent:
     """Keeps the residual of each motor over the last RECENT_S in which it moved."""
 
     def __init__(self, rows_hz: float) -> None:
-        self._kept, self._least = round(RECENT_S * rows_hz), LEAST_S * rows_hz
+        self._kept = round(RECENT_S * rows_hz)
+        self._least = LEAST_S * rows_hz
         self._last: PredictedRows | None = None
         self._moving: list[FloatArray] = []
 
@@ -118,7 +118,8 @@ class Predictor:
         self._payload = as_calibrated(calibration, payload, LIVE)
         warn_without_temperature(calibration, LIVE, None)
         self._calibration, self._model = on_cell(calibration, cell)
-        self._conditioning, self._rate_hz = conditioning_of(calibration), rate_hz
+        self._conditioning = conditioning_of(calibration)
+        self._rate_hz = rate_hz
         self._filter = decimator(rate_hz, self._conditioning.decimation_cutoff_hz)
         edge = round(EDGE_S * rate_hz)
         self.rows_hz = rate_hz / self._filter.factor
@@ -129,7 +130,9 @@ class Predictor:
         self._band = np.full(len(cell.axes), np.inf)  # calibrations of earlier versions do not say what they left
         if calibration.current_residual is not None:
             self._band = 2.0 * np.array(calibration.current_residual)
-        self._cycle, self._position, self._current = -1, np.zeros((0, 0)), np.zeros((0, 0))
+        self._cycle = -1
+        self._position = np.zeros((0, 0))
+        self._current = np.zeros((0, 0))
 
     def take(self, cycle: IntArray, position_rad: FloatArray, current: FloatArray) -> list[PredictedRows]:
         """Take samples in their order; returns the rows that are complete now.
@@ -152,7 +155,9 @@ class Predictor:
 
     def _take(self, cycle: int, position_rad: FloatArray, current: FloatArray) -> PredictedRows | None:
         if cycle != self._cycle + len(self._position) or not len(self._position):
-            self._cycle, self._position, self._current = cycle, position_rad, current
+            self._cycle = cycle
+            self._position = position_rad
+            self._current = current
         else:
             self._position = np.concatenate((self._position, position_rad))
             self._current = np.concatenate((self._current, current))
@@ -161,11 +166,14 @@ class Predictor:
         found = self._predict()
         # The next window begins so that its first whole row follows the last one of this.
         done = found.cycle[-1] + self._filter.factor - self._cycle - 1 - self._margin
-        self._cycle, self._position, self._current = self._cycle + done, self._position[done:], self._current[done:]
+        self._cycle += done
+        self._position = self._position[done:]
+        self._current = self._current[done:]
         return found
 
     def _predict(self) -> PredictedRows:
-        rate_hz, settings = self._rate_hz, self._conditioning
+        rate_hz = self._rate_hz
+        settings = self._conditioning
         raw = np.ascontiguousarray(self._position.T)
         smooth = low_pass(raw, rate_hz, settings.position_cutoff_hz, settings.position_order)
         position, velocity, acceleration = central_differences(smooth, rate_hz)
@@ -179,7 +187,8 @@ class Predictor:
         moving, motor_moving = moving_samples(velocity, self._still, self._model.drive_train)
         data = replace(data, moving=moving.T, motor_moving=motor_moving.T)
         still = ~row_masks(self._model, data, settings)[1][:, whole]
-        predicted, measured = predicted[:, whole], measured[:, whole]
+        predicted = predicted[:, whole]
+        measured = measured[:, whole]
         predicted = np.where(still, np.nan, predicted)
         return PredictedRows(self._cycle + 1 + centres[whole], predicted.T, (measured - predicted).T, self._band)
 

@@ -85,8 +85,12 @@ class CellWatch:
         calibration: Calibration | None,
         payload: str | None,
     ) -> None:
-        self._cell_file, self._cell, self._network, self._feed = cell_file, cell, network, feed
-        self._calibration, self._payload = calibration, payload
+        self._cell_file = cell_file
+        self._cell = cell
+        self._network = network
+        self._feed = feed
+        self._calibration = calibration
+        self._payload = payload
         offset_ns = time.time_ns() - network.link.clock()
         self._monitor = CellMonitor(network.link, network.axes, self._take, offset_ns, taken=lambda: bus_taken(cell))
         self._ampere: list[float | None] = [None] * len(network.axes)
@@ -98,7 +102,8 @@ class CellWatch:
         self._facts: RunFacts | None = None
         self._source: _SampleSource | None = None
         self._samples: list[Sample] = []  # since the last reading
-        self._count, self._missing = 0, [0] * len(network.axes)
+        self._count = 0
+        self._missing = [0] * len(network.axes)
         self._cycles = range(0)  # of the run so far
         self._predictor: Predictor | None = None
         self._recent: Recent | None = None
@@ -187,7 +192,9 @@ class CellWatch:
     def _follow(self, reading: CellReading, recorder: bool) -> None:
         """Begin anew where the source of the samples has changed."""
         if reading.source is ReadingSource.OVERHEARD and reading.sync_hz == 0.0:
-            self._facts, self._source, self._remark = None, None, "no prediction: there is no SYNC"
+            self._facts = None
+            self._source = None
+            self._remark = "no prediction: there is no SYNC"
             self._samples.clear()
             return
         recorder = recorder and reading.source is ReadingSource.OVERHEARD
@@ -208,7 +215,8 @@ class CellWatch:
                 self._own_facts(rate_hz or 0.0) if run is None else replace(run, log=None, moves=0, bus_load={})
             )
         except LogIncomplete as error:
-            self._facts, self._remark = None, str(error)
+            self._facts = None
+            self._remark = str(error)
 
     def _rate_hz(self, reading: CellReading) -> float | None:
         """Rate of the samples; None where SYNC began or changed within a reading, whose count is then not its rate."""
@@ -218,7 +226,8 @@ class CellWatch:
         declared_hz = 0.0 if sync is None else 1e6 / sync.period_us
         if self._lockstep:
             return declared_hz
-        before_hz, self._sync_hz = self._sync_hz, reading.sync_hz
+        before_hz = self._sync_hz
+        self._sync_hz = reading.sync_hz
         counting_hz = 2.0 / reading.seconds  # error of a count of SYNCs
         known = self._source
         known_hz = None if known is None or known.reading is not reading.source else known.rate_hz
@@ -251,7 +260,9 @@ class CellWatch:
     def _begin(self, facts: RunFacts) -> None:
         """Publish a run and begin its prediction."""
         self._monitor.period_ns = None if self._lockstep else round(1e9 / facts.rate_hz)
-        self._facts, self._count, self._missing = facts, 0, [0] * len(facts.axes)
+        self._facts = facts
+        self._count = 0
+        self._missing = [0] * len(facts.axes)
         self._feed.begin(facts, self._statistics)
         for axis in self._codes:
             self._publish_fault(axis)
@@ -276,7 +287,8 @@ class CellWatch:
             for rows in self._predictor.take(np.array([sample.cycle for sample in whole]), position, current):
                 self._recent.add(rows)
         except IdentificationError as error:
-            self._predictor, self._remark = None, f"no prediction: {error}"
+            self._predictor = None
+            self._remark = f"no prediction: {error}"
 
     def _prediction(self) -> CellPrediction | None:
         if self._calibration is None:

@@ -33,7 +33,8 @@ def check_controller(cell_file: Path, cell: Cell) -> None:
     Raises:
         ConfigurationInconsistent: one is more than NAMEPLATE_RATIO times the other.
     """
-    controller, file = cell.controller, cell.controller_path
+    controller = cell.controller
+    file = cell.controller_path
     if controller is None or file is None:
         return
     try:
@@ -110,19 +111,19 @@ def actual_current_note(cell: Cell) -> str | None:
 
 def _require_alike(cell_file: Path, cell: Cell, references: Sequence[Reference | None]) -> None:
     """Refuse nameplates whose size is beyond NAMEPLATE_RATIO of a reference; signs are compared before a write."""
-    wrong = [
-        (index, axis.nameplate_gain, axis.gain_unit, reference)
-        for index, (axis, reference) in enumerate(zip(cell.axes, references, strict=True))
-        if reference is not None and not _alike(axis.nameplate_gain, reference[0])
-    ]
+    wrong: dict[int, Reference] = {}
+    for index, (axis, reference) in enumerate(zip(cell.axes, references, strict=True)):
+        if reference is not None and not _alike(axis.nameplate_gain, reference[0]):
+            wrong[index] = reference
     if not wrong:
         return
     document = parse_yaml(read_configuration(cell_file), str(cell_file))
     faults = []
-    for index, nameplate, unit, (gain, source) in wrong:
+    for index, (gain, source) in wrong.items():
+        axis = cell.axes[index]
         keys = document.tree["axes"][index]
         key = next(key for key in keys if key.startswith("nameplate_gain"))
-        found = f"{nameplate:g} {unit}, while it is {gain:.4g} {source}"
+        found = f"{axis.nameplate_gain:g} {axis.gain_unit}, while it is {gain:.4g} {source}"
         faults.append(Fault(("axes", index, key), found, f"the same within a factor of {NAMEPLATE_RATIO:g}"))
     raise ConfigurationInconsistent(
         **fault_texts(document, faults),

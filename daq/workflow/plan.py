@@ -11,24 +11,33 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field, model_validator
 
-from daq.config.cell import Cell, JointUnit
-from daq.errors import UsageError
+from daq.config.cell import DEGREE, Cell, JointUnit, model_of
+from daq.config.yaml_file import StrictModel, parse_yaml, read_model, read_yaml_bytes
+from daq.errors import ConfigurationInconsistent, UsageError
+from daq.files import replace_file
 from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_CONDITION_OF_CHAIN, LARGEST_STD_PERCENT
 from daq.workflow.experiment import (
-    POSITION_MARGIN,
     RUNS,
     Experiment,
+    JointLimits,
     PlannedMove,
     experiment_duration_s,
     experiment_of,
     path_of,
+    paths_of,
+    scene_of,
     towards,
 )
+from drivers.errors import MotionRefused
 from drivers.move import Trapezoid
 from ident.arrays import FloatArray
+from ident.planning.clearance import CLOSURES, Checker, Obstruction
 from ident.planning.gain_verdict import verdicts
 
 
@@ -103,9 +112,7 @@ class Search:
         self._duration_s = duration_s
         self._speed = speed
         self._largest_condition = largest_condition
-        limits = np.array([axis.limits.position for axis in self._cell.axes])
-        margin = POSITION_MARGIN * (limits[:, 1] - limits[:, 0])
-        self._low, self._high = limits[:, 0] + margin, limits[:, 1] - margin
+        self._low, self._high = JointLimits.of(self._cell).targets()
 
     def random_moves(self) -> Draft:
         """Clear random moves that fill the duration.
@@ -123,8 +130,10 @@ class Search:
         raise _unfit(self._cell, self._duration_s, found, "at least 5, better 30", "allow a longer run")
 
     def _filled(self) -> tuple[list[PlannedMove], list[Trapezoid]]:
-        moves, paths = [self._clear_start()], list[Trapezoid]()
-        left, retreats = self._duration_s - DWELL_S, 0
+        moves = [self._clear_start()]
+        paths: list[Trapezoid] = []
+        left = self._duration_s - DWELL_S
+        retreats = 0
         while True:
             move = self._clear_move(np.array(moves[-1].target_rad))
             if move is not None:
@@ -155,7 +164,9 @@ class Search:
             for candidate in self._drafts(draft, [self._proposal(draft.moves) for _ in range(count)]):
                 value, found = self._judge(candidate, best)
                 if value < best:
-                    chosen, best, worst = candidate, value, found
+                    chosen = candidate
+                    best = value
+                    worst = found
             draft = chosen
             done += count
             progress(done, worst)
@@ -174,10 +185,14 @@ class Search:
         return value, found
 
     def _proposal(self, moves: tuple[PlannedMove, ...]) -> tuple[PlannedMove, ...]:
-        rng, low, high = self._rng, self._low, self._high
+        rng = self._rng
+        low = self._low
+        high = self._high
         kind = KINDS[int(rng.choice(len(KINDS), p=CHANCES))]
         index, other = (int(number) for number in rng.integers(len(moves), size=2))
-        before, old, after = moves[:index], moves[index], moves[index + 1 :]
+        before = moves[:index]
+        old = moves[index]
+        after = moves[index + 1 :]
         random = self._random_move()
         match kind:
             case Kind.ANEW:
@@ -228,14 +243,16 @@ class Search:
         known |= {
             way: (path, information) for (way, path), information in zip(fresh.items(), informations, strict=True)
         }
-        return [
-            Draft(moves, tuple(known[way][0] for way in ways), tuple(known[way][1] for way in ways))
-            for moves, ways in kept
-        ]
+        drafts = []
+        for moves, ways in kept:
+            paths, of_paths = zip(*(known[way] for way in ways), strict=True)
+            drafts.append(Draft(moves, paths, of_paths))
+        return drafts
 
     def _clear_start(self) -> PlannedMove:
         for _ in range(MAX_TRIES):
-            move, checker = self._random_move(), self._experiment.scene.checker
+            move = self._random_move()
+            checker = self._experiment.scene.checker
             if checker.robot.closures:
                 near = towards(checker, checker.home, np.array(move.target_rad), self._low, self._high)
                 move = replace(move, target_rad=self._written(near))
@@ -246,7 +263,8 @@ class Search:
     def _clear_move(self, start: FloatArray) -> PlannedMove | None:
         for _ in range(MAX_TRIES):
             move = self._random_move()
-            checker, target = self._experiment.scene.checker, np.array(move.target_rad)
+            checker = self._experiment.scene.checker
+            target = np.array(move.target_rad)
             if checker.robot.closures:  # a way to a far target often leaves the workspace
                 target = towards(checker, start, target, self._low, self._high)
                 move = replace(move, target_rad=self._written(target))
@@ -335,7 +353,8 @@ def plan(
     search = Search(experiment, np.random.default_rng(seed), duration_s, speed, largest_condition)
     draft = search.improve(search.random_moves(), exchanges, lambda done, found: progress(done, float(np.max(found))))
     information = np.sum(experiment.informations(draft.paths), axis=0)
-    predicted, found = experiment.design.std_percent(information), experiment.design.condition(information)
+    predicted = experiment.design.std_percent(information)
+    found = experiment.design.condition(information)
     worst = int(np.argmax(predicted))
     remedy = "allow a longer run, more exchanges, wider joint limits or higher speed"
     if not found <= largest_condition:
@@ -364,3 +383,195 @@ def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
         for move in plan_.moves
     )
     return replace(plan_, duration_s=experiment_duration_s(cell, moves), moves=moves)
+
+
+# The file of a plan: moves that a person can read, change and approve before anything moves
+
+LONGEST_S = 3600.0
+Velocity = Annotated[float, Field(ge=0.01, le=1)]  #: Slower than a hundredth of its limits a move would hardly end
+Acceleration = Annotated[float, Field(ge=0.0001, le=1)]
+"""A hundredth of the speed on the same ways is a ten-thousandth of the acceleration."""
+
+
+class _Move(StrictModel):
+    target_deg: tuple[float, ...] | None = None
+    target: tuple[float, ...] | None = None
+    velocity: Velocity
+    acceleration: Acceleration
+    dwell_s: Annotated[float, Field(ge=0, le=60)] = 0.0
+
+    @model_validator(mode="after")
+    def _one_target(self) -> _Move:
+        if (self.target_deg is None) == (self.target is None):
+            raise ValueError("target_deg, or target where some axes are in mm")
+        return self
+
+
+class _Plan(StrictModel):
+    format: Literal["drivegain-plan"]
+    cell: str
+    seed: int
+    condition: Annotated[float, Field(gt=0)]
+    # Plans of earlier versions have none.
+    predicted_std_percent: tuple[Annotated[float, Field(gt=0)], ...] = ()
+    moves: Annotated[tuple[_Move, ...], Field(min_length=1, max_length=10_000)]
+
+
+def save_plan(plan: Plan, path: Path) -> None:
+    """Write a plan; a file of that name is replaced whole.
+
+    Raises:
+        OSError: from the file system.
+    """
+    key = _key(plan.units)
+    predicted = ", ".join(f"{value:.3f}" for value in plan.predicted_std_percent)
+    lines = [
+        "# Synchronised point-to-point moves; velocity and acceleration are shares of the joint limits.",
+        f"# Targets: {', '.join(unit.name for unit in plan.units)}.",
+        "format: drivegain-plan",
+        f"cell: {plan.cell}",
+        f"seed: {plan.seed}",
+        f"condition: {plan.condition:.1f}    # of the weighted observation matrix",
+        f"predicted_std_percent: [{predicted}]    # of each gain, moves made without load and with the payload",
+        "moves:",
+    ]
+    for move in plan.moves:
+        target = ", ".join(f"{at / unit.si:.3f}" for at, unit in zip(move.target_rad, plan.units, strict=True))
+        lines.append(
+            f"  - {{{key}: [{target}], velocity: {move.velocity:.3f}, acceleration: {move.acceleration:.4f}, "
+            f"dwell_s: {move.dwell_s:.3f}}}"
+        )
+    replace_file(path, ("\n".join(lines) + "\n").encode())
+
+
+def load_plan(path: Path, cell: Cell) -> Plan:
+    """Read a plan for a cell; one that was changed by hand is checked as strictly as one that was made.
+
+    Raises:
+        ConfigurationError: the file is missing, is not what its schema says, a target lies outside the joint limits,
+            the plan takes longer than an hour, or a way leaves the declared workspace or clearance.
+    """
+    model = read_model(parse_yaml(read_yaml_bytes(path), str(path)), _Plan)
+    if model.cell != cell.name:
+        remedy = "make a plan for this cell: `drivegain plan CELL`"
+        raise _refused(str(path), f"a plan for cell {model.cell!r}", f"one for {cell.name!r}", remedy)
+    if len(model.predicted_std_percent) not in (0, len(cell.axes)):
+        found = f"{len(model.predicted_std_percent)} numbers"
+        remedy = "make the plan anew: `drivegain plan CELL`"
+        raise _refused(f"{path}: predicted_std_percent", found, f"{len(cell.axes)}, one a gain", remedy)
+    moves = tuple(_move(path, cell, number, move) for number, move in enumerate(model.moves))
+    duration_s = experiment_duration_s(cell, moves)
+    if duration_s > LONGEST_S:
+        found = f"{duration_s:.0f} s of moves and dwells"
+        remedy = "leave moves out, or raise velocity and acceleration"
+        raise _refused(f"{path}: moves", found, f"at most {LONGEST_S:.0f} s", remedy)
+    _check_room(path, cell, moves)
+    return Plan(
+        cell=model.cell,
+        seed=model.seed,
+        condition=model.condition,
+        predicted_std_percent=model.predicted_std_percent,
+        duration_s=duration_s,
+        moves=moves,
+        units=tuple(axis.unit for axis in cell.axes),
+    )
+
+
+def _key(units: tuple[JointUnit, ...]) -> str:
+    return "target_deg" if all(unit == DEGREE for unit in units) else "target"
+
+
+def _refused(where: str, found: str, expected: str, remedy: str = "correct the move") -> ConfigurationInconsistent:
+    return ConfigurationInconsistent(where, found=found, expected=expected, remedy=remedy)
+
+
+def _move(path: Path, cell: Cell, number: int, move: _Move) -> PlannedMove:
+    key = "target_deg" if move.target is None else "target"
+    values = move.target_deg or move.target or ()
+    where = f"{path}: moves[{number}].{key}"
+    expected_key = _key(tuple(axis.unit for axis in cell.axes))
+    if key != expected_key:
+        units = ", ".join(f"{axis.name} {axis.unit.name}" for axis in cell.axes)
+        raise _refused(where, key, f"{expected_key} ({units})")
+    if len(values) != len(cell.axes):
+        raise _refused(where, f"{len(values)} positions", f"{len(cell.axes)}, one a joint")
+    target = tuple(value * axis.unit.si for value, axis in zip(values, cell.axes, strict=True))
+    for axis, position in zip(cell.axes, target, strict=True):
+        lower, upper = axis.limits.position
+        if not lower <= position <= upper:
+            expected = f"{axis.unit.spell(lower)} to {axis.unit.spell(upper)}, the joint's limits"
+            remedy = "correct the move, or the limits if they are wrong"
+            raise _refused(f"{where}, {axis.name}", axis.unit.spell(position), expected, remedy)
+    return PlannedMove(target, move.velocity, move.acceleration, move.dwell_s)
+
+
+def check_approach(cell: Cell, plan: Plan, start_rad: FloatArray) -> None:
+    """Refuse a way to the first target that leaves what the cell file declares.
+
+    Args:
+        cell: with `workspace`, `clearance` or closures; without any, nothing is known of the room.
+        plan: for this cell.
+        start_rad: where the robot stands [rad; m of a prismatic joint], shape (n,).
+
+    Raises:
+        MotionRefused: with the place and the bodies that come too close.
+    """
+    first = np.array(plan.moves[0].target_rad)
+    check_way(cell, start_rad, first, "the way from here to the first target of the plan")
+
+
+def check_way(cell: Cell, start_rad: FloatArray, end_rad: FloatArray, way: str) -> None:
+    """Refuse a way, named for the message, that leaves what the cell file declares.
+
+    Raises:
+        MotionRefused: with the place and the bodies that come too close.
+    """
+    if not _is_bounded(cell):
+        return
+    found = _checker(cell).obstruction(start_rad, end_rad)
+    if found is not None:
+        raise MotionRefused(
+            f"{way}: found {_spell(cell, found)}; bring the robot near the first target by hand, or correct "
+            f"{_keys(found)} in the cell file"
+        )
+
+
+def _is_bounded(cell: Cell) -> bool:
+    """Whether the cell file says where the robot must not go."""
+    return cell.clearance is not None or cell.chain is not None
+
+
+def _spell(cell: Cell, found: Obstruction) -> str:
+    where = ", ".join(axis.unit.spell(p) for axis, p in zip(cell.axes, found.position, strict=True))
+    if found.first == CLOSURES:
+        return f"that the loops do not close, or are close to a singularity, at ({where})"
+    return f"{1000 * found.distance_m:.0f} mm between {found.first} and {found.second} at ({where})"
+
+
+def _keys(found: Obstruction) -> str:
+    return "`closures`, `motors` and `limits`" if found.first == CLOSURES else "`workspace` and `clearance`"
+
+
+def _checker(cell: Cell) -> Checker:
+    """Distances to what the cell file declares; that a guessed arm touches itself refuses nothing."""
+    robot = model_of(cell).robot
+    lightest = min((payload.mass_kg for payload in cell.payloads), default=1.0)
+    scene = scene_of(cell, robot, lightest)
+    return Checker(robot, replace(scene.checker.scene, pairs=())) if scene.guessed else scene.checker
+
+
+def _check_room(path: Path, cell: Cell, moves: tuple[PlannedMove, ...]) -> None:
+    """Refuse ways that leave what the cell file declares."""
+    if not _is_bounded(cell):
+        return
+    checker = _checker(cell)
+    minimum_m = checker.scene.minimum_m
+    for number, way in enumerate(paths_of(cell, moves), start=1):
+        found = checker.obstruction(np.asarray(way.start), np.asarray(way.end))
+        if found is not None:
+            raise _refused(
+                f"{path}: moves[{number}], on the way there",
+                _spell(cell, found),
+                "poses inside the workspace" if found.first == CLOSURES else f"at least {1000 * minimum_m:.0f} mm",
+                f"correct the move, or {_keys(found)} in the cell file",
+            )

@@ -17,6 +17,7 @@ from daq.config.cell import Cell, joint_names
 from daq.config.cell_buses import bus_loads, cell_address, drive_axes, load_warnings, polling_fits, polling_warnings
 from daq.config.cell_file import bundle
 from daq.config.drive import shipped_profiles
+from daq.config.policy import Permission
 from daq.environment import software
 from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
 from daq.files import sha256
@@ -26,12 +27,10 @@ from daq.log.feed import Feed, RunFacts
 from daq.log.metadata import Loss, RunInfo, RunStatistics, loss_reason, readback_of_drives
 from daq.log.motion import RecordedMotion
 from daq.log.writer import LogContent, LogWriter
-from daq.workflow.experiment import path_of
+from daq.workflow.experiment import JointLimits, path_of
 from daq.workflow.interlock import release_check
 from daq.workflow.nameplates import check_nameplates, nameplate_warnings
-from daq.workflow.plan import Plan
-from daq.workflow.plan_file import check_approach
-from daq.workflow.recovery import bring_back, recovery_move
+from daq.workflow.plan import Plan, check_approach, check_way
 from daq.workflow.safeguards import (
     DiskRoom,
     FreeBytes,
@@ -56,8 +55,8 @@ from ident.model.bodies import Payload
 LOCKSTEP_TIMEOUT_S = 3.0  #: Time for all answers to a SYNC; a simulated cell on a busy machine may be that late
 GUARD_MS = {declared.PacingMode.TIMED: 500, declared.PacingMode.LOCKSTEP: 5000}
 """Silence of the recorder after which the amplifiers stop; in lockstep nothing moves while the recorder is late."""
-SYNC_SILENCE_S, SYNC_SILENCE_PERIODS = 0.1, 3
-"""Silence of the SYNC producer [s, periods; the longer counts] after which this program sends SYNC to stop the axes."""
+SYNC_SILENCE_S = 0.1  #: Silence of the SYNC producer after which this program sends SYNC to stop the axes
+SYNC_SILENCE_PERIODS = 3  #: The same in periods; the longer counts
 ALLOWANCE_S = 10.0
 """Time added to moves and dwells for enabling, hand-shakes, settling and the stop; a good run takes less."""
 LATE_LOSSES_S = 0.25
@@ -79,6 +78,10 @@ class Clocks:
         wall_ns = self.wall_ns()
         after_ns = self.monotonic_ns()
         return wall_ns - (before_ns + after_ns) // 2
+
+    def now(self) -> datetime:
+        """Return the time of the wall clock, in UTC."""
+        return datetime.fromtimestamp(self.wall_ns() * 1e-9, UTC)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +159,7 @@ def record(
     Raises:
         UsageError: the weighed mass is not the payload's, or a file of that name exists; no file was made.
         MotionRefused: motion is disabled, an axis is unguarded or outside its limits, or the moves leave them; no file
-            was made, and nothing has moved, except where an axis was brought back (`daq.workflow.recovery`).
+            was made, and nothing has moved, except where an axis was brought back (`recovery_move`).
         NotReleased: the interlock does not release the robot; nothing has moved.
         DiskSpaceShort: before the run, nothing has moved; during it, the axes were stopped, and the log is complete but
             marked invalid.
@@ -169,7 +172,7 @@ def record(
     out = request.out
     granted_by = _permission(request.granted_by)
     check_entered_mass(cell, request.payload, request.entered_kg)
-    require_released = require_released or release_check(cell, partial(_wall_time, clocks))
+    require_released = require_released or release_check(cell, clocks.now)
     require_released()
     with defer_full_gc(), network_of(cell, block_signals) as network, _sync_producer(cell, network) as wanted:
         network.prepare()
@@ -214,12 +217,12 @@ def record(
             short = _keep_motion(samples, kept, room, max(1, round(SPACE_CHECK_S * rate_hz)))
             stream.read_on(LATE_LOSSES_S)
             log.readings(polling.temperatures(stream.time_ns))
-            valid, reason = _judged(
-                stream.statistics,
-                _stopped(short, kept, len(moves)),
-                impossible=partial(kept.motion.reason, cell, readback, rate_hz),
+            reason = (
+                _stopped(short, kept, len(moves))
+                or stream_losses(stream.statistics)
+                or kept.motion.reason(cell, readback, rate_hz)
             )
-            log.conclude(valid, reason, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns())
+            log.conclude(not reason, reason, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns())
         kept.feed.finish()
         if short is not None:
             raise short
@@ -373,14 +376,16 @@ def motor_limits(cell: Cell, scale: SiScaling) -> tuple[AxisLimits, ...]:
     A coupled motor turns with several joints: its range is the sum of theirs (eq. 24). The limits of the joints are
     checked in the plan.
     """
-    lower, upper = np.array([axis.limits.position for axis in cell.axes]).T - scale.offset_rad
+    limits = JointLimits.of(cell)
+    lower = limits.lower - scale.offset_rad
+    upper = limits.upper - scale.offset_rad
     forwards = np.maximum(cell.ratio, 0.0)
     backwards = np.minimum(cell.ratio, 0.0)
     low = (forwards @ lower + backwards @ upper) / scale.rad_per_count
     high = (forwards @ upper + backwards @ lower) / scale.rad_per_count
     turns = np.abs(cell.ratio) * ROUNDING / scale.rad_per_count[:, None]
-    velocity = turns @ np.array([axis.limits.velocity for axis in cell.axes])
-    acceleration = turns @ np.array([axis.limits.acceleration for axis in cell.axes])
+    velocity = turns @ limits.velocity
+    acceleration = turns @ limits.acceleration
     return tuple(
         AxisLimits(int(np.floor(least)), int(np.ceil(most)), float(fast), float(hard))
         for least, most, fast, hard in zip(low, high, velocity, acceleration, strict=True)
@@ -424,10 +429,6 @@ def _permission(granted_by: str | None) -> str:
     return granted_by
 
 
-def _wall_time(clocks: Clocks) -> datetime:
-    return datetime.fromtimestamp(clocks.wall_ns() * 1e-9, UTC)
-
-
 def _require_guarded(network: CanopenNetwork, unguarded: bool) -> None:
     """Refuse axes that go on moving when this program is killed, unless that was accepted.
 
@@ -442,6 +443,86 @@ def _require_guarded(network: CanopenNetwork, unguarded: bool) -> None:
             remedy=f"nothing has moved; pass --unguarded to move {', '.join(without)} all the same, with a hand at the "
             "emergency stop; a scheduled job needs `policy: {unguarded: allowed}` in the cell file",
         )
+
+
+# An abrupt stop, of a brake or a killed recorder, may end a little beyond a limit. No recording begins there. A cell
+# file with `policy: {recovery_motion: allowed}` permits a slow return by a little; it needs the same permission to
+# move, and the same interlock, as every motion.
+
+LARGEST_SHARE = 0.02  #: Of an axis's range: farther beyond a limit a person has to find out why
+RECOVERY_SPEED = 0.05  #: Share of an axis's limits of velocity and acceleration
+INSIDE = 0.001  #: Share of the range by which the return ends within the limit: a loop at rest is off by some counts
+LEAST_PER_S = 3.0  #: Least velocity and acceleration of a move [counts/s, counts/s²]
+
+
+def recovery_move(
+    cell: Cell, scale: SiScaling, start_counts: Sequence[int], limits: Sequence[AxisLimits]
+) -> tuple[Move, tuple[AxisLimits, ...], str] | None:
+    """Return the move that brings all axes within their limits, its own limits, and a remark; None if all are inside.
+
+    Raises:
+        MotionRefused: an axis is outside and the cell does not allow the return, or it is too long or not clear.
+    """
+    outside: list[str] = []
+    target: list[int] = []
+    largest_share = 0.0
+    for name, start, limit in zip(cell.axis_names, start_counts, limits, strict=True):
+        low = limit.position_min_counts
+        high = limit.position_max_counts
+        beyond = max(low - start, start - high, 0)
+        if not beyond:
+            target.append(start)
+            continue
+        share = beyond / max(high - low, 1)
+        largest_share = max(largest_share, share)
+        outside.append(f"{name} at {start} counts, {beyond} ({100.0 * share:.2g} % of its range) beyond its limits")
+        inside = INSIDE * (high - low)
+        target.append(round(np.clip(start, low + inside, high - inside)))
+    if not outside:
+        return None
+    found = "; ".join(outside)
+    _require_allowed(cell, found, largest_share)
+    here = scale.joint_position(np.array(start_counts))
+    there = scale.joint_position(np.array(target))
+    check_way(cell, here, there, "the slow return within the limits")
+    slow = tuple(
+        AxisLimits(
+            min(limit.position_min_counts, start),
+            max(limit.position_max_counts, start),
+            max(RECOVERY_SPEED * limit.velocity_counts_s, LEAST_PER_S),
+            max(RECOVERY_SPEED * limit.acceleration_counts_s2, LEAST_PER_S),
+        )
+        for start, limit in zip(start_counts, limits, strict=True)
+    )
+    return synchronised_move(start_counts, tuple(target), slow), slow, f"{found}; it was brought back slowly"
+
+
+def bring_back(
+    network: CanopenNetwork, pacing: Pacing, move: Move, limits: tuple[AxisLimits, ...], granted_by: str
+) -> None:
+    """Make the recovery move; the network is then as after `prepare`.
+
+    Raises:
+        DriverError: as `execute`; the axes were stopped.
+    """
+    stream = SyncStream(network, pacing)
+    with closing(execute(network, stream, (move,), MotionPermission(granted_by, limits))) as samples:
+        for _ in samples:
+            pass
+    network.prepare()  # a motion ends the guards
+
+
+def _require_allowed(cell: Cell, found: str, share: float) -> None:
+    by_hand = "nothing has moved; bring it back by hand"
+    if cell.chain is not None:
+        remedy = f"{by_hand}: no motor of a closed chain moves alone"
+    elif share > LARGEST_SHARE:
+        remedy = f"{by_hand}, and find out how it got there: it is too far for `recovery_motion`"
+    elif cell.recovery_motion is not Permission.ALLOWED:
+        remedy = f"{by_hand}, or allow a slow return with `policy: {{recovery_motion: allowed}}` in the cell file"
+    else:
+        return
+    raise MotionRefused(found, expected="every axis within its limits", remedy=remedy)
 
 
 def _start(
@@ -487,25 +568,9 @@ def _stopped(short: DiskSpaceShort | None, kept: Kept, moves: int) -> str:
     return "" if short is None else f"stopped after {kept.done} of {moves} moves: {short.found}"
 
 
-def _judged(statistics: StreamStatistics, stopped: str, impossible: Callable[[], str]) -> tuple[bool, str]:
-    """Return whether a run is valid, and why not.
-
-    Args:
-        statistics: of its stream.
-        stopped: why the moves were not finished; empty where they were.
-        impossible: says why no robot moves by the samples, as a fit judges them; empty where one may.
-    """
-    if stopped:
-        return False, stopped
-    valid, reason = _verdict(statistics)
-    if valid:
-        reason = impossible()
-    return not reason, reason
-
-
-def _verdict(statistics: StreamStatistics) -> tuple[bool, str]:
-    """Return whether a run is valid, and its losses: a lost or unexplained frame makes it invalid."""
-    reason = loss_reason(
+def stream_losses(statistics: StreamStatistics) -> str:
+    """Return the losses of a run, each of which makes it invalid; empty without a lost or unexplained frame."""
+    return loss_reason(
         {
             Loss.MISSING: statistics.missing,
             Loss.LATE: statistics.late,
@@ -518,7 +583,6 @@ def _verdict(statistics: StreamStatistics) -> tuple[bool, str]:
             Loss.BACKLOG: statistics.backlog_dropped,
         }
     )
-    return not reason, reason
 
 
 def _sync(cell: Cell) -> declared.Sync:

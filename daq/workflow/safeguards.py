@@ -114,7 +114,8 @@ def check_entered_mass(cell: Cell, payload: Payload | None, entered_kg: float | 
             expected="the mass of what is mounted",
             remedy="name the payload too, or leave out its mass",
         )
-    declared_kg, within_kg = payload.known["m"], tolerance_kg(cell.payloads, payload.name)
+    declared_kg = payload.known["m"]
+    within_kg = tolerance_kg(cell.payloads, payload.name)
     if not agree(entered_kg, declared_kg, within_kg):
         raise UsageError(
             f"payload {payload.name!r}",

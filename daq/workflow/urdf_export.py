@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 
 import numpy as np
 
 from daq.config.cell import Cell
-from daq.errors import ConfigurationMissing, ControllerUnfit, SchemaMismatch
+from daq.errors import ControllerUnfit, SchemaMismatch
 from daq.formats.xml_document import Element, parse
+from daq.workflow.experiment import JointLimits
 from ident.arrays import FloatArray
 from ident.calibration import Calibration
 from ident.effects.effect import Property
@@ -56,22 +56,6 @@ class PhysicalRobot:
     shifts: tuple[Shift, ...]
 
 
-def require_solver() -> None:
-    """Say at once that the solver is missing, before anything is computed.
-
-    Raises:
-        ConfigurationMissing: with the extra to install.
-    """
-    missing = [package for package in ("cvxpy", "clarabel") if find_spec(package) is None]
-    if missing:
-        raise ConfigurationMissing(
-            "physical parameters",
-            found=f"no package {' and '.join(missing)}",
-            expected="the semidefinite solver of the optional extra `physical`",
-            remedy="pip install 'drivegain[physical]'",
-        )
-
-
 def physical_robot(calibration: Calibration, model: Model, limits: FloatArray, urdf: str) -> PhysicalRobot:
     """The parameters of bodies that could exist and need the torques that the calibration says.
 
@@ -105,10 +89,10 @@ def physical_robot(calibration: Calibration, model: Model, limits: FloatArray, u
 
 def cell_limits(cell: Cell) -> FloatArray:
     """Middle and half of the range of each axis, and MOTION of its speed and acceleration, shape (4, n) [rad, s]."""
-    ends = np.array([axis.limits.position for axis in cell.axes])
-    speed = [MOTION * axis.limits.velocity for axis in cell.axes]
-    acceleration = [MOTION * axis.limits.acceleration for axis in cell.axes]
-    return np.array([ends.mean(axis=1), 0.5 * (ends[:, 1] - ends[:, 0]), speed, acceleration])
+    limits = JointLimits.of(cell)
+    middle = 0.5 * (limits.lower + limits.upper)
+    half_range = 0.5 * (limits.upper - limits.lower)
+    return np.array([middle, half_range, MOTION * limits.velocity, MOTION * limits.acceleration])
 
 
 MAX_BYTES = 16 * 2**20  #: No URDF is larger; meshes are files of their own

@@ -6,35 +6,49 @@ Several calibrations are compared on runs that they may never have seen (paper �
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from daq.config.cell import Cell
+from daq.config.cell import Cell, model_of
 from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationUnreadable, LogsDiffer
 from daq.log.conversion import load_run
-from daq.workflow.corrections import Corrections
-from daq.workflow.diagnoses import diagnose_run, not_repeated
-from daq.workflow.remaining_corrections import CORRECTIONS, on_cell
-from daq.workflow.validation import DataUse, Validation
-from ident.arrays import FloatArray
-from ident.calibration import Calibration
+from daq.workflow.diagnoses import drift_diagnosis, with_verbs
+from daq.workflow.geometry_diagnoses import calibrated_model
+from ident.arrays import BoolArray, FloatArray
+from ident.calibration import AcceptedEffect, Calibration
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
+from ident.effects.dictionary import GEOMETRY as CORRECTION_FAMILIES
+from ident.effects.effect import PlacedEffect
 from ident.effects.friction import TemperatureFriction
-from ident.effects.geometry_corrections import corrected_model
+from ident.effects.geometry_corrections import (
+    GravityDirection,
+    ZeroOffset,
+    corrected_model,
+    turn_between,
+    turned_gravity,
+)
 from ident.effects.signals import REFERENCE_C
+from ident.equations.instants import read_instants
 from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.rows import row_filter, row_masks
+from ident.equations.system import System
 from ident.errors import DataUnfit, Diagnosis, IdentificationError
+from ident.estimators.diagnosis import axis_error_diagnoses, exchanged_channels, scale_diagnoses
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.estimators.least_squares import wls
+from ident.estimators.payload_diagnosis import payload_diagnoses
+from ident.estimators.refusals import idle_joints
+from ident.estimators.turned_geometry import GEOMETRY, find_turned_geometry
+from ident.geometry_drift import geometry_drift
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
 from ident.prediction import (
@@ -42,11 +56,55 @@ from ident.prediction import (
     corrections_of,
     measured_torque,
     mounted_parameters,
+    placed_effect,
     predict_torque,
+    standard_parameters,
 )
 from ident.weighing import RowsToWeigh, rows_to_weigh, weigh_rows
 
 _LOG = logging.getLogger("drivegain")
+
+CORRECTIONS = frozenset(family[0].name for family in CORRECTION_FAMILIES)
+"""Names of effects that correct the description."""
+
+
+class DataUse(Enum):
+    """Whether a calibration has met a log, by the log's digest."""
+
+    FIT = "seen by the fit"
+    HOLDOUT = "held out"
+    NEW = "not seen"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Validation:
+    """One run under a calibration; arrays are joint-first, decimated rows last."""
+
+    log: Path  #: where the run was read
+    run: str  #: its name
+    digest: str  #: of the log (sha256, hex)
+    data_use: DataUse  #: whether the fit has seen it
+    same_configuration: bool  #: the log carries the cell configuration that the calibration was made with
+    partial: bool  #: the log was salvaged from a recording that never finished
+    time_s: FloatArray  #: of each row, since the start of the run, shape (r,)
+    measured_nm: FloatArray  #: V g with the calibration's gains, shape (n, r)
+    predicted_nm: FloatArray  #: what the calibration says the joints need, shape (n, r)
+    use: BoolArray  #: rows of each joint that count, shape (n, r)
+
+    @property
+    def error(self) -> RelativeError:
+        """‖ρ‖/‖Y‖ of each axis and in total [%]."""
+        return relative_error(self.measured_nm, self.predicted_nm, self.use)
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether the fit has used the run and judged it, all of its runs together."""
+        return self.data_use is DataUse.FIT and self.same_configuration
+
+    @property
+    def rows(self) -> int:
+        """Equations that count, of all joints."""
+        return int(np.count_nonzero(self.use))
 
 
 def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None = None) -> tuple[Validation, ...]:
@@ -63,7 +121,7 @@ def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None =
         CalibrationUnreadable: the calibration does not say its filter.
         IdentificationError: the calibration cannot speak of this run: unknown mounting, effect or parameter.
     """
-    conditioning = conditioning_of(calibration)
+    conditioning_of(calibration)  # refuses a calibration without a filter before any log is read
     validations: list[Validation] = []
     corrections = Corrections()
     for log in logs:
@@ -71,8 +129,7 @@ def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None =
         corrections.note(log, run)
         check_cell(calibration, log, described)
         warn_without_temperature(calibration, run.name, run.temperature_c)
-        own, model = on_cell(calibration, described)
-        validations.append(predicted(own, conditioning, model, log, run, described.digest))
+        validations.append(predicted(calibration, described, log, run))
     return tuple(validations)
 
 
@@ -101,7 +158,8 @@ def conditioning_of(calibration: Calibration) -> Conditioning:
             expected=f"a list standstill_rad_s and numbers {', '.join(sorted(expected.keys() - {'standstill_rad_s'}))}",
             remedy="fit the logs again with this drivegain",
         )
-    order, speeds = round(found.pop("position_order")), tuple(found.pop("standstill_rad_s"))
+    order = round(found.pop("position_order"))
+    speeds = tuple(found.pop("standstill_rad_s"))
     return Conditioning(**found, position_order=order, standstill_rad_s=speeds)
 
 
@@ -132,15 +190,22 @@ def unpredictable(calibration: Calibration, payload: Payload | None) -> str:
     return ""
 
 
-def predicted(
-    calibration: Calibration, conditioning: Conditioning, model: Model, log: Path, run: Run, configuration_sha256: str
-) -> Validation:
+def predicted(calibration: Calibration, described: Cell, log: Path, run: Run) -> Validation:
     """One run under one calibration.
 
+    Args:
+        calibration: of the cell.
+        described: the cell, as the log or another description has it.
+        log: where the run was read.
+        run: as it was read.
+
     Raises:
+        CalibrationUnreadable: the calibration does not say its filter.
         IdentificationError: the calibration cannot speak of this run.
     """
-    warn_of_corrections(calibration, run.name, configuration_sha256)
+    conditioning = conditioning_of(calibration)
+    calibration, model = on_cell(calibration, described)
+    warn_of_corrections(calibration, run.name, described.digest)
     run = replace(run, payload=as_calibrated(calibration, run.payload, run.name))
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
@@ -152,7 +217,7 @@ def predicted(
         run=run.name,
         digest=run.digest,
         data_use=data_use(calibration, run),
-        same_configuration=configuration_sha256 == calibration.configuration_sha256,
+        same_configuration=described.digest == calibration.configuration_sha256,
         partial=run.partial,
         time_s=data.time_s[filter_.centres(len(data.time_s))] - data.time_s[0],
         measured_nm=filter_(measured_torque(calibration, model, data.current_a, data.motion()).T),
@@ -283,7 +348,10 @@ def cross_validate(
                 expected=f"that of {first}: {calibrations[first].filter}",
                 remedy="a relative error can be compared under one filter only: fit both with one cell file",
             )
-    runs, bare, loaded, validations = [], [], [], []
+    runs = []
+    bare = []
+    loaded = []
+    validations = []
     diagnoses: list[Diagnosis] = []
     corrections = Corrections()
     for log in logs:
@@ -299,17 +367,14 @@ def cross_validate(
             if reason:
                 reasons.setdefault(reason, []).append(label)
             else:
-                own, own_model = on_cell(calibration, described)
-                found[label] = predicted(own, conditioning, own_model, log, run, described.digest)
+                found[label] = predicted(calibration, described, log, run)
         if first in found:
             validations.append(found[first])
-        condition, standard = None, None
+        condition = None
+        standard = None
         with suppress(IdentificationError):
-            corrected = corrected_model(model, corrections_of(first_own))
-            standard = reduce_runs(corrected, (run,), conditioning)
-            # A payload without columns of its own is part of the link that carries it.
-            system = regrouped(standard, payload_columns=((),) * len(standard.payloads))
-            condition = wls(system, _gains(calibrations[first])).condition
+            standard = _standard_system(first_own, model, run, conditioning)
+            condition = _condition(calibrations[first], standard)
         if standard is not None and first in found and not found[first].is_judged:
             diagnoses += diagnose_run(first_own, found[first], model, run, standard, conditioning)
         if run.payload is not None:
@@ -353,6 +418,19 @@ def cross_validate(
     )
 
 
+def _standard_system(calibration: Calibration, model: Model, run: Run, conditioning: Conditioning) -> System:
+    """Equations of one run in standard parameters, of the description as the calibration corrects it."""
+    corrected = corrected_model(model, corrections_of(calibration))
+    return reduce_runs(corrected, (run,), conditioning)
+
+
+def _condition(calibration: Calibration, standard: System) -> float:
+    """Condition of the weighted observation matrix of a run."""
+    # A payload without columns of its own is part of the link that carries it.
+    system = regrouped(standard, payload_columns=((),) * len(standard.payloads))
+    return wls(system, _gains(calibration)).condition
+
+
 def diagnose_log(calibration: Calibration, log: Path, run: Run, described: Cell) -> tuple[Diagnosis, ...]:
     """Judge a log that the fit of a calibration has not seen, as `cross_validate` does.
 
@@ -364,12 +442,11 @@ def diagnose_log(calibration: Calibration, log: Path, run: Run, described: Cell)
     """
     if unpredictable(calibration, run.payload):
         return ()
+    validation = predicted(calibration, described, log, run)
     calibration, model = on_cell(calibration, described)
     conditioning = conditioning_of(calibration)
-    validation = predicted(calibration, conditioning, model, log, run, described.digest)
     with suppress(IdentificationError):
-        corrected = corrected_model(model, corrections_of(calibration))
-        standard = reduce_runs(corrected, (run,), conditioning)
+        standard = _standard_system(calibration, model, run, conditioning)
         return diagnose_run(calibration, validation, model, run, standard, conditioning)
     return ()
 
@@ -380,11 +457,8 @@ def _masses(
     first = next(iter(calibrations.values()))
     nameplate = [gain.nameplate for gain in first.gains]
     sets = dict(calibrations)
-    if (
-        isinstance(rows, RowsToWeigh)
-        and rows.bare
-        and all([gain.value for gain in one.gains] != nameplate for one in sets.values())
-    ):
+    has_nameplate = any(_gains(one).tolist() == nameplate for one in sets.values())
+    if isinstance(rows, RowsToWeigh) and rows.bare and not has_nameplate:
         entered = tuple(replace(gain, value=gain.nameplate, std=0.0) for gain in first.gains)
         sets = {MANUFACTURER: replace(first, gains=entered, covariance_factor=None), **sets}
     masses: dict[str, Mass | str] = {}
@@ -412,3 +486,170 @@ def _masses(
 
 def _gains(calibration: Calibration) -> FloatArray:
     return np.array([gain.value for gain in calibration.gains])
+
+
+def diagnose_run(
+    calibration: Calibration,
+    validation: Validation,
+    model: Model,
+    run: Run,
+    standard: System,
+    conditioning: Conditioning,
+) -> tuple[Diagnosis, ...]:
+    """Judge a run that the fit of a calibration has not seen: scale and sign of its currents, its payload, its errors.
+
+    Args:
+        calibration: of the cell.
+        validation: what it predicts of the run, and what was measured.
+        model: of the cell.
+        run: as it was read.
+        standard: equations of this run alone, in standard parameters (`reduce_runs`).
+        conditioning: the filters.
+    """
+    if any(one.name in GEOMETRY for one in calibration.diagnoses):
+        return ()  # it predicts in a wrong geometry
+    runs = (run.name,)
+    axes = [gain.axis for gain in calibration.gains]
+    use = validation.use
+    carried = replace(run, payload=as_calibrated(calibration, run.payload, run.name))
+    data = differentiate(carried, model.drive_train, conditioning)
+    left_nm = validation.measured_nm - validation.predicted_nm
+    moved = geometry_drift(calibration, model, data, conditioning, left_nm, use)
+    if moved is not None:
+        return (drift_diagnosis(moved, model, axes, runs),)
+    size = _rms(validation.measured_nm, use)
+    left = _rms(left_nm, use)
+    idle = idle_joints(model, size, left)
+    used = use & ~idle[:, None]
+    found = list(scale_diagnoses(validation.measured_nm, validation.predicted_nm, used, axes, runs))
+    if run.payload is not None and not found:
+        found += _payload_diagnoses(calibration, run.payload, standard)
+    errors = list(map(with_verbs, axis_error_diagnoses(size, left, idle, axes, runs)))
+    if not errors and not any(one.name == "current-reversed" for one in found):
+        return tuple(found)
+    turned = find_turned_geometry(model, read_instants(model, (run,), conditioning), _gains(calibration))
+    if turned is not None:
+        return (turned.diagnosis(axes, runs),)
+    exchanged = exchanged_channels(model, (run,), conditioning, axes) if errors else None
+    if exchanged is not None:
+        return (replace(exchanged, runs=runs),)
+    return tuple(found or errors)
+
+
+def _rms(torque_nm: FloatArray, use: BoolArray) -> FloatArray:
+    """Root mean square of each axis over its rows that count, shape (m,); zero without any."""
+    rows = np.maximum(use.sum(axis=1), 1)
+    return np.asarray(np.sqrt(np.sum(torque_nm**2, axis=1, where=use) / rows))
+
+
+def _payload_diagnoses(calibration: Calibration, payload: Payload, standard: System) -> Iterator[Diagnosis]:
+    """Compare the payload of a run with that of its mounting in the calibration."""
+    mounted = mounted_parameters(calibration, payload.mounting)
+    unknown = tuple(
+        index
+        for index, parameter in enumerate(LINK_PARAMETERS)
+        if parameter not in payload.known and parameter in mounted
+    )
+    of_payload = [mounted[LINK_PARAMETERS[index]].value for index in unknown]
+    values = np.concatenate((standard_parameters(calibration, standard.model), of_payload))
+    return payload_diagnoses(regrouped(standard, standard.base, (unknown,)), _gains(calibration), values)
+
+
+def not_repeated(stored: Iterable[Diagnosis], fresh: Iterable[Diagnosis]) -> Iterator[Diagnosis]:
+    """Yield stored diagnoses, less those that were made again of each of their runs."""
+    again: set[tuple[str, str, tuple[str, ...]]] = set()
+    for one in fresh:
+        again.update((one.name, run, one.axes) for run in one.runs)
+    for one in stored:
+        of_runs = {(one.name, run, one.axes) for run in one.runs}
+        if not of_runs or not of_runs <= again:
+            yield one
+
+
+# A search corrects what the cell file says of zeros and of the mounting (`ident.effects.geometry_corrections`), and
+# tells the operator to correct the cell file. Once that is done, a calibration of before must not correct the same
+# number again: it keeps how the number was described, and what is left to correct is the difference.
+
+
+def with_described(calibration: Calibration, cell: Cell) -> Calibration:
+    """Keep with each correction how its fit found the number described.
+
+    Args:
+        calibration: of a fit.
+        cell: that the fit was made with.
+    """
+    effects: list[AcceptedEffect] = []
+    for accepted in calibration.effects:
+        kept = accepted
+        if accepted.name in CORRECTIONS:
+            placed, _ = placed_effect(accepted, calibration)
+            kept = replace(accepted, described=_described(placed, cell))
+        effects.append(kept)
+    return replace(calibration, effects=tuple(effects))
+
+
+def on_cell(calibration: Calibration, cell: Cell) -> tuple[Calibration, Model]:
+    """A calibration with the corrections that a cell still needs, and the model with which it predicts.
+
+    Args:
+        calibration: of the cell, at any date.
+        cell: as it is described now.
+
+    Raises:
+        EffectRefused: the calibration holds an effect that does not exist.
+        ModelError: the robot is described otherwise than at the fit.
+    """
+    effects = tuple(_remaining(accepted, calibration, cell) for accepted in calibration.effects)
+    return replace(calibration, effects=effects), calibrated_model(calibration, cell)
+
+
+def _remaining(accepted: AcceptedEffect, calibration: Calibration, cell: Cell) -> AcceptedEffect:
+    """An effect with what is left of it to correct."""
+    if accepted.described is None:
+        return accepted
+    placed, values = placed_effect(accepted, calibration)
+    now = _described(placed, cell)
+    if now is None or now == accepted.described:
+        return accepted
+    then = np.array(accepted.described)
+    match placed.effect:
+        case ZeroOffset():
+            left = values - (np.array(now) - then)
+        case GravityDirection():
+            left = turn_between(np.array(now), turned_gravity(then, values.tolist()))
+        case _:
+            return accepted
+    by_name = dict(zip((column.name for column in placed.columns), left, strict=True))
+    coefficients = tuple(replace(one, value=float(by_name[one.name])) for one in accepted.coefficients)
+    return replace(accepted, coefficients=coefficients)
+
+
+def _described(placed: PlacedEffect, cell: Cell) -> tuple[float, ...] | None:
+    """The number that a correction corrects, as a cell describes it; None of a correction of recordings."""
+    match placed.effect:
+        case ZeroOffset():
+            return (float(cell.axes[placed.axis].zero_offset_rad),)
+        case GravityDirection():
+            gravity: FloatArray = model_of(cell).robot.gravity_m_s2
+            return tuple(float(one) for one in gravity)
+        case _:
+            return None
+
+
+class Corrections:
+    """The corrections that were said; logs that carry one description share one line."""
+
+    def __init__(self) -> None:
+        self._said: set[tuple[str, ...]] = set()
+
+    def note(self, log: Path, run: Run) -> None:
+        """Say what the given description corrects in a log, unless an earlier log of the command had the same."""
+        recording = run.recording
+        if recording is None or not recording.corrected or recording.corrected in self._said:
+            return
+        self._said.add(recording.corrected)
+        _LOG.warning(
+            "%s: the given description of the cell replaces the one in the log; they differ in %s",
+            log,
+            ", ".join(recording.corrected),
+        )

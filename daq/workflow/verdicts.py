@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from daq.errors import ConfigurationError
-from daq.log.conversion import load_run
 from daq.workflow.experiment import LAG_ONE, experiment_of, extra_moves
 from daq.workflow.fit import Fit
 from ident.data.dataset import differentiate
@@ -25,8 +24,10 @@ def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
     by σ of the fit / predicted σ: a plan predicts ratios of σ well, but not the noise level.
     """
     found = fitted.identification
-    estimate, system = found.estimate, found.system
-    independent, first = list(system.base.independent), len(system.columns)
+    estimate = found.estimate
+    system = found.system
+    independent = list(system.base.independent)
+    first = len(system.columns)
     standard = np.zeros(len(found.model.columns))
     standard[independent] = estimate.parameters[: len(independent)]
     payloads = []
@@ -62,8 +63,7 @@ def needed_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
 def _excitations(fitted: Fit) -> Iterator[tuple[Excitation, tuple[int | None, ...]]]:
     found = fitted.identification
     mountings = [payload.mounting for payload in found.system.payloads]
-    for log in fitted.logs:
-        run, _ = load_run(log, fitted.cell, fitted.lossy)
+    for run in fitted.runs(fitted.logs):
         data = differentiate(run, found.model.drive_train, found.conditioning)
         mounted = None if run.payload is None else mountings.index(run.payload.mounting)
         yield recorded(found.model, data, found.conditioning), (mounted,)

@@ -11,12 +11,12 @@ from daq.config.cell import Cell
 from daq.config.same_cell import differing_sections
 from daq.errors import ConfigurationError, LogRepeated, LogsDiffer
 from daq.log.conversion import load_run
-from daq.workflow.corrections import Corrections
 from daq.workflow.experiment import experiment_of, extra_moves
-from daq.workflow.remaining_corrections import on_cell
 from daq.workflow.validate import (
+    Corrections,
     check_cell,
     conditioning_of,
+    on_cell,
     unpredictable,
     warn_of_corrections,
     warn_of_fitted,

@@ -15,8 +15,7 @@ from daq.config.cell_buses import bus_address
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
-from daq.workflow.plan import plan
-from daq.workflow.plan_file import load_plan, save_plan
+from daq.workflow.plan import load_plan, plan, save_plan
 from daq.workflow.record import RecordingRequest, record
 from drivers.canopen.bus import open_bus
 from drivers.simulation.cell import SimulatedCell

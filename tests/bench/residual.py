@@ -15,8 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from daq.config.cell_file import bundle, load_cell
-from daq.workflow.plan import plan
-from daq.workflow.plan_file import load_plan, save_plan
+from daq.workflow.plan import load_plan, plan, save_plan
 from tests.bench.fleet_cells import START_NS, print_line, write_log
 from tests.studies.direct_cell import simulate_run
 from tests.studies.effect_cells import SINGLE_EFFECTS, EffectCase

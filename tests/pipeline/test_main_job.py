@@ -166,7 +166,7 @@ def searched(demonstration: Path) -> tuple[str, list[RenderableType]]:
         parts.extend(f"Written: {path}" for path in written if path is not None)
 
     with pytest.MonkeyPatch.context() as patch, redirect_stderr(said):
-        patch.setattr("daq.cli.terminal.print_view", keep)
+        patch.setattr("daq.cli.fit.print_view", keep)
         holdout = str(demonstration / "held-out.mcap")
         assert main(["residual", *logs, "--holdout", holdout, "--out", str(out)]) == ExitCode.OK
     return said.getvalue(), parts

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from daq.workflow.declared_effects import BOOTSTRAP_SEED
-from daq.workflow.description import geometry_beside
+from daq.workflow.diagnoses import geometry_beside
+from daq.workflow.fit import BOOTSTRAP_SEED
 from ident.data.run import Run
 from ident.data.unsigned_current import unsigned_currents
 from ident.discovery.evidence import gather

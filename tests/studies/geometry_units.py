@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from daq.config.cell import Cell, model_of
-from daq.workflow.declared_effects import declared_effects
+from daq.workflow.fit import declared_effects
 from ident.data.run import Run
 from ident.discovery.declared import with_declared
 from ident.discovery.evidence import Evidence, gather

@@ -24,7 +24,7 @@ from daq.cli import main as drivegain
 from daq.config.cell_buses import bus_address
 from daq.config.cell_file import load_cell
 from daq.report.paper_tables import PaperTable, percent
-from daq.workflow.plan_file import load_plan
+from daq.workflow.plan import load_plan
 from daq.workflow.record import RecordingRequest, record
 from drivers.canopen.bus import open_bus
 from drivers.simulation.cell import SimulatedCell

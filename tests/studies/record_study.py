@@ -27,8 +27,7 @@ from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations, software
 from daq.files import replace_file
 from daq.log.metadata import VERSION
-from daq.workflow.plan import Plan, plan
-from daq.workflow.plan_file import load_plan, save_plan
+from daq.workflow.plan import Plan, load_plan, plan, save_plan
 from daq.workflow.record import RecordingRequest, record
 from drivers.canopen.bus import open_bus
 from drivers.simulation.cell import SimulatedCell

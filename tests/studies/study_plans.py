@@ -8,8 +8,7 @@ from pathlib import Path
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
-from daq.workflow.plan import Plan, plan
-from daq.workflow.plan_file import load_plan, save_plan
+from daq.workflow.plan import Plan, load_plan, plan, save_plan
 from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished
 
 CELL = shipped_configurations() / "cells" / "demo.yaml"

@@ -20,7 +20,7 @@ from drivers.stream.answers import StreamStatistics
 @pytest.fixture
 def cells(tmp_path: Path, checkout: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     """Cell files by pacing; any plan will do."""
-    monkeypatch.setattr("daq.workflow.plan_file.load_plan", lambda *_: None)
+    monkeypatch.setattr("daq.workflow.plan.load_plan", lambda *_: None)
     monkeypatch.setattr("daq.workflow.plan.slowed", lambda *_: None)
     folder = tmp_path / "cells"
     folder.mkdir()

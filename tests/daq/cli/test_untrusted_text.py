@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from daq.jobs.cell_fit import Failure, Summary
-from daq.jobs.fleet import FleetRow
-from daq.jobs.fleet_report import FIRST_COLUMNS, fleet_csv, fleet_report
+from daq.jobs.fleet import FIRST_COLUMNS, FleetRow, fleet_csv, fleet_report
 from daq.ledger.ledger import read_history
 from daq.ledger.watch import Series, watch
 from daq.report.document import json_text

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from daq.config.cell import DEGREE, Cell, DeclaredEffect, robot_of
 from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent, SchemaMismatch
-from daq.workflow.declared_effects import declared_effects
+from daq.workflow.fit import declared_effects
 from ident.model.bodies import LINK_PARAMETERS
 from ident.model.urdf import read_urdf
 from tests.conftest import CHECKOUT

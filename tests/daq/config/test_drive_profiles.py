@@ -27,7 +27,7 @@ from daq.log.reader import read_log
 from daq.report.bus_views import current_signals
 from daq.simulation.simulation_file import load_simulation
 from daq.workflow.nameplates import actual_current_note
-from daq.workflow.plan_file import load_plan
+from daq.workflow.plan import load_plan
 from daq.workflow.record import RecordingRequest, record
 from drivers.canopen.bus import open_bus
 from drivers.profiles.profile import DriveProfile, FactBasis, ObjectEntry, ScaleForm, TapPoint

@@ -28,8 +28,7 @@ from daq.jobs.session import Session, sessions
 from daq.ledger.audit import AuditEntry, read, verify
 from daq.report.residual_page import save_report
 from daq.simulation.simulation_file import load_simulation
-from daq.workflow.plan import Plan, plan
-from daq.workflow.plan_file import save_plan
+from daq.workflow.plan import Plan, plan, save_plan
 from daq.workflow.record import Clocks, record
 from drivers.canopen.bus import open_bus
 from drivers.simulation.cell import SimulatedCell

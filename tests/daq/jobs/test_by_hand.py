@@ -10,7 +10,7 @@ import pytest
 
 from daq.cli.app import main
 from daq.errors import ExitCode, NotReleased
-from daq.workflow.plan_file import load_plan
+from daq.workflow.plan import load_plan
 from daq.workflow.record import RecordingRequest, record
 from drivers.errors import MotionRefused
 from drivers.simulation.cell import SimulatedCell

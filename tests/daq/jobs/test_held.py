@@ -32,9 +32,8 @@ from daq.errors import (
     exit_code,
 )
 from daq.jobs.context import section_of
-from daq.jobs.job import preview
+from daq.jobs.job import preview, time_bound
 from daq.jobs.journal import Form, Journal
-from daq.jobs.time_bound import time_bound
 from daq.ledger.audit import AuditAction
 from daq.workflow.bus_lock import bus_lock, lock_name
 from daq.workflow.interlock import MAX_OUTPUT_CHARACTERS, Finished, require_release, run_command

@@ -10,11 +10,11 @@ from pathlib import Path
 import can
 import pytest
 
-import daq.jobs.drives
+import daq.jobs.context
 import daq.workflow.record
 from daq.config.cell import PacingMode
 from daq.config.cell_buses import bus_address
-from daq.jobs.drives import check_drives
+from daq.jobs.context import check_drives
 from drivers.canopen.bus import open_bus
 from drivers.errors import BusBusy, StateRefused
 from drivers.simulation.cell import SimulatedCell
@@ -29,7 +29,7 @@ STAYS = PowerState.QUICK_STOP_ACTIVE
 def _short_guard(monkeypatch: pytest.MonkeyPatch) -> None:
     """A job waits for as long as a guard and a stop may take."""
     monkeypatch.setattr(daq.workflow.record, "GUARD_MS", dict.fromkeys(PacingMode, GUARD_MS))
-    monkeypatch.setattr(daq.jobs.drives, "STOP_S", 0.2)
+    monkeypatch.setattr(daq.jobs.context, "STOP_S", 0.2)
 
 
 def leave(cell: SimulatedCell, state: PowerState, recorder_id: int = 127) -> PowerState:
@@ -75,7 +75,7 @@ def test_a_drive_that_moves_in_its_quick_stop_is_left_alone(
     tmp_path: Path, one_move: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     places = iter(((0,), (17,)))
-    monkeypatch.setattr(daq.jobs.drives, "_positions", lambda *_: next(places))
+    monkeypatch.setattr(daq.jobs.context, "_positions", lambda *_: next(places))
     rig = make_rig(tmp_path / "cell", one_move)
     with serving(rig) as cell:
         leave(cell, STAYS)

@@ -12,7 +12,7 @@ from daq.errors import RunInvalid
 from daq.log.conversion import load_run
 from daq.log.metadata import Loss, reports_only_losses
 from daq.log.reader import LossyLogs
-from daq.workflow.record import _verdict
+from daq.workflow.record import stream_losses
 from drivers.stream.answers import StreamStatistics
 from tests.daq.logs import demo_content, samples, write
 
@@ -64,9 +64,9 @@ def test_the_recorder_counts_them_by_these_names() -> None:
     counted = StreamStatistics(
         missing=1, late=2, wrong_length=3, kernel_dropped=4, interface_dropped=5, backlog_dropped=6
     )
-    valid, reason = _verdict(counted)
-    assert not valid
+    reason = stream_losses(counted)
+    assert reason
     assert reports_only_losses(reason)
     assert {part.split(" ", 1)[1] for part in reason.split(", ")} == {loss.value for loss in Loss if loss.masked}
     assert {loss.value for loss in Loss if loss.masked} == set(MASKED)
-    assert not reports_only_losses(_verdict(StreamStatistics(missing=1, skipped_periods=1))[1])
+    assert not reports_only_losses(stream_losses(StreamStatistics(missing=1, skipped_periods=1)))

@@ -18,8 +18,7 @@ from daq.config.cell_file import load_cell
 from daq.config.workspace import Clearance
 from daq.report.plan_preview import STEP_S, find_preview, preview_data, preview_page
 from daq.workflow.experiment import PlannedMove, experiment_duration_s, scene_of
-from daq.workflow.plan import Plan
-from daq.workflow.plan_file import check_approach
+from daq.workflow.plan import Plan, check_approach
 from drivers.errors import MotionRefused
 from ident.model.robot import poses
 from ident.planning.clearance import BASE, Box, Checker

@@ -20,9 +20,8 @@ from rich.table import Table
 from daq.cli.terminal import PIPE_COLUMNS
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
-from daq.jobs import fleet_report
 from daq.jobs.cell_fit import Failure, Summary
-from daq.jobs.fleet import FleetRow
+from daq.jobs.fleet import FleetRow, fleet_view
 from daq.ledger.ledger import read_history
 from daq.ledger.watch import Series, watch
 from daq.report import (
@@ -42,7 +41,7 @@ from daq.report.log import log_lines
 from daq.report.text import WholeTable
 from daq.workflow.live_prediction import RecentCurrent
 from daq.workflow.monitor import CellPrediction, WatchedCell
-from daq.workflow.validation import DataUse
+from daq.workflow.validate import DataUse
 from daq.writeback.judgement import NOTHING
 from daq.writeback.request import GainChange
 from drivers.stream.monitor import AxisReading, CellReading, ReadingSource
@@ -220,7 +219,7 @@ def _fleet(cell: Cell, _: Any) -> Iterator[RenderableType]:
     summary = Summary(GAINS, (("load-friction", AXES[3]),), 3.21, held_out=False, partial=True)
     results: tuple[Summary | Failure, ...] = (summary, Failure("DataUnfit", "run-17.mcap lost 1234 samples", 4))
     names = ("press-4-in-hall-12-line-7", "gantry-23")
-    return fleet_report.fleet_view(
+    return fleet_view(
         [FleetRow(name, "c" * 64, (), (), one, 1234.56) for name, one in zip(names, results, strict=True)]
     )
 
@@ -245,7 +244,7 @@ EXAMPLES: dict[str, Callable[[Cell, Any], Iterable[RenderableType]]] = {
     "bus_views.scan_table": _scan,
     "fit.comparison_tables": _comparison,
     "fit.error_table": lambda _cell, _: [fit.error_table("Error", AXES, {"held out, before": ERROR})],
-    "fleet_report.fleet_view": _fleet,
+    "fleet.fleet_view": _fleet,
     "gains.gain_table": lambda _cell, _: [gains.gain_table(GAINS, dict.fromkeys(AXES, -1230.5), title="Gains")],
     "gains.torque_table": lambda _cell, _: [gains.torque_table([TorqueSlope(-1250.0, 0.0123, 98765)] * 14, GAINS)],
     "history.axis_table": lambda _cell, known: [history.axis_table(known[1][3], known[2])],

@@ -11,7 +11,7 @@ import pytest
 from daq.config.cell import Cell, DeclaredEffect
 from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent, UsageError
-from daq.workflow.declared_effects import declared_effects, refuse_effects, with_effects_of_cell
+from daq.workflow.fit import declared_effects, refuse_effects, with_effects_of_cell
 from ident.effects.effect import PlacedEffect
 from ident.effects.position import Counterbalance
 from ident.estimators.identify import identify

@@ -25,7 +25,7 @@ from daq.log.metadata import run_from_record, run_record
 from daq.log.reader import LossyLogs, read_log
 from daq.workflow import fit as fit_module
 from daq.workflow.fit import Fit, Reading, calibration_of, close_loop, fit
-from daq.workflow.plan_file import load_plan
+from daq.workflow.plan import load_plan
 from daq.workflow.record import Clocks, RecordingRequest, record
 from daq.workflow.safeguards import check_entered_mass
 from daq.writeback.gates.gate import Gate, GateContext

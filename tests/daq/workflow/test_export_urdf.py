@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-import daq.workflow.urdf_export
+import daq.environment
 from daq.cli.app import main
 from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
@@ -217,7 +217,7 @@ def test_what_is_refused_and_with_which_code(
 def test_a_closed_chain_is_refused_without_the_solver_too(
     checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(daq.workflow.urdf_export, "find_spec", lambda _: None)
+    monkeypatch.setattr(daq.environment, "find_spec", lambda _: None)
     five_bar = replace(
         demo_calibration(),
         cell="five-bar",
@@ -269,7 +269,7 @@ def test_without_the_solver_the_extra_is_named(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     cell, calibration, _ = tx40
-    monkeypatch.setattr(daq.workflow.urdf_export, "find_spec", lambda name: None if name == "cvxpy" else object())
+    monkeypatch.setattr(daq.environment, "find_spec", lambda name: None if name == "cvxpy" else object())
     assert _export(calibration, "--cell", cell, "--out", tmp_path / "robot.urdf") == 6
     assert "pip install 'drivegain[physical]'" in capsys.readouterr().err
     assert not (tmp_path / "robot.urdf").exists()
@@ -277,8 +277,7 @@ def test_without_the_solver_the_extra_is_named(
 
 def test_nothing_brings_the_solver_along_at_start_up() -> None:
     code = (
-        "import sys, daq.cli.app, daq.cli.export, ident.physical.physical;"
-        "print({'cvxpy', 'clarabel'} & set(sys.modules))"
+        "import sys, daq.cli.app, daq.cli.logs, ident.physical.physical;print({'cvxpy', 'clarabel'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

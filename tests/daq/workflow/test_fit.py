@@ -19,7 +19,6 @@ from daq.log.reader import LossyLogs
 from daq.report.document import json_tree
 from daq.report.fit import fit_report, fit_view
 from daq.workflow import fit as fit_module
-from daq.workflow import verdicts as verdicts_module
 from daq.workflow.cases import CaseFit
 from daq.workflow.fit import calibration_of, fit
 from ident.data.conditioning import Conditioning
@@ -118,7 +117,6 @@ def test_every_method_hears_of_a_payload_that_was_not_there(
 
 def test_an_axis_that_did_not_move_has_a_dash_and_no_number(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
-    monkeypatch.setattr(verdicts_module, "load_run", shelf.load)
     found = fit(_paths("run0", "run1"))
     calibration = calibration_of(found, datetime(2025, 1, 2, tzinfo=UTC))
     rested = RelativeError((1.0, float("nan"), 3.0, 4.0, 5.0, 6.0), 7.0)
@@ -148,7 +146,6 @@ def test_the_drives_own_torque_is_shown_beside_the_gains_and_changes_none(
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
     without = fit(_paths("run0", "run1"), holdout=_paths("run2"))
     monkeypatch.setattr(fit_module, "load_run", load)
-    monkeypatch.setattr(verdicts_module, "load_run", load)
     found = fit(_paths("run0", "run1"), holdout=_paths("run2"))
     np.testing.assert_array_equal(found.estimate.gains, without.estimate.gains)
     assert without.torque_slopes == ()

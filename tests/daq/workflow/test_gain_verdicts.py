@@ -14,7 +14,6 @@ from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.log.reader import LossyLogs
 from daq.workflow import fit as fit_module
-from daq.workflow import verdicts as verdicts_module
 from daq.workflow.fit import Fit, fit
 from daq.workflow.verdicts import gain_verdicts, needed_verdicts
 from ident.data.run import Run
@@ -37,7 +36,6 @@ def fitted() -> Iterator[Fit]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fit_module, "load_run", load)
-        patch.setattr(verdicts_module, "load_run", load)
         yield fit((Path("bare"), Path("loaded")))
 
 

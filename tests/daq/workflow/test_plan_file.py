@@ -17,8 +17,7 @@ from daq.config.cell_file import load_cell
 from daq.config.workspace import Clearance
 from daq.errors import ConfigurationInconsistent, ExitCode, SchemaMismatch
 from daq.report.plan_preview import find_preview
-from daq.workflow.plan import Plan, plan
-from daq.workflow.plan_file import check_approach, load_plan, save_plan
+from daq.workflow.plan import Plan, check_approach, load_plan, plan, save_plan
 from drivers.errors import MotionRefused
 from ident.planning.clearance import Box
 

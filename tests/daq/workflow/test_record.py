@@ -19,7 +19,7 @@ from daq.errors import ExitCode, RunInvalid
 from daq.log.conversion import load_run
 from daq.log.reader import read_log
 from daq.log.salvage import salvage
-from daq.workflow.plan_file import load_plan
+from daq.workflow.plan import load_plan
 from daq.workflow.record import LATE_LOSSES_S, Clocks, Recorded, RecordingRequest, record
 from daq.workflow.safeguards import NEVER
 from drivers.canopen.network import CanopenNetwork, SignalBlocker

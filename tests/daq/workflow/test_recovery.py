@@ -13,7 +13,7 @@ from daq.config.cell_file import load_cell
 from daq.config.policy import Permission
 from daq.errors import ExitCode, exit_code
 from daq.log.reader import read_log
-from daq.workflow.recovery import SLOW, recovery_move
+from daq.workflow.record import RECOVERY_SPEED, recovery_move
 from drivers.errors import MotionRefused
 from tests.daq.workflow.test_record import ELBOW, Rig
 
@@ -63,8 +63,8 @@ def test_where_the_cell_allows_it_the_axis_goes_slowly_back_and_the_run_begins(o
     declared = load_cell(outside.cell_file)
     limits, scale = declared.axes[ELBOW - 1].limits, 57.29577951308232 * COUNTS_PER_DEG
     velocity, acceleration = struct.unpack_from("<II", first)
-    assert 0 < velocity <= SLOW * 1.01 * limits.velocity * scale
-    assert 0 < acceleration <= SLOW * 1.01 * limits.acceleration * scale
+    assert 0 < velocity <= RECOVERY_SPEED * 1.01 * limits.velocity * scale
+    assert 0 < acceleration <= RECOVERY_SPEED * 1.01 * limits.acceleration * scale
     samples = read_log(outside.out).samples.position_counts[:, ELBOW - 1]
     assert samples[0] < LIMIT  # the log begins behind the return
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from daq.config.cell import Cell, model_of
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import decode_calibration, encode_calibration
-from daq.workflow.remaining_corrections import on_cell, with_described
+from daq.workflow.validate import on_cell, with_described
 from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.effects.geometry_corrections import corrected_model, turn_between, turned_gravity
 from ident.prediction import corrections_of

@@ -10,7 +10,7 @@ import pytest
 from daq.config.cell import KERNEL, RECORDER
 from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent
-from daq.workflow.record import Clocks, _pacing, _sync_producer, _verdict, network_of
+from daq.workflow.record import Clocks, _pacing, _sync_producer, network_of, stream_losses
 from drivers.stream.answers import StreamStatistics
 from drivers.stream.producers import DriveProducer, KernelProducer
 from drivers.stream.sync import FollowedSync
@@ -76,6 +76,6 @@ def test_the_stream_can_stop_the_sync_that_it_follows(
 
 @pytest.mark.parametrize("name", [field.name for field in fields(StreamStatistics)])
 def test_whatever_is_lost_makes_a_run_invalid(name: str) -> None:
-    valid, reason = _verdict(StreamStatistics(**{name: 3}))
-    assert valid == (name in EXPLAINED)
-    assert valid or reason.startswith("3 ")
+    reason = stream_losses(StreamStatistics(**{name: 3}))
+    assert (not reason) == (name in EXPLAINED)
+    assert not reason or reason.startswith("3 ")

@@ -14,8 +14,7 @@ from daq.cli.validate import cell_of
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.errors import CalibrationUnreadable
-from daq.workflow.validate import conditioning_of, together, validate, warn_without_temperature
-from daq.workflow.validation import DataUse
+from daq.workflow.validate import DataUse, conditioning_of, together, validate, warn_without_temperature
 from ident.calibration import AcceptedEffect, Calibration
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import demo_content, samples, write
