@@ -224,10 +224,13 @@ def _parsed(document: DcfDocument) -> dict[KeyPath, str]:
     )
     try:
         parser.read_string(document.text.removeprefix(_BYTE_ORDER_MARK))
-    except configparser.Error as error:
+    except (configparser.Error, AttributeError) as error:
+        # An indented line goes on with the value above it; without a value, Python before 3.13 fails for want of one.
+        no_value = isinstance(error, AttributeError)
+        why = "an indented line below a name without `=`" if no_value else " ".join(str(error).split())[:200]
         raise ControllerUnfit(
             document.name,
-            found=f"no DCF ({' '.join(str(error).split())[:200]})",
+            found=f"no DCF ({why})",
             expected="sections of name=value (CiA 306)",
             remedy="correct the file; nothing was written",
         ) from error

@@ -6,6 +6,7 @@ import configparser
 import json
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -273,6 +274,21 @@ def test_any_other_difference_is_found(kind: ControllerFormat, data: st.DataObje
 def test_whatever_is_in_the_file_it_is_refused_in_words(kind: ControllerFormat, begin: bytes, noise: bytes) -> None:
     with pytest.raises(ControllerUnfit, match=r"nothing was written|is this the right file"):
         decode_document(begin + noise, "robot", kind).locate(("6076.nowhere",))
+
+
+def test_a_line_that_goes_on_with_no_value_is_no_dcf() -> None:
+    """To `configparser`, an indented line belongs to the value above it."""
+    document = decode_document(b"[2003]\nDataType=8\nParameterValue=1.5\n[6076]\nflag\n  x\n", "a.dcf")
+    with pytest.raises(ControllerUnfit, match=r"no DCF"):
+        document.with_values({"2003": "2.5"})
+
+
+@settings(max_examples=300)
+@given(lines=st.lists(st.sampled_from(["[6076]", "[2003]", "flag", "  x", "a=1", "=", "ParameterValue=1.5", ";", ""])))
+def test_a_dcf_of_any_lines_is_read_or_refused_in_words(lines: list[str]) -> None:
+    document = decode_document("\n".join(lines).encode(), "a.dcf")
+    with suppress(ControllerUnfit):
+        document.readings()
 
 
 @pytest.mark.parametrize(
