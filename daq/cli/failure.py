@@ -99,6 +99,10 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
         "use a heavier payload or a plan of `drivegain plan`",
     ),
     identification.NotConverged: ("a fit that settles", "check the cell file, or try `fit --method wls`"),
+    identification.EffectImpossible: (
+        "coefficients that physics allows",
+        "check this effect, `zero_offset_deg` and `gravity_m_s2` in the cell file",
+    ),
     identification.EffectRefused: (
         "effects as `drivegain residual` and the cell file's reference have them",
         "correct `effects` of the calibration or of the cell file, or fit the logs again",

@@ -7,6 +7,7 @@ depend on its form.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from contextlib import suppress
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -35,12 +36,12 @@ Subindex = Annotated[int, Field(ge=0, le=0xFF)]
 Text = Annotated[str, Field(min_length=1, max_length=400)]
 
 
-class SectionModel(StrictModel):
+class SectionModel(StrictModel, ABC):
     """A section that `drivers` has as a class of its own."""
 
+    @abstractmethod
     def built(self) -> Any:
         """Convert to the class of `drivers`."""
-        raise NotImplementedError
 
 
 def _parts(model: StrictModel) -> dict[str, Any]:

@@ -69,7 +69,8 @@ class ErrorReport(Report):
     hint: str = ""
     axes: str = ""
     """axes that had power and are not confirmed without it"""
-    unconfirmed: list[str] = Field(default=[], description="what could not be confirmed")
+    unconfirmed: list[str] = Field(default=[])
+    """what could not be confirmed"""
 
 
 def _attributes(kind: type[Report], source: object) -> dict[str, Any]:

@@ -123,9 +123,6 @@ class Fit:
             yield load_run(log, self.cell, self.lossy)[0]
 
 
-BOOTSTRAP_SEED = 0  #: Fixes the verdict of a significance test; no decision depends on it for declared effects
-
-
 class Undecided(Enum):
     """Which effects join the model although held-out logs do not confirm them."""
 
@@ -217,6 +214,7 @@ class Reading:
 
 
 _LOG = logging.getLogger("drivegain")
+BOOTSTRAP_SEED = 0  #: Of the significance tests, so that the same logs get the same verdicts
 
 
 def fit_logs(
@@ -450,12 +448,12 @@ def close_loop(
         last = replace(steps[-1], after=evidence_with_geometry(steps[-1].after, start.geometry_covariance))
         steps = (*steps[:-1], last)
     closed = replace(start, identification=before, steps=(*known, *steps))
-    wrong = impossible_declared(closed.steps[-1].after, places)
-    if wrong:  # the fit hoped for a correction of the geometry, and the search made none
-        raise EffectImpossible(f"the declared {wrong}")
-    if closed.estimate is described:
-        return closed
     with named_causes(closed.recordings):
+        wrong = impossible_declared(closed.steps[-1].after, places)
+        if wrong:  # the fit hoped for a correction of the geometry, and the search made none
+            raise EffectImpossible(f"the declared {wrong}")
+        if closed.estimate is described:
+            return closed
         return judged(closed)
 
 

@@ -37,13 +37,13 @@ def with_declared(
     Args:
         start: identified by ``ml``, from `gather`, without effects.
         declared: the effects, with the settings to begin with.
-        rng: of the bootstrap, for what the findings say; no gate keeps an effect out.
+        rng: of the bootstrap, for what the findings say, and of the geometry's test where an effect is impossible.
         progress: called with a description of each step.
         axes: their names in it; those of the robot's joints when empty.
 
     Returns:
-        a step an effect; a search that begins with the last one's evidence keeps them. Where the geometry is to blame
-        (`is_geometry_to_blame`), coefficients may be impossible until it is corrected.
+        a step an effect; a search that begins with the last one's evidence keeps them. Where the geometry is to blame,
+        coefficients may be impossible until it is corrected: ask `impossible_declared` after a search.
 
     Raises:
         EffectImpossible: the coefficients of an effect are impossible.
@@ -67,28 +67,19 @@ def with_declared(
             raise EffectRefused(f"the declared {name}: the model contains it already")
         limits_nm = detection_limits_nm(model.search_problem, gates)
         steps.append(Step((), (), limits_nm, finding, evidence, declared=True))
-    require_possible(evidence, rng, names)
+    wrong = impossible_declared(evidence, names)
+    if wrong and not _is_geometry_to_blame(evidence, rng, names):
+        raise EffectImpossible(f"the declared {wrong}")
     return tuple(steps)
 
 
-def require_possible(evidence: Evidence, rng: np.random.Generator, axes: Sequence[str]) -> None:
-    """Refuse declared effects whose coefficients are impossible, unless the geometry is to blame.
+def impossible_declared(evidence: Evidence, axes: Sequence[str]) -> str:
+    """Name the first declared effect with impossible coefficients, and say which; empty where all are possible.
 
     Args:
-        evidence: identified by ``ml``, with the declared effects first.
-        rng: of the bootstrap in the test of the geometry.
-        axes: names of the axes.
-
-    Raises:
-        EffectImpossible: as said.
+        evidence: with the declared effects first.
+        axes: their names.
     """
-    wrong = impossible_declared(evidence, axes)
-    if wrong and not is_geometry_to_blame(evidence, rng):
-        raise EffectImpossible(f"the declared {wrong}")
-
-
-def impossible_declared(evidence: Evidence, axes: Sequence[str]) -> str:
-    """Name the first declared effect with impossible coefficients, and say which; empty where all are possible."""
     estimate = evidence.estimate
     for placed in evidence.effects[: evidence.declared]:
         own = own_unknowns(estimate, (placed,))
@@ -98,13 +89,8 @@ def impossible_declared(evidence: Evidence, axes: Sequence[str]) -> str:
     return ""
 
 
-def is_geometry_to_blame(evidence: Evidence, rng: np.random.Generator) -> bool:
-    """Whether the data ask for another geometry, and all declared effects are possible with it.
-
-    Args:
-        evidence: identified by ``ml``, with the declared effects.
-        rng: of the bootstrap.
-    """
+def _is_geometry_to_blame(evidence: Evidence, rng: np.random.Generator, axes: Sequence[str]) -> bool:
+    """Whether the data ask for another geometry, and all declared effects are possible with it."""
     try:
         mistake = check_geometry(evidence, rng).mistake
     except TooFewMoves:
@@ -116,8 +102,7 @@ def is_geometry_to_blame(evidence: Evidence, rng: np.random.Generator) -> bool:
         corrected = with_effects(evidence, (*evidence.effects, correction))
     except UNFITTED:
         return False
-    names = [joint.name for joint in evidence.model.robot.places]
-    return not impossible_declared(replace(corrected, declared=evidence.declared), names)
+    return not impossible_declared(replace(corrected, declared=evidence.declared), axes)
 
 
 def _with_declared_form(evidence: Evidence, forms: Sequence[PlacedEffect]) -> Evidence:

@@ -9,9 +9,8 @@ what the model lacks. A zero offset is planted on every joint on which these run
     python -m tests.studies.geometry_study --minutes 0               nothing is searched: the tables of what is there
 
 Layout: out/geometry-study/<unit>.csv, the row of one unit; out/geometry-study.csv has all. Where all units of the seeds
-are there, docs/evidence/data gets them with the summary. Real recordings whose
-gravity is turned by 90 and by 180 degrees are units of the study, too: their rows say what direction `fit` names, and
-what error the fit has as declared.
+are there, docs/evidence/data gets them with the summary. Real recordings whose gravity is turned by 90 and by 180
+degrees are units of the study, too: their rows say what direction `fit` names, and what error it has as declared.
 """
 
 from __future__ import annotations
@@ -30,6 +29,7 @@ from daq.files import replace_file
 from tests.studies.fingerprint import digest, digest_of_source
 from tests.studies.geometry_runs import STUDIED, RunsOfRobot, fingerprint_of_runs
 from tests.studies.geometry_units import (
+    NAN,
     OBSERVABLE,
     OFFSETS_DEG,
     REAL,
@@ -53,6 +53,7 @@ OUT = Path("out/geometry-study")
 TABLE = Path("docs") / "evidence" / "data" / "geometry.csv"
 SUMMARY = TABLE.with_name("geometry-summary.csv")
 SEEDS = (1, 2, 3, 4)
+WORSE_PERCENT = 0.2  #: By which a worst gain may be worse than in the clean cell
 
 
 def units_of(out: Path, robots: Sequence[str], seeds: Sequence[int], mistakes: Sequence[str]) -> list[MistakeUnit]:
@@ -88,6 +89,36 @@ def summary(rows: Sequence[MistakeRow]) -> str:
         if own:
             lines.append(f"| {robot} | {mistake} | {size:.4g} | {_figures(own)} |")
     return "\n".join(lines)
+
+
+def totals(rows: Sequence[MistakeRow]) -> str:
+    """How many mistakes are named, how many clean cells have an effect, and which worst gains stay worse."""
+    simulated = [row for row in rows if row.planted and row.mistake != TURNED]
+    mistaken = [row for row in simulated if row.mistake != Mistake.CLEAN.value]
+    smallest: dict[str, float] = {}
+    for row in mistaken:
+        smallest[row.mistake] = min(row.size, smallest.get(row.mistake, row.size))
+    larger = [row for row in mistaken if row.size > smallest[row.mistake]]
+    clean = [row for row in simulated if row.mistake == Mistake.CLEAN.value]
+    bent = [row for row in clean if row.others or row.named]
+    worst = {(row.robot, row.seed): row.gain_error_after_percent for row in clean}
+    lines = [
+        f"two larger sizes: {sum(row.named for row in larger)} of {len(larger)} named",
+        f"all sizes: {sum(row.named for row in mistaken)} of {len(mistaken)} named",
+        f"clean: {len(bent)} of {len(clean)} with an effect",
+    ]
+    lines += [_place(row) for row in larger if not row.named]
+    for row in mistaken:
+        raised = row.gain_error_after_percent - worst.get((row.robot, row.seed), NAN)
+        if raised > WORSE_PERCENT:
+            lines.append(f"worst gain {raised:.2f} points worse than the clean cell's: {_place(row)}")
+    return "\n".join(lines)
+
+
+def _place(row: MistakeRow) -> str:
+    found = "" if row.named else ", not named"
+    others = f", but {', '.join(row.others)}" if row.others else ""
+    return f"{row.robot}, seed {row.seed}, {row.mistake} {row.axis} {row.size:.4g}{found}{others}"
 
 
 def _figures(rows: Sequence[MistakeRow]) -> str:
@@ -155,7 +186,7 @@ def main(arguments: list[str] | None = None) -> int:
     if len(rows) == len(every) and {unit.name for unit in every} == {unit.name for unit in units}:
         replace_file(TABLE, table)
         replace_file(SUMMARY, as_csv(summary(rows)).encode())
-    print_line(f"\n{left} units of this piece were not begun\n\n{summary(rows)}")
+    print_line(f"\n{left} units of this piece were not begun\n\n{summary(rows)}\n\n{totals(rows)}")
     return 0
 
 

@@ -98,6 +98,18 @@ class Timeline(can.BusABC):
         return None
 
 
+class ProducerOnTimeline(Producer):
+    """The axis that sends SYNC by itself on such a bus."""
+
+    def __init__(self, timeline: Timeline) -> None:
+        super().__init__("J1", PERIOD_NS // 1000)
+        self._timeline = timeline
+
+    def pause(self) -> None:
+        """Stop it at once."""
+        self._timeline.pause()
+
+
 def run(
     delays_ns: Sequence[Sequence[int]],
     stops_ns: Sequence[tuple[int, int]],
@@ -119,9 +131,7 @@ def run(
         bus = SplitBus(SplitAddress(tuple(parts)), ends, lambda: clock.now_ns * 1e-9)
     network.link._bus = bus
     network.link.sync_producer = "J1" if producer else None
-    j1 = Producer("J1", PERIOD_NS // 1000)
-    j1.pause = ends[0].pause  # type: ignore[method-assign]
-    followed = FollowedSync(PERIOD_NS, j1, timeout_s=0.1, clock=clock)
+    followed = FollowedSync(PERIOD_NS, ProducerOnTimeline(ends[0]), timeout_s=0.1, clock=clock)
     stream = SyncStream(network, followed if producer else TimedSync(PERIOD_NS, 0, clock))
     samples = [stream.advance() for _ in range(CYCLES)]
     if to_the_end:
