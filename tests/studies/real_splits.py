@@ -146,8 +146,9 @@ def judge_unit(unit: SplitUnit) -> tuple[JudgedEffect, ...]:
     spent_s = time.process_time() - begun_s
     written = written_effects(steps)
     start = gather(found, rest, unseen)
-    end = _around(start, steps[-1].after)
-    end = with_effects(end, written)
+    end = start  # where nothing is written; a refit would differ by rounding, and that alike in all blocks
+    if written:
+        end = with_effects(_around(start, steps[-1].after), written)
     names = [placed.name_among(cell.axis_names) for placed in written]
     rows = [_judged(unit, cell.axis_names, EVERYTHING, start, end, tuple(names), spent_s)]
     for placed, name in zip(written, names, strict=True):
