@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ident.arrays import FloatArray
 from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, prepare_search, score_candidates
 from ident.discovery.evidence import (
     Evidence,
@@ -233,9 +234,9 @@ def _refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
     """Why an effect of a joint fit may be a disturbance in the position loop alone; empty where it may not.
 
     A torque that disturbs the arm moves it, and comes back in the current: columns of the recorded motion then explain
-    a part of it, which those of the demanded motion do not. Their coefficients may be zero, and are nearer to zero than
-    to those of the fit. Instruments that would not show an effect of that size refute no named one; nor do those by
-    which nothing can be fitted.
+    a part of it, which those of the demanded motion do not. What the columns explain is then nearer to zero by
+    instruments than to the fit: it may be zero, or it is another number than that of the fit. Instruments that would
+    not show an effect of that size refute no named one; nor do those by which nothing can be fitted.
     """
     try:
         estimate = by_instruments(evidence)
@@ -247,14 +248,39 @@ def _refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
     place = len(estimate.gains) + own
     values = values_of(estimate, own)
     fitted = values_of(evidence.estimate, own)
-    covariance = estimate.covariance[np.ix_(place, place)]
-    if not (why := in_noise(values, covariance, SHOWN)):
-        return ""
+    why = _contradiction(placed, values, fitted, estimate.covariance[np.ix_(place, place)])
+    return f"with instruments from the demanded motion, {why}" if why else ""
+
+
+def _contradiction(placed: PlacedEffect, values: FloatArray, fitted: FloatArray, covariance: FloatArray) -> str:
+    """Why coefficients by instruments contradict those of a fit; empty where they do not.
+
+    Args:
+        placed: the effect.
+        values: of its coefficients by instruments, shape (p,).
+        fitted: the same of the fit.
+        covariance: of the values, shape (p, p).
+    """
+    may_be_zero = in_noise(values, covariance, SHOWN)
+    if may_be_zero and is_unnamed(placed.effect):
+        return may_be_zero
     precision = np.linalg.pinv(covariance, hermitian=True)
-    nearer = float(fitted @ precision @ (fitted - 2.0 * values)) > 0.0  # |values − fitted|² > |values|²
-    if not is_unnamed(placed.effect) and (not nearer or in_noise(fitted, covariance)):
+    is_nearer_to_zero = float(fitted @ precision @ (fitted - 2.0 * values)) > 0.0  # |values − fitted|² > |values|²
+    if not is_nearer_to_zero:
         return ""
-    return f"with instruments from the demanded motion, {why}"
+    if may_be_zero:
+        would_be_seen = not in_noise(fitted, covariance)
+        return may_be_zero if would_be_seen else ""
+    differs = not in_noise(fitted - values, covariance, SHOWN)
+    return _sizes_text(placed, values, fitted) if differs else ""
+
+
+def _sizes_text(placed: PlacedEffect, values: FloatArray, fitted: FloatArray) -> str:
+    """Say how large an effect is by instruments, and by the fit."""
+    parts: list[str] = []
+    for column, value, found in zip(placed.effect.coefficients, values, fitted, strict=True):
+        parts.append(f"{column.name} is {value:.3g} {column.unit}, not {found:.3g} as in the fit")
+    return ", ".join(parts)
 
 
 def _pruned(model: JointFit, accepted: Finding, rng: np.random.Generator, gates: Gates) -> JointFit | SetAside:
