@@ -41,7 +41,8 @@ _DARK = {
 _CODE = re.compile("`([^`\n]+)`")
 _NUMBER = re.compile(r"[+\-±]?([\d.]+(e[+-]?\d+)?|nan|inf)( .*)?|-")
 DRAWING = """
-svg text { fill: var(--ink); font: 14px system-ui, sans-serif; font-variant-numeric: tabular-nums; }
+svg text { fill: var(--ink); font: 14px system-ui, sans-serif; font-variant-numeric: tabular-nums;
+  stroke: var(--paper); stroke-width: 4px; stroke-linejoin: round; paint-order: stroke; }
 svg .soft { fill: var(--soft); font-size: 13px; } svg .end { text-anchor: end; } svg .mid { text-anchor: middle; }
 svg .grid { stroke: var(--line); } svg .zero { stroke: var(--ink); } svg .limit { stroke: var(--act); stroke-width: 2; }
 svg .range { fill: var(--shade); } svg .band { fill: var(--data); opacity: 0.25; }
@@ -56,7 +57,7 @@ svg .other { stroke: var(--act); stroke-width: 2; stroke-dasharray: 5 3; }
 svg .cloud { stroke-width: 2.2; stroke-linecap: round; opacity: 0.4; }
 svg .rest { stroke: var(--act); stroke-width: 2.2; stroke-linecap: round; opacity: 0.4; }
 """
-"""Style of the drawings of `daq.report.svg`."""
+"""Style of the drawings of `daq.report.svg`. A text has an edge in the colour of the paper: no line crosses it."""
 
 
 def palette(light: Mapping[str, str], dark: Mapping[str, str]) -> str:

@@ -191,7 +191,8 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
         ranking = figure(
             plot_ranking(ranked, () if added is None else added.ambiguity, axes),
             "Candidates by how much they reduce the error of left-out moves. Full: passed every check. Pale: these "
-            "data cannot distinguish it from the added one. Hollow: failed a check.",
+            "data cannot distinguish it from the added one. Hollow: failed a check. The scale counts the squared "
+            "noise of one sample as 1.",
         )
     in_words = [
         f"Not added to {axes[aside.finding.axis]}: {effect_text(aside.finding.effect, axes)}: {aside.reason(axes)}."
