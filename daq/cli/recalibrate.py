@@ -1,4 +1,4 @@
-"""`drivegain recalibrate` and `install-units`: the scheduled job, which moves the robot, and the timer that runs it."""
+"""`drivegain recalibrate` and `schedule`: the job, which moves the robot, and the timer that runs it."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ _SYSTEM = Path("/etc/systemd/system")
 _OF_USER = Path(".config/systemd/user")
 
 
-def install_units(
+def schedule_verb(
     cell: Annotated[Path, typer.Argument(help="Cell file with `recalibration`.")],
     to: Annotated[
         Path | None,
@@ -129,7 +129,8 @@ def install_units(
 ) -> None:
     """Create a service and a timer for `drivegain recalibrate`; the last lines printed show how to enable them.
 
-    The timer does not catch up on a missed date, and the job checks the interlock before every motion.
+    The timer does not catch up on a missed date, and the job checks the interlock before every motion. The earlier
+    name of this verb, `install-units`, goes on working.
     """
     from daq.config.cell_file import load_cell
     from daq.jobs.context import section_of, target_of
@@ -203,7 +204,7 @@ def check_schedule(schedule: str) -> None:
 
 def require_own_unit(path: Path, option: str = "") -> None:
     """Refuse to replace a file that this verb did not write, or a unit without the option of this cell."""
-    from daq.jobs.units import MARK
+    from daq.jobs.units import MARKS
 
     with writing(path):
         # Reading a pipe would block; only a regular file can be a unit of ours.
@@ -212,9 +213,9 @@ def require_own_unit(path: Path, option: str = "") -> None:
         return
     found = ""
     expected = ""
-    if text is None or not text.startswith(MARK):
+    if text is None or not text.startswith(MARKS):
         found = "a unit that drivegain did not write"
-        expected = "one of an earlier `install-units`"
+        expected = "one of an earlier `schedule`"
     elif option not in text:
         found = "the unit of another cell file"
         expected = f"one with {option}"
@@ -223,6 +224,4 @@ def require_own_unit(path: Path, option: str = "") -> None:
         raise UsageError(str(path), found=found, expected=f"no such file, or {expected}", remedy=remedy)
 
 
-INSTALL_UNITS = Verb(
-    "install-units", install_units, "drivegain install-units press-4/cells/press-4.yaml --schedule weekly"
-)
+SCHEDULE = Verb("schedule", schedule_verb, "drivegain schedule press-4/cells/press-4.yaml --schedule weekly")

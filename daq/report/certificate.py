@@ -75,7 +75,7 @@ class EarlierCalibration(Report):
 
 
 class CertificateReport(Report):
-    """`report`: the numbers of the certificate."""
+    """`certificate`: the numbers of the page."""
 
     format: Literal["drivegain-certificate"]
     version: Literal[1]

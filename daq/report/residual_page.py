@@ -69,7 +69,8 @@ def save_report(
 
 def beside_nameplate(fitted: Fit, calibration: Calibration) -> Comparison:
     """Compare the gains of a fit with the nameplate: a fit reads no controller."""
-    unread = "The controller was not read; `drivegain report calibration.yaml --cell CELL` compares with its gains."
+    command = "`drivegain certificate calibration.yaml --cell CELL`"
+    unread = f"The controller was not read; {command} compares with its gains."
     return without_controller(calibration, unread, datetime.fromisoformat(calibration.created), fitted.cell)
 
 

@@ -64,7 +64,7 @@ def test_a_cell_without_the_section_names_what_it_lacks(
     tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cell = checkout / "configs" / "cells" / "demo.yaml"
-    for verb in ("recalibrate", "install-units"):
+    for verb in ("recalibrate", "schedule", "install-units"):
         assert main([verb, "--cell", str(cell)]) == ExitCode.CONFIGURATION
         assert "recalibration" in capsys.readouterr().err
 

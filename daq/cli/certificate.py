@@ -1,4 +1,4 @@
-"""`drivegain report`: the certificate of a calibration as one page."""
+"""`drivegain certificate`, once called `report`: the certificate of a calibration as one page."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.terminal import check_folder, check_replaceable, print_view, write_output
+from daq.cli.terminal import check_folder, check_page, check_replaceable, print_view, write_output
 from daq.cli.verb import CalibrationArgument, JsonOption, Verb, output_option, print_json
 from daq.files import replace_file
 
 
-def report_verb(
+def certificate_verb(
     calibration: CalibrationArgument,
     out: Annotated[
         Path | None,
@@ -29,7 +29,8 @@ def report_verb(
     """Write the certificate of a calibration: one page for screen, phone and paper, without network or script.
 
     It shows each gain beside the one in the controller with the limits, the error on held-out runs, the effects, what
-    would be written where, and one verdict. Nothing is written to the controller.
+    would be written where, and one verdict. Nothing is written to the controller. The earlier name of this verb,
+    `report`, goes on working.
     """
 
     from daq.config.cell_file import load_cell
@@ -40,6 +41,7 @@ def report_verb(
     from daq.writeback.request import Request
 
     page = out or calibration.with_suffix(".html")
+    check_page(page, "--out")
     check_folder(page)
     check_replaceable(page, MARK, "page of drivegain")
     content = read_calibration_bytes(calibration)
@@ -61,4 +63,4 @@ def report_verb(
         print_view((certificate.sentence,), page)
 
 
-REPORT = Verb("report", report_verb, "drivegain report calibration.yaml --cell CELL")
+CERTIFICATE = Verb("certificate", certificate_verb, "drivegain certificate calibration.yaml --cell CELL")
