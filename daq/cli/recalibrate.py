@@ -18,7 +18,7 @@ from daq.advice import for_command_line
 from daq.cli.terminal import interruptible
 from daq.cli.verb import JsonOption, Verb, output_option, print_json
 from daq.environment import login
-from daq.errors import DaqError, ExitCode, UsageError, exit_code, writing
+from daq.errors import DaqError, ExitCode, OutputFailed, UsageError, exit_code, writing
 from daq.files import replace_file
 from daq.report.text import printable
 from drivers.errors import DriverError, all_notes, stop_notes
@@ -70,12 +70,14 @@ def recalibrate_verb(
 def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> None:
 
     from daq.config.cell_file import load_cell
+    from daq.documents.session_state import Outcome
     from daq.jobs.context import Tools
     from daq.jobs.job import preview, recalibrate
+    from daq.jobs.journal import Level
     from daq.jobs.reporting import conclusion_report, text
     from daq.jobs.session import CALIBRATION
     from daq.log.feed import Feed
-    from daq.report.certificate import compare
+    from daq.report.comparison import compare
     from daq.report.job_schemas import DryRunReport
     from daq.report.residual_page import save_report
     from daq.workflow.record import record
@@ -86,11 +88,14 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
         declared = replace(declared, recalibration=replace(declared.recalibration, every_h=0.0))
     who = f"drivegain recalibrate, {login()}"
     with interruptible() as block_signals, Feed(cell) as feed:
+        fits: list[tuple[Fit, Account, Calibration, Path]] = []
 
         def certify(fitted: Fit, changed: Account, calibration: Calibration, folder: Path) -> None:
             request = Request(calibration, datetime.now(UTC))
             command = f"drivegain apply {shlex.quote(str(cell))} {shlex.quote(str(folder.parent / CALIBRATION))}"
-            save_report(fitted, changed, calibration, folder, compare(declared, request, command))
+            compared = compare(declared, request, command)
+            save_report(fitted, changed, calibration, folder, compared, session=folder.parent.name)
+            fits.append((fitted, changed, calibration, folder))
 
         tools = Tools(save_report=certify, record=partial(record, feed=feed))
         if dry_run:
@@ -101,6 +106,12 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
                 typer.echo("\n".join((f"Dry run: {seen.remark}", *(f"  {step}" for step in seen.steps))))
             return
         ended = recalibrate(cell, declared, tools, journal, who=who, block_signals=block_signals)
+        if ended.outcome is Outcome.APPLIED and fits:
+            # Once more: the first certificate was made before the gains were written.
+            try:
+                certify(*fits[-1])
+            except OutputFailed as error:
+                journal.say(Level.WARNING, "the certificate does not say that the gains are written", text=str(error))
     if json:
         print_json(conclusion_report(ended, cell))
     else:
