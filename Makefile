@@ -20,7 +20,7 @@ help:
 	@echo "make test-processes  whole jobs: the tutorial followed to the letter, jobs that are killed, two buses, real recordings"
 	@echo "make test-vcan  the main job over real SocketCAN (vcan), under User-Mode Linux where this kernel has none"
 	@echo "make chaos    random faults at random moments on SocketCAN for 10 minutes; SEED=1 MINUTES=10 or ROUND=7 (docs/evidence/socketcan.md)"
-	@echo "make test-console  the live console in headless Chromium beside whole recordings; screenshots in out/console"
+	@echo "make test-console  the live console in headless Chromium beside whole recordings, screenshots in out/console; the certificate on paper"
 	@echo "make docs    build the documentation site into out/docs, offline, warnings as errors"
 	@echo "make screenshots  refresh the pictures of the documentation from real commands; minutes"
 	@echo "make setup   make .venv alone"
@@ -111,7 +111,7 @@ vcan-tools:
 CHROMIUM = $$(command -v chromium || command -v chromium-browser || command -v google-chrome)
 
 test-console: setup browser
-	DRIVEGAIN_CHROMIUM="$(CHROMIUM)" $(BIN)/python -m pytest -q -m browser tests/daq/console
+	DRIVEGAIN_CHROMIUM="$(CHROMIUM)" $(BIN)/python -m pytest -q -m browser tests/daq/console tests/daq/report
 
 browser:
 	@[ -n "$(CHROMIUM)" ] || { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq && \

@@ -32,6 +32,9 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers", "processes: a whole job: on several processes or buses, or a real recording (make test-processes)"
     )
+    config.addinivalue_line(
+        "markers", "browser: drives Chromium, where DRIVEGAIN_CHROMIUM names it (make test-console)"
+    )
 
 
 def pytest_sessionstart() -> None:

@@ -39,7 +39,7 @@ BY_JOB = {
         Listed("fit", "daq.cli.fit:FIT", "Identify all drive gains and dynamic parameters."),
         Listed("residual", "daq.cli.fit:RESIDUAL", "Fit, then detect and add missing effects."),
         Listed("validate", "daq.cli.validate:VALIDATE", "Predict the torque of other logs with a calibration."),
-        Listed("report", "daq.cli.report:REPORT", "Write the certificate of a calibration as one page."),
+        Listed("certificate", "daq.cli.certificate:CERTIFICATE", "Judge a calibration on one page, to print and sign."),
         Listed("apply", "daq.cli.apply:APPLY", "Write gains to the controller; a dry run without --yes."),
         Listed("rollback", "daq.cli.apply:ROLLBACK", "Undo the last write."),
     ),
@@ -52,7 +52,7 @@ BY_JOB = {
     ),
     Job.MAINTAIN: (
         Listed("recalibrate", "daq.cli.recalibrate:RECALIBRATE", "Scheduled job: record, fit, propose or apply."),
-        Listed("install-units", "daq.cli.recalibrate:INSTALL_UNITS", "Schedule the job with systemd or cron."),
+        Listed("schedule", "daq.cli.recalibrate:SCHEDULE", "Run the job on a schedule, by systemd or cron."),
         Listed("sign", "daq.cli.sign:SIGN", "Sign a calibration as its second approver."),
         Listed("fleet", "daq.cli.fleet:FLEET", "Fit the logs of many cells."),
         Listed("salvage", "daq.cli.logs:SALVAGE", "Save the readable part of an unfinished or damaged log."),
@@ -67,6 +67,8 @@ BY_JOB = {
 }
 """Verbs by job, in the order of the help; each is imported when it is called."""
 VERBS = tuple(listed for verbs in BY_JOB.values() for listed in verbs)
+ALIASES = {"report": "certificate", "install-units": "schedule"}
+"""Names of earlier versions, which go on working; the help and the completion do not list them."""
 
 
 class _Verbs(TyperGroup):
@@ -74,7 +76,9 @@ class _Verbs(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         """Return name, command and remaining arguments, with the verb itself in place of its placeholder."""
-        name, command, rest = super().resolve_command(ctx, args)
+        first, *others = args
+        named = ALIASES.get(first, first)
+        name, command, rest = super().resolve_command(ctx, [named, *others])
         listed = next((listed for listed in VERBS if listed.name == name), None)
         return name, command if listed is None else listed.load().command(), rest
 

@@ -47,7 +47,7 @@ def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: Json
         with suppress(DaqError):
             load_calibration(log)
             error.found = "a calibration"
-            error.remedy = f"`drivegain report {log}` reads it"
+            error.remedy = f"`drivegain certificate {log}` reads it"
         raise
     if json:
         print_json(report)

@@ -11,7 +11,14 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.terminal import check_folder, check_output, check_replaceable, progress_bar, write_output
+from daq.cli.terminal import (
+    check_folder,
+    check_output,
+    check_page,
+    check_replaceable,
+    progress_bar,
+    write_output,
+)
 from daq.cli.verb import CellArgument, JsonOption, Verb, output_option, print_json, say_next
 from daq.errors import UsageError
 from daq.files import replace_file
@@ -54,6 +61,7 @@ def plan_verb(
     if preview is not None:
         if os.path.realpath(preview) == os.path.realpath(out):
             raise UsageError("--preview", found="the name of --out", expected="another", remedy="choose another name")
+        check_page(preview, "--preview")
         check_folder(preview)
         check_replaceable(preview, MARK, "preview of a plan")
     declared = load_cell(cell)

@@ -1,4 +1,4 @@
-"""`drivegain recalibrate` and `install-units`: the scheduled job, which moves the robot, and the timer that runs it."""
+"""`drivegain recalibrate` and `schedule`: the job, which moves the robot, and the timer that runs it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from daq.advice import for_command_line
 from daq.cli.terminal import interruptible
 from daq.cli.verb import JsonOption, Verb, output_option, print_json
 from daq.environment import login
-from daq.errors import DaqError, ExitCode, UsageError, exit_code, writing
+from daq.errors import DaqError, ExitCode, OutputFailed, UsageError, exit_code, writing
 from daq.files import replace_file
 from daq.report.text import printable
 from drivers.errors import DriverError, all_notes, stop_notes
@@ -70,12 +70,14 @@ def recalibrate_verb(
 def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> None:
 
     from daq.config.cell_file import load_cell
+    from daq.documents.session_state import Outcome
     from daq.jobs.context import Tools
     from daq.jobs.job import preview, recalibrate
+    from daq.jobs.journal import Level
     from daq.jobs.reporting import conclusion_report, text
     from daq.jobs.session import CALIBRATION
     from daq.log.feed import Feed
-    from daq.report.certificate import compare
+    from daq.report.comparison import compare
     from daq.report.job_schemas import DryRunReport
     from daq.report.residual_page import save_report
     from daq.workflow.record import record
@@ -86,11 +88,14 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
         declared = replace(declared, recalibration=replace(declared.recalibration, every_h=0.0))
     who = f"drivegain recalibrate, {login()}"
     with interruptible() as block_signals, Feed(cell) as feed:
+        fits: list[tuple[Fit, Account, Calibration, Path]] = []
 
         def certify(fitted: Fit, changed: Account, calibration: Calibration, folder: Path) -> None:
             request = Request(calibration, datetime.now(UTC))
             command = f"drivegain apply {shlex.quote(str(cell))} {shlex.quote(str(folder.parent / CALIBRATION))}"
-            save_report(fitted, changed, calibration, folder, compare(declared, request, command))
+            compared = compare(declared, request, command)
+            save_report(fitted, changed, calibration, folder, compared, session=folder.parent.name)
+            fits.append((fitted, changed, calibration, folder))
 
         tools = Tools(save_report=certify, record=partial(record, feed=feed))
         if dry_run:
@@ -101,6 +106,12 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
                 typer.echo("\n".join((f"Dry run: {seen.remark}", *(f"  {step}" for step in seen.steps))))
             return
         ended = recalibrate(cell, declared, tools, journal, who=who, block_signals=block_signals)
+        if ended.outcome is Outcome.APPLIED and fits:
+            # Once more: the first certificate was made before the gains were written.
+            try:
+                certify(*fits[-1])
+            except OutputFailed as error:
+                journal.say(Level.WARNING, "the certificate does not say that the gains are written", text=str(error))
     if json:
         print_json(conclusion_report(ended, cell))
     else:
@@ -116,7 +127,7 @@ _SYSTEM = Path("/etc/systemd/system")
 _OF_USER = Path(".config/systemd/user")
 
 
-def install_units(
+def schedule_verb(
     cell: Annotated[Path, typer.Argument(help="Cell file with `recalibration`.")],
     to: Annotated[
         Path | None,
@@ -129,7 +140,8 @@ def install_units(
 ) -> None:
     """Create a service and a timer for `drivegain recalibrate`; the last lines printed show how to enable them.
 
-    The timer does not catch up on a missed date, and the job checks the interlock before every motion.
+    The timer does not catch up on a missed date, and the job checks the interlock before every motion. The earlier
+    name of this verb, `install-units`, goes on working.
     """
     from daq.config.cell_file import load_cell
     from daq.jobs.context import section_of, target_of
@@ -203,7 +215,7 @@ def check_schedule(schedule: str) -> None:
 
 def require_own_unit(path: Path, option: str = "") -> None:
     """Refuse to replace a file that this verb did not write, or a unit without the option of this cell."""
-    from daq.jobs.units import MARK
+    from daq.jobs.units import MARKS
 
     with writing(path):
         # Reading a pipe would block; only a regular file can be a unit of ours.
@@ -212,9 +224,9 @@ def require_own_unit(path: Path, option: str = "") -> None:
         return
     found = ""
     expected = ""
-    if text is None or not text.startswith(MARK):
+    if text is None or not text.startswith(MARKS):
         found = "a unit that drivegain did not write"
-        expected = "one of an earlier `install-units`"
+        expected = "one of an earlier `schedule`"
     elif option not in text:
         found = "the unit of another cell file"
         expected = f"one with {option}"
@@ -223,6 +235,4 @@ def require_own_unit(path: Path, option: str = "") -> None:
         raise UsageError(str(path), found=found, expected=f"no such file, or {expected}", remedy=remedy)
 
 
-INSTALL_UNITS = Verb(
-    "install-units", install_units, "drivegain install-units press-4/cells/press-4.yaml --schedule weekly"
-)
+SCHEDULE = Verb("schedule", schedule_verb, "drivegain schedule press-4/cells/press-4.yaml --schedule weekly")

@@ -95,6 +95,18 @@ def check_folder(out: Path | None) -> None:
         )
 
 
+def check_page(out: Path, option: str) -> None:
+    """Refuse a name for a page whose suffix says another format than HTML."""
+    if out.suffix.lower() in ("", ".html"):
+        return
+    raise UsageError(
+        f"{option} {out}",
+        found=f"a name that ends in {out.suffix}",
+        expected="a name that ends in .html",
+        remedy="choose such a name; a browser prints the page, or saves it as a PDF",
+    )
+
+
 def check_replaceable(out: Path, mark: str, kind: str) -> None:
     """Refuse to overwrite a file of another kind: one that is not empty and lacks the mark of this kind in its head.
 

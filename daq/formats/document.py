@@ -17,6 +17,7 @@ To add a format:
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -36,6 +37,11 @@ FORMATS: dict[ControllerFormat, tuple[Callable[[bytes, str], ControllerDocument]
     ControllerFormat.DCF: (dcf_document, (".dcf", ".eds")),
 }
 """Reader of each format (content and name of the file), and the suffixes of its files."""
+_COMMENTS: dict[ControllerFormat, re.Pattern[str]] = {
+    ControllerFormat.YAML: re.compile(r"[^\r\n#]*[ \t]#[ \t]*([^\r\n]*[^\s])"),
+    ControllerFormat.XML: re.compile(r"[^\r\n]*?<!--[ \t]*([^\r\n]*?)[ \t]*-->"),
+}
+"""Comment behind a number, by format; the other formats have none on the line of a number."""
 
 
 def format_of(name: str) -> ControllerFormat:
@@ -45,6 +51,21 @@ def format_of(name: str) -> ControllerFormat:
             if suffix.lower() in suffixes:
                 return known
     return ControllerFormat.YAML
+
+
+def comment_behind(rest: str, name: str, format: ControllerFormat | None = None) -> str:  # noqa: A002
+    """Return the comment behind a number on its line, empty where there is none.
+
+    Args:
+        rest: text of the file behind the number.
+        name: of the file.
+        format: of the file; None where its name says it.
+    """
+    pattern = _COMMENTS.get(format or format_of(name))
+    if pattern is None:
+        return ""
+    found = pattern.match(rest)
+    return "" if found is None else found[1]
 
 
 def decode_document(content: bytes, name: str, format: ControllerFormat | None = None) -> ControllerDocument:  # noqa: A002

@@ -76,6 +76,19 @@ def sessions(folder: Path, cell: str | None = None) -> tuple[Session, ...]:
     return tuple(sorted(found, key=lambda session: (session.began, session.folder.name)))
 
 
+def session_of(calibration: Path, digest: str) -> str | None:
+    """Return the name of the session that made a calibration; None for a file in no session's folder.
+
+    Args:
+        calibration: its file.
+        digest: SHA-256 of the file, as the session noted it.
+    """
+    state = _read(calibration.resolve().parent / STATE)
+    if state is None or state.fitted is None or state.fitted.calibration_sha256 != digest:
+        return None
+    return state.session
+
+
 @contextmanager
 def _listing(folder: Path) -> Iterator[None]:
     try:

@@ -13,8 +13,10 @@ from daq.config.cell import Cell
 from daq.config.recalibration import Recalibration
 from daq.errors import ExitCode, UsageError
 
-MARK = "# Made by `drivegain install-units`, which may replace this file."
-"""First line of what is ours; a file of that name without it is not ours."""
+MARK = "# Made by `drivegain schedule`, which may replace this file."
+"""First line of a unit that drivegain made."""
+MARKS = (MARK, "# Made by `drivegain install-units`, which may replace this file.")
+"""The same and that of earlier versions; a file of that name without one of them is not ours."""
 _SEARCHED = (("systemd", "system"), ("systemd", "user"))  #: Ends of the folders in which systemd finds units
 STOP_S = 30  #: Time for the axes to stop and the session to be saved, after SIGTERM [s]
 CRON = {"hourly": "0 * * * *", "daily": "0 3 * * *", "weekly": "0 3 * * 0", "monthly": "0 3 1 * *"}

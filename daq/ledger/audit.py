@@ -48,6 +48,8 @@ class AuditAction(Enum):
     NOTHING_TO_DO = "nothing to do"  #: A write was asked for, and the target had this content already
     RECALIBRATION_BEGUN = "recalibration begun"
     RECALIBRATION_ENDED = "recalibration ended"
+    ACCEPTED = "accepted"
+    """A calibration was tried in the cell and accepted; details: cell, session, SHA-256 of the calibration's file."""
     ACKNOWLEDGED = "acknowledged"
     CALIBRATION_ENTERED = "calibration entered"
     """The history has this calibration; details: SHA-256 of its file, cell, time, document, and its figures."""

@@ -67,7 +67,14 @@ WRITES = frozenset(
     }
 )
 """What `record_write` enters."""
-SESSIONS = frozenset({AuditAction.PROPOSED, AuditAction.RECALIBRATION_BEGUN, AuditAction.RECALIBRATION_ENDED})
+SESSIONS = frozenset(
+    {
+        AuditAction.PROPOSED,
+        AuditAction.RECALIBRATION_BEGUN,
+        AuditAction.RECALIBRATION_ENDED,
+        AuditAction.ACCEPTED,
+    }
+)
 """What `record_session` enters."""
 
 
@@ -191,14 +198,14 @@ def record_write(
 def record_session(
     audit: Path, action: AuditAction, *, at: datetime, who: str, subject: str, details: Mapping[str, object]
 ) -> AuditEntry:
-    """Enter a step of a scheduled job, which writes to no controller.
+    """Enter a step of a session, which writes to no controller.
 
     Raises:
         ValueError: the action is none of `SESSIONS`.
         AuditUnusable, OutputFailed: it could not be recorded.
     """
     if action not in SESSIONS:
-        raise ValueError(f"{action.value!r} is no step of a job")
+        raise ValueError(f"{action.value!r} is no step of a session")
     with writing(audit):
         return append(audit, action, at=at, who=who, subject=subject, details=details)
 

@@ -1,4 +1,4 @@
-"""The certificate as a page: the first sheet for everybody, what it rests on folded below."""
+"""The certificate as a page: one sheet to print and sign, and on the screen what it rests on, folded below."""
 
 from __future__ import annotations
 
@@ -6,14 +6,33 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from daq.report.certificate import EARLIER, AxisRow, Certificate, Verdict, identity
+from daq.report.certificate import EARLIER, AxisRow, Certificate, Verdict
+from daq.report.certificate_status import status_text
 from daq.report.effect_names import WORDS, accepted_text, curve_of, size_text
 from daq.report.gains import MASS_HEADINGS, mass_rows, value_rows, warning_texts, with_deviation
-from daq.report.html import element, figure, folded, html_list, html_page, pair, paragraph, section, table, terms
+from daq.report.html import (
+    element,
+    figure,
+    folded,
+    html_list,
+    html_page,
+    on_paper,
+    on_screen,
+    pair,
+    paragraph,
+    part,
+    section,
+    signature_line,
+    table,
+    terms,
+)
+from daq.report.identity import identity
 from daq.report.picture import QUANTITY
 from daq.report.svg import Interval, Line, before_after_drawing, chart, intervals
 from daq.report.text import SHOWN_SIGMAS, percent_text
-from ident.calibration import AcceptedEffect, Calibration
+from daq.writeback.file_target import FileEdit
+from daq.writeback.request import GainChange
+from ident.calibration import AcceptedEffect, Calibration, Source
 from ident.estimators.estimate import RelativeError
 
 _LOOK = {Verdict.REFUSED: "act", Verdict.WAITING: "act", Verdict.UNCHANGED: "quiet", Verdict.NOT_COMPARED: "quiet"}
@@ -50,34 +69,50 @@ def certificate_page(certificate: Certificate, consequence: str = "", details: S
         consequence: what the effects change in the gains, a sentence; empty where it is not known.
         details: further folded sections, before those of the calibration itself.
     """
-    calibration, look = certificate.calibration, _LOOK.get(certificate.verdict, "")
+    calibration = certificate.calibration
+    look = _LOOK.get(certificate.verdict, "")
+    sign = _SIGN[certificate.verdict]
+    if certificate.comparison.in_force is not None and certificate.verdict is not Verdict.REFUSED:
+        look = ""
+        sign = _SIGN[Verdict.READY]
     return html_page(
-        f"Calibration of cell {calibration.cell}",
+        f"Calibration of cell {calibration.cell}, certificate {certificate.origin.id}",
         (
             '<main class="sheet">',
-            paragraph("Calibration certificate", "kind"),
+            paragraph(f"Calibration certificate {certificate.origin.id}", "kind"),
             element("h1", f"Cell {calibration.cell}"),
-            paragraph(f"{_SIGN[certificate.verdict]} {certificate.sentence}", f"verdict {look}"),
+            paragraph(f"{sign} {certificate.sentence}", f"verdict {look}"),
             *_next(certificate, look),
             *_warnings(certificate),
-            terms(identity(calibration).items()),
+            terms(_facts(certificate).items()),
             _gains(certificate),
             _effects(calibration, consequence),
-            _write(certificate),
+            _digests(certificate),
+            signature_line("Name", "Date", "Signature"),
             "</main>",
             *_since(certificate),
             '<section class="details">',
             element("h2", "Details"),
             *details,
-            *_evidence(calibration),
+            *_evidence(certificate),
             "</section>",
         ),
     )
 
 
+def _facts(certificate: Certificate) -> dict[str, str]:
+    """State, session and identity of the calibration, by name."""
+    facts = {"Status": status_text(certificate.comparison)}
+    if certificate.origin.session is not None:
+        facts["Session"] = certificate.origin.session
+    return facts | identity(certificate.calibration)
+
+
 def _next(certificate: Certificate, look: str) -> Iterator[str]:
     """The next step, below the verdict."""
     comparison = certificate.comparison
+    if comparison.in_force is not None:
+        return
     if comparison.unread:
         yield paragraph(comparison.unread, f"next {look}")
     elif comparison.command and certificate.verdict in {Verdict.READY, Verdict.WAITING}:
@@ -95,7 +130,7 @@ def _warnings(certificate: Certificate) -> Iterator[str]:
 
 
 def _gains(certificate: Certificate) -> str:
-    place = "in the controller" if certificate.comparison.edit is not None else "nameplate"
+    place = certificate.shown_place
     rows = [
         (
             row.change.axis,
@@ -103,15 +138,15 @@ def _gains(certificate: Certificate) -> str:
             f"{with_deviation(gain.value, gain.std)} {gain.unit}",
             _percent(row.change.change_percent),
             _limit(row.allowed_percent),
-            row.words(certificate.place),
+            row.words(place),
         )
-        for gain, row in zip(certificate.calibration.gains, certificate.rows, strict=True)
+        for gain, row in zip(certificate.calibration.gains, certificate.shown, strict=True)
     ]
     return section(
         "Drive gains",
         table("", ("axis", place, "identified ± σ", "change [%]", "limit [%]", "verdict"), rows, "words"),
         paragraph(f"{certificate.note[0].upper()}{certificate.note[1:]}."),
-        pair((_changes(certificate), *_errors(certificate.calibration))),
+        pair((_changes(certificate), *_errors(certificate.calibration), _write(certificate))),
     )
 
 
@@ -129,9 +164,9 @@ def _interval(row: AxisRow) -> Interval:
 
 def _changes(certificate: Certificate) -> str:
     """Gains beside their limits."""
-    place = certificate.place
-    drawn = intervals([_interval(row) for row in certificate.rows], "Change of each gain", f"from the {place} [%]")
-    caption = f"0 is the gain of the {place}. Bar: ± 2 σ, often shorter than the dot. Shaded: within the limits."
+    place = certificate.shown_place
+    drawn = intervals([_interval(row) for row in certificate.shown], "Change of each gain", f"from the {place} [%]")
+    caption = f"0 is the {place}. Bar: ± 2 σ, often shorter than the dot. Shaded: within the limits."
     return figure(drawn, caption, f"Change from the {place}")
 
 
@@ -204,21 +239,62 @@ def _effect(effect: AcceptedEffect, calibration: Calibration) -> str:
     torque = f"{QUANTITY[shown.force]} [{shown.force}]{against}"
     title = f"{effect.axis}: {QUANTITY[shown.force]} that the declared model lacks"
     drawn = chart((Line(shown.x, shown.torque_nm),), title, (shown.variable, torque), half=shown.half_nm)
-    return text + figure(drawn, band, title)
+    return text + on_screen(figure(drawn, band, title))
 
 
 def _write(certificate: Certificate) -> str:
-    edit = certificate.comparison.edit
+    """What was written into the controller's file, or would be; empty for gains that must not be written."""
+    comparison = certificate.comparison
+    edit = comparison.edit
     if edit is None:
         return ""
+    place = "/".join(edit.file.parts[-2:])
+    if comparison.in_force is not None and certificate.before is not None:
+        before = {one.axis: one.old for one in certificate.before.changes}
+        rows = [_written_row(one, before[one.axis], f"{one.old:.9g}") for one in edit.changes]
+        return part(
+            f"What was written into {place}",
+            table("", ("axis", "key", "line", "previous", "current"), rows),
+            *_old_comments(edit),
+        )
+    if comparison.in_force is not None or certificate.verdict is Verdict.REFUSED:
+        return ""
     if not edit.has_effect:
-        return section("What would be written", paragraph(f"Nothing: {edit.file.name} has these gains already."))
-    rows = [(one.axis, one.key, str(one.line), f"{one.old:.9g}", one.spelling or "-") for one in edit.changes]
-    return section(
-        f"What would be written into {'/'.join(edit.file.parts[-2:])}",
-        table("", ("axis", "key", "line", "now", "new"), rows),
+        return part("What would be written", paragraph(f"Nothing: {edit.file.name} has these gains already."))
+    rows = [_written_row(one, one.old, one.spelling or "-") for one in edit.changes]
+    return part(
+        f"What would be written into {place}",
+        table("", ("axis", "key", "line", "current", "new"), rows),
         paragraph("This page writes nothing."),
     )
+
+
+def _written_row(change: GainChange, old: float, new: str) -> tuple[str, ...]:
+    return change.axis, change.key, str(change.line), f"{old:.9g}", new
+
+
+def _old_comments(edit: FileEdit) -> Iterator[str]:
+    """Say that comments behind the gains are those of the earlier gains: a write changes numbers alone."""
+    comments = edit.comments
+    if comments:
+        axis, text = next(iter(comments.items()))
+        yield paragraph(f"The comment behind a gain is still the old one. {axis}: “{text}”.")
+
+
+def _digests(certificate: Certificate) -> str:
+    """Digests of all files that the certificate rests on, for paper: the screen has them in the details."""
+    calibration = certificate.calibration
+    rows = [("calibration", certificate.origin.sha256)]
+    if calibration.configuration_sha256:
+        rows.append(("configuration", calibration.configuration_sha256))
+    rows += [(_log_name(source), source.sha256) for source in calibration.sources]
+    return on_paper(element("h3", "SHA-256"), terms(rows))
+
+
+def _log_name(source: Source) -> str:
+    if source.role == "fit":
+        return source.name
+    return f"{source.name} ({_ROLES.get(source.role, source.role)})"
 
 
 def _since(certificate: Certificate) -> Iterator[str]:
@@ -280,8 +356,9 @@ def _rival_text(rival: str) -> str:
     return f"{WORDS.get(name, name)} {where}"
 
 
-def _evidence(calibration: Calibration) -> Iterator[str]:
+def _evidence(certificate: Certificate) -> Iterator[str]:
     """Basis of the calibration: ambiguity, parameters, filters and logs."""
+    calibration = certificate.calibration
     rivals = [
         (effect.axis, accepted_text(effect, calibration), "; ".join(map(_rival_text, effect.ambiguity)))
         for effect in calibration.effects
@@ -311,7 +388,7 @@ def _evidence(calibration: Calibration) -> Iterator[str]:
             "of a name (Iam, fvm, fsm): coupled motors. A sum is what motion shows of several links together; a name "
             "after a colon is a payload."
         ),
-        table("", ("parameter", "value ± σ", "unit"), value_rows(parameters)),
+        table("", ("parameter", "value ± σ", "unit"), value_rows(parameters), "stacked"),
     )
     filters = []
     for name, value in calibration.filter.items():
@@ -321,12 +398,12 @@ def _evidence(calibration: Calibration) -> Iterator[str]:
     fit = calibration.relative_error_percent
     yield folded(
         "Filters, logs and digests",
-        table("Filters", ("setting", "value"), filters),
-        table("Logs", ("log", "used for", "sha256"), logs),
+        table("Filters", ("setting", "value"), filters, "stacked"),
+        table("Logs", ("log", "used for", "sha256"), logs, "names"),
         paragraph(
             f"Estimator {_METHODS.get(calibration.method, calibration.method)}, {calibration.rows} rows, condition "
             f"{calibration.condition:.0f}; on the data of the fit the model leaves {percent_text(fit.total)} %. "
-            f"Configuration {calibration.configuration_sha256 or 'not known'}, made {calibration.created} by "
-            f"{calibration.software}."
+            f"Calibration {certificate.origin.sha256}, configuration "
+            f"{calibration.configuration_sha256 or 'not known'}, made {calibration.created} by {calibration.software}."
         ),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
@@ -213,7 +214,22 @@ def mass_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
 
 def value_rows(parameters: Iterable[Parameter]) -> list[tuple[str, str, str]]:
     """Return rows of a table of parameters: name, value ± σ, unit."""
-    return [(one.name, with_deviation(one.value, one.std), one.unit) for one in parameters]
+    return [(sum_text(one.name), with_deviation(one.value, one.std), one.unit) for one in parameters]
+
+
+_FACTOR = re.compile(r"(?<=[+-] )([0-9.]+(?:e-?[0-9]+)?)\*")
+"""Factor of a term in the name of a base parameter, `+ 0.4318*mx2`."""
+
+
+def sum_text(name: str) -> str:
+    """Write the name of a base parameter for readers: `Izz1 + Ia1 + 0.4318·mx2` for `Izz1 + 1.0*Ia1 + 0.4318*mx2`."""
+    return _FACTOR.sub(_factor_text, name)
+
+
+def _factor_text(found: re.Match[str]) -> str:
+    if float(found[1]) == 1.0:
+        return ""
+    return f"{found[1]}·"
 
 
 def with_deviation(value: float, std: float) -> str:

@@ -1,8 +1,8 @@
 """Pieces of a page that needs no other file: no address, pictures inside, every text escaped.
 
 The page reads on a phone (16 px; wide tables scroll in a box of their own, those with a verdict stack their cells), on
-paper (the first sheet is one A4 page, closed sections are left out) and in dark mode. Colour-blind readers can
-distinguish the colours, and no meaning rests on colour alone.
+paper (the first sheet is one page of A4 or Letter, closed sections are left out) and in dark mode. Colour-blind
+readers can distinguish the colours, and no meaning rests on colour alone.
 """
 
 from __future__ import annotations
@@ -39,9 +39,11 @@ _DARK = {
     "pale": "#2F6F99",
 }
 _CODE = re.compile("`([^`\n]+)`")
+_OPTION = re.compile(r"(?<!\S)--?[\w-]+")
 _NUMBER = re.compile(r"[+\-±]?([\d.]+(e[+-]?\d+)?|nan|inf)( .*)?|-")
 DRAWING = """
-svg text { fill: var(--ink); font: 14px system-ui, sans-serif; font-variant-numeric: tabular-nums; }
+svg text { fill: var(--ink); font: 14px system-ui, sans-serif; font-variant-numeric: tabular-nums;
+  stroke: var(--paper); stroke-width: 4px; stroke-linejoin: round; paint-order: stroke; }
 svg .soft { fill: var(--soft); font-size: 13px; } svg .end { text-anchor: end; } svg .mid { text-anchor: middle; }
 svg .grid { stroke: var(--line); } svg .zero { stroke: var(--ink); } svg .limit { stroke: var(--act); stroke-width: 2; }
 svg .range { fill: var(--shade); } svg .band { fill: var(--data); opacity: 0.25; }
@@ -56,7 +58,7 @@ svg .other { stroke: var(--act); stroke-width: 2; stroke-dasharray: 5 3; }
 svg .cloud { stroke-width: 2.2; stroke-linecap: round; opacity: 0.4; }
 svg .rest { stroke: var(--act); stroke-width: 2.2; stroke-linecap: round; opacity: 0.4; }
 """
-"""Style of the drawings of `daq.report.svg`."""
+"""Style of the drawings of `daq.report.svg`. A text has an edge in the colour of the paper: no line crosses it."""
 
 
 def palette(light: Mapping[str, str], dark: Mapping[str, str]) -> str:
@@ -88,7 +90,7 @@ p, ul { margin: 0.4rem 0; }
   margin: 0.8rem 0 0; }
 .next { border-left: 0.4rem solid var(--data); background: var(--shade); margin: 0; padding: 0 0.8rem 0.6rem; }
 .act { border-color: var(--act); } .quiet { border-color: var(--soft); }
-code { font: 0.95em ui-monospace, monospace; }
+code { font: 0.95em ui-monospace, monospace; } code span { white-space: nowrap; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: 0.1rem 1rem; margin: 0.8rem 0; }
 dt { color: var(--soft); } dd { margin: 0; }
 .scroll { overflow-x: auto; }
@@ -100,6 +102,7 @@ th:first-child, .text { text-align: left; } th:first-child { padding-left: 0; }
 .names tbody th { white-space: nowrap; position: sticky; left: 0; background: var(--paper); }
 .words { width: 100%; } .words .text { white-space: normal; }
 .pair { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 21rem), 1fr)); gap: 0 1.5rem; }
+.pair > section { grid-column: 1 / -1; } .paper { display: none; }
 figure { margin: 0.6rem 0; max-width: 26rem; } figcaption { color: var(--soft); font-size: 0.9rem; }
 svg { width: 100%; height: auto; display: block; }
 details { border-bottom: 1px solid var(--line); } details > :not(summary) { margin-left: 0.2rem; }
@@ -112,17 +115,35 @@ summary:focus-visible { outline: 3px solid var(--data); }
     border-bottom: 1px solid var(--line); }
   .words th, .words td { border: 0; padding: 0; text-align: left; white-space: normal; overflow-wrap: anywhere; }
   .words td:last-child { grid-area: 1 / 2; }
+  .stacked, .stacked tbody { display: block; } .stacked thead { display: none; }
+  .stacked tr { display: flex; flex-wrap: wrap; gap: 0 0.6rem; padding: 0.3rem 0;
+    border-bottom: 1px solid var(--line); }
+  .stacked th { flex-basis: 100%; } .stacked th, .stacked td { border: 0; padding: 0; text-align: left; }
   .words td:not(:last-child)::before { content: attr(data-name); display: block; color: var(--soft);
     font-size: 0.9rem; }
 }
-@page { size: A4; margin: 13mm; }
+@page { margin: 11mm; }
 @media print {
-  html { font-size: 8.5pt; } body { margin: 0; padding: 0; max-width: none; font-size: 9pt; }
-  h1 { font-size: 15pt; } h2 { font-size: 11pt; margin: 3mm 0 1mm; } .verdict { font-size: 11pt; margin: 2mm 0 0; }
-  .pair { grid-template-columns: 1fr 1fr; } .scroll { overflow: visible; } figure { max-width: 85mm; }
-  th, td { padding: 0.4mm 1.5mm; border-width: 0.5pt; } td { white-space: normal; }
-  .sheet { break-after: page; } figure, table, dl, .verdict { break-inside: avoid; } h2, h3 { break-after: avoid; }
-  .next { break-before: avoid; } details:not([open]), .details:not(:has(details[open])) { display: none; }
+  html { font-size: 8.5pt; }
+  body { margin: 0; padding: 0; max-width: none; font-size: 8.5pt; line-height: 1.3; }
+  h1 { font-size: 14pt; margin: 0 0 1mm; } h2 { font-size: 10pt; margin: 2.5mm 0 1mm; }
+  h3 { font-size: 8.5pt; margin: 1.5mm 0 0.5mm; } p, ul { margin: 0.8mm 0; } dl { margin: 1.5mm 0; }
+  .verdict { font-size: 10pt; margin: 1.5mm 0 0; padding: 1.2mm 2mm; } .next { padding: 0 2mm 1.2mm; }
+  .screen { display: none; } .paper { display: block; }
+  .sheet > dl { grid-template-columns: max-content 1fr max-content 1fr; gap: 0 3mm; }
+  .sheet > dl > dt.long { grid-column: 1; } .sheet > dl > dd.long { grid-column: 2 / -1; }
+  .pair { grid-template-columns: repeat(auto-fit, minmax(55mm, 1fr)); gap: 0 5mm; }
+  .pair > section { grid-column: auto; }
+  .scroll { overflow: visible; } figure { max-width: 62mm; margin: 1mm 0; } figcaption { font-size: 7pt; }
+  table { margin: 1mm 0; } th, td { padding: 0.3mm 1.5mm; border-width: 0.5pt; } td { white-space: normal; }
+  .pair table { font-size: 7pt; }
+  .paper dl { font-size: 7pt; line-height: 1.25; gap: 0 3mm; margin: 0; }
+  .paper dd { font-family: ui-monospace, monospace; }
+  .sign { display: flex; gap: 8mm; margin-top: 11mm; break-inside: avoid; }
+  .sign span { flex: 1; border-top: 0.5pt solid var(--ink); padding-top: 0.5mm; color: var(--soft); }
+  figure, table, dl, .verdict { break-inside: avoid; } h2, h3 { break-after: avoid; } .next { break-before: avoid; }
+  .details { break-before: page; }
+  details:not([open]), .details:not(:has(details[open])) { display: none; }
 }
 """
 )
@@ -168,8 +189,14 @@ def html_document(title: str, mark: str, style: str, body: str, script: str = ""
 def element(tag: str, text: str, kind: str = "") -> str:
     """Build an element of plain text, `code` between back quotes; its kind is a CSS class."""
     named = f' class="{kind}"' if kind else ""
-    words = _CODE.sub(r"<code>\1</code>", spelled(text))
+    words = _CODE.sub(_code, spelled(text))
     return f"<{tag}{named}>{words}</{tag}>"
+
+
+def _code(found: re.Match[str]) -> str:
+    """Mark a command up; a line is never broken within the name of an option."""
+    command = _OPTION.sub(r"<span>\g<0></span>", found[1])
+    return f"<code>{command}</code>"
 
 
 def paragraph(text: str, kind: str = "") -> str:
@@ -182,6 +209,27 @@ def section(title: str, *body: str) -> str:
     return "\n".join(("<section>", element("h2", title), *body, "</section>"))
 
 
+def part(title: str, *body: str) -> str:
+    """Build a part of a section under a smaller heading."""
+    return "\n".join(("<section>", element("h3", title), *body, "</section>"))
+
+
+def on_paper(*body: str) -> str:
+    """Show something on paper alone."""
+    return "\n".join(('<section class="paper">', *body, "</section>"))
+
+
+def on_screen(*body: str) -> str:
+    """Show something on the screen alone."""
+    return "\n".join(('<div class="screen">', *body, "</div>"))
+
+
+def signature_line(*names: str) -> str:
+    """Build lines to be filled in by hand, side by side, each above its name; for paper alone."""
+    lines = "".join(element("span", name) for name in names)
+    return f'<div class="paper sign">{lines}</div>'
+
+
 def folded(title: str, *body: str) -> str:
     """Build a section that a reader opens; paper shows it if it was open."""
     return "\n".join(("<details>", element("summary", title), *body, "</details>"))
@@ -192,16 +240,25 @@ def html_list(texts: Iterable[str]) -> str:
     return f"<ul>{''.join(element('li', text) for text in texts)}</ul>"
 
 
+_LONG = 48  #: Characters of a value that takes the width of the paper, where shorter ones take half of it
+
+
 def terms(pairs: Iterable[tuple[str, str]]) -> str:
     """Build a list of names with their values."""
-    return f"<dl>{''.join(element('dt', name) + element('dd', value) for name, value in pairs)}</dl>"
+    parts = []
+    for name, value in pairs:
+        kind = "long" if len(value) > _LONG else ""
+        parts.append(element("dt", name, kind))
+        parts.append(element("dd", value, kind))
+    return f"<dl>{''.join(parts)}</dl>"
 
 
 def table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
     """Build a table of plain texts; the first cell of each row is its heading, and its kind is a CSS class.
 
     A column with any cell that is no number is aligned to the left. Kind "words" is for rows that end in a sentence:
-    a phone shows each row as a card. Kind "names" keeps the names of the rows in sight where the table scrolls.
+    a phone shows each row as a card. Kind "names" keeps the names of the rows in sight where the table scrolls. Kind
+    "stacked" is for long names and few numbers: a phone shows the numbers below the name.
     """
     lines = list(rows)
     texts = [not all(_NUMBER.fullmatch(line[column]) for line in lines) for column in range(len(headings))]

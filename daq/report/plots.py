@@ -216,4 +216,4 @@ def plot_ranking(findings: Sequence[Finding], rivals: Sequence[PlacedEffect], ax
         if (one.effect.name, one.axis) in alike:
             kind = "alike"
         rows.append((f"{axes[one.axis]}: {effect_text(one.effect, axes)}", one.held_out_fall, kind))
-    return ranking(rows, "Candidates", "fall of the squared error [noise variances]")
+    return ranking(rows, "Candidates", "squared error that it removes")

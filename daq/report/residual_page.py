@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
 from daq.errors import writing
 from daq.files import replace_file
-from daq.report.certificate import Comparison, certify, without_controller
+from daq.ledger.standing import Standing
+from daq.report.certificate import Origin, certify
 from daq.report.certificate_page import certificate_page
+from daq.report.comparison import Comparison, without_controller
 from daq.report.document import json_text
 from daq.report.effect_names import effect_text, variable_text
 from daq.report.fit import coefficients, identifiability_notes, start_of
@@ -51,9 +54,21 @@ _SHOWN = 10  #: Candidates of a turn that are drawn; residual.json has them all
 
 
 def save_report(
-    fitted: Fit, account: Account, calibration: Calibration, folder: Path, comparison: Comparison | None = None
+    fitted: Fit,
+    account: Account,
+    calibration: Calibration,
+    folder: Path,
+    comparison: Comparison | None = None,
+    session: str | None = None,
 ) -> None:
     """Write report.html and residual.json, each whole or not at all; without a comparison, beside the nameplate.
+
+    Args:
+        fitted, account: the fit with its effects, and what they changed.
+        calibration: of the fit.
+        folder: to write into.
+        comparison: with the controller.
+        session: name of the session that made the calibration; None where there was none.
 
     Raises:
         OutputFailed: the file system refuses.
@@ -61,7 +76,7 @@ def save_report(
     body = residual_report(fitted, account, calibration)
     # Not strictly: a document that is made takes every sequence for a list, and a calibration has tuples.
     document = ResidualFile.model_validate({"format": FORMAT, "version": VERSION, **dict(body)}, strict=False)
-    content = {PAGE: residual_page(fitted, account, calibration, comparison), DOCUMENT: json_text(document)}
+    content = {PAGE: residual_page(fitted, account, calibration, comparison, session), DOCUMENT: json_text(document)}
     with writing(folder):
         for name, text in content.items():
             replace_file(folder / name, text.encode())
@@ -69,12 +84,23 @@ def save_report(
 
 def beside_nameplate(fitted: Fit, calibration: Calibration) -> Comparison:
     """Compare the gains of a fit with the nameplate: a fit reads no controller."""
-    unread = "The controller was not read; `drivegain report calibration.yaml --cell CELL` compares with its gains."
-    return without_controller(calibration, unread, datetime.fromisoformat(calibration.created), fitted.cell)
+    unread = (
+        "The controller was not read; `drivegain certificate calibration.yaml --cell CELL` compares with its gains."
+    )
+    now = datetime.fromisoformat(calibration.created)
+    compared = without_controller(calibration, unread, now, fitted.cell)
+    # It was made just now.
+    return replace(compared, standing=Standing(now))
 
 
-def residual_page(fitted: Fit, account: Account, calibration: Calibration, comparison: Comparison | None = None) -> str:
-    """Build the certificate of a closed loop with the account of its turns folded below."""
+def residual_page(
+    fitted: Fit,
+    account: Account,
+    calibration: Calibration,
+    comparison: Comparison | None = None,
+    session: str | None = None,
+) -> str:
+    """Build the certificate of a closed loop with the account of its turns folded below; see `save_report`."""
     axes = fitted.cell.axis_names
     comparison = comparison or beside_nameplate(fitted, calibration)
     errors = [(name, *map(percent_text, (*error.axes, error.total))) for name, error in error_rows(account).items()]
@@ -109,7 +135,8 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration, compa
         *(_turn(fitted, number, step) for number, step in enumerate(searched_steps(fitted), start=1)),
         _limits(fitted, calibration),
     )
-    return certificate_page(certify(calibration, comparison), gains_sentence(fitted, account), details)
+    certificate = certify(calibration, comparison, origin=Origin.of(calibration, session))
+    return certificate_page(certificate, gains_sentence(fitted, account), details)
 
 
 def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed: PlacedEffect) -> str:
@@ -191,7 +218,8 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
         ranking = figure(
             plot_ranking(ranked, () if added is None else added.ambiguity, axes),
             "Candidates by how much they reduce the error of left-out moves. Full: passed every check. Pale: these "
-            "data cannot distinguish it from the added one. Hollow: failed a check.",
+            "data cannot distinguish it from the added one. Hollow: failed a check. The scale counts the squared "
+            "noise of one sample as 1.",
         )
     in_words = [
         f"Not added to {axes[aside.finding.axis]}: {effect_text(aside.finding.effect, axes)}: {aside.reason(axes)}."

@@ -36,7 +36,7 @@ REPORTS: dict[str, Any] = {
     "fit": FitReport | CasesReport,
     "residual": ResidualReport,
     "validate": ValidateReport,
-    "report": CertificateReport,
+    "certificate": CertificateReport,
     "apply": FileChange | DriveChange,
     "rollback": FileRollback | DriveRollback,
     "info": InfoReport,

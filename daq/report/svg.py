@@ -216,11 +216,14 @@ def ranking(rows: Sequence[tuple[str, float, str]], title: str, unit: str) -> st
     lines = sum(map(len, names))
     longest = _ROOM * max(_largest(length for _, length, _ in rows), 1e-9)
     scale = _Scale(0.0, longest, (17.0 * lines + 25.0 * len(rows)) / _ROW, 8.0, 60.0)
-    parts, y = list(scale.frame(unit)), _TOP
+    parts = list(scale.ticks(unit))
+    y = _TOP
     for words, (_, length, kind) in zip(names, rows, strict=True):
         for line in words:
             y += 17.0
             parts.append(_text(0, y - 3, line))
+        # The grid is drawn behind the bars alone: no line crosses a name.
+        parts += scale.grid(y, y + 18.0)
         width = max(scale.x(max(length, 0.0)) - scale.x(0.0), 1.0)
         number = f"{length:.0f}" if abs(length) >= 100.0 else f"{length:.3g}"
         parts.append(
@@ -281,11 +284,22 @@ class _Scale:
         return _TOP + _ROW * (row + 0.5)
 
     def frame(self, unit: str) -> Iterator[str]:
+        """Grid over all rows, and the numbers of the scale."""
+        yield from self.grid(_TOP, self.bottom)
+        yield from self.ticks(unit)
+
+    def grid(self, top: float, bottom: float) -> Iterator[str]:
+        """Lines at the numbers of the scale, between two heights."""
         for tick in _ticks(self.low, self.high):
-            yield _line(self.x(tick), _TOP, self.x(tick), self.bottom, "grid")
-            yield _text(
-                self.x(tick), self.bottom + 14, f"{tick:+g}" if self.low < 0 and tick else f"{tick:g}", "soft mid"
-            )
+            yield _line(self.x(tick), top, self.x(tick), bottom, "grid")
+
+    def ticks(self, unit: str) -> Iterator[str]:
+        """Numbers of the scale with their unit, below all rows; with a sign where some are negative."""
+        for tick in _ticks(self.low, self.high):
+            number = f"{tick:g}"
+            if self.low < 0.0 < tick:
+                number = f"+{number}"
+            yield _text(self.x(tick), self.bottom + 14, number, "soft mid")
         yield _text((self.left + self.right) / 2, self.bottom + 30, unit, "soft mid")
 
 

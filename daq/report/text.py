@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from textwrap import wrap
 from typing import Any
 
@@ -31,6 +32,14 @@ def _spelled(character: str) -> str:
     """A character as Python writes it: \\x1b, \\u202e."""
     number = ord(character)
     return f"\\x{number:02x}" if number < 0x100 else f"\\u{number:04x}" if number < 0x10000 else f"\\U{number:08x}"
+
+
+def minute_text(iso: str) -> str:
+    """Write an ISO 8601 time to the minute, in UTC; any other text as it is."""
+    try:
+        return datetime.fromisoformat(iso).astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    except ValueError:
+        return iso or "time not known"
 
 
 def terminal_text(text: str) -> Text:

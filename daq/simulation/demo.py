@@ -19,7 +19,7 @@ from daq.documents.calibration_file import EffectEntry, as_document, save_calibr
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
 from daq.files import replace_file
-from daq.report.certificate import Comparison
+from daq.report.comparison import compare
 from daq.report.fit import start_of
 from daq.report.job_schemas import DemoGain, DemoLog, DemoPlan, DemoReport, FleetEffect
 from daq.report.plots import draw_fit
@@ -119,16 +119,19 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     if cell.controller_path is None:
         raise UsageError("the demo cell", found="no controller", expected="one", remedy="install drivegain again")
     target = out / "controller.yaml"
+    audit = out / "audit.jsonl"
     replace_file(target, cell.controller_path.read_bytes())
     proposal = propose(FileTarget.of(cell, target), Request(calibration, now()))
-    written = None if proposal.refusals else apply(proposal, now(), audit=out / "audit.jsonl", who="demo")
+    written = None if proposal.refusals else apply(proposal, now(), audit=audit, who="demo")
     reporter.step("draw the pictures")
     spec = load_simulation(settings.simulation)
     truth = {axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, spec.axes, strict=True)}
     draw_fit(fitted, calibration, truth, out)
     changed = account(start_of(fitted), fitted.steps)
     (out / REPORT).mkdir(exist_ok=True)
-    save_report(fitted, changed, calibration, out / REPORT, Comparison.of(proposal, cell.apply))
+    # After the write, so that the certificate says that the gains are written.
+    compared = compare(cell, Request(calibration, now()), file=target, audit=audit)
+    save_report(fitted, changed, calibration, out / REPORT, compared)
     return DemoOutcome(cell, nodes, plans, recorded, fitted, changed, calibration, truth, proposal, written)
 
 

@@ -20,7 +20,7 @@ from daq.config.cell import Cell
 from daq.config.controller import ControllerFormat
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
 from daq.files import fsync_folder, replace_file, sha256
-from daq.formats.document import decode_document, read_controller_file
+from daq.formats.document import comment_behind, decode_document, read_controller_file
 from daq.formats.scalar import ControllerDocument, rewrite_gain
 from daq.writeback.file_access import back_up, backups, exclusive_writer, require_existing, resolve_links
 from daq.writeback.request import Edit, GainChange, GateFinding, is_writable, require_axes, short_digest
@@ -53,6 +53,18 @@ class FileEdit(Edit):
             n=1,
         )
         return "".join(line if line.endswith("\n") else f"{line}\n" for line in lines)
+
+    @property
+    def comments(self) -> dict[str, str]:
+        """Comment behind each gain on its line, by axis; a write leaves it as it is."""
+        document = self.document(self.before or b"")
+        scalars = document.locate(tuple(change.key for change in self.changes))
+        found = {}
+        for change, scalar in zip(self.changes, scalars, strict=True):
+            comment = comment_behind(document.text[scalar.end :], str(self.file), self.format)
+            if comment:
+                found[change.axis] = comment
+        return found
 
     def document(self, content: bytes) -> ControllerDocument:
         """Parse a content in the file's format."""

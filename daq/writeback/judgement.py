@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from daq.config.cell import Cell
 from daq.errors import DaqError
@@ -49,9 +50,19 @@ NOT_JUDGED = JudgedChange()
 """Judgement of a gain whose numbers are not finite."""
 
 
-def query_history(cell: Cell, target: str, request: Request, changes: Sequence[GainChange]) -> Spread:
-    """Return the figures of a cell's history; none, with a warning, where it cannot be read."""
-    ledger = Ledger.of(cell)
+def query_history(
+    cell: Cell, target: str, request: Request, changes: Sequence[GainChange], audit: Path | None = None
+) -> Spread:
+    """Return the figures of a cell's history; none, with a warning, where it cannot be read.
+
+    Args:
+        cell: as it is now.
+        target: the controller's file, or the drives, as the audit log names them.
+        request: calibration that is judged.
+        changes: of its gains.
+        audit: another audit log than the cell's.
+    """
+    ledger = Ledger.of(cell, audit)
     if ledger is None:
         return NOTHING
     try:

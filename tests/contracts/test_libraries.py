@@ -13,11 +13,11 @@ import pytest
 import daq
 import drivers
 import ident
-from daq.cli.app import VERBS
+from daq.cli.app import ALIASES, VERBS
 
 ROOT = Path(__file__).parents[2]
 OPTION = re.compile(r"(?<![\w-])--[a-z]")
-VERB = re.compile(rf"drivegain ({'|'.join(verb.name for verb in VERBS)})\b")
+VERB = re.compile(rf"drivegain ({'|'.join((*(verb.name for verb in VERBS), *ALIASES))})\b")
 
 
 def _strings(code: str) -> Iterator[str]:
@@ -37,6 +37,7 @@ def _commands(code: str) -> list[str]:
     [
         ('raise ValueError("pass --known")', True),
         ('f"{name}: `drivegain fit` wrote it"', True),
+        ('"""Read by `drivegain certificate`."""', True),
         ('"""Read by `drivegain report`."""', True),
         ('"a drivegain simulated amplifier"', False),
         ('"from -- to, a--b, -1"', False),

@@ -61,6 +61,17 @@ def test_the_copy_of_the_controller_file_has_the_gains_and_every_comment(demonst
     ]
 
 
+def test_the_certificate_says_that_the_gains_are_written(demonstration: Path) -> None:
+    page = (demonstration / "report" / "report.html").read_text(encoding="utf-8")
+    assert "✓ Written on " in page
+    assert " by demo to controller.yaml: all 6 gains changed by more than noise" in page
+    assert "What was written into out/controller.yaml" in page
+    assert "Ready to be written" not in page
+    assert "would be written" not in page
+    # 32.96 was in the controller before.
+    assert ">32.96<" in page
+
+
 def test_the_pictures_are_there(demonstration: Path) -> None:
     pictures = {path.name for pattern in ("*.png", "*.svg") for path in demonstration.glob(pattern)}
     assert pictures == {"torques.svg", "gains.png", "residual-J3-load-friction.svg"}

@@ -17,7 +17,7 @@ import yaml
 from rich.console import Console
 
 from daq.cli import main
-from daq.cli.app import BY_JOB, VERBS
+from daq.cli.app import ALIASES, BY_JOB, VERBS
 from daq.cli.init import INIT
 from daq.cli.plan import free_name
 from daq.cli.terminal import say_written, show_steps
@@ -62,6 +62,26 @@ def test_the_list_shows_every_verb_with_its_whole_summary(capsys: pytest.Capture
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     for listed in VERBS:
         assert f"{listed.name} {listed.summary}" in lines
+
+
+@pytest.mark.parametrize(("earlier", "name"), ALIASES.items())
+def test_an_earlier_name_is_the_same_verb_and_is_not_listed(
+    earlier: str, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert name in {listed.name for listed in VERBS}
+    assert main([name, "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert main([earlier, "--help"]) == 0
+    assert capsys.readouterr().out == shown
+    assert f"`{earlier}`, goes on working" in _squeezed_lines(shown)
+    assert main(["--help"]) == 0
+    listed = {line.split()[0] for line in capsys.readouterr().out.splitlines() if line.startswith("  ")}
+    assert name in listed
+    assert earlier not in listed
+
+
+def _squeezed_lines(text: str) -> str:
+    return " ".join(text.split())
 
 
 def test_every_job_of_the_help_has_its_verbs(capsys: pytest.CaptureFixture[str]) -> None:
@@ -133,7 +153,7 @@ def test_a_calibration_is_no_log_but_known(tmp_path: Path, capsys: pytest.Captur
     assert main(["info", str(file)]) == ExitCode.DATA_UNFIT
     said = capsys.readouterr().err
     assert "found:    a calibration\n" in said
-    assert f"do:       `drivegain report {file}` reads it" in said
+    assert f"do:       `drivegain certificate {file}` reads it" in said
 
 
 def test_progress_in_a_pipe_is_a_whole_line_a_step(capsys: pytest.CaptureFixture[str]) -> None:

@@ -77,6 +77,8 @@ def test_bash_completes_verbs_options_and_names_of_files(shell: Shell, tmp_path:
     shell.type("drivegain mon\t", "monitor ")
     shell.type("lat\t", r"lathe\.yaml ")
     shell.type("--inter\t", "--interval ")
+    # An earlier name of a verb has the options of the verb.
+    shell.type("\x15drivegain report --besi\t", "--beside ")
 
 
 @pytest.mark.parametrize("shell_name", ["bash", "zsh", "fish"])

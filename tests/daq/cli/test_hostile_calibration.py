@@ -68,7 +68,7 @@ def test_nonsense_is_refused_by_every_verb_before_anything_is_written(
     verbs = [
         ["apply", file, fitted, "--yes"],
         ["history", file, "--add", fitted],
-        ["report", fitted, "--cell", file, "--out", str(out)],
+        ["certificate", fitted, "--cell", file, "--out", str(out)],
         ["validate", fitted, "no.mcap"],
         ["weigh", "no.mcap", "--calibration", fitted],
         ["contact", "no.mcap", "--calibration", fitted],

@@ -56,12 +56,15 @@ def test_links_in_a_circle_are_refused_by_every_verb(cell: Path, name: str, caps
     make_circle(Path(os.path.normpath(cell.parent / name)))
     file, fitted = str(cell), str(calibration)
     verbs = [["apply", file, fitted, "--yes"], ["rollback", file], ["history", file, "--verify"]]
-    verbs += [["recalibrate", file, "--dry-run"], ["install-units", file], ["validate", fitted, "no.mcap"]]
+    verbs += [["recalibrate", file, "--dry-run"], ["schedule", file], ["validate", fitted, "no.mcap"]]
     if name in CONFIGURED:
-        verbs += [["history", file, "--rebuild"], ["report", fitted, "--cell", file, "--out", str(cell.parent / "out")]]
+        verbs += [
+            ["history", file, "--rebuild"],
+            ["certificate", fitted, "--cell", file, "--out", str(cell.parent / "out")],
+        ]
     for verb in verbs[:-1] if name == "demo.yaml" else verbs:
         code, said = main(verb), capsys.readouterr().err
-        if "calibration" in name and verb[0] in ("rollback", "history", "recalibrate", "install-units"):
+        if "calibration" in name and verb[0] in ("rollback", "history", "recalibrate", "schedule"):
             continue
         assert code in REFUSED, (verb, code, said)
         assert Path(name).name in said or verb[0] == "validate", (verb, said)

@@ -206,7 +206,7 @@ VERBS: dict[str, tuple[list[str], ExitCode]] = {
     "validate": (["validate", "CALIBRATION", "LOG", "--cell", "CELL"], ExitCode.DATA_UNFIT),
     "weigh": (["weigh", "CALIBRATION", "LOG", "--cell", "CELL"], ExitCode.DATA_UNFIT),
     "contact": (["contact", "CALIBRATION", "LOG", "--cell", "CELL"], ExitCode.DATA_UNFIT),
-    "report": (["report", "DEMO", "--cell", "CELL"], ExitCode.CALIBRATION_REFUSED),
+    "certificate": (["certificate", "DEMO", "--cell", "CELL"], ExitCode.CALIBRATION_REFUSED),
     "export urdf": (["export", "urdf", "CELL", "DEMO", "--out", "out.urdf"], ExitCode.CONFIGURATION),
     "export bag": (["export", "bag", "LOG", "--calibration", "CALIBRATION", "--out", "bag"], ExitCode.CONFIGURATION),
     "monitor": (["monitor", "CELL", "--calibration", "DEMO", "--once"], ExitCode.DATA_UNFIT),

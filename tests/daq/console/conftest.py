@@ -1,4 +1,4 @@
-"""A cell for the console's tests; those in a browser need Chromium."""
+"""A cell for the console's tests."""
 
 from __future__ import annotations
 
@@ -8,13 +8,6 @@ import pytest
 
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Make the marker known."""
-    config.addinivalue_line(
-        "markers", "browser: drives Chromium, where DRIVEGAIN_CHROMIUM names it (make test-console)"
-    )
 
 
 @pytest.fixture(scope="session")

@@ -112,7 +112,7 @@ def test_a_dry_run_shows_and_yes_writes_and_nothing_foreign_is_replaced(
     rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "units"
-    command = ["install-units", "--cell", str(rig.cell_file), "--to", str(folder)]
+    command = ["schedule", "--cell", str(rig.cell_file), "--to", str(folder)]
     assert main(command) == ExitCode.OK
     shown = capsys.readouterr().out
     assert "Dry run" in shown
@@ -135,13 +135,26 @@ def test_a_dry_run_shows_and_yes_writes_and_nothing_foreign_is_replaced(
     assert (folder / f"{NAME}.service").read_bytes() == before
 
 
+def test_a_unit_of_an_earlier_version_is_replaced(rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "units"
+    # Under its earlier name, with the first line that earlier versions wrote.
+    command = ["install-units", "--cell", str(rig.cell_file), "--to", str(folder), "--yes"]
+    assert main(command) == ExitCode.OK
+    service = folder / f"{NAME}.service"
+    now = service.read_text(encoding="utf-8")
+    assert now.startswith("# Made by `drivegain schedule`, which may replace this file.\n")
+    service.write_text(now.replace("`drivegain schedule`", "`drivegain install-units`", 1), encoding="utf-8")
+    assert main(command) == ExitCode.OK
+    assert service.read_text(encoding="utf-8") == now
+
+
 def test_cron_gets_a_line(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["install-units", "--cell", str(rig.cell_file), "--cron"]) == ExitCode.OK
+    assert main(["schedule", "--cell", str(rig.cell_file), "--cron"]) == ExitCode.OK
     line = capsys.readouterr().out
     assert line.startswith("0 3 * * 0  ")
     assert line.rstrip().endswith(f"recalibrate --cell '{rig.cell_file}'")
     assert line.count("\n") == 1
-    assert main(["install-units", "--cell", str(rig.cell_file), "--cron", "--schedule", "Sun 03:00"]) == ExitCode.USAGE
+    assert main(["schedule", "--cell", str(rig.cell_file), "--cron", "--schedule", "Sun 03:00"]) == ExitCode.USAGE
 
 
 def test_names_and_paths_cannot_say_more_than_they_are(rig: Rig) -> None:
@@ -163,7 +176,7 @@ def test_the_unit_of_another_cell_and_a_pipe_are_left_alone(
     rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "units"
-    command = ["install-units", "--to", str(folder), "--yes", "--cell"]
+    command = ["schedule", "--to", str(folder), "--yes", "--cell"]
     assert main([*command, str(rig.cell_file)]) == ExitCode.OK
     other = rig.cell_file.with_name("another.yaml")
     shutil.copyfile(rig.cell_file, other)
@@ -182,7 +195,7 @@ def test_the_unit_of_another_cell_and_a_pipe_are_left_alone(
 def test_a_schedule_that_no_line_can_say_is_refused(
     rig: Rig, tmp_path: Path, schedule: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["install-units", "--cell", str(rig.cell_file), "--to", str(tmp_path / "units"), "--schedule", schedule]
+    command = ["schedule", "--cell", str(rig.cell_file), "--to", str(tmp_path / "units"), "--schedule", schedule]
     assert main([*command, "--yes"]) == ExitCode.USAGE
     assert "--schedule" in capsys.readouterr().err
     assert not (tmp_path / "units").exists()
@@ -190,6 +203,6 @@ def test_a_schedule_that_no_line_can_say_is_refused(
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not on this computer")
 def test_systemd_reads_the_schedule_before_it_is_written(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["install-units", "--cell", str(rig.cell_file), "--schedule", "every sunday"]) == ExitCode.USAGE
+    assert main(["schedule", "--cell", str(rig.cell_file), "--schedule", "every sunday"]) == ExitCode.USAGE
     assert "calendar" in capsys.readouterr().err
-    assert main(["install-units", "--cell", str(rig.cell_file), "--schedule", "Sun 03:00"]) == ExitCode.OK
+    assert main(["schedule", "--cell", str(rig.cell_file), "--schedule", "Sun 03:00"]) == ExitCode.OK

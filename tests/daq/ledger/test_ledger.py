@@ -195,9 +195,9 @@ def test_a_time_without_its_zone_is_refused(ledger: Ledger) -> None:
     assert read_history(ledger).entries == ()
 
 
-def test_a_step_of_a_write_is_no_step_of_a_job(ledger: Ledger) -> None:
+def test_a_step_of_a_write_is_no_step_of_a_session(ledger: Ledger) -> None:
     given_: dict[str, Any] = {"at": BEGIN, "who": "anna", "subject": "x", "details": {}}
-    with pytest.raises(ValueError, match="no step of a job"):
+    with pytest.raises(ValueError, match="no step of a session"):
         record_session(ledger.audit, AuditAction.APPLIED, **given_)
     with pytest.raises(ValueError, match="no step of a write"):
         record_write(ledger.audit, AuditAction.RECALIBRATION_ENDED, **given_)

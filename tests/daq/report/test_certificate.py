@@ -3,29 +3,39 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from daq.cli.app import main
-from daq.documents.calibration_file import save_calibration
+from daq.config.cell_file import load_cell
+from daq.documents.calibration_file import encode_calibration, load_calibration, save_calibration
+from daq.documents.session_state import Fitted, SessionState
 from daq.errors import CalibrationRefused, ExitCode
-from daq.report.certificate import Verdict, certificate_report, certify, without_controller
+from daq.files import sha256
+from daq.jobs.session import Session, save, session_of
+from daq.ledger.audit import AuditAction
+from daq.ledger.ledger import record_session
+from daq.report.certificate import Certificate, Origin, Verdict, certificate_report, certify
 from daq.report.certificate_page import certificate_page
+from daq.report.comparison import compare, without_controller
 from daq.report.document import json_tree
 from daq.report.effect_names import curve_of, named_size, size_text
 from daq.report.gains import with_deviation
 from daq.writeback.gates.gate import Gate
+from daq.writeback.request import Request
 from ident.calibration import AcceptedEffect, Calibration, Parameter, PayloadMass
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import LoadFriction
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Smooth
-from tests.daq.calibrations import RECORDED, demo_calibration, with_recordings
+from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, RECORDED, calibration_for, demo_calibration, with_recordings
 
 NOW = RECORDED + timedelta(hours=1)
 HOSTILE = '<script>alert("x")</script>&<img src=http://example.org/x>'
@@ -222,7 +232,7 @@ def test_the_verb_writes_one_page_and_never_over_another_file(
     file, page = tmp_path / "calibration.yaml", tmp_path / "calibration.html"
     save_calibration(demo_calibration(), file)
     cell = str(checkout / "configs" / "cells" / "demo.yaml")
-    assert main(["report", str(file), "--cell", cell, "--beside", str(file), "--json"]) == ExitCode.OK
+    assert main(["certificate", str(file), "--cell", cell, "--beside", str(file), "--json"]) == ExitCode.OK
     document = json.loads(capsys.readouterr().out)
     # The configuration of the demo cell is not the one that the calibration names.
     assert document["verdict"] == "refused"
@@ -232,13 +242,15 @@ def test_the_verb_writes_one_page_and_never_over_another_file(
     texts = Reader(page.read_text(encoding="utf-8")).texts
     taken = "the number in the controller taken as exact (all axes)."
     assert f"More than noise: probability below 1 % among all axes, {taken}" in texts
-    assert {axis["written"] for axis in document["axes"]} <= set(texts)
-    assert main(["report", str(file), "--json"]) == ExitCode.OK
+    # Of gains that must not be written the page does not show what would be.
+    assert not {axis["written"] for axis in document["axes"]} & set(texts)
+    assert not any("would be written" in text for text in texts)
+    assert main(["certificate", str(file), "--json"]) == ExitCode.OK
     unread = json.loads(capsys.readouterr().out)["axes"]
     assert all(axis["key"] is axis["line"] is None for axis in unread)
     assert "the nameplate taken as exact (all axes)." in page.read_text(encoding="utf-8")
     page.write_text("the user's own", encoding="utf-8")
-    assert main(["report", str(file)]) == ExitCode.USAGE
+    assert main(["certificate", str(file)]) == ExitCode.USAGE
     assert page.read_text(encoding="utf-8") == "the user's own"
 
 
@@ -250,3 +262,213 @@ def test_a_calibration_without_an_error_for_each_gain_is_refused(count: int) -> 
     for judged, earlier in ((torn, None), (made, torn)):
         with pytest.raises(CalibrationRefused, match="one error for each"):
             certify(judged, compared, earlier)
+
+
+@pytest.fixture
+def cell_file(tmp_path: Path, checkout: Path) -> Path:
+    """A copy of the demo cell whose controller may be written."""
+    configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
+    return configs / "cells" / "demo.yaml"
+
+
+def _certificate(cell_file: Path, calibration_file: Path, **changes: object) -> Certificate:
+    content = calibration_file.read_bytes()
+    calibration = replace(load_calibration(calibration_file), **changes)  # type: ignore[arg-type]
+    request = Request(calibration, datetime.now(UTC), file=calibration_file, content=content)
+    compared = compare(load_cell(cell_file), request)
+    return certify(calibration, compared, origin=Origin(sha256(content)))
+
+
+def _apply(cell_file: Path, calibration_file: Path) -> None:
+    words = ["apply", str(cell_file), str(calibration_file), "--yes", "--by", "A. Miller"]
+    assert main(words) == ExitCode.OK
+
+
+def _document(certificate: Certificate) -> dict[str, Any]:
+    return json_tree(certificate_report(certificate))
+
+
+def test_a_certificate_has_the_same_id_each_time_and_another_calibration_another_one(tmp_path: Path) -> None:
+    calibration = demo_calibration()
+    other = replace(calibration, created="2025-01-02T03:04:06+00:00")
+    file = tmp_path / "calibration.yaml"
+    save_calibration(calibration, file)
+    names = [Origin.of(one).id for one in (calibration, calibration, other)]
+    assert names[0] == names[1] != names[2]
+    assert names[0] == sha256(file.read_bytes())[:12]
+    certificate = certify(calibration, without_controller(calibration, "", NOW))
+    document = _document(certificate)
+    assert document["id"] == names[0]
+    assert document["sha256"] == sha256(encode_calibration(calibration))
+    assert f"Calibration certificate {names[0]}" in Reader(certificate_page(certificate)).texts
+
+
+def test_gains_that_are_not_written_may_be_written_and_what_would_be_is_shown(cell_file: Path) -> None:
+    certificate = _certificate(cell_file, calibration_for(cell_file))
+    assert certificate.verdict is Verdict.READY
+    document = _document(certificate)
+    assert document["status"]["state"] == "not written"
+    assert document["status"]["write"] is document["status"]["acceptance"] is None
+    texts = Reader(certificate_page(certificate)).texts
+    assert "What would be written into controllers/demo.yaml" in texts
+    assert {axis["written"] for axis in document["axes"]} <= set(texts)
+    assert any(text.startswith("not written (as of ") for text in texts)
+
+
+def test_gains_that_were_written_are_shown_as_written_beside_the_previous_ones(cell_file: Path) -> None:
+    calibration_file = calibration_for(cell_file)
+    ready = _certificate(cell_file, calibration_file)
+    _apply(cell_file, calibration_file)
+    certificate = _certificate(cell_file, calibration_file)
+    document = _document(certificate)
+    status = document["status"]
+    assert status["state"] == "written"
+    assert status["write"]["who"].startswith("A. Miller")
+    assert status["write"]["target"] == str(cell_file.parents[1] / "controllers" / "demo.yaml")
+    assert status["ended"] is None
+    assert document["sentence"].startswith("Written on ")
+    assert "by A. Miller" in document["sentence"]
+    assert "most J4 by -20.1 %" in document["sentence"]
+    # In JSON the gains are compared with those that are in the controller now.
+    assert document["verdict"] == "unchanged"
+    assert [axis["old"] for axis in document["axes"]] == pytest.approx(IDENTIFIED, rel=1e-4)
+    texts = Reader(certificate_page(certificate)).texts
+    assert {f"{old:.5g}" for old in NAMEPLATE} <= set(texts)
+    assert "What was written into controllers/demo.yaml" in texts
+    assert not any("would be written" in text or "Ready" in text for text in texts)
+    assert texts.count("differs from the previous gain") == 6
+    assert [row.judged for row in certificate.shown] == [row.judged for row in ready.rows]
+    # The comments of the demo's controller file say where the earlier gains came from.
+    assert any("J1: “Nm at the joint per A, from the data sheet”" in text for text in texts)
+
+
+def test_a_write_that_was_rolled_back_is_not_in_force(cell_file: Path) -> None:
+    calibration_file = calibration_for(cell_file)
+    _apply(cell_file, calibration_file)
+    assert main(["rollback", str(cell_file), "--by", "B. Ode"]) == ExitCode.OK
+    certificate = _certificate(cell_file, calibration_file)
+    document = _document(certificate)
+    assert document["status"]["state"] == "replaced"
+    assert document["status"]["ended"]["who"].startswith("B. Ode")
+    assert "; rolled back on " in document["status"]["text"]
+    assert not document["sentence"].startswith("Written")
+    assert "What would be written into controllers/demo.yaml" in Reader(certificate_page(certificate)).texts
+
+
+def test_a_file_that_was_changed_by_hand_after_the_write_is_noticed(cell_file: Path) -> None:
+    calibration_file = calibration_for(cell_file)
+    _apply(cell_file, calibration_file)
+    controller = cell_file.parents[1] / "controllers" / "demo.yaml"
+    text = controller.read_text(encoding="utf-8")
+    controller.write_text(text.replace("gain: 33.9", "gain: 34.9", 1), encoding="utf-8")
+    document = _document(_certificate(cell_file, calibration_file))
+    assert document["status"]["state"] == "replaced"
+    assert "; the file has other gains now (as of " in document["status"]["text"]
+    assert not document["sentence"].startswith("Written")
+
+
+def test_a_written_calibration_that_a_check_would_refuse_today_says_both(cell_file: Path) -> None:
+    calibration_file = calibration_for(cell_file)
+    _apply(cell_file, calibration_file)
+    policy = "\npolicy: {apply: {max_std_percent: 0.1}}\n"
+    cell_file.write_text(cell_file.read_text(encoding="utf-8") + policy, encoding="utf-8")
+    certificate = _certificate(cell_file, calibration_file)
+    assert certificate.verdict is Verdict.REFUSED
+    assert certificate.sentence.startswith("Written on ")
+    assert ". Today a check refuses them: J1: σ 0.40 %, expected at most 0.1 % (and 5 more, below)." in (
+        certificate.sentence
+    )
+
+
+def test_an_accepted_calibration_says_when_and_by_whom(cell_file: Path) -> None:
+    calibration_file = calibration_for(cell_file)
+    _apply(cell_file, calibration_file)
+    details = {"session": "x", "cell": "demo", "calibration_sha256": sha256(calibration_file.read_bytes())}
+    audit = cell_file.with_name("demo.audit.jsonl")
+    record_session(audit, AuditAction.ACCEPTED, at=NOW, who="A. Miller", subject="x", details=details)
+    status = _document(_certificate(cell_file, calibration_file))["status"]
+    assert status["state"] == "accepted"
+    assert status["acceptance"] == {"at": NOW.isoformat(), "who": "A. Miller"}
+    assert "; accepted on 2025-01-02 03:00 UTC by A. Miller (as of " in status["text"]
+
+
+def test_a_name_in_the_audit_log_commands_neither_a_terminal_nor_a_page(
+    cell_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calibration_file = calibration_for(cell_file)
+    _apply(cell_file, calibration_file)
+    who = f"\x1b[2J{HOSTILE}"
+    details = {"session": "x", "cell": "demo", "calibration_sha256": sha256(calibration_file.read_bytes())}
+    audit = cell_file.with_name("demo.audit.jsonl")
+    record_session(audit, AuditAction.ACCEPTED, at=NOW, who=who, subject="x", details=details)
+    capsys.readouterr()
+    assert main(["certificate", str(calibration_file), "--cell", str(cell_file)]) == ExitCode.OK
+    said = capsys.readouterr().out
+    assert "accepted on 2025-01-02 03:00 UTC by \\x1b[2J" in said
+    assert "\x1b" not in said
+    page = calibration_file.with_suffix(".html").read_text(encoding="utf-8")
+    assert "<script" not in page
+    assert "\x1b" not in page
+
+
+def test_without_a_cell_the_status_is_not_known(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "calibration.yaml"
+    save_calibration(demo_calibration(), file)
+    assert main(["certificate", str(file), "--json"]) == ExitCode.OK
+    document = json.loads(capsys.readouterr().out)
+    assert document["status"]["state"] == "not known"
+    assert document["status"]["as_of"] is None
+    assert "--cell CELL" in document["status"]["text"]
+    assert document["session"] is None
+
+
+def test_a_calibration_in_a_session_names_it_and_another_one_in_its_folder_does_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "20250102T030000Z"
+    folder.mkdir()
+    file = folder / "calibration.yaml"
+    save_calibration(demo_calibration(), file)
+    digest = sha256(file.read_bytes())
+    at = NOW.isoformat()
+    state = SessionState(
+        session=folder.name,
+        cell="demo",
+        configuration_sha256="c",
+        plans_sha256="p",
+        began=at,
+        attempt_began=at,
+        fitted=Fitted(calibration_sha256=digest, sentences=()),
+    )
+    save(Session(folder, state))
+    assert session_of(file, digest) == folder.name
+    assert session_of(file, "0" * 64) is None
+    assert session_of(tmp_path / "calibration.yaml", digest) is None
+    assert main(["certificate", str(file), "--json"]) == ExitCode.OK
+    assert json.loads(capsys.readouterr().out)["session"] == folder.name
+    assert folder.name in Reader(file.with_suffix(".html").read_text(encoding="utf-8")).texts
+
+
+@pytest.mark.parametrize("name", ["page.pdf", "page.htm", "page.html.txt"])
+def test_a_name_of_another_format_is_refused(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "calibration.yaml"
+    save_calibration(demo_calibration(), file)
+    out = tmp_path / name
+    assert main(["certificate", str(file), "--out", str(out)]) == ExitCode.USAGE
+    said = capsys.readouterr().err
+    assert "expected: a name that ends in .html" in said
+    assert "saves it as a PDF" in said
+    assert not out.exists()
+    for other in ("page.HTML", "page"):
+        assert main(["certificate", str(file), "--out", str(tmp_path / other)]) == ExitCode.OK
+
+
+def test_the_earlier_name_of_the_verb_writes_the_same_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "calibration.yaml"
+    save_calibration(demo_calibration(), file)
+    found = []
+    for verb in ("certificate", "report"):
+        page = tmp_path / f"{verb}.html"
+        assert main([verb, str(file), "--out", str(page), "--json"]) == ExitCode.OK
+        found.append((page.read_bytes(), capsys.readouterr().out))
+    assert found[0] == found[1]

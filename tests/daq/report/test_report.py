@@ -11,10 +11,12 @@ from xml.etree import ElementTree
 import matplotlib.image
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rich.console import Console
 
-from daq.report.gains import gain_table, plot_gains, torque_sentences, with_deviation
+from daq.report.gains import gain_table, plot_gains, sum_text, torque_sentences, with_deviation
 from daq.report.plots import plot_residual, plot_torques
 from daq.report.svg import Line, before_after_drawing, chart, ranking, sheet, visible_points
 from ident.calibration import Gain
@@ -131,6 +133,41 @@ def test_no_word_of_a_ranking_is_cut_off() -> None:
     assert " ".join(text for text, _, _ in texts if text in name) == name
     assert all(8.5 * len(text) + x <= width and y <= height for text, x, y in texts if text in name)
     assert {"5846", "3.2"} <= {text for text, _, _ in texts}
+
+
+def test_no_grid_line_of_a_ranking_crosses_a_name() -> None:
+    names = ("J3: a torque that depends on the load torque and that no named effect explains", "J2: a spring")
+    drawn = ElementTree.fromstring(ranking([(name, 5846.2, "full") for name in names], "t", "%"))
+    lines = [(float(one.attrib["y1"]), float(one.attrib["y2"])) for one in drawn.iter("line")]
+    words = " ".join(names)
+    baselines = [float(one.attrib["y"]) for one in drawn.iter("text") if one.text is not None and one.text in words]
+    assert lines
+    assert len(baselines) >= len(names) + 1
+    for y in baselines:
+        # Letters reach 11 above the baseline of a text of 14.
+        assert all(bottom <= y - 11.0 or top >= y for top, bottom in lines)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("Izz1 + 1.0*Ia1 - 1.0*Iyy2 + 0.07*mz3", "Izz1 + Ia1 - Iyy2 + 0.07·mz3"),
+        ("m6 - 1e-06*m7 + 21.0*m8", "m6 - 1e-06·m7 + 21.0·m8"),
+        ("fv1", "fv1"),
+        ("Ixx:disc", "Ixx:disc"),
+        ("c of load-friction on J1*2", "c of load-friction on J1*2"),
+    ],
+)
+def test_a_sum_of_parameters_is_written_for_readers(name: str, text: str) -> None:
+    assert sum_text(name) == text
+
+
+@given(st.lists(st.tuples(st.sampled_from("+-"), st.floats(1e-6, 1e3)), min_size=1, max_size=5))
+def test_every_factor_of_a_sum_but_one_can_be_read_back(terms: list[tuple[str, float]]) -> None:
+    rounded = [(sign, round(factor, 6)) for sign, factor in terms]
+    name = "Izz1" + "".join(f" {sign} {factor}*m{number}" for number, (sign, factor) in enumerate(rounded))
+    shown = re.findall(r" ([+-]) (?:([0-9.e-]+)·)?m[0-9]", sum_text(name))
+    assert [(sign, float(factor or 1.0)) for sign, factor in shown] == rounded
 
 
 def test_the_table_says_error_and_truth_within_80_columns() -> None:

@@ -16,7 +16,8 @@ from daq.config.cell import Cell, model_of
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.log.reader import LossyLogs
-from daq.report.certificate import certificate_report, certify, without_controller
+from daq.report.certificate import certificate_report, certify
+from daq.report.comparison import without_controller
 from daq.report.document import json_tree
 from daq.workflow import fit as fitting
 from daq.workflow.fit import Fit, calibration_of, fit, with_corrected_geometry

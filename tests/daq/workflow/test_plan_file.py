@@ -146,5 +146,7 @@ def test_the_command_line_says_how_well_each_gain_will_be_seen(
     for _ in range(2):  # a preview is replaced
         assert main([*arguments, "--preview", str(page)]) == ExitCode.OK
     assert find_preview(tmp_path / "plan.yaml") == page
+    assert main([*arguments, "--preview", str(tmp_path / "look.pdf")]) == ExitCode.USAGE
+    assert "a name that ends in .html" in capsys.readouterr().err
     assert main([*arguments, "--sigma", "0.1"]) == ExitCode.USAGE
     assert main([*arguments, "--payload", "anvil"]) == ExitCode.CONFIGURATION

@@ -20,8 +20,9 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import decode_calibration, encode_calibration
 from daq.log.reader import LossyLogs
-from daq.report.certificate import certify, without_controller
+from daq.report.certificate import certify
 from daq.report.certificate_page import certificate_page
+from daq.report.comparison import without_controller
 from daq.report.validation import validation_view
 from daq.workflow import fit as fit_module
 from daq.workflow import validate as validate_module

@@ -20,7 +20,7 @@ from daq.config.controller import ControllerFormat
 from daq.config.yaml_file import MAX_BYTES
 from daq.errors import ControllerUnfit
 from daq.formats.dcf_document import DcfDocument
-from daq.formats.document import FORMATS, decode_document, format_of, read_controller_file
+from daq.formats.document import FORMATS, comment_behind, decode_document, format_of, read_controller_file
 from daq.formats.json_document import JsonDocument
 from daq.formats.scalar import ControllerDocument, rewrite_gain
 from daq.formats.xml_document import XmlDocument
@@ -636,3 +636,25 @@ def test_only_a_regular_file_of_bounded_size_is_read(tmp_path: Path) -> None:
     link.symlink_to(tmp_path / "there.yaml")
     (tmp_path / "there.yaml").write_bytes(b"a: 1\n")
     assert read_controller_file(link) == b"a: 1\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "comment"),
+    [
+        ("a.yaml", "gain: 32.96   # Nm per A, from the data sheet \nother: 1\n", "Nm per A, from the data sheet"),
+        ("a.yaml", "gain: '32.96' # of 'J1': {a: #2}\r\n", "of 'J1': {a: #2}"),
+        ("a.yaml", "{gain: 32.96, kp: 7}  # both", "both"),
+        ("a.yaml", "gain: 32.96\n# of the next line\n", ""),
+        ("a.yaml", "gain: 32.96 #\nkp: 7 # of another number\n", ""),
+        ("a.xml", "<gain>32.96</gain> <!-- old --> <!-- second -->\n", "old"),
+        ("a.xml", "<gain>32.96</gain>\n<!-- of the next line -->\n", ""),
+        ("a.json", '{"gain": 32.96}  # no comment', ""),
+        ("a.dcf", "ParameterValue=32.96\n; of the next line\n", ""),
+    ],
+)
+def test_the_comment_behind_a_number_is_that_of_its_line(name: str, text: str, comment: str) -> None:
+    rest = text.partition("32.96")[2]
+    assert comment_behind(rest, name) == comment
+    as_format = {".yaml": ControllerFormat.YAML, ".xml": ControllerFormat.XML}.get(Path(name).suffix)
+    if as_format is not None:
+        assert comment_behind(rest, "a.conf", as_format) == comment

@@ -1,4 +1,4 @@
-"""`drivegain report`: the certificate of a calibration as one page."""
+"""`drivegain certificate`, once called `report`: the certificate of a calibration as one page."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.terminal import check_folder, check_replaceable, print_view, write_output
+from daq.cli.terminal import check_folder, check_page, check_replaceable, print_view, write_output
 from daq.cli.verb import CalibrationArgument, JsonOption, Verb, output_option, print_json
-from daq.files import replace_file
+from daq.files import replace_file, sha256
 
 
-def report_verb(
+def certificate_verb(
     calibration: CalibrationArgument,
     out: Annotated[
         Path | None,
@@ -28,37 +28,45 @@ def report_verb(
 ) -> None:
     """Write the certificate of a calibration: one page for screen, phone and paper, without network or script.
 
-    It shows each gain beside the one in the controller with the limits, the error on held-out runs, the effects, what
-    would be written where, and one verdict. Nothing is written to the controller.
+    It shows one verdict, each gain with the current gain and the limits, the error on held-out runs, the effects, what
+    would be written or was written where, and a line to sign. Nothing is written to the controller. The earlier name
+    of this verb, `report`, goes on working.
     """
 
     from daq.config.cell_file import load_cell
     from daq.documents.calibration_file import decode_calibration, load_calibration, read_calibration_bytes
-    from daq.report.certificate import certificate_report, certify, compare, without_controller
+    from daq.jobs.session import session_of
+    from daq.report.certificate import Origin, certificate_report, certify
     from daq.report.certificate_page import certificate_page
+    from daq.report.certificate_status import status_text
+    from daq.report.comparison import compare, without_controller
     from daq.report.html import MARK
+    from daq.report.text import terminal_text
     from daq.writeback.request import Request
 
     page = out or calibration.with_suffix(".html")
+    check_page(page, "--out")
     check_folder(page)
     check_replaceable(page, MARK, "page of drivegain")
     content = read_calibration_bytes(calibration)
     fitted = decode_calibration(content, str(calibration))
     earlier = None if beside is None else load_calibration(beside)
     request = Request(fitted, datetime.now(UTC), file=calibration, content=content)
+    digest = sha256(content)
     if cell is None:
         unread = "The controller was not read; add --cell CELL to compare with its gains and the limits of the cell."
         comparison = without_controller(fitted, unread, request.now)
     else:
         command = f"drivegain apply {shlex.quote(str(cell))} {shlex.quote(str(calibration))}"
         comparison = compare(load_cell(cell), request, command)
-    certificate = certify(fitted, comparison, earlier)
+    certificate = certify(fitted, comparison, earlier, Origin(digest, session_of(calibration, digest)))
     with write_output(page):
         replace_file(page, certificate_page(certificate).encode())
     if json:
         print_json(certificate_report(certificate))
     else:
-        print_view((certificate.sentence,), page)
+        status = f"Certificate {certificate.origin.id}, {status_text(comparison)}."
+        print_view((terminal_text(certificate.sentence), terminal_text(status)), page)
 
 
-REPORT = Verb("report", report_verb, "drivegain report calibration.yaml --cell CELL")
+CERTIFICATE = Verb("certificate", certificate_verb, "drivegain certificate calibration.yaml --cell CELL")
