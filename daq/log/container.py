@@ -43,6 +43,7 @@ from drivers.messages import CellEvent, SlowReading
 
 MAGIC = b"\x89MCAP0\r\n"
 UNFINISHED = ".part"  #: Suffix of a log that is being written, or whose recorder has died
+HEAD_BYTES = 9  #: Kind and length before every record
 LARGEST_RECORD = 64 * 2**20  #: [bytes]; our chunks hold 200 ms
 LARGEST_CHUNK = 64 * 2**20
 LARGEST_RATIO = 200
@@ -121,11 +122,11 @@ class RecordFile:
         offset = stream.seek(len(MAGIC))
         while True:
             self.whole_bytes = offset
-            head = stream.read(9)
-            opcode, length = struct.unpack("<BQ", head) if len(head) == 9 else (0, LARGEST_RECORD)
+            head = stream.read(HEAD_BYTES)
+            opcode, length = struct.unpack("<BQ", head) if len(head) == HEAD_BYTES else (0, LARGEST_RECORD)
             if length > LARGEST_RECORD:
                 raise self.corrupt(offset, f"a record of {length} bytes", f"at most {LARGEST_RECORD}")
-            body = stream.read(length) if len(head) == 9 else b""
+            body = stream.read(length) if len(head) == HEAD_BYTES else b""
             if len(body) < length:
                 raise self._truncated(offset + len(head) + len(body), offset)
             if opcode == Opcode.DATA_END:
@@ -138,7 +139,7 @@ class RecordFile:
             elif all(opcode != known for known, _ in _PARSERS):
                 raise self.corrupt(offset, f"a record of kind {opcode:#04x}", "one of a data section")
             yield from self._record(offset, opcode, body)
-            offset += 9 + length
+            offset += HEAD_BYTES + length
 
     def _records(self, stream: BinaryIO, size: int) -> Iterator[tuple[int, McapRecord]]:
         self._check_start(stream, size)
@@ -148,9 +149,9 @@ class RecordFile:
         offset = stream.seek(len(MAGIC))
         in_data = True
         while offset < size - len(MAGIC):
-            head = stream.read(9)
-            opcode, length = struct.unpack("<BQ", head) if len(head) == 9 else (0, size)
-            if length > min(size - len(MAGIC) - offset - 9, LARGEST_RECORD):
+            head = stream.read(HEAD_BYTES)
+            opcode, length = struct.unpack("<BQ", head) if len(head) == HEAD_BYTES else (0, size)
+            if length > min(size - len(MAGIC) - offset - HEAD_BYTES, LARGEST_RECORD):
                 raise self.corrupt(offset, f"a record of {length} bytes", "one that fits the file")
             body = stream.read(length)
             digest.update(head)
@@ -161,13 +162,13 @@ class RecordFile:
             elif opcode == Opcode.FOOTER and not in_data:
                 crc = zlib.crc32(body[:16], zlib.crc32(head, crc))
                 self._check_crc(offset, "summary", _parse(Footer.read, body, self, offset).summary_crc, crc)
-                offset += 9 + length
+                offset += HEAD_BYTES + length
                 break
             else:
                 crc = zlib.crc32(body, zlib.crc32(head, crc))
                 if in_data:
                     yield from self._record(offset, opcode, body)
-            offset += 9 + length
+            offset += HEAD_BYTES + length
         else:
             raise self.corrupt(offset, "no footer", "one before the end")
         if offset != size - len(MAGIC):
@@ -236,6 +237,22 @@ class RecordFile:
         if self._records_left < 0:
             raise self.corrupt(offset, "too many messages for a file of its size", "a recording")
 
+    def records_inside(self, offset: int, data: bytes) -> Iterator[tuple[int, int, int]]:
+        """Yield kind, start and end of each record of a chunk.
+
+        Raises:
+            LogCorrupt: one is longer than the chunk, or there are more than a recording of this size has.
+        """
+        start = 0
+        while start < len(data):
+            self.spend(offset)
+            opcode = data[start]
+            end = start + HEAD_BYTES + int.from_bytes(data[start + 1 : start + HEAD_BYTES], "little")
+            if end > len(data):
+                raise self.corrupt(offset, "a record beyond the end of its chunk", "one inside")
+            yield opcode, start, end
+            start = end
+
     def unpack(self, offset: int, chunk: Chunk) -> bytes:
         """Decompress a chunk.
 
@@ -285,7 +302,11 @@ def _parse(read: Callable[[ReadDataStream], Record], body: bytes, file: RecordFi
         raise file.corrupt(offset, f"a broken record ({type(error).__name__})", "an MCAP record") from error
 
 
-_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+_DEFINITIONS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+}
+_MESSAGE_HEAD_BYTES = HEAD_BYTES + 22  #: Kind, length, channel, sequence and two times
 _QUANTITIES = {topic: quantity for quantity, topic in READING_TOPICS.items()}
 _READ = (SAMPLES_TOPIC, EVENTS_TOPIC, *_QUANTITIES)  #: Topics that a fit needs; the others are for viewers
 
@@ -311,65 +332,48 @@ class ChunkContents:
             LogCorrupt: a record is broken.
             LogForeign: a topic has another type than in a log of a cell.
         """
-        start = self._definitions(offset, data)
-        if start == len(data):
-            return
-        head = self._message_head(offset, data, start)
-        if self._topic(head[2]) == SAMPLES_TOPIC:
-            count, rest = divmod(len(data) - start, 9 + head[1])
-            axes = self._axes(offset, head[1])
-            if not rest:
-                records = np.frombuffer(data, dtype=sample_dtype(axes), count=count, offset=start)
-                words = zip((records[name] for name in ("opcode", "length", "channel")), head[:3], strict=True)
-                if all((column == word).all() for column, word in words):
-                    yield offset, records
-                    return
-        yield from self._mixed(offset, data, start)
-
-    def _mixed(self, offset: int, data: bytes, start: int) -> Iterator[tuple[int, NDArray[np.void]]]:
-        """Yield the samples of a chunk with events and viewers' topics, or repacked by another tool."""
         samples: list[bytes] = []
-        while start < len(data):
-            opcode, length, channel, _, _, _ = self._message_head(offset, data, start)
-            record = data[start : start + 9 + length]
-            start += 9 + length
-            self._file.spend(offset)
+        for opcode, start, end in self._file.records_inside(offset, data):
+            if opcode in _DEFINITIONS:
+                self.define(_parse(_DEFINITIONS[opcode], data[start + HEAD_BYTES : end], self._file, offset))
             if opcode != Opcode.MESSAGE:
                 continue
+            channel = int.from_bytes(data[start + HEAD_BYTES : start + HEAD_BYTES + 2], "little")
             topic = self._topic(channel)
+            body = data[start + _MESSAGE_HEAD_BYTES : end]
             if topic == SAMPLES_TOPIC:
-                samples.append(record)
+                if not samples:
+                    alike = self._samples_alike(offset, data, start, end)
+                    if alike is not None:
+                        yield offset, alike
+                        return
+                samples.append(data[start:end])
             elif topic == EVENTS_TOPIC:
-                self._file.spend(offset, length)
+                self._file.spend(offset, len(body))
                 try:
-                    self.events.append(event_from_bytes(record[_MESSAGE_HEAD.size :]))
+                    self.events.append(event_from_bytes(body))
                 except (ValueError, struct.error) as error:
                     raise self._file.corrupt(offset, f"a broken event ({error})", EVENTS_SCHEMA) from error
             elif topic in _QUANTITIES:
                 try:
-                    self.readings.append(reading_from_bytes(record[_MESSAGE_HEAD.size :], _QUANTITIES[topic]))
+                    self.readings.append(reading_from_bytes(body, _QUANTITIES[topic]))
                 except (ValueError, struct.error) as error:
                     raise self._file.corrupt(offset, f"a broken reading ({error})", READING_SCHEMA) from error
         if samples:
-            axes = self._axes(offset, len(samples[0]) - 9)
+            axes = self._axes(offset, len(samples[0]))
             dtype = sample_dtype(axes)
             if any(len(sample) != dtype.itemsize for sample in samples):
                 raise self._file.corrupt(offset, "samples of different sizes", "one number of axes")
             yield offset, np.frombuffer(b"".join(samples), dtype=dtype)
 
-    def _definitions(self, offset: int, data: bytes) -> int:
-        """Read the schemas and channels at the start of a chunk; return the position of the first message."""
-        start = 0
-        while start < len(data) and data[start] != Opcode.MESSAGE:
-            self._file.spend(offset)
-            end = start + 9 + int.from_bytes(data[start + 1 : start + 9], "little")
-            if end > len(data):
-                raise self._file.corrupt(offset, "a record beyond the end of its chunk", "one inside")
-            if data[start] in {Opcode.SCHEMA, Opcode.CHANNEL}:
-                read = Schema.read if data[start] == Opcode.SCHEMA else Channel.read
-                self.define(_parse(read, data[start + 9 : end], self._file, offset))
-            start = end
-        return start
+    def _samples_alike(self, offset: int, data: bytes, start: int, end: int) -> NDArray[np.void] | None:
+        """Return the rest of a chunk as one array, if it holds nothing but samples as the first one of them."""
+        dtype = sample_dtype(self._axes(offset, end - start))
+        if (len(data) - start) % dtype.itemsize:
+            return None
+        records = np.frombuffer(data, dtype=dtype, offset=start)
+        heads = records[["opcode", "length", "channel"]]
+        return records if (heads == heads[0]).all() else None
 
     def define(self, record: McapRecord) -> None:
         """Register a schema or channel.
@@ -389,21 +393,13 @@ class ChunkContents:
                 )
             self._channels[record.id] = record
 
-    def _message_head(self, offset: int, data: bytes, start: int) -> tuple[int, int, int, int, int, int]:
-        if start + _MESSAGE_HEAD.size > len(data):
-            raise self._file.corrupt(offset, "a message beyond the end of its chunk", "one inside")
-        opcode, length, channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(data, start)
-        if start + 9 + length > len(data):
-            raise self._file.corrupt(offset, "a message beyond the end of its chunk", "one inside")
-        return opcode, length, channel, sequence, log_time, publish_time
-
     def _topic(self, channel: int) -> str:
         known = self._channels.get(channel)
         return known.topic if known else ""
 
-    def _axes(self, offset: int, length: int) -> int:
-        """Return the number of axes of samples of this length."""
+    def _axes(self, offset: int, size: int) -> int:
+        """Return the number of axes of samples of this size, as records."""
         for axes in range(1, LARGEST_AXES + 1):
-            if sample_dtype(axes).itemsize == 9 + length:
+            if sample_dtype(axes).itemsize == size:
                 return axes
-        raise self._file.corrupt(offset, f"a sample of {length} bytes", f"1 to {LARGEST_AXES} axes")
+        raise self._file.corrupt(offset, f"a sample of {size - HEAD_BYTES} bytes", f"1 to {LARGEST_AXES} axes")
