@@ -17,11 +17,10 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from daq.config.cell import Cell, joint_names
-from daq.config.cell_file import cell_from_bundle
 from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
 from daq.files import fsync_folder
-from daq.log.conversion import scaling, unwrapped
+from daq.log.conversion import continuous_counts, scaling
 from daq.log.message import (
     CURRENTS_TOPIC,
     DEFINITIONS,
@@ -77,7 +76,7 @@ def export_bag(path: Path, out: Path, calibration: Calibration | None = None) ->
             str(out), found="a file or folder of that name", expected="none", remedy="choose another --out"
         )
     log = read_log(path)
-    cell = cell_from_bundle(log.head.files, names={"cell.yaml": f"{path}, cell.yaml"})
+    cell = log.head.cell(path)
     found = None if calibration is None else mismatch_of_calibration(calibration, cell)
     if found is not None:
         raise ConfigurationInconsistent(
@@ -111,9 +110,7 @@ def export_bag(path: Path, out: Path, calibration: Calibration | None = None) ->
 def _messages(log: Log, cell: Cell, gains: Sequence[float]) -> Iterator[tuple[int, str, bytes]]:
     """Yield stamp [ns], topic and CDR bytes of every message."""
     samples, scale = log.samples, scaling(cell, log.head.readback)
-    is_counter = np.array([axis.position_rad_per_count is None for axis in log.head.readback.axes])
-    counts = np.where(is_counter, unwrapped(samples.position_counts), samples.position_counts)
-    position = scale.joint_position(counts)
+    position = scale.joint_position(continuous_counts(samples.position_counts, log.head.readback))
     velocity = mean_velocity(position, samples.time_ns)
     current = samples.current_raw * scale.current_per_unit
     effort = joint_effort(cell, current, gains) if len(gains) else np.empty((len(current), 0))

@@ -55,14 +55,14 @@ bytes each; without a bound, megabytes of equal events take gigabytes and minute
 BYTES_A_UNIT = 64  #: An event of so many bytes counts as another record: its text is kept
 
 Record = TypeVar("Record", bound=McapRecord)
-_PARSERS: tuple[tuple[Opcode, Callable[[ReadDataStream], McapRecord]], ...] = (
-    (Opcode.HEADER, Header.read),
-    (Opcode.SCHEMA, Schema.read),
-    (Opcode.CHANNEL, Channel.read),
-    (Opcode.ATTACHMENT, Attachment.read),
-    (Opcode.METADATA, Metadata.read),
-    (Opcode.CHUNK, Chunk.read),
-)
+_PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
+    Opcode.HEADER: Header.read,
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.ATTACHMENT: Attachment.read,
+    Opcode.METADATA: Metadata.read,
+    Opcode.CHUNK: Chunk.read,
+}
 
 
 class RecordFile:
@@ -136,7 +136,7 @@ class RecordFile:
             if opcode == Opcode.MESSAGE_INDEX:
                 if length < 6 or length != 6 + int.from_bytes(body[2:6], "little"):
                     raise self.corrupt(offset, "a broken index", "one of the chunk before it")
-            elif all(opcode != known for known, _ in _PARSERS):
+            elif opcode not in _PARSERS:
                 raise self.corrupt(offset, f"a record of kind {opcode:#04x}", "one of a data section")
             yield from self._record(offset, opcode, body)
             offset += HEAD_BYTES + length
@@ -180,9 +180,8 @@ class RecordFile:
         if opcode == Opcode.ATTACHMENT:
             stored = int.from_bytes(body[-4:], "little")
             self._check_crc(offset, "attachment", stored, zlib.crc32(body[:-4]))
-        for known, read in _PARSERS:
-            if opcode == known:
-                yield offset, _parse(read, body, self, offset)
+        if opcode in _PARSERS:
+            yield offset, _parse(_PARSERS[opcode], body, self, offset)
 
     def _check_start(self, stream: BinaryIO, size: int) -> None:
         start = stream.read(len(MAGIC))
@@ -302,10 +301,6 @@ def _parse(read: Callable[[ReadDataStream], Record], body: bytes, file: RecordFi
         raise file.corrupt(offset, f"a broken record ({type(error).__name__})", "an MCAP record") from error
 
 
-_DEFINITIONS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
-    Opcode.SCHEMA: Schema.read,
-    Opcode.CHANNEL: Channel.read,
-}
 _MESSAGE_HEAD_BYTES = HEAD_BYTES + 22  #: Kind, length, channel, sequence and two times
 _QUANTITIES = {topic: quantity for quantity, topic in READING_TOPICS.items()}
 _READ = (SAMPLES_TOPIC, EVENTS_TOPIC, *_QUANTITIES)  #: Topics that a fit needs; the others are for viewers
@@ -334,8 +329,8 @@ class ChunkContents:
         """
         samples: list[bytes] = []
         for opcode, start, end in self._file.records_inside(offset, data):
-            if opcode in _DEFINITIONS:
-                self.define(_parse(_DEFINITIONS[opcode], data[start + HEAD_BYTES : end], self._file, offset))
+            if opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
+                self.define(_parse(_PARSERS[opcode], data[start + HEAD_BYTES : end], self._file, offset))
             if opcode != Opcode.MESSAGE:
                 continue
             channel = int.from_bytes(data[start + HEAD_BYTES : start + HEAD_BYTES + 2], "little")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from math import pi
 from pathlib import Path
@@ -13,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.cell import DEGREE, Cell, model_of
-from daq.config.cell_file import cell_from_bundle
 from daq.config.same_cell import Correction, correction_of
 from daq.errors import CurrentSaturated, LogIncomplete, LogsDiffer, PositionImplausible, RunInvalid
 from daq.log.impossible import motion_fault
 from daq.log.metadata import Readback, reports_only_losses
 from daq.log.reader import Log, LossyLogs, SampleChecks, read_log
-from drivers.messages import CellEvent, EventKind, Quantity
+from drivers.messages import CellEvent, EventKind, Quantity, SlowReading
 from ident.arrays import BoolArray, FloatArray
 from ident.data.run import Recording, Run
 from ident.data.torque_channel import TorqueChannel
@@ -119,7 +119,7 @@ def load_run(path: Path | str, cell: Cell | None = None, lossy: LossyLogs = Loss
             100.0 * speed,
         )
     if cell is None:
-        own = cell_from_bundle(log.head.files, names={"cell.yaml": f"{path}, cell.yaml"})
+        own = log.head.cell(path)
         return run_from_log(log, own, lossy), own
     serials = [_serial(axis.drive) for axis in log.head.readback.axes]
     correction = correction_of(str(path), log.head.files, cell, serials)
@@ -273,20 +273,29 @@ def moves(events: tuple[CellEvent, ...], time_ns: NDArray[np.int64]) -> NDArray[
     return number[np.maximum(np.searchsorted(begin_ns, time_ns, side="right") - 1, 0)]
 
 
+def readings_by_axis(readings: Iterable[SlowReading], quantity: Quantity) -> dict[int, list[tuple[int, float]]]:
+    """Return time [ns] and value of the readings of a quantity, in the order of time, by the index of their axis."""
+    found = defaultdict(list)
+    for reading in readings:
+        if reading.quantity is quantity:
+            found[reading.axis].append((reading.time_ns, reading.value))
+    return {axis: sorted(own) for axis, own in found.items()}
+
+
 def temperatures(log: Log) -> FloatArray | None:
     """Return the temperature of each axis at each sample [°C], shape (k, n); None in a log without any.
 
     It is interpolated between readings, and constant before the first and after the last; NaN for an axis without.
     """
-    readings = [reading for reading in log.readings if reading.quantity is Quantity.TEMPERATURE]
+    readings = readings_by_axis(log.readings, Quantity.TEMPERATURE)
     if not readings:
         return None
     time_ns = log.samples.time_ns
     found = np.full(log.samples.position_counts.shape, np.nan)
-    for axis in {reading.axis for reading in readings}:
-        own = sorted((one.time_ns - int(time_ns[0]), one.value) for one in readings if one.axis == axis)
-        at_ns, values = np.array(own).T
-        found[:, axis] = np.interp(time_ns - time_ns[0], at_ns, values)
+    for axis, own in readings.items():
+        at_ns = np.array([stamp for stamp, _ in own], dtype=np.int64)
+        values = [value for _, value in own]
+        found[:, axis] = np.interp(time_ns - time_ns[0], at_ns - time_ns[0], values)
     return found
 
 
@@ -302,7 +311,7 @@ def torque_channels(log: Log, cell: Cell, current: FloatArray, valid: BoolArray)
         current: recorded currents in the gains' unit, shape (k, n).
         valid: samples that may be used, shape (k, n).
     """
-    readings = [reading for reading in log.readings if reading.quantity is Quantity.TORQUE]
+    readings = readings_by_axis(log.readings, Quantity.TORQUE)
     if not readings:
         return ()
     time_ns, rate_hz = log.samples.time_ns, log.head.run.rate_hz
@@ -312,7 +321,7 @@ def torque_channels(log: Log, cell: Cell, current: FloatArray, valid: BoolArray)
     np.cumsum((current, valid), axis=1, out=sums[:, 1:])
     channels = []
     for axis, reduction in enumerate(DriveTrain(cell.ratio).reduction):
-        own = sorted((one.time_ns, one.value) for one in readings if one.axis == axis)
+        own = readings.get(axis, [])
         at_ns = np.array([stamp for stamp, _ in own], dtype=np.int64)
         row = np.searchsorted(time_ns, at_ns - round(0.5e9 / rate_hz))
         inside = (row >= far) & (row + far < len(time_ns))

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.cell import Cell
-from daq.config.cell_file import cell_from_bundle
 from daq.errors import ConfigurationMissing, OutputFailed, UsageError
-from daq.log.conversion import moves, scaling, unwrapped
+from daq.log.conversion import answers, moves, readings_by_axis, scaling, unwrapped
 from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import LogReader, SampleBlock
 from drivers.messages import CellEvent, Quantity, SlowReading
@@ -86,7 +85,7 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
     watch: MotionWatch | None = None
     for block in reader:
         if watch is None:
-            cell = cell_from_bundle(reader.head.files, names={"cell.yaml": f"{log}, cell.yaml"})
+            cell = reader.head.cell(log)
             watch = MotionWatch(cell, reader.head)
         watch.take(block)
     assert watch is not None  # the reader refuses a log without samples
@@ -129,14 +128,12 @@ def tables(
     last: tuple[NDArray[np.int32], NDArray[np.int64]] | None = None
     first_ns = 0
     names = column_names(cell)
-    every = {
-        f"{names[axis]}.{_SLOW_COLUMNS[quantity]}": sorted(
-            (one.time_ns, one.value) for one in readings if (one.axis, one.quantity) == (axis, quantity)
-        )
-        for axis in range(len(names))
-        for quantity in Quantity
-    }
-    slow = {name: found for name, found in every.items() if found}
+    by_quantity = {quantity: readings_by_axis(readings, quantity) for quantity in Quantity}
+    slow = {}
+    for axis, name in enumerate(names):
+        for quantity, by_axis in by_quantity.items():
+            if axis in by_axis:
+                slow[f"{name}.{_SLOW_COLUMNS[quantity]}"] = by_axis[axis]
     for block, is_last in _with_last(reader):
         scale = scaling(cell, reader.head.readback)
         is_counter = np.array([axis.position_rad_per_count is None for axis in reader.head.readback.axes])
@@ -167,6 +164,7 @@ def _columns(
         "time_s": (block.time_ns - first_ns) * 1e-9,
         "move": np.full(len(block.cycle), -1, dtype=np.int64) if move is None else move,
     }
+    answered = answers(block.missing, len(cell.axes)).astype(np.uint8)
     for index, (axis, name) in enumerate(zip(cell.axes, column_names(cell), strict=True)):
         current = axis.gain_unit.partition("/")[2].strip() or "A"
         columns |= {
@@ -175,7 +173,7 @@ def _columns(
             f"{name}.motor_counts": counts[:, index],
             f"{name}.current_raw": block.current_raw[:, index],
             f"{name}.statusword": block.statusword[:, index],
-            f"{name}.answered": ((block.missing >> np.uint32(index)) & 1 == 0).astype(np.uint8),
+            f"{name}.answered": answered[:, index],
         }
     return columns
 

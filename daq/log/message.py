@@ -171,9 +171,7 @@ def event_from_bytes(data: bytes) -> CellEvent:
     end += -end % 4
     (code,) = struct.unpack_from("<I", data, end)
     text, _ = _string_from(data, end + 4)
-    if seconds < 0 or nanoseconds >= 1_000_000_000:
-        raise ValueError(f"time {seconds} s, {nanoseconds} ns")
-    time_ns = seconds * 1_000_000_000 + nanoseconds
+    time_ns = _time_ns(seconds, nanoseconds)
     return CellEvent(time_ns, None if axis == WHOLE_CELL else axis, EventKind(kind), code, text)
 
 
@@ -192,11 +190,16 @@ def reading_from_bytes(data: bytes, quantity: Quantity) -> SlowReading:
     head, seconds, nanoseconds, axis, value = _READING.unpack(data)
     if head != _ENCAPSULATION:
         raise ValueError(f"encapsulation {head!r}, expected little-endian CDR")
-    if seconds < 0 or nanoseconds >= 1_000_000_000:
-        raise ValueError(f"time {seconds} s, {nanoseconds} ns")
+    time_ns = _time_ns(seconds, nanoseconds)
     if not 0 <= axis < LARGEST_AXES or not math.isfinite(value):
         raise ValueError(f"a value of {value} for axis {axis}")
-    return SlowReading(seconds * 1_000_000_000 + nanoseconds, axis, quantity, value)
+    return SlowReading(time_ns, axis, quantity, value)
+
+
+def _time_ns(seconds: int, nanoseconds: int) -> int:
+    if seconds < 0 or nanoseconds >= 1_000_000_000:
+        raise ValueError(f"time {seconds} s, {nanoseconds} ns")
+    return seconds * 1_000_000_000 + nanoseconds
 
 
 def _string(text: str) -> bytes:

@@ -141,24 +141,16 @@ def check_current(current: FloatArray, wanted: ImportDescription, file: Table) -
             )
     found = impossible_current(current)
     if found is not None:
-        raise TableUnfit(
-            file.place(found.row, wanted.current.columns[found.axis]),
-            found=found.found,
-            expected=found.expected,
-            remedy="samples are never invented: cut the recording there, or export it again",
-        )
+        place = file.place(found.row, wanted.current.columns[found.axis])
+        raise found.error(TableUnfit, place, "samples are never invented: cut the recording there, or export it again")
 
 
 def check_speed(name: str, joint_rad: FloatArray, rate_hz: float, cell: Cell) -> None:
     """Refuse implausible speeds. A wrong rate scales them all; over many samples they are far above the noise."""
     found = impossible_speed(joint_rad, rate_hz, cell)
     if found is not None:
-        raise TableUnfit(
-            f"{name}, axis {cell.axes[found.axis].name}",
-            found=found.found,
-            expected=found.expected,
-            remedy="most likely rate_hz is too high, or the unit of the time column or of the positions is another",
-        )
+        remedy = "most likely rate_hz is too high, or the unit of the time column or of the positions is another"
+        raise found.error(TableUnfit, f"{name}, axis {cell.axes[found.axis].name}", remedy)
     limits = np.array([axis.limits.velocity for axis in cell.axes])
     share = float((fastest_speeds(joint_rad, rate_hz) / limits).max())
     if share < SLOW_SHARE:
@@ -191,11 +183,10 @@ def check_steps(
     row = found.row
     if clock is not None:
         row = int(clock.row[min(np.searchsorted(clock.time_s, clock.tick_s[row]), len(clock.row) - 1)])
-    raise TableUnfit(
+    raise found.error(
+        TableUnfit,
         f"{file.place(row, wanted.position.columns[found.axis])}, axis {cell.axes[found.axis].name}",
-        found=found.found,
-        expected=found.expected,
-        remedy="cut the recording there, or export it again; a column that wraps (at 360 degrees, at a turn of "
+        "cut the recording there, or export it again; a column that wraps (at 360 degrees, at a turn of "
         "the motor, as a counter) has to be made continuous",
     )
 

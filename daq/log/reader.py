@@ -12,6 +12,8 @@ import numpy as np
 from mcap.records import Attachment, Chunk, Header, McapRecord, Metadata
 from numpy.typing import NDArray
 
+from daq.config.cell import Cell
+from daq.config.cell_file import cell_from_bundle
 from daq.config.yaml_file import MAX_BYTES
 from daq.errors import ClockImplausible, CyclesLost, DataError, LogIncomplete, LogMissing, LogUnreadable
 from daq.log.container import UNFINISHED, ChunkContents, RecordFile
@@ -59,6 +61,14 @@ class LogHead:
     run: RunInfo  #: facts about the recording
     readback: Readback  #: answers of the amplifiers
     files: Mapping[str, bytes]  #: all attachments by name, with the cell's bundle
+
+    def cell(self, log: Path) -> Cell:
+        """Return the cell of the log, which is named in messages.
+
+        Raises:
+            ConfigurationError: its configuration is inconsistent.
+        """
+        return cell_from_bundle(self.files, names={"cell.yaml": f"{log}, cell.yaml"})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,6 +220,8 @@ class LogReader:
         self.damage: LogUnreadable | None = None
         self._file = RecordFile(path)
         self._chunks = ChunkContents(self._file)
+        self.events = self._chunks.events  #: read so far
+        self.readings = self._chunks.readings  #: slow ones, read so far
         self._attachments: dict[str, bytes] = {}
         self._metadata: dict[str, dict[str, str]] = {}
         self.checks = SampleChecks(path)  #: of the samples read so far
@@ -250,16 +262,6 @@ class LogReader:
             LogIncomplete: the counts or the readback are missing.
         """
         return self.checks.contradiction(self.head, self.statistics, self.readings)
-
-    @property
-    def events(self) -> list[CellEvent]:
-        """Events read so far."""
-        return self._chunks.events
-
-    @property
-    def readings(self) -> list[SlowReading]:
-        """Slow readings read so far."""
-        return self._chunks.readings
 
     @property
     def whole_bytes(self) -> int:

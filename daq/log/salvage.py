@@ -10,7 +10,6 @@ from itertools import chain
 from pathlib import Path
 
 from daq.config.cell import Cell
-from daq.config.cell_file import cell_from_bundle
 from daq.errors import LogIncomplete, LogUnreadable, UsageError
 from daq.files import open_regular
 from daq.log.container import UNFINISHED
@@ -81,7 +80,7 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
             str(damaged), found="no samples", expected="at least one", remedy="record the run again"
         )
     head = reader.head
-    cell = cell_from_bundle(head.files, names={"cell.yaml": f"{damaged}, cell.yaml"})
+    cell = head.cell(damaged)
     scale = scaling(cell, head.readback)
     run = replace(head.run, origin=f"{head.run.origin}; salvaged from {damaged.name}")
     content = LogContent.of(cell, run, head.files, head.readback)
@@ -108,24 +107,15 @@ def _copy(
     for block in blocks:
         width = block.position_counts.shape[1]
         if width != axes:
-            raise LogIncomplete(
-                str(reader.path),
-                found=f"samples of {width} axes",
-                expected=f"{axes}, as in its cell configuration",
-                remedy="it is not a recording of this software",
-            )
+            raise _foreign(reader.path, f"samples of {width} axes", f"{axes}")
         watch.take(block)
         for event in reader.events[known_events:]:
             log.event(event)
         known_events = len(reader.events)
         fresh = reader.readings[known_readings:]
         if foreign := {reading.axis for reading in fresh if reading.axis >= axes}:
-            raise LogIncomplete(
-                str(reader.path),
-                found=f"a torque or temperature of axis {max(foreign)}, counted from 0",
-                expected=f"those of {axes} axes, as in its cell configuration",
-                remedy="it is not a recording of this software",
-            )
+            surplus = f"a torque or temperature of axis {max(foreign)}, counted from 0"
+            raise _foreign(reader.path, surplus, f"those of {axes} axes")
         log.readings(fresh)
         known_readings = len(reader.readings)
         columns = (getattr(block, name).tolist() for name in SampleBlock.__slots__)
@@ -149,6 +139,15 @@ def _copy(
         cell, reader.head, reader.checks, judged, watch, lambda: LogReader(reader.path).until_damage()
     )
     log.conclude(*verdict, partial=True)
+
+
+def _foreign(path: Path, found: str, expected: str) -> LogIncomplete:
+    return LogIncomplete(
+        str(path),
+        found=found,
+        expected=f"{expected}, as in its cell configuration",
+        remedy="it is not a recording of this software",
+    )
 
 
 def _refuse_running(damaged: Path) -> None:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from rich.text import Text
 
 from daq.config.cell_buses import bus_loads
-from daq.config.cell_file import cell_from_bundle
 from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import LogReader
 from daq.report.bus_views import current_signals
@@ -228,7 +227,7 @@ def info_report(path: Path) -> InfoReport:
     for block in reader:
         if watch is None:
             first_ns = int(block.time_ns[0])
-            cell = cell_from_bundle(reader.head.files, names={"cell.yaml": f"{path}, cell.yaml"})
+            cell = reader.head.cell(path)
             watch = MotionWatch(cell, reader.head)
         watch.take(block)
         last_ns = int(block.time_ns[-1])
