@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
-from numpy.typing import NDArray
 
 from daq.config.cell import Cell, joint_names
 from daq.config.same_cell import mismatch_of_calibration
@@ -38,7 +37,7 @@ from daq.log.message import (
 )
 from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import Log, SampleChecks, read_log
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, IntArray
 from ident.calibration import Calibration
 from ident.model.model import DriveTrain
 
@@ -127,7 +126,7 @@ def _messages(log: Log, cell: Cell, gains: Sequence[float]) -> Iterator[tuple[in
         yield reading.time_ns, READING_TOPICS[reading.quantity], reading_bytes(reading)
 
 
-def mean_velocity(position: FloatArray, time_ns: NDArray[np.int64]) -> FloatArray:
+def mean_velocity(position: FloatArray, time_ns: IntArray) -> FloatArray:
     """Mean velocity over VELOCITY_S about each sample, shorter at the ends [rad/s or m/s], shape (k, n).
 
     Args:
@@ -150,7 +149,7 @@ def joint_effort(cell: Cell, current: FloatArray, gains: Sequence[float]) -> Flo
         current: [unit of the gains' denominator], shape (k, n).
         gains: g of each axis, shape (n,).
     """
-    return np.asarray((np.asarray(gains) * current) @ DriveTrain(cell.ratio).direction)
+    return (np.asarray(gains) * current) @ DriveTrain(cell.ratio).direction
 
 
 def _write(writer: Writer, messages: Sequence[tuple[int, str, bytes]]) -> None:

@@ -54,6 +54,8 @@ RECORDS, BYTES_A_RECORD = 500_000, 4
 bytes each; without a bound, megabytes of equal events take gigabytes and minutes."""
 BYTES_A_UNIT = 64  #: An event of so many bytes counts as another record: its text is kept
 
+RecordArray = NDArray[np.void]  #: Records with samples, of `sample_dtype`
+PlacedRecord = tuple[int, McapRecord]  #: Offset in the file, and the record there
 Record = TypeVar("Record", bound=McapRecord)
 _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.HEADER: Header.read,
@@ -83,7 +85,7 @@ class RecordFile:
         self._allowance = self._records_left = 0
         self._zstd = zstandard.ZstdDecompressor()
 
-    def __iter__(self) -> Generator[tuple[int, McapRecord], None, None]:
+    def __iter__(self) -> Generator[PlacedRecord, None, None]:
         """Yield offset and record, without the records that only index others.
 
         The file is open until the last record, or until the generator is closed: who may stop before the end, as at an
@@ -91,7 +93,7 @@ class RecordFile:
         """
         yield from self._opened(self._records)
 
-    def unfinished(self) -> Generator[tuple[int, McapRecord], None, None]:
+    def unfinished(self) -> Generator[PlacedRecord, None, None]:
         """Yield the records before the damage of a file without a valid end, then raise an error with its place.
 
         Such a file has only the checksums of chunks and attachments, so an unknown kind of record counts as damage. A
@@ -100,8 +102,8 @@ class RecordFile:
         yield from self._opened(self._unfinished_records)
 
     def _opened(
-        self, records: Callable[[BinaryIO, int], Iterator[tuple[int, McapRecord]]]
-    ) -> Generator[tuple[int, McapRecord], None, None]:
+        self, records: Callable[[BinaryIO, int], Iterator[PlacedRecord]]
+    ) -> Generator[PlacedRecord, None, None]:
         try:
             with open_regular(self._source) as stream:
                 size = os.fstat(stream.fileno()).st_size
@@ -116,7 +118,7 @@ class RecordFile:
                 remedy="check the name",
             ) from error
 
-    def _unfinished_records(self, stream: BinaryIO, size: int) -> Iterator[tuple[int, McapRecord]]:
+    def _unfinished_records(self, stream: BinaryIO, size: int) -> Iterator[PlacedRecord]:
         self._check_start(stream, size)
         crc = zlib.crc32(MAGIC)
         offset = stream.seek(len(MAGIC))
@@ -141,7 +143,7 @@ class RecordFile:
             yield from self._record(offset, opcode, body)
             offset += HEAD_BYTES + length
 
-    def _records(self, stream: BinaryIO, size: int) -> Iterator[tuple[int, McapRecord]]:
+    def _records(self, stream: BinaryIO, size: int) -> Iterator[PlacedRecord]:
         self._check_start(stream, size)
         self._check_end(stream, size)
         digest = hashlib.sha256(MAGIC)
@@ -176,7 +178,7 @@ class RecordFile:
         digest.update(MAGIC)
         self.sha256 = digest.hexdigest()
 
-    def _record(self, offset: int, opcode: int, body: bytes) -> Iterator[tuple[int, McapRecord]]:
+    def _record(self, offset: int, opcode: int, body: bytes) -> Iterator[PlacedRecord]:
         if opcode == Opcode.ATTACHMENT:
             stored = int.from_bytes(body[-4:], "little")
             self._check_crc(offset, "attachment", stored, zlib.crc32(body[:-4]))
@@ -316,7 +318,7 @@ class ChunkContents:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
 
-    def samples(self, offset: int, data: bytes) -> Iterator[tuple[int, NDArray[np.void]]]:
+    def samples(self, offset: int, data: bytes) -> Iterator[tuple[int, RecordArray]]:
         """Yield the samples of a chunk, all at once if it holds nothing else; its events and readings are collected.
 
         Args:
@@ -361,7 +363,7 @@ class ChunkContents:
                 raise self._file.corrupt(offset, "samples of different sizes", "one number of axes")
             yield offset, np.frombuffer(b"".join(samples), dtype=dtype)
 
-    def _samples_alike(self, offset: int, data: bytes, start: int, end: int) -> NDArray[np.void] | None:
+    def _samples_alike(self, offset: int, data: bytes, start: int, end: int) -> RecordArray | None:
         """Return the rest of a chunk as one array, if it holds nothing but samples as the first one of them."""
         dtype = sample_dtype(self._axes(offset, end - start))
         if (len(data) - start) % dtype.itemsize:

@@ -17,10 +17,11 @@ from daq.config.cell import DEGREE, Cell, model_of
 from daq.config.same_cell import Correction, correction_of
 from daq.errors import CurrentSaturated, LogIncomplete, LogsDiffer, PositionImplausible, RunInvalid
 from daq.log.impossible import motion_fault
+from daq.log.message import RawArray
 from daq.log.metadata import Readback, reports_only_losses
 from daq.log.reader import Log, LossyLogs, SampleChecks, read_log
 from drivers.messages import CellEvent, EventKind, Quantity, SlowReading
-from ident.arrays import BoolArray, FloatArray
+from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.run import Recording, Run
 from ident.data.torque_channel import TorqueChannel
 from ident.data.unsigned_current import unsigned_currents
@@ -45,7 +46,7 @@ class SiScaling:
     def joint_position(self, counts: NDArray[np.integer]) -> FloatArray:
         """Return joint positions [rad or m] of motor counts, shape (..., n): q = R⁻¹ q_motor + offset (paper eq. 24)"""
         motor_rad = counts * self.rad_per_count
-        return np.asarray(motor_rad @ self.to_joint.T + self.offset_rad, dtype=np.float64)
+        return motor_rad @ self.to_joint.T + self.offset_rad
 
     def joints_known(self, answered: BoolArray) -> BoolArray:
         """Return whether every motor that moves a joint answered, shape (k, n), from the answers of the motors."""
@@ -247,7 +248,7 @@ def answers(missing: NDArray[np.uint32], axes: int) -> BoolArray:
     return np.asarray(missing[:, None] >> np.arange(axes, dtype=np.uint32) & 1 == 0, dtype=np.bool_)
 
 
-def continuous_counts(position_counts: NDArray[np.int32], readback: Readback) -> NDArray[np.int64]:
+def continuous_counts(position_counts: RawArray, readback: Readback) -> IntArray:
     """Return positions without the wraps of an encoder's counter, shape (k, n)."""
     is_counter = [axis.position_rad_per_count is None for axis in readback.axes]
     return np.where(is_counter, unwrapped(position_counts), position_counts)
@@ -259,7 +260,7 @@ def _serial(drive: Mapping[str, Any]) -> int | None:
     return serial if type(serial) is int and 0 <= serial < 2**32 else None
 
 
-def moves(events: tuple[CellEvent, ...], time_ns: NDArray[np.int64]) -> NDArray[np.int64] | None:
+def moves(events: tuple[CellEvent, ...], time_ns: IntArray) -> IntArray | None:
     """Return the number of the move of each sample, shape (k,); None in a log without moves.
 
     A move lasts until the next one starts, so the standstill between two moves belongs to the first. Samples before
@@ -370,9 +371,7 @@ def check_limits(name: str, position_rad: FloatArray, cell: Cell, valid: BoolArr
             )
 
 
-def unwrapped(
-    counts: NDArray[np.int32], before: tuple[NDArray[np.int32], NDArray[np.int64]] | None = None
-) -> NDArray[np.int64]:
+def unwrapped(counts: RawArray, before: tuple[RawArray, IntArray] | None = None) -> IntArray:
     """Unwrap the positions of a 32 bit encoder counter, shape (k, n).
 
     A jump of more than half the range between two samples is a wrap: no motor makes 2³¹ counts in one period.

@@ -20,9 +20,11 @@ from numpy.typing import NDArray
 from daq.config.cell import Cell
 from daq.errors import ConfigurationMissing, OutputFailed, UsageError
 from daq.log.conversion import answers, moves, readings_by_axis, scaling, unwrapped
+from daq.log.message import RawArray
 from daq.log.motion import MotionWatch, log_verdict
 from daq.log.reader import LogReader, SampleBlock
 from drivers.messages import CellEvent, Quantity, SlowReading
+from ident.arrays import FloatArray, IntArray
 
 Columns = dict[str, NDArray[Any]]  #: Columns of equal length by name, in order
 Write = Callable[[Columns], None]
@@ -125,7 +127,7 @@ def tables(
     Raises:
         LogUnreadable: the log is damaged, or cell and log do not belong together.
     """
-    last: tuple[NDArray[np.int32], NDArray[np.int64]] | None = None
+    last: tuple[RawArray, IntArray] | None = None
     first_ns = 0
     names = column_names(cell)
     by_quantity = {quantity: readings_by_axis(readings, quantity) for quantity in Quantity}
@@ -152,10 +154,10 @@ def tables(
 def _columns(
     cell: Cell,
     block: SampleBlock,
-    counts: NDArray[np.int64],
-    joints: NDArray[np.float64],
-    per_unit: NDArray[np.float64],
-    move: NDArray[np.int64] | None,
+    counts: IntArray,
+    joints: FloatArray,
+    per_unit: FloatArray,
+    move: IntArray | None,
     first_ns: int,
 ) -> Columns:
     columns: Columns = {
@@ -194,7 +196,7 @@ def column_names(cell: Cell) -> list[str]:
 _SLOW_COLUMNS = {Quantity.TORQUE: "motor_torque_Nm", Quantity.TEMPERATURE: "temperature_degC"}
 
 
-def _in_rows(time_ns: NDArray[np.int64], found: list[tuple[int, float]], *, to_end: bool) -> NDArray[np.float64]:
+def _in_rows(time_ns: IntArray, found: list[tuple[int, float]], *, to_end: bool) -> FloatArray:
     """Take the readings of a block's rows from the front of a list; rows without one are NaN.
 
     Args:

@@ -141,7 +141,7 @@ def fastest_speeds(joint_rad: FloatArray, rate_hz: float) -> FloatArray:
     speeds = np.abs(joint_rad[step:] - joint_rad[:-step]) * rate_hz / step
     if not len(speeds):
         return np.zeros(joint_rad.shape[1])
-    return np.asarray(np.percentile(speeds, SPEED_PERCENTILE, axis=0), dtype=np.float64)
+    return np.percentile(speeds, SPEED_PERCENTILE, axis=0)
 
 
 def between_answers(joint_rad: FloatArray, answered: BoolArray) -> FloatArray:

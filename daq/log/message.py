@@ -13,6 +13,7 @@ import struct
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.messages import CellEvent, EventKind, Quantity, Sample, SlowReading
 
@@ -24,6 +25,7 @@ URDF_TOPIC, URDF_SCHEMA = "/robot_description", "std_msgs/msg/String"
 READING_TOPICS = {Quantity.TORQUE: "/cell/torque", Quantity.TEMPERATURE: "/cell/temperature"}
 """Topics of the slow readings; a log without such readings has no such topic."""
 READING_SCHEMA = "drivegain_msgs/msg/AxisReading"
+RawArray = NDArray[np.int32]  #: Counts and currents as amplifiers send them
 LARGEST_AXES = 32  #: Number of bits in `missing`
 
 _SEPARATOR = "=" * 80 + "\n"

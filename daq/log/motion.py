@@ -15,6 +15,7 @@ from daq.config.cell import Cell
 from daq.errors import DataError
 from daq.log.conversion import answers, continuous_counts, scaling
 from daq.log.impossible import LARGEST_OUTLIER, SPEED_MARGIN, motion_fault
+from daq.log.message import RawArray
 from daq.log.metadata import Readback, RunStatistics
 from daq.log.reader import LogHead, SampleBlock, SampleChecks, joined
 from drivers.messages import Sample
@@ -24,8 +25,8 @@ def motion_reason(
     cell: Cell,
     readback: Readback,
     rate_hz: float,
-    position_counts: NDArray[np.int32],
-    current_raw: NDArray[np.int32],
+    position_counts: RawArray,
+    current_raw: RawArray,
     missing: NDArray[np.uint32],
 ) -> str:
     """Return why no robot moves by the samples of a log, with the axis; empty where one may.
@@ -66,7 +67,7 @@ class MotionWatch:
         self._readback = head.readback
         self._scale = scaling(cell, head.readback)
         self._limits = np.array([axis.limits.velocity for axis in cell.axes])
-        self._last: NDArray[np.int32] | None = None
+        self._last: RawArray | None = None
         self._fastest = 0.0  # in multiples of the velocity limit
         self._peak = np.zeros(len(cell.axes))
         self._usual = np.full(len(cell.axes), np.inf)

@@ -9,16 +9,16 @@ from enum import Enum
 from pathlib import Path
 
 import numpy as np
-from mcap.records import Attachment, Chunk, Header, McapRecord, Metadata
+from mcap.records import Attachment, Chunk, Header, Metadata
 from numpy.typing import NDArray
 
 from daq.config.cell import Cell
 from daq.config.cell_file import cell_from_bundle
 from daq.config.yaml_file import MAX_BYTES
 from daq.errors import ClockImplausible, CyclesLost, DataError, LogIncomplete, LogMissing, LogUnreadable
-from daq.log.container import UNFINISHED, ChunkContents, RecordFile
+from daq.log.container import UNFINISHED, ChunkContents, PlacedRecord, RecordArray, RecordFile
 from daq.log.mcap_bag import foreign_recording
-from daq.log.message import ENCAPSULATION_WORD, LARGEST_AXES, SAMPLES_TOPIC
+from daq.log.message import ENCAPSULATION_WORD, LARGEST_AXES, SAMPLES_TOPIC, RawArray
 from daq.log.metadata import (
     READBACK,
     RUN,
@@ -33,6 +33,7 @@ from daq.log.metadata import (
     unsealed,
 )
 from drivers.messages import CellEvent, SlowReading
+from ident.arrays import IntArray
 
 BLOCK_SAMPLES = 4096  #: Samples of a block; at most these and one chunk are in memory
 LARGEST_ENTRIES = 1000  #: Attachments and metadata of a log; those of the shipped cells are a dozen
@@ -47,9 +48,9 @@ class SampleBlock:
     """Samples of k cycles, in the order of the log."""
 
     cycle: NDArray[np.uint64]  #: number of the sampling period, shape (k,), uint64
-    time_ns: NDArray[np.int64]  #: time of the SYNC [ns], shape (k,), int64
-    position_counts: NDArray[np.int32]  #: shape (k, n), int32
-    current_raw: NDArray[np.int32]  #: shape (k, n), int32
+    time_ns: IntArray  #: time of the SYNC [ns], shape (k,), int64
+    position_counts: RawArray  #: shape (k, n), int32
+    current_raw: RawArray  #: shape (k, n), int32
     statusword: NDArray[np.uint16]  #: shape (k, n), uint16
     missing: NDArray[np.uint32]  #: bit i for axis i, shape (k,), uint32
 
@@ -273,16 +274,16 @@ class LogReader:
         """Whether the recorder's summary has been read."""
         return STATISTICS in self._metadata
 
-    def _checked(self, records: Iterator[tuple[int, McapRecord]]) -> Iterator[tuple[int, McapRecord]]:
+    def _checked(self, records: Iterator[PlacedRecord]) -> Iterator[PlacedRecord]:
         """Refuse metadata without a seal: only the end of the file would cover them."""
         for offset, record in records:
             if isinstance(record, Metadata) and SEAL not in record.metadata:
                 raise self._file.corrupt(offset, f"metadata {record.name!r} without a seal", f"an entry {SEAL!r}")
             yield offset, record
 
-    def _blocks(self, records: Iterable[tuple[int, McapRecord]]) -> Iterator[SampleBlock]:
+    def _blocks(self, records: Iterable[PlacedRecord]) -> Iterator[SampleBlock]:
         """Join several chunks to a block: numpy's calls cost more than the 150 samples of one chunk."""
-        waiting: list[NDArray[np.void]] = []
+        waiting: list[RecordArray] = []
         start = 0
         try:
             for offset, chunk in self._sample_chunks(records):
@@ -298,7 +299,7 @@ class LogReader:
         if waiting:
             yield self._block(start, waiting)
 
-    def _sample_chunks(self, records: Iterable[tuple[int, McapRecord]]) -> Iterator[tuple[int, NDArray[np.void]]]:
+    def _sample_chunks(self, records: Iterable[PlacedRecord]) -> Iterator[tuple[int, RecordArray]]:
         for offset, record in records:
             if isinstance(record, Attachment | Metadata):
                 self._check_entry(offset, record)
@@ -370,7 +371,7 @@ class LogReader:
         """See `Log.partial`; after the iteration."""
         return self.statistics.partial or self.path.name.endswith(UNFINISHED)
 
-    def _block(self, offset: int, chunks: list[NDArray[np.void]]) -> SampleBlock:
+    def _block(self, offset: int, chunks: list[RecordArray]) -> SampleBlock:
         # Joined as bytes: numpy would convert the fields chunk by chunk.
         records = np.frombuffer(b"".join(chunk.tobytes() for chunk in chunks), dtype=chunks[0].dtype)
         axes = records["position_counts"].shape[1]
