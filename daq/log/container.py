@@ -275,19 +275,16 @@ class RecordFile:
                 remedy="convert the file with a tool for MCAP",
             )
         data = chunk.data
-        if chunk.compression == "zstd":
-            try:
+        try:
+            if chunk.compression == "zstd":
                 claimed = zstandard.frame_content_size(data)
                 if claimed > size:
                     raise self.corrupt(offset, f"a chunk that unfolds to {claimed} bytes", f"{size}, as declared")
                 data = self._zstd.decompress(data, max_output_size=size)
-            except zstandard.ZstdError as error:
-                raise self.corrupt(offset, f"a broken chunk ({error})", "zstd") from error
-        elif chunk.compression == "lz4":
-            try:
+            elif chunk.compression == "lz4":
                 data = LZ4FrameDecompressor().decompress(data, max_length=size)
-            except (RuntimeError, EOFError) as error:
-                raise self.corrupt(offset, f"a broken chunk ({error})", "lz4") from error
+        except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+            raise self.corrupt(offset, f"a broken chunk ({error})", chunk.compression) from error
         if len(data) != size:
             raise self.corrupt(offset, f"a chunk of {len(data)} bytes", f"{size}, as declared")
         self._check_crc(offset, "chunk", chunk.uncompressed_crc, zlib.crc32(data))
@@ -316,7 +313,7 @@ class ChunkContents:
         self.readings: list[SlowReading] = []  #: likewise
         self._file = file
         self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
+        self._topics: dict[int, str] = {}
 
     def samples(self, offset: int, data: bytes) -> Iterator[tuple[int, RecordArray]]:
         """Yield the samples of a chunk, all at once if it holds nothing else; its events and readings are collected.
@@ -336,7 +333,7 @@ class ChunkContents:
             if opcode != Opcode.MESSAGE:
                 continue
             channel = int.from_bytes(data[start + HEAD_BYTES : start + HEAD_BYTES + 2], "little")
-            topic = self._topic(channel)
+            topic = self._topics.get(channel)
             body = data[start + _MESSAGE_HEAD_BYTES : end]
             if topic == SAMPLES_TOPIC:
                 if not samples:
@@ -388,11 +385,7 @@ class ChunkContents:
                 raise self._file.foreign(
                     f"{record.topic} as {name} in {record.message_encoding!r}", f"{expected} in 'cdr'"
                 )
-            self._channels[record.id] = record
-
-    def _topic(self, channel: int) -> str:
-        known = self._channels.get(channel)
-        return known.topic if known else ""
+            self._topics[record.id] = record.topic
 
     def _axes(self, offset: int, size: int) -> int:
         """Return the number of axes of samples of this size, as records."""

@@ -222,10 +222,11 @@ def _string_from(data: bytes, start: int) -> tuple[str, int]:
 
 def joint_state_prefix(names: Sequence[str]) -> bytes:
     """Encode the fields of a JointState between its stamp and its positions: they are the same for every message."""
-    data = bytearray(struct.pack("<I", 1) + b"\0")  # empty frame_id
-    for word in (None, *(name.encode() + b"\0" for name in names)):
-        data += b"\0" * (-len(data) % 4)  # the stamp before it is 8 bytes long, so alignment counts from here too
-        data += struct.pack("<I", len(names) if word is None else len(word)) + (word or b"")
+    # The stamp before them is 8 bytes long, so alignment counts from here too.
+    data = bytearray(_string(""))  # frame_id
+    data += b"\0" * (-len(data) % 4) + struct.pack("<I", len(names))
+    for name in names:
+        data += b"\0" * (-len(data) % 4) + _string(name)
     return bytes(data)
 
 

@@ -409,9 +409,16 @@ def read_log(path: Path | str) -> Log:
     path = Path(path)
     reader = LogReader(path)
     samples = joined(reader)
-    head, statistics = reader.head, reader.statistics
-    events, readings = tuple(reader.events), tuple(reader.readings)
-    return Log(path, reader.digest, head, samples, events, readings, statistics, reader.partial)
+    return Log(
+        path,
+        reader.digest,
+        reader.head,
+        samples,
+        tuple(reader.events),
+        tuple(reader.readings),
+        reader.statistics,
+        reader.partial,
+    )
 
 
 def joined(blocks: Iterable[SampleBlock]) -> SampleBlock:
