@@ -5,12 +5,13 @@ from __future__ import annotations
 import importlib
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from importlib.util import find_spec
-from math import isnan
+from itertools import chain, pairwise
+from math import inf, isnan
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +137,9 @@ def tables(
         for quantity, by_axis in by_quantity.items():
             if axis in by_axis:
                 slow[f"{name}.{_SLOW_COLUMNS[quantity]}"] = by_axis[axis]
-    for block, is_last in _with_last(reader):
+    for block, following in pairwise(chain(reader, (None,))):
+        assert block is not None  # None follows the last one
+        end_ns = inf if following is None else int(following.time_ns[0])
         scale = scaling(cell, reader.head.readback)
         is_counter = np.array([axis.position_rad_per_count is None for axis in reader.head.readback.axes])
         if last is None:
@@ -147,7 +150,7 @@ def tables(
         joints = scale.joint_position(counts)
         yield {
             **_columns(cell, block, counts, joints, scale.current_per_unit, moves(events, block.time_ns), first_ns),
-            **{name: _in_rows(block.time_ns, found, to_end=is_last) for name, found in slow.items()},
+            **{name: _in_rows(block.time_ns, found, end_ns) for name, found in slow.items()},
         }
 
 
@@ -196,31 +199,19 @@ def column_names(cell: Cell) -> list[str]:
 _SLOW_COLUMNS = {Quantity.TORQUE: "motor_torque_Nm", Quantity.TEMPERATURE: "temperature_degC"}
 
 
-def _in_rows(time_ns: IntArray, found: list[tuple[int, float]], *, to_end: bool) -> FloatArray:
+def _in_rows(time_ns: IntArray, found: list[tuple[int, float]], end_ns: float) -> FloatArray:
     """Take the readings of a block's rows from the front of a list; rows without one are NaN.
 
     Args:
         time_ns: of the rows, shape (k,).
         found: time and value of the readings that are left, in their order; those of these rows are taken out.
-        to_end: the rows are the last, and take all that is left.
+        end_ns: time of the row after them; infinite behind the last.
     """
     values = np.full(len(time_ns), np.nan)
-    step = int(time_ns[-1] - time_ns[-2]) if len(time_ns) > 1 else 1
-    while found and (to_end or found[0][0] < time_ns[-1] + step):
+    while found and found[0][0] < end_ns:
         stamp, value = found.pop(0)
         values[max(0, int(np.searchsorted(time_ns, stamp, side="right")) - 1)] = value
     return values
-
-
-def _with_last(blocks: Iterable[SampleBlock]) -> Iterator[tuple[SampleBlock, bool]]:
-    """Yield each block, and whether it is the last."""
-    held: SampleBlock | None = None
-    for block in blocks:
-        if held is not None:
-            yield held, False
-        held = block
-    if held is not None:
-        yield held, True
 
 
 @contextmanager
