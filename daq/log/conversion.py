@@ -56,7 +56,8 @@ class SiScaling:
 
     def joint_position_of(self, counts: tuple[int, ...]) -> list[float]:
         """Convert one sample, for /joint_states."""
-        return [float(value) for value in self.joint_position(np.array(counts, dtype=np.int64))]
+        position: list[float] = self.joint_position(np.array(counts, dtype=np.int64)).tolist()
+        return position
 
 
 def scaling(cell: Cell, readback: Readback) -> SiScaling:
@@ -269,18 +270,22 @@ def moves(events: tuple[CellEvent, ...], time_ns: IntArray) -> IntArray | None:
     starts = sorted((event.time_ns, event.code) for event in events if event.kind is EventKind.MOVE_START)
     if not starts:
         return None
-    begin_ns = np.array([start[0] for start in starts], dtype=np.int64)
-    number = np.array([start[1] for start in starts], dtype=np.int64)
+    number: IntArray
+    begin_ns, number = np.array(starts, dtype=np.int64).T
     return number[np.maximum(np.searchsorted(begin_ns, time_ns, side="right") - 1, 0)]
 
 
-def readings_by_axis(readings: Iterable[SlowReading], quantity: Quantity) -> dict[int, list[tuple[int, float]]]:
-    """Return time [ns] and value of the readings of a quantity, in the order of time, by the index of their axis."""
+def readings_by_axis(readings: Iterable[SlowReading], quantity: Quantity) -> dict[int, tuple[IntArray, FloatArray]]:
+    """Return times [ns] and values of the readings of a quantity, in the order of time, by the index of their axis."""
     found = defaultdict(list)
     for reading in readings:
         if reading.quantity is quantity:
             found[reading.axis].append((reading.time_ns, reading.value))
-    return {axis: sorted(own) for axis, own in found.items()}
+    series = {}
+    for axis, own in found.items():
+        stamps, values = zip(*sorted(own), strict=True)
+        series[axis] = np.array(stamps, dtype=np.int64), np.array(values, dtype=np.float64)
+    return series
 
 
 def temperatures(log: Log) -> FloatArray | None:
@@ -293,9 +298,7 @@ def temperatures(log: Log) -> FloatArray | None:
         return None
     time_ns = log.samples.time_ns
     found = np.full(log.samples.position_counts.shape, np.nan)
-    for axis, own in readings.items():
-        at_ns = np.array([stamp for stamp, _ in own], dtype=np.int64)
-        values = [value for _, value in own]
+    for axis, (at_ns, values) in readings.items():
         found[:, axis] = np.interp(time_ns - time_ns[0], at_ns - time_ns[0], values)
     return found
 
@@ -321,9 +324,9 @@ def torque_channels(log: Log, cell: Cell, current: FloatArray, valid: BoolArray)
     sums = np.zeros((2, len(current) + 1, len(cell.axes)))
     np.cumsum((current, valid), axis=1, out=sums[:, 1:])
     channels = []
+    none = np.empty(0, dtype=np.int64), np.empty(0)
     for axis, reduction in enumerate(DriveTrain(cell.ratio).reduction):
-        own = readings.get(axis, [])
-        at_ns = np.array([stamp for stamp, _ in own], dtype=np.int64)
+        at_ns, values = readings.get(axis, none)
         row = np.searchsorted(time_ns, at_ns - round(0.5e9 / rate_hz))
         inside = (row >= far) & (row + far < len(time_ns))
         row, at_ns = row[inside], at_ns[inside]
@@ -337,7 +340,7 @@ def torque_channels(log: Log, cell: Cell, current: FloatArray, valid: BoolArray)
                 time_s=(at_ns[whole] - time_ns[0]) * 1e-9,
                 current_a=beside[0, whole],
                 nearby_a=0.5 * (before[0] + after[0])[whole],
-                torque_nm=float(reduction) * np.array([value for _, value in own])[inside][whole],
+                torque_nm=float(reduction) * values[inside][whole],
             )
         )
     return tuple(channels)

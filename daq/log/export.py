@@ -130,6 +130,7 @@ def tables(
     """
     last: tuple[RawArray, IntArray] | None = None
     first_ns = 0
+    end_ns = -inf
     names = column_names(cell)
     by_quantity = {quantity: readings_by_axis(readings, quantity) for quantity in Quantity}
     slow = {}
@@ -139,6 +140,7 @@ def tables(
                 slow[f"{name}.{_SLOW_COLUMNS[quantity]}"] = by_axis[axis]
     for block, following in pairwise(chain(reader, (None,))):
         assert block is not None  # None follows the last one
+        begin_ns = end_ns
         end_ns = inf if following is None else int(following.time_ns[0])
         scale = scaling(cell, reader.head.readback)
         is_counter = np.array([axis.position_rad_per_count is None for axis in reader.head.readback.axes])
@@ -150,7 +152,7 @@ def tables(
         joints = scale.joint_position(counts)
         yield {
             **_columns(cell, block, counts, joints, scale.current_per_unit, moves(events, block.time_ns), first_ns),
-            **{name: _in_rows(block.time_ns, found, end_ns) for name, found in slow.items()},
+            **{name: _in_rows(block.time_ns, *found, begin_ns, end_ns) for name, found in slow.items()},
         }
 
 
@@ -199,18 +201,22 @@ def column_names(cell: Cell) -> list[str]:
 _SLOW_COLUMNS = {Quantity.TORQUE: "motor_torque_Nm", Quantity.TEMPERATURE: "temperature_degC"}
 
 
-def _in_rows(time_ns: IntArray, found: list[tuple[int, float]], end_ns: float) -> FloatArray:
-    """Take the readings of a block's rows from the front of a list; rows without one are NaN.
+def _in_rows(
+    time_ns: IntArray, reading_ns: IntArray, readings: FloatArray, begin_ns: float, end_ns: float
+) -> FloatArray:
+    """Put the readings from one time to another into the rows of a block, shape (k,); rows without one are NaN.
 
     Args:
         time_ns: of the rows, shape (k,).
-        found: time and value of the readings that are left, in their order; those of these rows are taken out.
-        end_ns: time of the row after them; infinite behind the last.
+        reading_ns: increasing times of all readings of the log, shape (r,).
+        readings: their values, shape (r,).
+        begin_ns: time of the first row; before all readings if it is the first of the log.
+        end_ns: time of the row after the last; infinite behind the last of the log.
     """
     values = np.full(len(time_ns), np.nan)
-    while found and found[0][0] < end_ns:
-        stamp, value = found.pop(0)
-        values[max(0, int(np.searchsorted(time_ns, stamp, side="right")) - 1)] = value
+    inside = (reading_ns >= begin_ns) & (reading_ns < end_ns)
+    row = np.searchsorted(time_ns, reading_ns[inside], side="right") - 1
+    values[np.maximum(row, 0)] = readings[inside]
     return values
 
 
