@@ -25,7 +25,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, McapRecord, Metadata, Schema
 from numpy.typing import NDArray
 
-from daq.errors import LogCorrupt, LogForeign, LogMissing, LogTruncated
+from daq.errors import LogCorrupt, LogForeign, LogMissing, LogTruncated, reason_of
 from daq.files import open_regular
 from daq.log.message import (
     EVENTS_SCHEMA,
@@ -113,7 +113,7 @@ class RecordFile:
         except OSError as error:
             raise LogMissing(
                 str(self.path),
-                found=(error.strerror or type(error).__name__).lower(),
+                found=reason_of(error),
                 expected="a log (.mcap)",
                 remedy="check the name",
             ) from error
@@ -121,16 +121,19 @@ class RecordFile:
     def _unfinished_records(self, stream: BinaryIO, size: int) -> Iterator[PlacedRecord]:
         self._check_start(stream, size)
         crc = zlib.crc32(MAGIC)
-        offset = stream.seek(len(MAGIC))
+        self.whole_bytes = stream.seek(len(MAGIC))
         while True:
-            self.whole_bytes = offset
+            offset = self.whole_bytes
             head = stream.read(HEAD_BYTES)
-            opcode, length = struct.unpack("<BQ", head) if len(head) == HEAD_BYTES else (0, LARGEST_RECORD)
+            if len(head) < HEAD_BYTES:
+                raise self._truncated(offset + len(head), offset)
+            opcode = head[0]
+            length = _length(head)
             if length > LARGEST_RECORD:
                 raise self.corrupt(offset, f"a record of {length} bytes", f"at most {LARGEST_RECORD}")
-            body = stream.read(length) if len(head) == HEAD_BYTES else b""
+            body = stream.read(length)
             if len(body) < length:
-                raise self._truncated(offset + len(head) + len(body), offset)
+                raise self._truncated(offset + HEAD_BYTES + len(body), offset)
             if opcode == Opcode.DATA_END:
                 self._check_crc(offset, "data section", _parse(DataEnd.read, body, self, offset).data_section_crc, crc)
                 return
@@ -141,7 +144,7 @@ class RecordFile:
             elif opcode not in _PARSERS:
                 raise self.corrupt(offset, f"a record of kind {opcode:#04x}", "one of a data section")
             yield from self._record(offset, opcode, body)
-            offset += HEAD_BYTES + length
+            self.whole_bytes += HEAD_BYTES + length
 
     def _records(self, stream: BinaryIO, size: int) -> Iterator[PlacedRecord]:
         self._check_start(stream, size)
@@ -149,32 +152,35 @@ class RecordFile:
         digest = hashlib.sha256(MAGIC)
         crc = zlib.crc32(MAGIC)
         offset = stream.seek(len(MAGIC))
+        end = size - len(MAGIC)
+        opcode = 0
         in_data = True
-        while offset < size - len(MAGIC):
+        while in_data or opcode != Opcode.FOOTER:
+            if offset == end:
+                raise self.corrupt(offset, "no footer", "one before the end")
             head = stream.read(HEAD_BYTES)
-            opcode, length = struct.unpack("<BQ", head) if len(head) == HEAD_BYTES else (0, size)
-            if length > min(size - len(MAGIC) - offset - HEAD_BYTES, LARGEST_RECORD):
+            length = _length(head)
+            if not head or length > min(end - offset - HEAD_BYTES, LARGEST_RECORD):
                 raise self.corrupt(offset, f"a record of {length} bytes", "one that fits the file")
+            opcode = head[0]
             body = stream.read(length)
             digest.update(head)
             digest.update(body)
-            if opcode == Opcode.DATA_END and in_data:
+            if in_data and opcode == Opcode.DATA_END:
                 self._check_crc(offset, "data section", _parse(DataEnd.read, body, self, offset).data_section_crc, crc)
-                crc, in_data = 0, False
-            elif opcode == Opcode.FOOTER and not in_data:
+                crc = 0
+                in_data = False
+            elif in_data:
+                crc = zlib.crc32(body, zlib.crc32(head, crc))
+                yield from self._record(offset, opcode, body)
+            elif opcode == Opcode.FOOTER:
                 crc = zlib.crc32(body[:16], zlib.crc32(head, crc))
                 self._check_crc(offset, "summary", _parse(Footer.read, body, self, offset).summary_crc, crc)
-                offset += HEAD_BYTES + length
-                break
             else:
                 crc = zlib.crc32(body, zlib.crc32(head, crc))
-                if in_data:
-                    yield from self._record(offset, opcode, body)
             offset += HEAD_BYTES + length
-        else:
-            raise self.corrupt(offset, "no footer", "one before the end")
-        if offset != size - len(MAGIC):
-            raise self.corrupt(offset, f"{size - len(MAGIC) - offset} bytes behind the footer", "none")
+        if offset != end:
+            raise self.corrupt(offset, f"{end - offset} bytes behind the footer", "none")
         digest.update(MAGIC)
         self.sha256 = digest.hexdigest()
 
@@ -247,11 +253,10 @@ class RecordFile:
         start = 0
         while start < len(data):
             self.spend(offset)
-            opcode = data[start]
-            end = start + HEAD_BYTES + int.from_bytes(data[start + 1 : start + HEAD_BYTES], "little")
+            end = start + HEAD_BYTES + _length(data[start : start + HEAD_BYTES])
             if end > len(data):
                 raise self.corrupt(offset, "a record beyond the end of its chunk", "one inside")
-            yield opcode, start, end
+            yield data[start], start, end
             start = end
 
     def unpack(self, offset: int, chunk: Chunk) -> bytes:
@@ -289,6 +294,11 @@ class RecordFile:
             raise self.corrupt(offset, f"a chunk of {len(data)} bytes", f"{size}, as declared")
         self._check_crc(offset, "chunk", chunk.uncompressed_crc, zlib.crc32(data))
         return data
+
+
+def _length(head: bytes) -> int:
+    """Return the length of the body of a record."""
+    return int.from_bytes(head[1:], "little")
 
 
 def _parse(read: Callable[[ReadDataStream], Record], body: bytes, file: RecordFile, offset: int) -> Record:

@@ -49,21 +49,6 @@ class Exported:
     reason: str  #: why not
 
 
-def require_format(kind: TableFormat) -> None:
-    """Check that the package for a format is installed.
-
-    Raises:
-        ConfigurationMissing: it is not; the message names the extra to install.
-    """
-    if kind is TableFormat.PARQUET and find_spec("pyarrow") is None:
-        raise ConfigurationMissing(
-            "Parquet",
-            found="no package pyarrow",
-            expected="that of the optional extra `parquet`",
-            remedy="pip install 'drivegain[parquet]', or export --csv",
-        )
-
-
 def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
     """Write all samples of a log to a table; the file appears when it is whole.
 
@@ -75,10 +60,16 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
     Raises:
         UsageError: a file of that name exists.
         OutputFailed: the file system refuses.
-        ConfigurationMissing: the package for the format is missing.
+        ConfigurationMissing: the package for the format is missing; the message names the extra to install.
         LogUnreadable: the log is damaged or contradicts itself; nothing is written.
     """
-    require_format(kind)
+    if kind is TableFormat.PARQUET and find_spec("pyarrow") is None:
+        raise ConfigurationMissing(
+            "Parquet",
+            found="no package pyarrow",
+            expected="that of the optional extra `parquet`",
+            remedy="pip install 'drivegain[parquet]', or export --csv",
+        )
     if out.exists():
         raise UsageError(
             str(out), found="a file of that name", expected="none", remedy="choose another --out, or move it away"

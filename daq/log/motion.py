@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.cell import Cell
-from daq.errors import DataError
 from daq.log.conversion import answers, continuous_counts, scaling
 from daq.log.impossible import LARGEST_OUTLIER, SPEED_MARGIN, motion_fault
 from daq.log.message import RawArray
@@ -46,10 +45,8 @@ def motion_reason(
     position_rad = scale.joint_position(continuous_counts(position_counts, readback))
     known = scale.joints_known(answers(missing, len(cell.axes)))
     fault = motion_fault("", cell, rate_hz, position_rad, current_raw * scale.current_per_unit, known)
-    return "" if fault is None else _reason(fault)
-
-
-def _reason(fault: DataError) -> str:
+    if fault is None:
+        return ""
     axis = fault.subject.removeprefix(", ")
     return f"{axis}: {fault.found}"
 

@@ -375,10 +375,8 @@ class LogReader:
         # Joined as bytes: numpy would convert the fields chunk by chunk.
         records = np.frombuffer(b"".join(chunk.tobytes() for chunk in chunks), dtype=chunks[0].dtype)
         axes = records["position_counts"].shape[1]
-        fixed = [records[name] for name in ("positions", "currents", "statuswords", "encapsulation")]
-        if any(
-            (column != word).any() for column, word in zip(fixed, (axes, axes, axes, ENCAPSULATION_WORD), strict=True)
-        ):
+        lengths = np.stack([records[name] for name in ("positions", "currents", "statuswords")])
+        if (lengths != axes).any() or (records["encapsulation"] != ENCAPSULATION_WORD).any():
             raise self._file.corrupt(offset, "samples of another layout", f"little-endian CDR of {axes} axes")
         if (records["seconds"] < 0).any() or (records["nanoseconds"] >= 1_000_000_000).any():
             raise self._file.corrupt(offset, "samples from before 1970 or of a second that is too long", "Unix time")

@@ -104,11 +104,7 @@ def _copy(
     known_events = known_readings = 0
     axes = len(cell.axes)
     watch = MotionWatch(cell, reader.head)
-    for block in blocks:
-        width = block.position_counts.shape[1]
-        if width != axes:
-            raise _foreign(reader.path, f"samples of {width} axes", f"{axes}")
-        watch.take(block)
+    for block in chain(blocks, (None,)):  # events and readings may follow the last samples
         for event in reader.events[known_events:]:
             log.event(event)
         known_events = len(reader.events)
@@ -118,13 +114,16 @@ def _copy(
             raise _foreign(reader.path, surplus, f"those of {axes} axes")
         log.readings(fresh)
         known_readings = len(reader.readings)
+        if block is None:
+            break
+        width = block.position_counts.shape[1]
+        if width != axes:
+            raise _foreign(reader.path, f"samples of {width} axes", f"{axes}")
+        watch.take(block)
         columns = (getattr(block, name).tolist() for name in SampleBlock.__slots__)
         for cycle, time_ns, position, current, statusword, missing in zip(*columns, strict=True):
             log.write(Sample(cycle, time_ns, tuple(position), tuple(current), tuple(statusword), missing))
         progress(log.statistics.samples)
-    for event in reader.events[known_events:]:
-        log.event(event)
-    log.readings(reader.readings[known_readings:])
     if reader.concluded:
         contradiction = reader.contradiction
         found = [] if contradiction is None else [f"{contradiction.found}; expected {contradiction.expected}"]

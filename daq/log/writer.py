@@ -15,7 +15,7 @@ from types import TracebackType
 from mcap.writer import CompressionType, Writer
 
 from daq.config.cell import Cell, joint_names
-from daq.errors import OutputFailed, UsageError
+from daq.errors import OutputFailed, UsageError, reason_of
 from daq.files import fsync_folder, is_taken
 from daq.log.container import UNFINISHED
 from daq.log.message import (
@@ -326,7 +326,7 @@ class LogWriter:
     def _failed(self, error: OSError) -> OutputFailed:
         return OutputFailed(
             str(self.part),
-            found=(error.strerror or type(error).__name__).lower(),
+            found=reason_of(error),
             expected="a folder that can be written, with room",
             remedy=self._remedy
             or "what was recorded until then stays in that file, which no fit reads (`drivegain salvage` saves "
