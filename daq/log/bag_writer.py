@@ -35,7 +35,7 @@ from daq.log.message import (
     reading_bytes,
     text_bytes,
 )
-from daq.log.motion import MotionWatch, log_verdict
+from daq.log.motion import MotionWatch
 from daq.log.reader import Log, SampleChecks, read_log
 from ident.arrays import FloatArray, IntArray
 from ident.calibration import Calibration
@@ -102,7 +102,7 @@ def export_bag(path: Path, out: Path, calibration: Calibration | None = None) ->
     checks.take(log.samples)
     watch = MotionWatch(cell, log.head)
     watch.take(log.samples)
-    verdict = log_verdict(cell, log.head, checks, log.statistics, watch, lambda: (log.samples,))
+    verdict = watch.verdict(checks, log.statistics, lambda: (log.samples,))
     return BagWritten(dict(sorted(counts.items())), (last_ns - first_ns) * 1e-9, log.partial, *verdict)
 
 

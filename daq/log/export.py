@@ -22,7 +22,7 @@ from daq.config.cell import Cell
 from daq.errors import ConfigurationMissing, OutputFailed, UsageError
 from daq.log.conversion import answers, moves, readings_by_axis, scaling, unwrapped
 from daq.log.message import RawArray
-from daq.log.motion import MotionWatch, log_verdict
+from daq.log.motion import judge_log
 from daq.log.reader import LogReader, SampleBlock
 from drivers.messages import CellEvent, Quantity, SlowReading
 from ident.arrays import FloatArray, IntArray
@@ -74,15 +74,8 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
         raise UsageError(
             str(out), found="a file of that name", expected="none", remedy="choose another --out, or move it away"
         )
-    reader = LogReader(log)
     # The first pass finds all damage and all moves; the second writes, a block at a time.
-    watch: MotionWatch | None = None
-    for block in reader:
-        if watch is None:
-            cell = reader.head.cell(log)
-            watch = MotionWatch(cell, reader.head)
-        watch.take(block)
-    assert watch is not None  # the reader refuses a log without samples
+    reader, cell, verdict = judge_log(log)
     names: tuple[str, ...] = ()
     rows = 0
     unfinished = out.with_name(out.name + ".part")
@@ -101,7 +94,6 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
             unfinished.replace(out)
     except OSError as error:
         raise OutputFailed.of(out, error) from error
-    verdict = log_verdict(cell, reader.head, reader.checks, reader.statistics, watch, lambda: LogReader(log))
     return Exported(names, rows, reader.partial, *verdict)
 
 

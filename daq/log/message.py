@@ -105,12 +105,10 @@ def sample_bytes(layout: struct.Struct, sample: Sample) -> bytes:
         struct.error: a value does not fit its type, or the number of axes the layout.
     """
     axes = len(sample.position_counts)
-    seconds, nanoseconds = divmod(sample.time_ns, 1_000_000_000)
     return layout.pack(
         _ENCAPSULATION,
         sample.cycle,
-        seconds,
-        nanoseconds,
+        *divmod(sample.time_ns, 1_000_000_000),
         axes,
         *sample.position_counts,
         axes,
@@ -153,9 +151,8 @@ ENCAPSULATION_WORD = int.from_bytes(_ENCAPSULATION, "little")
 
 def event_bytes(event: CellEvent) -> bytes:
     """Encode one event."""
-    seconds, nanoseconds = divmod(event.time_ns, 1_000_000_000)
     axis = WHOLE_CELL if event.axis is None else event.axis
-    head = _EVENT.pack(_ENCAPSULATION, seconds, nanoseconds, axis)
+    head = _EVENT.pack(_ENCAPSULATION, *divmod(event.time_ns, 1_000_000_000), axis)
     kind = _string(event.kind.value)
     return head + kind + b"\0" * (-len(kind) % 4) + struct.pack("<I", event.code) + _string(event.text)
 
@@ -179,8 +176,7 @@ def event_from_bytes(data: bytes) -> CellEvent:
 
 def reading_bytes(reading: SlowReading) -> bytes:
     """Encode one slow reading; the topic names its quantity."""
-    seconds, nanoseconds = divmod(reading.time_ns, 1_000_000_000)
-    return _READING.pack(_ENCAPSULATION, seconds, nanoseconds, reading.axis, reading.value)
+    return _READING.pack(_ENCAPSULATION, *divmod(reading.time_ns, 1_000_000_000), reading.axis, reading.value)
 
 
 def reading_from_bytes(data: bytes, quantity: Quantity) -> SlowReading:
@@ -242,18 +238,12 @@ def joint_state_bytes(
         velocity: per second, shape (n,).
         effort: [Nm; N of a prismatic joint], shape (n,) or empty.
     """
-    seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
-    data = bytearray(struct.pack("<iI", seconds, nanoseconds) + prefix)
-    for values in (position, velocity, effort):
-        _append_doubles(data, values)
-    return _ENCAPSULATION + bytes(data)
+    return _doubles_bytes(time_ns, prefix, position, velocity, effort)
 
 
 def currents_bytes(time_ns: int, current_a: Sequence[float]) -> bytes:
     """Encode the currents of all axes [A], shape (n,)."""
-    data = bytearray(struct.pack("<iI", *divmod(time_ns, 1_000_000_000)))
-    _append_doubles(data, current_a)
-    return _ENCAPSULATION + bytes(data)
+    return _doubles_bytes(time_ns, b"", current_a)
 
 
 def text_bytes(text: str) -> bytes:
@@ -261,8 +251,11 @@ def text_bytes(text: str) -> bytes:
     return _ENCAPSULATION + _string(text)
 
 
-def _append_doubles(data: bytearray, values: Sequence[float]) -> None:
-    """Append a sequence of float64, aligned; an empty one has no element to be aligned."""
-    data += b"\0" * (-len(data) % 4) + struct.pack("<I", len(values))
-    if len(values):
-        data += b"\0" * (-len(data) % 8) + struct.pack(f"<{len(values)}d", *values)
+def _doubles_bytes(time_ns: int, prefix: bytes, *sequences: Sequence[float]) -> bytes:
+    """Encode a stamp, other fields and sequences of float64, aligned; an empty one has no element to be aligned."""
+    data = bytearray(struct.pack("<iI", *divmod(time_ns, 1_000_000_000)) + prefix)
+    for values in sequences:
+        data += b"\0" * (-len(data) % 4) + struct.pack("<I", len(values))
+        if len(values):
+            data += b"\0" * (-len(data) % 8) + struct.pack(f"<{len(values)}d", *values)
+    return _ENCAPSULATION + bytes(data)

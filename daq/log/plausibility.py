@@ -12,7 +12,16 @@ from math import pi
 import numpy as np
 
 from daq.config.cell import Cell
-from daq.config.import_description import ImportDescription, ScaledColumns, Side, TemperatureColumns, VelocityUnit
+from daq.config.import_description import (
+    ImportDescription,
+    PositionColumns,
+    PositionUnit,
+    ScaledColumns,
+    Side,
+    TemperatureColumns,
+    VelocityColumns,
+    VelocityUnit,
+)
 from daq.errors import PositionImplausible, TableUnfit
 from daq.log.impossible import fastest_speeds, impossible_current, impossible_speed, impossible_step
 from daq.log.resampling import Clock, on_clock
@@ -93,6 +102,17 @@ def _bits_of_counter(least: float, largest: float, step: float) -> int | None:
     return None
 
 
+def in_si(values: FloatArray, columns: PositionColumns | VelocityColumns, cell: Cell) -> FloatArray:
+    """Convert positions or velocities to rad or m, shape (k, n).
+
+    On the joint side a prismatic axis is in mm where others are in degrees; on the motor side everything is an angle.
+    """
+    if columns.unit not in {PositionUnit.DEG, PositionUnit.MM, VelocityUnit.DEG, VelocityUnit.MM}:
+        return values
+    units = [axis.unit.si if columns.side is Side.JOINT else pi / 180.0 for axis in cell.axes]
+    return values * np.array(units)
+
+
 def check_velocity(
     wanted: ImportDescription,
     cell: Cell,
@@ -104,10 +124,7 @@ def check_velocity(
     """Compare velocity columns with the positions, by the way moved in VELOCITY_WINDOW_S: it needs no derivative."""
     if (velocity := wanted.velocity) is None:
         return
-    stated = on_clock(files[velocity.file].take(velocity.columns), clock)
-    if velocity.unit in {VelocityUnit.DEG, VelocityUnit.MM}:
-        units = [axis.unit.si if velocity.side is Side.JOINT else pi / 180.0 for axis in cell.axes]
-        stated = stated * np.array(units)
+    stated = in_si(on_clock(files[velocity.file].take(velocity.columns), clock), velocity, cell)
     if velocity.side is Side.MOTOR:
         stated = stated @ np.linalg.inv(cell.ratio).T
     step = min(max(1, round(VELOCITY_WINDOW_S * rate_hz)), len(stated) - 1)

@@ -129,6 +129,11 @@ class SampleChecks:
             self._steps.setdefault(int(step_ns[place]), f"cycle {cycle[place + 1]} {{}} after cycle {cycle[place]}")
         self._steps = {step: self._steps[step] for step in (min(self._steps), max(self._steps))}
 
+    @property
+    def span_ns(self) -> int:
+        """Time from the first sample to the last [ns]."""
+        return int(self._last[1][0]) - self._first_ns
+
     def contradiction(
         self, head: LogHead, statistics: RunStatistics, readings: Iterable[SlowReading]
     ) -> LogIncomplete | None:

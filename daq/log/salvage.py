@@ -15,9 +15,9 @@ from daq.files import open_regular
 from daq.log.container import UNFINISHED
 from daq.log.conversion import scaling
 from daq.log.metadata import RunStatistics
-from daq.log.motion import MotionWatch, log_verdict
+from daq.log.motion import MotionWatch
 from daq.log.reader import LogReader, SampleBlock
-from daq.log.writer import NOTHING_KEPT, LogContent, LogWriter
+from daq.log.writer import LogContent, LogWriter
 from drivers.messages import EventKind, Sample
 
 _HARMLESS = (
@@ -85,13 +85,8 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
     run = replace(head.run, origin=f"{head.run.origin}; salvaged from {damaged.name}")
     content = LogContent.of(cell, run, head.files, head.readback)
     # A crash loses only this new file, so no clock is needed to flush in time.
-    log = LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0, remedy=NOTHING_KEPT)
-    with log:
-        try:
-            _copy(reader, chain((first,), blocks), log, cell, progress)
-        except BaseException:
-            log.part.unlink(missing_ok=True)  # half of what was saved is of no use
-            raise
+    with LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False) as log:
+        _copy(reader, chain((first,), blocks), log, cell, progress)
     size = damaged.stat().st_size
     damage = "" if reader.damage is None else f"{reader.damage.subject}: {reader.damage.found}"
     left_out = 0 if reader.damage is None else size - reader.whole_bytes
@@ -134,9 +129,7 @@ def _copy(
         found += [f"{sum(counted.missing)} missing answers"] if any(counted.missing) else []
         found += [f"{event.kind.value} ({event.text})" for event in reader.events if event.kind not in _HARMLESS][:3]
     judged = RunStatistics(0, 0, (), valid=not found, reason=", ".join(found))
-    verdict = log_verdict(
-        cell, reader.head, reader.checks, judged, watch, lambda: LogReader(reader.path).until_damage()
-    )
+    verdict = watch.verdict(reader.checks, judged, lambda: LogReader(reader.path).until_damage())
     log.conclude(*verdict, partial=True)
 
 

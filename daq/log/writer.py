@@ -55,7 +55,6 @@ FLUSH_NS = 150_000_000
 for the cycle on the bus and the chunk that is being packed."""
 JOINT_STATE_NS = 20_000_000  #: Time between two joint states, over which their velocity is the mean
 CHUNK_BYTES = 4 * 2**20  #: Never reached between two flushes; a chunk ends with one
-NOTHING_KEPT = "nothing was written; free space or rights, or choose another folder"
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +77,7 @@ class LogWriter:
     """Context manager that writes one log.
 
     The log is `PATH.part` until the block ends without an error; then it is finished, synced and renamed. After an
-    error the `.part` keeps everything up to that moment.
+    error the `.part` keeps everything up to that moment, or is removed if the log can be made again.
 
     Raises (on entry and later):
         UsageError: the log, or a `.part` of the same name, already exists. At the end: a file of that name has
@@ -92,7 +91,8 @@ class LogWriter:
         content: LogContent,
         joint_position: Callable[[tuple[int, ...]], Sequence[float]],
         clock_ns: Callable[[], int],
-        remedy: str = "",
+        *,
+        keeps_part: bool = True,
     ) -> None:
         """Store the arguments.
 
@@ -101,14 +101,14 @@ class LogWriter:
             content: start of the log.
             joint_position: converts motor counts to joint positions [rad or m], for /joint_states.
             clock_ns: monotonic clock, for the flush by wall time.
-            remedy: advice if the file system refuses, instead of that of a recording.
+            keeps_part: whether an error leaves the `.part`.
         """
         self.path = path
         self.part = path.with_name(path.name + UNFINISHED)
         self._content = content
         self._joint_position = joint_position
         self._clock_ns = clock_ns
-        self._remedy = remedy
+        self._keeps_part = keeps_part
         self._axes = len(content.readback.axes)
         self._layout = sample_struct(self._axes)
         self._prefix = joint_state_prefix(content.joint_names)
@@ -267,6 +267,9 @@ class LogWriter:
                 error.add_note(f"the log keeps less than it could: {failure}")
                 return
             raise (failure if isinstance(failure, OutputFailed) else self._failed(failure)) from failure
+        finally:
+            if not self._keeps_part:
+                self.part.unlink(missing_ok=True)  # after a success it has the name of the log
 
     def _take_name(self) -> None:
         """Rename the finished log without replacing a file that has appeared meanwhile."""
@@ -275,6 +278,7 @@ class LogWriter:
         except OSError as error:
             # Without an existing file it is a file system without hard links.
             if isinstance(error, FileExistsError) or self.path.exists():
+                self._keeps_part = True
                 raise UsageError(
                     str(self.path),
                     found="a file of that name, which was not there when the recording began",
@@ -324,11 +328,12 @@ class LogWriter:
                 self._missing[axis] += sample.missing >> axis & 1
 
     def _failed(self, error: OSError) -> OutputFailed:
+        remedy = "nothing was written; free space or rights, or choose another folder"
+        if self._keeps_part:
+            remedy = (
+                "what was recorded until then stays in that file, which no fit reads (`drivegain salvage` saves it); "
+                "free space and record again"
+            )
         return OutputFailed(
-            str(self.part),
-            found=reason_of(error),
-            expected="a folder that can be written, with room",
-            remedy=self._remedy
-            or "what was recorded until then stays in that file, which no fit reads (`drivegain salvage` saves "
-            "it); free space and record again",
+            str(self.part), found=reason_of(error), expected="a folder that can be written, with room", remedy=remedy
         )
