@@ -27,7 +27,7 @@ from daq.cli.terminal import (
     say_last,
     write_output,
 )
-from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json, taking
+from daq.cli.verb import CalibrationArgument, JsonOption, print_json, taking
 from daq.environment import login
 from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, ExitCode, UsageError
 from daq.report.text import terminal_text
@@ -254,9 +254,6 @@ def entered_masses(entries: Sequence[str], calibration: Calibration) -> dict[str
     return found
 
 
-APPLY = Verb("apply", apply_verb, "drivegain apply CELL calibration.yaml")
-
-
 def rollback_verb(
     cell: Annotated[Path | None, typer.Argument(help="Cell file; it names the controller file and the audit.")] = None,
     to: Annotated[Path | None, typer.Option("--to", help="Another controller file than the cell's.")] = None,
@@ -347,9 +344,6 @@ def rollback_drives(
         backup = "" if written.backup is None else written.backup.name
         console.print(f"Restored the values of {planned.source}; those before are now in {backup}.", end=" ")
         console.print(_saving_text(saving))
-
-
-ROLLBACK = Verb("rollback", rollback_verb, "drivegain rollback press-4/cells/press-4.yaml")
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,6 @@ from daq.cli.terminal import (
 from daq.cli.verb import (
     CellOption,
     JsonOption,
-    Verb,
     corrected_cell,
     output_option,
     print_json,
@@ -264,9 +263,6 @@ def _fit_cases(request: FitRequest, folder: Path) -> None:
         print_view(cases_view(fits, tables), *files.values(), page_file)
 
 
-FIT = Verb("fit", fit_verb, "drivegain fit unloaded.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml")
-
-
 @dataclass(frozen=True, slots=True)
 class ResidualRequest:
     """A search for what the model lacks, as the command line asks for it."""
@@ -408,13 +404,6 @@ def check_report(folder: Path | None, out: Path | None = None) -> None:
             pass
     for name, mark in MARKS.items():
         check_replaceable(folder / name, mark, "report of `drivegain residual`")
-
-
-RESIDUAL = Verb(
-    "residual",
-    residual_verb,
-    "drivegain residual unloaded.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml --report report",
-)
 
 
 def _save_certificate(fitted: Fit, calibration: Calibration, folder: Path) -> None:

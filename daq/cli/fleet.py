@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from daq.cli.terminal import check_replaceable, print_view, progress_bar, write_output
-from daq.cli.verb import JsonOption, Verb, output_option, print_json
+from daq.cli.verb import JsonOption, output_option, print_json
 from daq.errors import ExitCode, OutputFailed
 from daq.files import replace_file
 
@@ -68,6 +68,3 @@ def fleet_verb(
         print_view(fleet_view(rows), out, csv)
     if not all(row.fitted for row in rows):
         raise typer.Exit(ExitCode.DATA_UNFIT)
-
-
-FLEET = Verb("fleet", fleet_verb, "drivegain fleet logs --scheduler processes --out calibrations --csv fleet.csv")

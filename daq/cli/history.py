@@ -13,7 +13,7 @@ import typer
 
 from daq.cli.apply import applier
 from daq.cli.terminal import check_replaceable, output_console, say_written, write_output
-from daq.cli.verb import JsonOption, Verb, output_option, print_json
+from daq.cli.verb import JsonOption, output_option, print_json
 from daq.errors import (
     AuditUnusable,
     ConfigurationInconsistent,
@@ -313,6 +313,3 @@ def _write_files(chosen: tuple[Series, ...], cell: Cell, picture: Path | None, c
     if csv is not None:
         with write_output(csv):
             replace_file(csv, csv_text(chosen).encode())
-
-
-HISTORY = Verb("history", history_verb, "drivegain history press-4/cells/press-4.yaml --axis J4 --plot history.png")

@@ -18,7 +18,7 @@ from daq.cli.terminal import (
     status,
     write_output,
 )
-from daq.cli.verb import JsonOption, Verb, output_option, print_json
+from daq.cli.verb import JsonOption, output_option, print_json
 from daq.environment import require_packages, software
 from daq.errors import ConfigurationInconsistent, DaqError, LogForeign, OutputFailed, UsageError
 from daq.files import replace_file
@@ -55,9 +55,6 @@ def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: Json
         print_view(log_lines(json_tree(report), output_console().width))
 
 
-INFO = Verb("info", info, "drivegain info loaded.mcap")
-
-
 def import_files(
     description: Annotated[Path, typer.Argument(help="Import description (YAML): columns, units, rate.")],
     data: Annotated[Path, typer.Option("--data", help="Folder of the files.")],
@@ -79,11 +76,6 @@ def import_files(
     typer.echo(f"{out}: {statistics.samples} samples of {len(statistics.missing)} axes")
     for line in (*(() if timing is None else (timing_text(timing),)), *imported.remarks):
         typer.echo(printable(line))
-
-
-IMPORT = Verb(
-    "import", import_files, "drivegain import press-4/imports/press-4.yaml --data csv-files --out imported.mcap"
-)
 
 
 def salvage_verb(
@@ -111,9 +103,6 @@ def salvage_verb(
         typer.echo(f"left out: {saved.left_out_bytes} bytes, from {printable(saved.damage)}")
     if not statistics.valid:
         typer.echo(f"INVALID: {printable(statistics.reason)}; a fit will refuse it")
-
-
-SALVAGE = Verb("salvage", salvage_verb, "drivegain salvage loaded.mcap.part --out loaded-partial.mcap")
 
 
 def export_verb() -> None:
@@ -315,9 +304,3 @@ def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
 
     with write_output(out):
         replace_file(out, updated.content, check=check)
-
-
-EXPORT_LOG = Verb("log", export_log_verb, "drivegain export log loaded.mcap --csv --out loaded.csv")
-EXPORT_BAG = Verb("bag", export_bag_verb, "drivegain export bag loaded.mcap --out loaded-bag")
-EXPORT_URDF = Verb("urdf", export_urdf_verb, "drivegain export urdf CELL calibration.yaml --out robot.urdf")
-EXPORT = Verb("export", export_verb, EXPORT_URDF.example, (EXPORT_URDF, EXPORT_LOG, EXPORT_BAG))

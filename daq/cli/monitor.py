@@ -11,7 +11,7 @@ import typer
 from daq.cli.record import mounted
 from daq.cli.scan import no_answer
 from daq.cli.terminal import interruptible
-from daq.cli.verb import CellArgument, JsonOption, Verb, print_json
+from daq.cli.verb import CellArgument, JsonOption, print_json
 from daq.environment import require_packages
 from daq.errors import UsageError
 
@@ -80,9 +80,6 @@ def monitor_verb(
                 live.update(monitor_view(monitor_report(declared, watch.read(interval))), refresh=True)
 
 
-MONITOR = Verb("monitor", monitor_verb, "drivegain monitor CELL --calibration calibration.yaml")
-
-
 def console_verb(
     cell: CellArgument,
     calibration: Annotated[
@@ -146,6 +143,3 @@ def console_verb(
         token = new_token()
         typer.echo(f"Open http://127.0.0.1:{port}/{token}/ in a browser on this computer; Ctrl-C ends the page.")
         server_of(Page(declared, live, results, *beside), token, port).run(sockets=[listener])
-
-
-CONSOLE = Verb("console", console_verb, "drivegain console CELL --calibration calibration.yaml")

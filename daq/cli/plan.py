@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from daq.cli.terminal import check_folder, check_output, check_replaceable, progress_bar, write_output
-from daq.cli.verb import CellArgument, JsonOption, Verb, output_option, print_json, say_next
+from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, say_next
 from daq.errors import UsageError
 from daq.files import replace_file
 from daq.workflow.choices import EXCHANGES, LARGEST_STD_PERCENT
@@ -108,6 +108,3 @@ def say_how_to_resume(tried: list[int], exchanges: int) -> Iterator[None]:
         if done := tried[-1]:
             typer.echo(f"{done} of {exchanges} exchanges were tried; --exchanges {done} writes their plan", err=True)
         raise
-
-
-PLAN = Verb("plan", plan_verb, "drivegain plan CELL --out plan.yaml --seed 1 --duration 40")

@@ -16,7 +16,7 @@ import typer
 
 from daq.advice import for_command_line
 from daq.cli.terminal import interruptible
-from daq.cli.verb import JsonOption, Verb, output_option, print_json
+from daq.cli.verb import JsonOption, output_option, print_json
 from daq.environment import login
 from daq.errors import DaqError, ExitCode, UsageError, exit_code, writing
 from daq.files import replace_file
@@ -107,9 +107,6 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
         typer.echo(printable(text(ended, cell)), nl=False)
     if ended.exit_code:
         raise typer.Exit(ended.exit_code)
-
-
-RECALIBRATE = Verb("recalibrate", recalibrate_verb, "drivegain recalibrate press-4/cells/press-4.yaml --dry-run")
 
 
 _SYSTEM = Path("/etc/systemd/system")
@@ -221,8 +218,3 @@ def require_own_unit(path: Path, option: str = "") -> None:
     if found:
         remedy = "name another folder with --to, or move it away; remove it if the cell file has moved"
         raise UsageError(str(path), found=found, expected=f"no such file, or {expected}", remedy=remedy)
-
-
-INSTALL_UNITS = Verb(
-    "install-units", install_units, "drivegain install-units press-4/cells/press-4.yaml --schedule weekly"
-)

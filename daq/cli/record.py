@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.terminal import interruptible, progress_bar, say_last
-from daq.cli.verb import CellArgument, JsonOption, Verb, output_option, print_json, say_next, taking
+from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, say_next, taking
 from daq.environment import login
 from daq.errors import DaqError, DiskSpaceShort, ExitCode, OutputFailed, UsageError
 from daq.files import is_taken
@@ -234,10 +234,3 @@ def mounted(cell: Cell, name: str | None) -> Payload | None:
         expected=", ".join(known) or "none: the cell declares no payloads",
         remedy="weigh it and add it to `payloads` of the cell file",
     )
-
-
-RECORD = Verb(
-    "record",
-    record_verb,
-    "drivegain record CELL plan.yaml --out loaded.mcap --payload disc --mass 4.59 --enable-motion",
-)

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from daq.cli.terminal import check_folder, check_replaceable, print_view, write_output
-from daq.cli.verb import CalibrationArgument, JsonOption, Verb, output_option, print_json
+from daq.cli.verb import CalibrationArgument, JsonOption, output_option, print_json
 from daq.files import replace_file
 
 
@@ -59,6 +59,3 @@ def report_verb(
         print_json(certificate_report(certificate))
     else:
         print_view((certificate.sentence,), page)
-
-
-REPORT = Verb("report", report_verb, "drivegain report calibration.yaml --cell CELL")

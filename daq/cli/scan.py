@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.terminal import print_view
-from daq.cli.verb import CellArgument, JsonOption, Verb, print_json, say_next
+from daq.cli.verb import CellArgument, JsonOption, print_json, say_next
 from daq.errors import ConfigurationInconsistent, UsageError, VirtualBusEmpty
 from drivers.errors import DriverError, NodeMissing
 
@@ -169,9 +169,6 @@ def _fault_of(network: CanopenNetwork, axis: Axis) -> str:
     return "the drive names no error code (603Fh)" if code == 0 else f"{explain(code).hex}: {explain(code).text}"
 
 
-SCAN = Verb("scan", scan_verb, "drivegain scan CELL")
-
-
 _HEX = re.compile(r"(?:0[xX])?([0-9a-fA-F]{1,4})[hH]?")
 
 
@@ -204,6 +201,3 @@ def read_code(text: str) -> int:
             remedy="take it from the event's text (`drivegain info LOG`) or from object 603Fh",
         )
     return int(found.group(1), 16)
-
-
-EXPLAIN_EMCY = Verb("explain-emcy", explain_emcy_verb, "drivegain explain-emcy 8611h")

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from daq.cli.terminal import print_view
-from daq.cli.verb import CalibrationArgument, JsonOption, Verb, output_option, print_json
+from daq.cli.verb import CalibrationArgument, JsonOption, output_option, print_json
 from daq.errors import UsageError
 
 
@@ -100,11 +100,3 @@ def _password() -> str:
     if not sys.stdin.isatty():
         return sys.stdin.readline().rstrip("\n")
     return str(typer.prompt("Password of the key", hide_input=True, err=True))
-
-
-SIGN_KEY = Verb("key", sign_key_verb, "drivegain sign key --name anna --folder keys")
-SIGN_CALIBRATION = Verb(
-    "calibration", sign_calibration_verb, "drivegain sign calibration calibration.yaml --key keys/anna.key --name anna"
-)
-SIGN_CHECK = Verb("check", sign_check_verb, "drivegain sign check CELL calibration.yaml")
-SIGN = Verb("sign", sign_verb, SIGN_CALIBRATION.example, (SIGN_KEY, SIGN_CALIBRATION, SIGN_CHECK))

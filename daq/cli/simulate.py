@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.terminal import at_most_one, interruptible, output_console, print_view, show_steps, write_output
-from daq.cli.verb import JsonOption, Verb, output_option, print_json
+from daq.cli.verb import JsonOption, output_option, print_json
 from daq.errors import ConfigurationInconsistent, UsageError
 from daq.files import read_regular, replace_file
 from daq.report.text import Sentence
@@ -203,9 +203,6 @@ def how_to_reach(parts: Sequence[BusPart], period_us: int) -> str:
     )
 
 
-SIMULATE = Verb("simulate", simulate, "drivegain simulate demo --payload disc --faults faults-example")
-
-
 def demo(
     out: Annotated[Path, output_option("--out", "Folder to fill.")] = Path("out/demo"),
     simulation: Annotated[Path | None, typer.Option(help="Another simulation file than the shipped one.")] = None,
@@ -257,6 +254,3 @@ def demo_view(outcome: DemoOutcome) -> Iterator[RenderableType]:
         errors = (100.0 * (gain / truth[axis] - 1.0) for axis, gain in zip(truth, fitted.paper.gains, strict=True))
         yield "Errors of the paper's total least squares on the same rows: " + ", ".join(f"{e:+.2f} %" for e in errors)
     yield ""
-
-
-DEMO = Verb("demo", demo, "drivegain demo --out out/demo")

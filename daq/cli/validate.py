@@ -15,7 +15,6 @@ from daq.cli.verb import (
     CalibrationArgument,
     CellOption,
     JsonOption,
-    Verb,
     cells_in,
     corrected_cell,
     output_option,
@@ -124,9 +123,6 @@ def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]
     return {file.stem if stems[file.stem] == 1 else str(file): load_calibration(file) for file in files}
 
 
-VALIDATE = Verb("validate", validate_verb, "drivegain validate calibration.yaml held-out.mcap --pictures pictures")
-
-
 def weigh_verb(
     calibration: CalibrationArgument,
     logs: Annotated[list[Path], typer.Argument(help="Logs with the body, mounted one way.")],
@@ -152,9 +148,6 @@ def weigh_verb(
         print_json(weigh_report(found))
     else:
         print_view(weighed_view(found))
-
-
-WEIGH = Verb("weigh", weigh_verb, "drivegain weigh calibration.yaml held-out.mcap --bare unloaded.mcap")
 
 
 def contact_verb(
@@ -188,6 +181,3 @@ def contact_verb(
         print_json(contact_report(found, described, log, picture))
     else:
         print_view(contact_view(found, described), picture)
-
-
-CONTACT = Verb("contact", contact_verb, "drivegain contact calibration.yaml loaded.mcap --quiet held-out.mcap")

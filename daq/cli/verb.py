@@ -107,13 +107,21 @@ class Job(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """One verb."""
+    """One verb. The module of its function is imported when it is called or explained."""
 
     name: str  #: on the command line
-    function: Callable[..., None]  #: takes its arguments as typer parses them; its docstring is the help
+    #: Function, as module:name; it takes its arguments as typer parses them, and its docstring is the help.
+    place: str
     example: str  #: a command line that works, shown at the end of the help; CELL is the cell file of the user's folder
-    #: Verbs with arguments of their own, `drivegain export urdf …`; then `function` takes none and is the help alone.
+    summary: str = ""  #: one line for the list of verbs
+    #: Verbs with arguments of their own, `drivegain export urdf …`; then the function takes none and is the help alone.
     kinds: tuple[Verb, ...] = ()
+
+    def function(self) -> Callable[..., None]:
+        """Import the function."""
+        module, _, name = self.place.partition(":")
+        function: Callable[..., None] = getattr(importlib.import_module(module), name)
+        return function
 
     def command(self) -> Any:
         """Click command of this verb, or group of its kinds."""
@@ -127,25 +135,10 @@ class Verb:
             epilog=self.example,
         )
         if self.kinds:
-            app.callback()(self.function)
+            app.callback()(self.function())
         for verb in self.kinds or (self,):
-            app.command(verb.name, cls=_VerbCommand, epilog=verb.example)(verb.function)
+            app.command(verb.name, cls=_VerbCommand, epilog=verb.example)(verb.function())
         return typer.main.get_command(app)
-
-
-@dataclass(frozen=True, slots=True)
-class Listed:
-    """Entry of the list of verbs, before the verb is imported."""
-
-    name: str  #: on the command line
-    place: str  #: where its `Verb` is defined, as module:name
-    summary: str  #: one line for the list
-
-    def load(self) -> Verb:
-        """Import the verb."""
-        module, _, name = self.place.partition(":")
-        verb: Verb = getattr(importlib.import_module(module), name)
-        return verb
 
 
 _HYPHEN = "\u2011"  #: Non-breaking: a line is broken at spaces alone, so that --enable-motion stays whole
