@@ -126,14 +126,13 @@ def record_verb(options: RecordOptions) -> None:
 def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:
     """Say in notes of an error what became of the samples, and what helps a cell that is too slow for its clock."""
     from daq.config.cell import PacingMode
-    from daq.config.cell_buses import SIMULATED_INTERFACES
 
     if part.exists():
         error.add_note(
             f"kept: the samples recorded until then are in {part}, which `fit` does not read; {_next_command(part)}"
         )
     if isinstance(error, SampleLost) and cell.sync is not None and cell.sync.pacing is PacingMode.TIMED:
-        real = any(bus.interface not in SIMULATED_INTERFACES for bus in cell.buses)
+        real = not all(bus.kind.is_simulated for bus in cell.buses)
         error.add_note(
             "hint: check the load of bus and computer, or use a longer `sync.period_us`"
             if real

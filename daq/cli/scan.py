@@ -128,7 +128,7 @@ def no_answer(cell: Cell, missing: Sequence[Axis], answered: tuple[int, ...], wa
     """Error for axes that did not answer: amplifiers without power, or a simulated cell that was not started."""
     from daq.cli.simulate import SHIPPED
 
-    if answered or any(bus.interface != "virtual" for bus in cell.buses):
+    if answered or not all(bus.kind.is_of_process for bus in cell.buses):
         return NodeMissing(missing, answered, wait_s)
     name = cell.name if cell.name in SHIPPED else "FILE"
     return VirtualBusEmpty(

@@ -25,7 +25,6 @@ from drivers.canopen.bus import BusAddress
 AnyBus = Bus | BusAddress  #: A bus of a cell file, or by its address
 SHARED_FOLDERS = (Path("/run/lock"), Path("/var/lock"), Path("/tmp"))
 """Tried in this order; all users of a computer must come to the same one, so TMPDIR is not asked."""
-VIRTUAL = "virtual"  #: python-can's bus within one process: a bus of that name in another process is another bus
 
 
 @contextmanager
@@ -100,9 +99,9 @@ def require_untaken(buses: Iterable[AnyBus], folder: Path | None = None) -> None
 def lock_name(bus: AnyBus) -> str:
     """Name of a bus's lock file: by interface and channel, for a hub by its host's address and port."""
     parts = [bus.interface, bus.channel]
-    if bus.interface == "socketcand":
+    if bus.kind.has_server:
         parts += [_address(bus), str(bus.port)]
-    elif bus.interface == VIRTUAL:
+    elif bus.kind.is_of_process:
         parts.append(str(os.getpid()))
     return "drivegain-" + "-".join(re.sub(r"[^A-Za-z0-9.]", "_", part) for part in parts) + ".lock"
 

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from typing import Self, cast
 
 from drivers.canopen.bus import BusAddress
+from drivers.canopen.interfaces import SOCKETCAND
 from drivers.errors import BusError
 
 HOST = "127.0.0.1"
@@ -53,7 +54,7 @@ class Hub:
         if self._server is None:
             raise BusError(f"hub {HOST}:{self._port}", "is not running")
         port = self._server.sockets[0].getsockname()[1]
-        return BusAddress("socketcand", channel or self.channels[0], host=HOST, port=port)
+        return BusAddress(SOCKETCAND.name, channel or self.channels[0], host=HOST, port=port)
 
     def __enter__(self) -> Self:
         self._loop = asyncio.new_event_loop()
