@@ -18,7 +18,7 @@ from daq.cli.terminal import (
     status,
     write_output,
 )
-from daq.cli.verb import JsonOption, output_option, print_json
+from daq.cli.verb import JsonOption, output_option, print_json, read_calibration, read_cell
 from daq.environment import require_packages, software
 from daq.errors import ConfigurationInconsistent, DaqError, LogForeign, OutputFailed, UsageError
 from daq.files import replace_file
@@ -37,7 +37,6 @@ NewLogOption = Annotated[Path, output_option("--out", "Log to write (.mcap); mus
 
 def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: JsonOption = False) -> None:
     """Show what is in a log: role and payload, duration, losses, moves, validity."""
-    from daq.documents.calibration_file import load_calibration
     from daq.report.document import json_tree
     from daq.report.log import info_report, log_lines
 
@@ -45,7 +44,7 @@ def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: Json
         report = info_report(log)
     except LogForeign as error:
         with suppress(DaqError):
-            load_calibration(log)
+            read_calibration(log)
             error.found = "a calibration"
             error.remedy = f"`drivegain report {log}` reads it"
         raise
@@ -154,11 +153,10 @@ def export_bag_verb(
 
     Joint states are at the full rate, with the names of the URDF's joints; effort only with --calibration.
     """
-    from daq.documents.calibration_file import load_calibration
     from daq.log.bag_writer import export_bag
     from daq.report.log import bag_report
 
-    known = None if calibration is None else load_calibration(calibration)
+    known = None if calibration is None else read_calibration(calibration)
     with status("writing the bag"):
         done = export_bag(log, out, known)
     _warn(log, done.partial, done.valid, done.reason)
@@ -186,7 +184,6 @@ def export_urdf_verb(
     """
     from daq.config.cell_file import URDF, bundle
     from daq.config.yaml_file import read_yaml_bytes
-    from daq.documents.calibration_file import load_calibration
     from daq.report.urdf_views import urdf_report, urdf_view
     from daq.workflow.fit import DOUBTFUL_PERCENT
     from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, update_urdf
@@ -202,7 +199,7 @@ def export_urdf_verb(
     given = urdf or cell
     calibration = calibration or cell
     check_output(out, (calibration, given), FORMAT)
-    known = load_calibration(calibration)
+    known = read_calibration(calibration)
     left = known.relative_error_percent.total
     if not left <= DOUBTFUL_PERCENT:  # it explains too little of the torque to derive bodies from it
         raise ModelContradicted(
@@ -263,10 +260,9 @@ def joint_updates(robot: PhysicalRobot) -> dict[str, JointUpdate]:
 
 
 def _declared(calibration: Calibration, path: Path) -> Cell:
-    from daq.config.cell_file import load_cell
     from daq.config.same_cell import mismatch_of_calibration
 
-    cell = load_cell(path)
+    cell = read_cell(path)
     found = mismatch_of_calibration(calibration, cell)
     if found is not None:
         raise ConfigurationInconsistent(

@@ -11,10 +11,9 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.terminal import check_folder, check_output, check_replaceable, progress_bar, write_output
-from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, say_next
+from daq.cli.terminal import check_folder, check_output, check_replaceable, progress_bar, write_file, write_output
+from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, read_cell, say_next
 from daq.errors import UsageError
-from daq.files import replace_file
 from daq.workflow.choices import EXCHANGES, LARGEST_STD_PERCENT
 
 
@@ -42,7 +41,6 @@ def plan_verb(
     The moves keep the joint limits and the cell's workspace, and keep clear of the arm itself. The prediction is for
     these moves made once without load and once with the payload.
     """
-    from daq.config.cell_file import load_cell
     from daq.report.plan import plan_report, plan_text
     from daq.report.plan_preview import MARK, preview_page
     from daq.workflow.experiment import RUNS, experiment_of, extra_moves, paths_of
@@ -56,7 +54,7 @@ def plan_verb(
             raise UsageError("--preview", found="the name of --out", expected="another", remedy="choose another name")
         check_folder(preview)
         check_replaceable(preview, MARK, "preview of a plan")
-    declared = load_cell(cell)
+    declared = read_cell(cell)
     check_controller(cell, declared)
     experiment = experiment_of(declared, payload)
     tried = [0]
@@ -81,9 +79,7 @@ def plan_verb(
         save_plan(made, out)
     if preview is not None:
         checked = load_plan(out, declared)
-        with write_output(preview):
-            page = preview_page(declared, checked.moves, experiment.scene.checker, out.read_bytes())
-            replace_file(preview, page.encode())
+        write_file(preview, preview_page(declared, checked.moves, experiment.scene.checker, out.read_bytes()))
     excitation, _ = experiment.excitation(paths_of(declared, made.moves))
     judged = verdicts(experiment.design, [(excitation, RUNS)], extra_moves(experiment))
     if json:

@@ -16,7 +16,7 @@ import typer
 
 from daq.advice import for_command_line
 from daq.cli.terminal import interruptible
-from daq.cli.verb import JsonOption, output_option, print_json
+from daq.cli.verb import JsonOption, output_option, print_json, read_cell
 from daq.environment import login
 from daq.errors import DaqError, ExitCode, UsageError, exit_code, writing
 from daq.files import replace_file
@@ -69,7 +69,6 @@ def recalibrate_verb(
 
 def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> None:
 
-    from daq.config.cell_file import load_cell
     from daq.jobs.context import Tools
     from daq.jobs.job import preview, recalibrate
     from daq.jobs.reporting import conclusion_report, text
@@ -81,7 +80,7 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
     from daq.workflow.record import record
     from daq.writeback.request import Request
 
-    declared = load_cell(cell)
+    declared = read_cell(cell)
     if now and declared.recalibration is not None:
         declared = replace(declared, recalibration=replace(declared.recalibration, every_h=0.0))
     who = f"drivegain recalibrate, {login()}"
@@ -128,11 +127,10 @@ def install_units(
 
     The timer does not catch up on a missed date, and the job checks the interlock before every motion.
     """
-    from daq.config.cell_file import load_cell
     from daq.jobs.context import section_of, target_of
     from daq.jobs.units import Installation, cell_option, cron_line, next_commands, units_of
 
-    declared = load_cell(cell)
+    declared = read_cell(cell)
     section = section_of(declared)
     target_of(declared)  # refuses a cell without a controller file
     place = cell.resolve()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.terminal import interruptible, progress_bar, say_last
-from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, say_next, taking
+from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, read_cell, say_next, taking
 from daq.environment import login
 from daq.errors import DaqError, DiskSpaceShort, ExitCode, OutputFailed, UsageError
 from daq.files import is_taken
@@ -56,7 +56,6 @@ def record_verb(options: RecordOptions) -> None:
     11 where it does not.
     A run with losses is kept, marked invalid, and ends with exit code 4; `fit` refuses it.
     """
-    from daq.config.cell_file import load_cell
     from daq.log.feed import Feed
     from daq.report.log import record_report
     from daq.workflow.bus_lock import bus_lock
@@ -64,7 +63,7 @@ def record_verb(options: RecordOptions) -> None:
     from daq.workflow.record import RecordingRequest, record
     from daq.workflow.safeguards import check_entered_mass
 
-    declared = load_cell(options.cell)
+    declared = read_cell(options.cell)
     moves = slowed(declared, load_plan(options.plan, declared), options.speed)
     who = options.operator or login()
     carried = mounted(declared, options.payload)

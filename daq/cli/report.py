@@ -9,9 +9,15 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.terminal import check_folder, check_replaceable, print_view, write_output
-from daq.cli.verb import CalibrationArgument, JsonOption, output_option, print_json
-from daq.files import replace_file
+from daq.cli.terminal import check_folder, check_replaceable, print_view, write_file
+from daq.cli.verb import (
+    CalibrationArgument,
+    JsonOption,
+    output_option,
+    print_json,
+    read_calibration,
+    read_cell,
+)
 
 
 def report_verb(
@@ -32,8 +38,7 @@ def report_verb(
     would be written where, and one verdict. Nothing is written to the controller.
     """
 
-    from daq.config.cell_file import load_cell
-    from daq.documents.calibration_file import decode_calibration, load_calibration, read_calibration_bytes
+    from daq.documents.calibration_file import decode_calibration, read_calibration_bytes
     from daq.report.certificate import certificate_report, certify, compare, without_controller
     from daq.report.certificate_page import certificate_page
     from daq.report.html import MARK
@@ -44,17 +49,16 @@ def report_verb(
     check_replaceable(page, MARK, "page of drivegain")
     content = read_calibration_bytes(calibration)
     fitted = decode_calibration(content, str(calibration))
-    earlier = None if beside is None else load_calibration(beside)
+    earlier = None if beside is None else read_calibration(beside)
     request = Request(fitted, datetime.now(UTC), file=calibration, content=content)
     if cell is None:
         unread = "The controller was not read; add --cell CELL to compare with its gains and the limits of the cell."
         comparison = without_controller(fitted, unread, request.now)
     else:
         command = f"drivegain apply {shlex.quote(str(cell))} {shlex.quote(str(calibration))}"
-        comparison = compare(load_cell(cell), request, command)
+        comparison = compare(read_cell(cell), request, command)
     certificate = certify(fitted, comparison, earlier)
-    with write_output(page):
-        replace_file(page, certificate_page(certificate).encode())
+    write_file(page, certificate_page(certificate))
     if json:
         print_json(certificate_report(certificate))
     else:

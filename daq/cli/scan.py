@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.terminal import print_view
-from daq.cli.verb import CellArgument, JsonOption, print_json, say_next
+from daq.cli.verb import CellArgument, JsonOption, print_json, read_cell, say_next
 from daq.errors import ConfigurationInconsistent, UsageError, VirtualBusEmpty
 from drivers.errors import DriverError, NodeMissing
 
@@ -40,12 +40,11 @@ def scan_verb(
     another master uses the bus, nothing is sent: exit code 12 or 5.
     """
     from daq.config.cell_buses import bus_parts, drive_axes
-    from daq.config.cell_file import load_cell
     from daq.report.bus_views import scan_report, scan_view, scanned_nodes
     from daq.workflow.bus_lock import bus_lock
     from daq.workflow.nameplates import check_nameplates, nameplate_warnings
 
-    declared = load_cell(cell)
+    declared = read_cell(cell)
     found: dict[str, tuple[FoundNode, ...]] = {}
     misfits: dict[str, str] = {}
     scales: dict[str, ScaleReading | None] = {}

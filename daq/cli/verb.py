@@ -28,6 +28,7 @@ from daq.files import judge_target
 if TYPE_CHECKING:
     from daq.config.cell import Cell
     from daq.report.document import Report
+    from ident.calibration import Calibration
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 CellArgument = Annotated[Path, typer.Argument(help="Cell file.")]
@@ -68,11 +69,31 @@ def output_option(name: str, about: str) -> Any:
     return typer.Option(name, help=about, callback=judged_output)
 
 
-def corrected_cell(path: Path | None) -> Cell | None:
-    """Load the cell file of `--cell`; None where the description in the logs is used."""
+def read_cell(path: Path) -> Cell:
+    """Read a cell file.
+
+    Raises:
+        ConfigurationError: as `load_cell`.
+    """
     from daq.config.cell_file import load_cell
 
-    return None if path is None else load_cell(path)
+    return load_cell(path)
+
+
+def corrected_cell(path: Path | None) -> Cell | None:
+    """Read the cell file of `--cell`; None where the description in the logs is used."""
+    return None if path is None else read_cell(path)
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Read a calibration.
+
+    Raises:
+        CalibrationMissing, CalibrationUnreadable, CalibrationRefused: as `load_calibration`.
+    """
+    from daq.documents.calibration_file import load_calibration
+
+    return load_calibration(path)
 
 
 def taking(request: type[RequestT]) -> Callable[[Callable[[RequestT], None]], Callable[..., None]]:
