@@ -71,14 +71,10 @@ def taken_of(
         lines = [line for line in locks.read_text().splitlines() if " FLOCK " in line]
         held = {int(line.split()[-3].rpartition(":")[2]) for line in lines}
         where = folder or _shared_folder()
-        return tuple(bus for bus in buses if _inode(where / lock_name(bus)) in held)
+        files = {bus: where / lock_name(bus) for bus in buses}
+        return tuple(bus for bus, file in files.items() if file.exists() and file.stat().st_ino in held)
     except (OSError, ValueError, IndexError):
         return ()
-
-
-def _inode(file: Path) -> int | None:
-    """Return the inode of a lock file; None where there is none."""
-    return file.stat().st_ino if file.exists() else None
 
 
 def require_untaken(buses: Iterable[AnyBus], folder: Path | None = None) -> None:
