@@ -12,7 +12,6 @@ import errno
 import re
 import threading
 import time
-from collections.abc import Callable
 from typing import Self, cast
 
 from drivers.canopen.bus import BusAddress
@@ -39,12 +38,10 @@ class Hub:
         channels: names that clients may open; each is a bus of its own. Another name is refused, so that a typing
             error does not open an empty bus.
         port: to listen on; 0 chooses a free one, see ``address``.
-        clock: wall clock [s] for the frames' time stamps.
     """
 
-    def __init__(self, channels: tuple[str, ...], port: int = 0, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, channels: tuple[str, ...], port: int = 0) -> None:
         self.channels = channels
-        self.clock = clock
         self.clients: set[_Client] = set()
         self._port = port
         self._server: asyncio.Server | None = None
@@ -112,7 +109,7 @@ class _Client(asyncio.Protocol):
         buffer = self._incoming + data
         end = 0
         frames = []
-        stamp = b"%.6f" % self._hub.clock()
+        stamp = b"%.6f" % time.time()
         for match in _COMMAND.finditer(buffer):
             end = match.end()
             identifier, length, payload, command = match.groups()
