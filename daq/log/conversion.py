@@ -49,7 +49,7 @@ class SiScaling:
         return motor_rad @ self.to_joint.T + self.offset_rad
 
     def joints_known(self, answered: BoolArray) -> BoolArray:
-        """Return whether every motor that moves a joint answered, shape (k, n), from the answers of the motors."""
+        """Return whether every motor that moves a joint answered, shape (..., n), from the answers of the motors."""
         size = np.abs(self.to_joint)
         moves = size > 1e-12 * size.max()
         return np.asarray(~(~answered @ moves.T), dtype=np.bool_)

@@ -110,7 +110,7 @@ def in_si(values: FloatArray, columns: PositionColumns | VelocityColumns, cell: 
     if columns.unit not in {PositionUnit.DEG, PositionUnit.MM, VelocityUnit.DEG, VelocityUnit.MM}:
         return values
     units = [axis.unit.si if columns.side is Side.JOINT else pi / 180.0 for axis in cell.axes]
-    return values * np.array(units)
+    return values * np.array(units, dtype=np.float64)
 
 
 def check_velocity(

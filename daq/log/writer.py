@@ -48,7 +48,7 @@ from daq.log.metadata import (
     sealed,
     statistics_record,
 )
-from drivers.messages import CellEvent, Quantity, Sample, SlowReading
+from drivers.messages import CellEvent, Sample, SlowReading
 
 FLUSH_NS = 150_000_000
 """Time between two flushes, recorded or wall time, whichever ends first [ns]. A kill may cost 200 ms: the rest is
@@ -113,7 +113,7 @@ class LogWriter:
         self._layout = sample_struct(self._axes)
         self._prefix = joint_state_prefix(content.joint_names)
         self._held: list[tuple[int, int, bytes]] = []
-        self._reading_channels: dict[Quantity, int] = {}
+        self._channels: dict[str, int] = {}  # by topic
         self._samples = 0
         self._lost = 0
         self._missing = [0] * self._axes
@@ -179,9 +179,8 @@ class LogWriter:
             self.flush()
             self._flushed_recorded_ns, self._flushed_wall_ns = sample.time_ns, wall_ns
         try:
-            self._mcap.add_message(
-                self._samples_channel, sample.time_ns, data, sample.time_ns, sample.cycle & 0xFFFFFFFF
-            )
+            channel = self._channel(SAMPLES_TOPIC)
+            self._mcap.add_message(channel, sample.time_ns, data, sample.time_ns, sample.cycle & 0xFFFFFFFF)
         except OSError as error:
             raise self._failed(error) from error
         if sample.time_ns >= self._joint_state_due_ns:
@@ -196,20 +195,16 @@ class LogWriter:
         velocity = [(now - then) / elapsed_s for now, then in zip(position, before, strict=True)]
         self._joint_state_before = time_ns, position
         current = [raw * unit for raw, unit in zip(sample.current_raw, self._ampere_per_unit, strict=True)]
-        self._held.append((self._joints_channel, time_ns, joint_state_bytes(self._prefix, time_ns, position, velocity)))
-        self._held.append((self._currents_channel, time_ns, currents_bytes(time_ns, current)))
+        self._hold(JOINTS_TOPIC, time_ns, joint_state_bytes(self._prefix, time_ns, position, velocity))
+        self._hold(CURRENTS_TOPIC, time_ns, currents_bytes(time_ns, current))
 
     def event(self, event: CellEvent) -> None:
         """Append one event."""
-        self._held.append((self._events_channel, event.time_ns, event_bytes(event)))
+        self._hold(EVENTS_TOPIC, event.time_ns, event_bytes(event))
 
     def reading(self, reading: SlowReading) -> None:
         """Append one slow reading."""
-        channel = self._reading_channels.get(reading.quantity)
-        if channel is None:
-            channel = self._channel(READING_TOPICS[reading.quantity])
-            self._reading_channels[reading.quantity] = channel
-        self._held.append((channel, reading.time_ns, reading_bytes(reading)))
+        self._hold(READING_TOPICS[reading.quantity], reading.time_ns, reading_bytes(reading))
 
     def readings(self, readings: Iterable[SlowReading]) -> None:
         """Append several slow readings."""
@@ -304,19 +299,23 @@ class LogWriter:
         for name, data in {**self._content.files, READBACK: readback_bytes(self._content.readback)}.items():
             self._mcap.add_attachment(started_ns, started_ns, name, "application/octet-stream", data)
         self._mcap.add_metadata(RUN, sealed(run_record(self._content.run)))
-        self._samples_channel = self._channel(SAMPLES_TOPIC)
-        self._events_channel = self._channel(EVENTS_TOPIC)
-        self._joints_channel = self._channel(JOINTS_TOPIC)
-        self._currents_channel = self._channel(CURRENTS_TOPIC)
+        for topic in (SAMPLES_TOPIC, EVENTS_TOPIC, JOINTS_TOPIC, CURRENTS_TOPIC):  # also those without a message
+            self._channel(topic)
         if self._content.urdf:
-            urdf = self._channel(URDF_TOPIC)
-            self._held.append((urdf, started_ns, text_bytes(self._content.urdf)))
+            self._hold(URDF_TOPIC, started_ns, text_bytes(self._content.urdf))
         self._mcap.flush()
 
     def _channel(self, topic: str) -> int:
-        schema = SCHEMA_OF[topic]
-        identifier = self._mcap.register_schema(schema, "ros2msg", DEFINITIONS[schema].encode())
-        return self._mcap.register_channel(topic, "cdr", identifier)
+        """Return the channel of a topic, which is new at its first message."""
+        if topic not in self._channels:
+            schema = SCHEMA_OF[topic]
+            identifier = self._mcap.register_schema(schema, "ros2msg", DEFINITIONS[schema].encode())
+            self._channels[topic] = self._mcap.register_channel(topic, "cdr", identifier)
+        return self._channels[topic]
+
+    def _hold(self, topic: str, time_ns: int, data: bytes) -> None:
+        """Keep a message for the chunk behind the samples."""
+        self._held.append((self._channel(topic), time_ns, data))
 
     def _count(self, sample: Sample) -> None:
         self._samples += 1
