@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from daq.errors import ControllerUnfit
 from daq.formats.scalar import CORRECT_KEY, DECIMAL, OCTAL, ControllerDocument, IntegerStyle, KeyPath, Scalar, Values
-from daq.formats.sections import Entry, Section, parsed_values, sections_of
+from daq.formats.sections import DcfEntry, DcfSection, parsed_values, sections_of
 
 _KEY = re.compile(r"(?:0x)?([0-9a-f]{4})h?(?:(?:sub|:)(?:0x)?([0-9a-f]{1,2})h?)?", re.IGNORECASE)
 _TITLE = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]+))?")
@@ -66,7 +66,7 @@ class DcfDocument(ControllerDocument):
         """Return section and entry of an object's value."""
         return (self._section(sections_of(self.text), key).title, _VALUE)
 
-    def _section(self, sections: list[Section], key: str) -> Section:
+    def _section(self, sections: list[DcfSection], key: str) -> DcfSection:
         match = _KEY.fullmatch(key)
         if match is None:
             raise self.unfit(key, "a key that names no object", f"{CORRECT_KEY}: 6076, 2003:01 or 2003sub1")
@@ -88,7 +88,7 @@ class DcfDocument(ControllerDocument):
             raise self.unfit(key, f"no section [{'] or ['.join(titles)}] ({has})", CORRECT_KEY)
         return found[0]
 
-    def _locate(self, sections: list[Section], key: str) -> Scalar:
+    def _locate(self, sections: list[DcfSection], key: str) -> Scalar:
         section = self._section(sections, key)
         names = Counter(entry.name for entry in section.entries)
         doubled = sorted(name for name, count in names.items() if count > 1)
@@ -126,7 +126,7 @@ class DcfDocument(ControllerDocument):
             raise self.unfit(key, where, "write a plain integer, decimal or 0x", "an integer of its type") from error
         return Scalar(key, float(value), entry.value, entry.start, entry.line, style)
 
-    def _style(self, entries: dict[str, Entry], key: str, kind: int) -> IntegerStyle:
+    def _style(self, entries: dict[str, DcfEntry], key: str, kind: int) -> IntegerStyle:
         """Return the integers of a type within the limits of the file."""
         bits, signed = _INTEGERS[kind]
         lowest, highest = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
@@ -141,7 +141,7 @@ class DcfDocument(ControllerDocument):
                 raise self.unfit(key, found, "correct the limit", "an integer, or nothing") from error
         return IntegerStyle(bits, max(lowest, bounds[0]), min(highest, bounds[1]))
 
-    def _number(self, entries: dict[str, Entry], key: str, name: str, default: int) -> int:
+    def _number(self, entries: dict[str, DcfEntry], key: str, name: str, default: int) -> int:
         entry = entries.get(name)
         if entry is None or not entry.value:
             return default

@@ -16,7 +16,7 @@ _BYTE_ORDER_MARK = "ï»¿"  #: That of UTF-8, each byte a character
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class DcfEntry:
     """`name = value`; the place is that of the value."""
 
     name: str
@@ -26,17 +26,17 @@ class Entry:
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
+class DcfSection:
     """The entries under one `[title]`; keys and titles in lower case, as CiA 306 ignores the case."""
 
     title: str
     line: int
-    entries: list[Entry] = field(default_factory=list)
+    entries: list[DcfEntry] = field(default_factory=list)
 
 
-def sections_of(text: str) -> list[Section]:
+def sections_of(text: str) -> list[DcfSection]:
     """Split the text into sections; comments and lines other than `name=value` are skipped."""
-    sections: list[Section] = []
+    sections: list[DcfSection] = []
     for number, line in enumerate(_LINE.finditer(text), start=1):
         written = line[1].removeprefix(_BYTE_ORDER_MARK) if number == 1 else line[1]
         if written.lstrip().startswith(";"):
@@ -44,10 +44,10 @@ def sections_of(text: str) -> list[Section]:
         title = _SECTION.fullmatch(written)
         entry = _ENTRY.fullmatch(written)
         if title is not None:
-            sections.append(Section(title[1].strip().lower(), number))
+            sections.append(DcfSection(title[1].strip().lower(), number))
         elif entry is not None and sections:
             start = line.end(1) - len(written) + entry.start(2)
-            sections[-1].entries.append(Entry(entry[1].lower(), entry[2], start, number))
+            sections[-1].entries.append(DcfEntry(entry[1].lower(), entry[2], start, number))
     return sections
 
 
