@@ -12,6 +12,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,7 +21,7 @@ from typer.core import TyperGroup
 
 from daq.cli.failure import ErrorParts, show_failure
 from daq.cli.terminal import STARTED, WRITTEN, interruptible, remove_empty_folders, say_last
-from daq.cli.verb import HELP_NAMES, Job, Listed
+from daq.cli.verb import HELP_NAMES, Job, Verb
 from daq.environment import software
 from daq.errors import DaqError, ExitCode, OutputFailed
 from daq.report.text import printable
@@ -31,42 +32,183 @@ CLICK_ERROR: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ 
 """What typer raises of a command line that cannot be parsed: it brings a click of its own, without public names."""
 BY_JOB = {
     Job.COMMISSION: (
-        Listed("demo", "daq.cli.simulate:DEMO", "Run the whole calibration on a simulated six-axis cell."),
-        Listed("init", "daq.cli.init:INIT", "Create a folder for a new cell, with templates to fill in."),
-        Listed("scan", "daq.cli.scan:SCAN", "Compare the nodes on the bus with the cell file."),
-        Listed("plan", "daq.cli.plan:PLAN", "Choose moves that show the worst gain best."),
-        Listed("record", "daq.cli.record:RECORD", "Execute a plan and log it; this moves the robot."),
-        Listed("fit", "daq.cli.fit:FIT", "Identify all drive gains and dynamic parameters."),
-        Listed("residual", "daq.cli.fit:RESIDUAL", "Fit, then detect and add missing effects."),
-        Listed("validate", "daq.cli.validate:VALIDATE", "Predict the torque of other logs with a calibration."),
-        Listed("certificate", "daq.cli.certificate:CERTIFICATE", "Judge a calibration on one page, to print and sign."),
-        Listed("apply", "daq.cli.apply:APPLY", "Write gains to the controller; a dry run without --yes."),
-        Listed("rollback", "daq.cli.apply:ROLLBACK", "Undo the last write."),
+        Verb(
+            "demo",
+            "daq.cli.simulate:demo",
+            "drivegain demo --out out/demo",
+            "Run the whole calibration on a simulated six-axis cell.",
+        ),
+        Verb(
+            "init",
+            "daq.cli.init:init",
+            "drivegain init press-4 --simulated",
+            "Create a folder for a new cell, with templates to fill in.",
+        ),
+        Verb(
+            "scan", "daq.cli.scan:scan_verb", "drivegain scan CELL", "Compare the nodes on the bus with the cell file."
+        ),
+        Verb(
+            "plan",
+            "daq.cli.plan:plan_verb",
+            "drivegain plan CELL --out plan.yaml --seed 1 --duration 40",
+            "Choose moves that show the worst gain best.",
+        ),
+        Verb(
+            "record",
+            "daq.cli.record:record_verb",
+            "drivegain record CELL plan.yaml --out loaded.mcap --payload disc --mass 4.59 --enable-motion",
+            "Execute a plan and log it; this moves the robot.",
+        ),
+        Verb(
+            "fit",
+            "daq.cli.fit:fit_verb",
+            "drivegain fit unloaded.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml",
+            "Identify all drive gains and dynamic parameters.",
+        ),
+        Verb(
+            "residual",
+            "daq.cli.fit:residual_verb",
+            "drivegain residual unloaded.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml "
+            "--report report",
+            "Fit, then detect and add missing effects.",
+        ),
+        Verb(
+            "validate",
+            "daq.cli.validate:validate_verb",
+            "drivegain validate calibration.yaml held-out.mcap --pictures pictures",
+            "Predict the torque of other logs with a calibration.",
+        ),
+        Verb(
+            "certificate",
+            "daq.cli.certificate:certificate_verb",
+            "drivegain certificate calibration.yaml --cell CELL",
+            "Judge a calibration on one page, to print and sign.",
+        ),
+        Verb(
+            "apply",
+            "daq.cli.apply:apply_verb",
+            "drivegain apply CELL calibration.yaml",
+            "Write gains to the controller; a dry run without --yes.",
+        ),
+        Verb(
+            "rollback",
+            "daq.cli.apply:rollback_verb",
+            "drivegain rollback press-4/cells/press-4.yaml",
+            "Undo the last write.",
+        ),
     ),
     Job.LOOK: (
-        Listed("monitor", "daq.cli.monitor:MONITOR", "Show the state of the axes; nothing is changed."),
-        Listed("console", "daq.cli.monitor:CONSOLE", "Show the cell live on a page, with a stop button."),
-        Listed("info", "daq.cli.logs:INFO", "Show what is in a log."),
-        Listed("history", "daq.cli.history:HISTORY", "Show the calibrations of a cell and any drift."),
-        Listed("explain-emcy", "daq.cli.scan:EXPLAIN_EMCY", "Explain an error code of an amplifier."),
+        Verb(
+            "monitor",
+            "daq.cli.monitor:monitor_verb",
+            "drivegain monitor CELL --calibration calibration.yaml",
+            "Show the state of the axes; nothing is changed.",
+        ),
+        Verb(
+            "console",
+            "daq.cli.monitor:console_verb",
+            "drivegain console CELL --calibration calibration.yaml",
+            "Show the cell live on a page, with a stop button.",
+        ),
+        Verb("info", "daq.cli.logs:info", "drivegain info loaded.mcap", "Show what is in a log."),
+        Verb(
+            "history",
+            "daq.cli.history:history_verb",
+            "drivegain history press-4/cells/press-4.yaml --axis J4 --plot history.png",
+            "Show the calibrations of a cell and any drift.",
+        ),
+        Verb(
+            "explain-emcy",
+            "daq.cli.scan:explain_emcy_verb",
+            "drivegain explain-emcy 8611h",
+            "Explain an error code of an amplifier.",
+        ),
     ),
     Job.MAINTAIN: (
-        Listed("recalibrate", "daq.cli.recalibrate:RECALIBRATE", "Scheduled job: record, fit, propose or apply."),
-        Listed("schedule", "daq.cli.recalibrate:SCHEDULE", "Run the job on a schedule, by systemd or cron."),
-        Listed("sign", "daq.cli.sign:SIGN", "Sign a calibration as its second approver."),
-        Listed("fleet", "daq.cli.fleet:FLEET", "Fit the logs of many cells."),
-        Listed("salvage", "daq.cli.logs:SALVAGE", "Save the readable part of an unfinished or damaged log."),
+        Verb(
+            "recalibrate",
+            "daq.cli.recalibrate:recalibrate_verb",
+            "drivegain recalibrate press-4/cells/press-4.yaml --dry-run",
+            "Scheduled job: record, fit, propose or apply.",
+        ),
+        Verb(
+            "schedule",
+            "daq.cli.recalibrate:schedule_verb",
+            "drivegain schedule press-4/cells/press-4.yaml --schedule weekly",
+            "Run the job on a schedule, by systemd or cron.",
+        ),
+        Verb(
+            "sign",
+            "daq.cli.sign:sign_verb",
+            "drivegain sign calibration calibration.yaml --key keys/anna.key --name anna",
+            "Sign a calibration as its second approver.",
+            (
+                Verb("key", "daq.cli.sign:sign_key_verb", "drivegain sign key --name anna --folder keys"),
+                Verb(
+                    "calibration",
+                    "daq.cli.sign:sign_calibration_verb",
+                    "drivegain sign calibration calibration.yaml --key keys/anna.key --name anna",
+                ),
+                Verb("check", "daq.cli.sign:sign_check_verb", "drivegain sign check CELL calibration.yaml"),
+            ),
+        ),
+        Verb(
+            "fleet",
+            "daq.cli.fleet:fleet_verb",
+            "drivegain fleet logs --scheduler processes --out calibrations --csv fleet.csv",
+            "Fit the logs of many cells.",
+        ),
+        Verb(
+            "salvage",
+            "daq.cli.logs:salvage_verb",
+            "drivegain salvage loaded.mcap.part --out loaded-partial.mcap",
+            "Save the readable part of an unfinished or damaged log.",
+        ),
     ),
     Job.EXPERT: (
-        Listed("import", "daq.cli.logs:IMPORT", "Convert CSV, MATLAB or ROS 2 files to a log."),
-        Listed("export", "daq.cli.logs:EXPORT", "Write a calibration or a log for other programs."),
-        Listed("weigh", "daq.cli.validate:WEIGH", "Weigh the body on the flange with a calibration."),
-        Listed("contact", "daq.cli.validate:CONTACT", "Find external torques, with a threshold for alarms."),
-        Listed("simulate", "daq.cli.simulate:SIMULATE", "Run a simulated cell on a bus, to try the other verbs."),
+        Verb(
+            "import",
+            "daq.cli.logs:import_files",
+            "drivegain import press-4/imports/press-4.yaml --data csv-files --out imported.mcap",
+            "Convert CSV, MATLAB or ROS 2 files to a log.",
+        ),
+        Verb(
+            "export",
+            "daq.cli.logs:export_verb",
+            "drivegain export urdf CELL calibration.yaml --out robot.urdf",
+            "Write a calibration or a log for other programs.",
+            (
+                Verb(
+                    "urdf",
+                    "daq.cli.logs:export_urdf_verb",
+                    "drivegain export urdf CELL calibration.yaml --out robot.urdf",
+                ),
+                Verb("log", "daq.cli.logs:export_log_verb", "drivegain export log loaded.mcap --csv --out loaded.csv"),
+                Verb("bag", "daq.cli.logs:export_bag_verb", "drivegain export bag loaded.mcap --out loaded-bag"),
+            ),
+        ),
+        Verb(
+            "weigh",
+            "daq.cli.validate:weigh_verb",
+            "drivegain weigh calibration.yaml held-out.mcap --bare unloaded.mcap",
+            "Weigh the body on the flange with a calibration.",
+        ),
+        Verb(
+            "contact",
+            "daq.cli.validate:contact_verb",
+            "drivegain contact calibration.yaml loaded.mcap --quiet held-out.mcap",
+            "Find external torques, with a threshold for alarms.",
+        ),
+        Verb(
+            "simulate",
+            "daq.cli.simulate:simulate",
+            "drivegain simulate demo --payload disc --faults faults-example",
+            "Run a simulated cell on a bus, to try the other verbs.",
+        ),
     ),
 }
 """Verbs by job, in the order of the help; each is imported when it is called."""
-VERBS = tuple(listed for verbs in BY_JOB.values() for listed in verbs)
+VERBS = tuple(chain.from_iterable(BY_JOB.values()))
 ALIASES = {"report": "certificate", "install-units": "schedule"}
 """Names of earlier versions, which go on working; the help and the completion do not list them."""
 
@@ -79,15 +221,15 @@ class _Verbs(TyperGroup):
         first, *others = args
         named = ALIASES.get(first, first)
         name, command, rest = super().resolve_command(ctx, [named, *others])
-        listed = next((listed for listed in VERBS if listed.name == name), None)
-        return name, command if listed is None else listed.load().command(), rest
+        verb = next((verb for verb in VERBS if verb.name == name), None)
+        return name, command if verb is None else verb.command(), rest
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """List the verbs of each job with their whole summaries."""
-        width = max(len(listed.name) for listed in VERBS)
+        width = max(len(verb.name) for verb in VERBS)
         for job, verbs in BY_JOB.items():
             with formatter.section(job.value):
-                formatter.write_dl([(f"{listed.name:{width}}", listed.summary) for listed in verbs])
+                formatter.write_dl([(f"{verb.name:{width}}", verb.summary) for verb in verbs])
 
     def invoke(self, ctx: Any) -> Any:
         """Run the verb; an interrupt, SIGTERM or SIGHUP is one line that says what was written."""
@@ -120,8 +262,8 @@ def build_app() -> typer.Typer:
         rich_markup_mode=None,  # rich would read the units in brackets, [s], as markup and drop them
     )
     app.callback()(_options)
-    for listed in VERBS:
-        app.command(listed.name, help=listed.summary)(lambda: None)  # never called
+    for verb in VERBS:
+        app.command(verb.name, help=verb.summary)(lambda: None)  # never called
     return app
 
 

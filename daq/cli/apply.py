@@ -27,7 +27,7 @@ from daq.cli.terminal import (
     say_last,
     write_output,
 )
-from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json, taking
+from daq.cli.verb import CalibrationArgument, JsonOption, print_json, read_cell, taking
 from daq.environment import login
 from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, ExitCode, UsageError
 from daq.report.text import terminal_text
@@ -87,13 +87,12 @@ def apply_verb(options: ApplyOptions) -> None:
 
     The bounds of the gates are in the cell's `policy: {apply: ...}`; see docs/reference/gates.md.
     """
-    from daq.config.cell_file import load_cell
     from daq.documents.calibration_file import decode_calibration, read_calibration_bytes
     from daq.writeback.file_target import FileTarget
     from daq.writeback.request import Request
 
     saving = saving_of(options.ram_only, options.save_unknown, drives=options.drives)
-    declared = load_cell(options.cell)
+    declared = read_cell(options.cell)
     actor = applier(options.by)
     content = read_calibration_bytes(options.calibration)
     fitted = decode_calibration(content, str(options.calibration))
@@ -254,9 +253,6 @@ def entered_masses(entries: Sequence[str], calibration: Calibration) -> dict[str
     return found
 
 
-APPLY = Verb("apply", apply_verb, "drivegain apply CELL calibration.yaml")
-
-
 def rollback_verb(
     cell: Annotated[Path | None, typer.Argument(help="Cell file; it names the controller file and the audit.")] = None,
     to: Annotated[Path | None, typer.Option("--to", help="Another controller file than the cell's.")] = None,
@@ -274,14 +270,13 @@ def rollback_verb(
     give it with --audit, or the rollback is not in an audit. Drives are shown first and written with --yes: their
     values are in no file that could be reviewed.
     """
-    from daq.config.cell_file import load_cell
     from daq.ledger.ledger import MAY_LACK, is_damaged
     from daq.report.proposal import file_rollback_report, show_file_rollback
     from daq.writeback import target
     from daq.writeback.file_target import FileTarget
 
     saving = saving_of(ram_only, save_unknown, drives=drives)
-    declared = None if cell is None else load_cell(cell)
+    declared = None if cell is None else read_cell(cell)
     at_most_one(audit=audit, cell=cell)  # writes to a cell's controller are in the cell's audit
     if drives:
         at_most_one(drives=drives, to=to)
@@ -347,9 +342,6 @@ def rollback_drives(
         backup = "" if written.backup is None else written.backup.name
         console.print(f"Restored the values of {planned.source}; those before are now in {backup}.", end=" ")
         console.print(_saving_text(saving))
-
-
-ROLLBACK = Verb("rollback", rollback_verb, "drivegain rollback press-4/cells/press-4.yaml")
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,16 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.terminal import check_folder, check_page, check_replaceable, print_view, write_output
-from daq.cli.verb import CalibrationArgument, JsonOption, Verb, output_option, print_json
-from daq.files import replace_file, sha256
+from daq.cli.terminal import check_folder, check_page, check_replaceable, print_view, write_file
+from daq.cli.verb import (
+    CalibrationArgument,
+    JsonOption,
+    output_option,
+    print_json,
+    read_calibration,
+    read_cell,
+)
+from daq.files import sha256
 
 
 def certificate_verb(
@@ -33,8 +40,7 @@ def certificate_verb(
     of this verb, `report`, goes on working.
     """
 
-    from daq.config.cell_file import load_cell
-    from daq.documents.calibration_file import decode_calibration, load_calibration, read_calibration_bytes
+    from daq.documents.calibration_file import decode_calibration, read_calibration_bytes
     from daq.jobs.session import session_of
     from daq.report.certificate import Origin, certificate_report, certify
     from daq.report.certificate_page import certificate_page
@@ -50,7 +56,7 @@ def certificate_verb(
     check_replaceable(page, MARK, "page of drivegain")
     content = read_calibration_bytes(calibration)
     fitted = decode_calibration(content, str(calibration))
-    earlier = None if beside is None else load_calibration(beside)
+    earlier = None if beside is None else read_calibration(beside)
     request = Request(fitted, datetime.now(UTC), file=calibration, content=content)
     digest = sha256(content)
     if cell is None:
@@ -58,15 +64,11 @@ def certificate_verb(
         comparison = without_controller(fitted, unread, request.now)
     else:
         command = f"drivegain apply {shlex.quote(str(cell))} {shlex.quote(str(calibration))}"
-        comparison = compare(load_cell(cell), request, command)
+        comparison = compare(read_cell(cell), request, command)
     certificate = certify(fitted, comparison, earlier, Origin(digest, session_of(calibration, digest)))
-    with write_output(page):
-        replace_file(page, certificate_page(certificate).encode())
+    write_file(page, certificate_page(certificate))
     if json:
         print_json(certificate_report(certificate))
     else:
         status = f"Certificate {certificate.origin.id}, {status_text(comparison)}."
         print_view((terminal_text(certificate.sentence), terminal_text(status)), page)
-
-
-CERTIFICATE = Verb("certificate", certificate_verb, "drivegain certificate calibration.yaml --cell CELL")

@@ -26,7 +26,6 @@ from daq.cli.terminal import (
 from daq.cli.verb import (
     CellOption,
     JsonOption,
-    Verb,
     corrected_cell,
     output_option,
     print_json,
@@ -56,64 +55,90 @@ class Gains(Enum):
     FIXED = "fixed"
 
 
-LogsArgument = Annotated[list[Path], typer.Argument(help="Logs: without load, and with a weighed payload.")]
-HoldoutOption = Annotated[
-    list[Path] | None, typer.Option("--holdout", help="Held-out log, for the final error; repeatable.")
-]
-OutOption = Annotated[Path | None, output_option("--out", "Calibration file to write (calibration.yaml).")]
-PicturesOption = Annotated[Path | None, output_option("--pictures", "Folder for pictures; it is created.")]
-AcceptLossesOption = Annotated[
-    bool,
-    typer.Option("--accept-losses", help="Use logs with lost frames, less those samples; `apply` refuses the result."),
-]
-AsWiredOption = Annotated[
-    bool, typer.Option("--channels-as-wired", help="Do not look for exchanged currents: they are each axis' own.")
-]
-GainsOption = Annotated[Gains, typer.Option(help="fixed: hold the nameplate gains (classical IDIM).")]
-KnownOption = Annotated[Known, typer.Option(help="What is known of the payload; cad: its drawing too.")]
-EssentialOption = Annotated[
-    float | None,
-    typer.Option(min=1.5, help="Keep only essential parameters, whose relative σ are within this factor (10 to 30)."),
-]
-CasesOption = Annotated[
-    Path | None,
-    output_option("--cases", "Folder for the paper's cases 1 to 4, the nameplate gains and ml."),
-]
-CompareOption = Annotated[
-    bool,
-    typer.Option("--compare", help="Also run every estimator, at the cell's cut-offs, their half and their double."),
-]
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogsRequest:
+    """Logs to fit and places for the result, as the command line asks for them."""
 
-
-@dataclass(frozen=True, slots=True)
-class FitRequest:
-    """A fit of logs, as the command line asks for it."""
-
-    logs: LogsArgument
-    method: Annotated[
-        Method | None,
-        typer.Option(
-            help="ls, wls, tls of the paper; ml (default; wls with fixed gains); iv: instruments of the demand."
-        ),
+    logs: Annotated[list[Path], typer.Argument(help="Logs: without load, and with a weighed payload.")]
+    gains: Annotated[Gains, typer.Option(help="fixed: hold the nameplate gains (classical IDIM).")] = Gains.FREE
+    holdout: Annotated[
+        list[Path] | None, typer.Option("--holdout", help="Held-out log, for the final error; repeatable.")
     ] = None
-    gains: GainsOption = Gains.FREE
-    known: KnownOption = Known.MASS
-    essential: EssentialOption = None
-    cases: CasesOption = None
-    compare: CompareOption = False
-    holdout: HoldoutOption = None
-    out: OutOption = None
-    report: Annotated[Path | None, output_option("--report", "Folder for report.html, the certificate.")] = None
-    pictures: PicturesOption = None
+    out: Annotated[Path | None, output_option("--out", "Calibration file to write (calibration.yaml).")] = None
+    pictures: Annotated[Path | None, output_option("--pictures", "Folder for pictures; it is created.")] = None
     cell: CellOption = None
-    accept_losses: AcceptLossesOption = False
-    channels_as_wired: AsWiredOption = False
+    accept_losses: Annotated[
+        bool,
+        typer.Option(
+            "--accept-losses", help="Use logs with lost frames, less those samples; `apply` refuses the result."
+        ),
+    ] = False
+    channels_as_wired: Annotated[
+        bool, typer.Option("--channels-as-wired", help="Do not look for exchanged currents: they are each axis' own.")
+    ] = False
     json: JsonOption = False
 
     @property
     def gains_fixed(self) -> bool:
         """Whether the nameplate gains are held."""
         return self.gains is Gains.FIXED
+
+    @property
+    def lossy(self) -> LossyLogs:
+        """Whether logs with lost frames are used."""
+        from daq.log.reader import LossyLogs
+
+        return LossyLogs.ACCEPTED if self.accept_losses else LossyLogs.REFUSED
+
+    def options(self) -> list[object]:
+        """Return the options of the same logs as words of another command."""
+        words: list[object] = []
+        for log in self.holdout or ():
+            words += ("--holdout", log)
+        if self.cell is not None:
+            words += ("--cell", self.cell)
+        if self.gains_fixed:
+            words += ("--gains", self.gains.value)
+        if self.channels_as_wired:
+            words.append("--channels-as-wired")
+        return words
+
+    def check_places(self, report: Path | None) -> None:
+        """Refuse places of the output that cannot be written, before any long work."""
+        check_folder(self.out)
+        check_output(self.out, (*self.logs, *(self.holdout or ()), self.cell), CALIBRATION)
+        require_different(self.out, report=report, pictures=self.pictures)
+        check_report(report, self.out)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitRequest(LogsRequest):
+    """A fit of logs, as the command line asks for it."""
+
+    method: Annotated[
+        Method | None,
+        typer.Option(
+            help="ls, wls, tls of the paper; ml (default; wls with fixed gains); iv: instruments of the demand."
+        ),
+    ] = None
+    known: Annotated[Known, typer.Option(help="What is known of the payload; cad: its drawing too.")] = Known.MASS
+    essential: Annotated[
+        float | None,
+        typer.Option(
+            min=1.5, help="Keep only essential parameters, whose relative σ are within this factor (10 to 30)."
+        ),
+    ] = None
+    cases: Annotated[
+        Path | None,
+        output_option("--cases", "Folder for the paper's cases 1 to 4, the nameplate gains and ml."),
+    ] = None
+    compare: Annotated[
+        bool,
+        typer.Option(
+            "--compare", help="Also run every estimator, at the cell's cut-offs, their half and their double."
+        ),
+    ] = False
+    report: Annotated[Path | None, output_option("--report", "Folder for report.html, the certificate.")] = None
 
 
 @taking(FitRequest)
@@ -127,7 +152,7 @@ def fit_verb(request: FitRequest) -> None:
     if request.cases is not None:
         _fit_cases(request, request.cases)
         return
-    _check_places(request)
+    request.check_places(request.report)
     with status("identifying"):
         found = _fit(request)
         calibration = calibration_of_case(found, datetime.now(UTC))
@@ -142,38 +167,7 @@ def fit_verb(request: FitRequest) -> None:
         print_json(fit_report(found, calibration, comparison))
         return
     print_view(fit_view(found, calibration, comparison), request.out, request.report, request.pictures)
-    same = _holdout_words(request)
-    if request.cell is not None:
-        same += ["--cell", request.cell]
-    if request.gains_fixed:
-        same += ["--gains", request.gains.value]
-    if request.channels_as_wired:
-        same += ["--channels-as-wired"]
-    say_after_fit(calibration, [*request.logs, *same], request.out or Path("calibration.yaml"))
-
-
-def _check_places(request: FitRequest | ResidualRequest) -> None:
-    """Refuse places of the output that cannot be written, before any long work."""
-
-    check_folder(request.out)
-    inputs = (*request.logs, *(request.holdout or ()), request.cell)
-    check_output(request.out, inputs, CALIBRATION)
-    require_different(request.out, report=request.report, pictures=request.pictures)
-    check_report(request.report, request.out)
-
-
-def _holdout_words(request: FitRequest | ResidualRequest) -> list[object]:
-    """Return the held-out logs as words of a command."""
-    words: list[object] = []
-    for log in request.holdout or ():
-        words += ("--holdout", log)
-    return words
-
-
-def _losses_of(request: FitRequest | ResidualRequest) -> LossyLogs:
-    from daq.log.reader import LossyLogs
-
-    return LossyLogs.ACCEPTED if request.accept_losses else LossyLogs.REFUSED
+    say_after_fit(calibration, [*request.logs, *request.options()], request.out or Path("calibration.yaml"))
 
 
 def _fit(request: FitRequest) -> CaseFit:
@@ -192,7 +186,7 @@ def _fit(request: FitRequest) -> CaseFit:
             method=request.method,
             gains_fixed=request.gains_fixed,
             cell=cell,
-            lossy=_losses_of(request),
+            lossy=request.lossy,
             channels_as_wired=request.channels_as_wired,
         )
         found = CaseFit(fitted, (), None)
@@ -229,7 +223,7 @@ def _fit_cases(request: FitRequest, folder: Path) -> None:
         cases=folder,
         method=request.method,
         known=request.known is not Known.MASS,  # every case has its own
-        gains=request.gains is not Gains.FREE,  # likewise
+        gains=request.gains_fixed,  # likewise
         out=request.out,
         report=request.report,
         pictures=request.pictures,
@@ -264,26 +258,15 @@ def _fit_cases(request: FitRequest, folder: Path) -> None:
         print_view(cases_view(fits, tables), *files.values(), page_file)
 
 
-FIT = Verb("fit", fit_verb, "drivegain fit unloaded.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml")
-
-
-@dataclass(frozen=True, slots=True)
-class ResidualRequest:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResidualRequest(LogsRequest):
     """A search for what the model lacks, as the command line asks for it."""
 
-    logs: LogsArgument
-    gains: GainsOption = Gains.FREE
-    holdout: HoldoutOption = None
     seed: Annotated[int, typer.Option(help="Seed of the significance test, which fixes its verdict.", min=0)] = 0
-    out: OutOption = None
     report: Annotated[Path | None, output_option("--report", "Folder for report.html and residual.json.")] = None
-    pictures: PicturesOption = None
     leave_out_runs: Annotated[
         bool, typer.Option("--leave-out-runs", help="Also predict each run from a fit of the others: slow.")
     ] = False
-    cell: CellOption = None
-    accept_losses: AcceptLossesOption = False
-    channels_as_wired: AsWiredOption = False
     accept_worse_holdout: Annotated[
         bool,
         typer.Option(
@@ -302,7 +285,6 @@ class ResidualRequest:
         bool,
         typer.Option("--verbose", help="Also print the search, all errors and what these data cannot show."),
     ] = False
-    json: JsonOption = False
 
 
 @taking(ResidualRequest)
@@ -316,7 +298,7 @@ def residual_verb(request: ResidualRequest) -> None:
     from daq.workflow.fit import calibration_of, check_holdout
     from ident.discovery.before_after import account
 
-    _check_places(request)
+    request.check_places(request.report)
     with status("identifying") as report_step:
         closed = _search(request, report_step)
         calibration = calibration_of(closed, datetime.now(UTC))
@@ -352,9 +334,9 @@ def _search(request: ResidualRequest, report_step: Callable[[str], None]) -> Fit
         request.logs,
         holdout=request.holdout or (),
         method=Method.ML,
-        gains_fixed=request.gains is Gains.FIXED,
+        gains_fixed=request.gains_fixed,
         cell=corrected_cell(request.cell),
-        lossy=_losses_of(request),
+        lossy=request.lossy,
         keep_rows=True,
         channels_as_wired=request.channels_as_wired,
     )
@@ -365,18 +347,15 @@ def _search(request: ResidualRequest, report_step: Callable[[str], None]) -> Fit
 
 def _say_after_search(request: ResidualRequest) -> None:
     """Print the next step: the calibration tested on other logs, or the same search with a calibration to write."""
-    same: list[object] = [] if request.cell is None else ["--cell", request.cell]
     if request.out is not None:
-        say_next("drivegain", "validate", request.out, *(request.holdout or request.logs), *same)
+        described = [] if request.cell is None else ["--cell", request.cell]
+        say_next("drivegain", "validate", request.out, *(request.holdout or request.logs), *described)
         return
-    same += _holdout_words(request)
-    if request.gains is Gains.FIXED:
-        same += ["--gains", request.gains.value]
+    same = request.options()
     if request.seed:
-        same += ["--seed", str(request.seed)]
+        same += ["--seed", request.seed]
     switches = {
         "--accept-losses": request.accept_losses,
-        "--channels-as-wired": request.channels_as_wired,
         "--accept-worse-holdout": request.accept_worse_holdout,
         "--write-undecided": request.write_undecided,
     }
@@ -408,13 +387,6 @@ def check_report(folder: Path | None, out: Path | None = None) -> None:
             pass
     for name, mark in MARKS.items():
         check_replaceable(folder / name, mark, "report of `drivegain residual`")
-
-
-RESIDUAL = Verb(
-    "residual",
-    residual_verb,
-    "drivegain residual unloaded.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml --report report",
-)
 
 
 def _save_certificate(fitted: Fit, calibration: Calibration, folder: Path) -> None:

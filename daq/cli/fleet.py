@@ -8,10 +8,9 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.terminal import check_replaceable, print_view, progress_bar, write_output
-from daq.cli.verb import JsonOption, Verb, output_option, print_json
+from daq.cli.terminal import check_replaceable, print_view, progress_bar, write_file
+from daq.cli.verb import JsonOption, output_option, print_json
 from daq.errors import ExitCode, OutputFailed
-from daq.files import replace_file
 
 
 def fleet_verb(
@@ -60,14 +59,10 @@ def fleet_verb(
     with progress_bar("fitting the fleet") as report_progress, wanted as pool:
         rows = fit_fleet(found, pool, loop, cache, lambda: datetime.now(UTC), report_progress)
     if csv is not None:
-        with write_output(csv):
-            replace_file(csv, fleet_csv(rows).encode())
+        write_file(csv, fleet_csv(rows))
     if json:
         print_json(fleet_report(rows))
     else:
         print_view(fleet_view(rows), out, csv)
     if not all(row.fitted for row in rows):
         raise typer.Exit(ExitCode.DATA_UNFIT)
-
-
-FLEET = Verb("fleet", fleet_verb, "drivegain fleet logs --scheduler processes --out calibrations --csv fleet.csv")

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.apply import applier
-from daq.cli.terminal import check_replaceable, output_console, say_written, write_output
-from daq.cli.verb import JsonOption, Verb, output_option, print_json
+from daq.cli.terminal import check_replaceable, output_console, say_written, write_file
+from daq.cli.verb import JsonOption, output_option, print_json, read_cell
 from daq.errors import (
     AuditUnusable,
     ConfigurationInconsistent,
@@ -23,7 +23,6 @@ from daq.errors import (
     UsageError,
     evidence,
 )
-from daq.files import replace_file
 from daq.report.text import printable
 
 if TYPE_CHECKING:
@@ -66,7 +65,6 @@ def history_verb(
     calibration far off. What it may come from is asked, not claimed. docs/evidence/drift.md says how often an alarm is
     false.
     """
-    from daq.config.cell_file import load_cell
     from daq.ledger.ledger import MAY_LACK, Ledger
     from daq.report.history import (
         describe_actions,
@@ -78,7 +76,7 @@ def history_verb(
     )
     from daq.writeback.file_access import resolve_links
 
-    declared = load_cell(cell)
+    declared = read_cell(cell)
     ledger = Ledger.of(declared)
     if ledger is None:
         raise ConfigurationInconsistent(
@@ -308,11 +306,6 @@ def _write_files(chosen: tuple[Series, ...], cell: Cell, picture: Path | None, c
                 remedy="fit and apply one first",
             )
         kind = picture.suffix.lower().removeprefix(".")
-        with write_output(picture):
-            replace_file(picture, plot_history(drawn, kind, title=f"Drive gains of {cell.name}"))
+        write_file(picture, plot_history(drawn, kind, title=f"Drive gains of {cell.name}"))
     if csv is not None:
-        with write_output(csv):
-            replace_file(csv, csv_text(chosen).encode())
-
-
-HISTORY = Verb("history", history_verb, "drivegain history press-4/cells/press-4.yaml --axis J4 --plot history.png")
+        write_file(csv, csv_text(chosen))

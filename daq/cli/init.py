@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from daq.cli.terminal import write_output
-from daq.cli.verb import Verb, judged_output, say_next
+from daq.cli.verb import judged_output, say_next
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
 
@@ -86,6 +86,3 @@ def _copy(source: str, path: Path, name: str, texts: dict[str, Any]) -> Path:
         text = text.replace("pacing: lockstep", "pacing: timed   ").replace("unit: Nm(motor, a priori)", "unit: A")
         path.write_text(text, encoding="utf-8")
     return path
-
-
-INIT = Verb("init", init, "drivegain init press-4 --simulated")

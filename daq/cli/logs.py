@@ -18,7 +18,7 @@ from daq.cli.terminal import (
     status,
     write_output,
 )
-from daq.cli.verb import JsonOption, Verb, output_option, print_json
+from daq.cli.verb import JsonOption, output_option, print_json, read_calibration, read_cell
 from daq.environment import require_packages, software
 from daq.errors import ConfigurationInconsistent, DaqError, LogForeign, OutputFailed, UsageError
 from daq.files import replace_file
@@ -37,7 +37,6 @@ NewLogOption = Annotated[Path, output_option("--out", "Log to write (.mcap); mus
 
 def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: JsonOption = False) -> None:
     """Show what is in a log: role and payload, duration, losses, moves, validity."""
-    from daq.documents.calibration_file import load_calibration
     from daq.report.document import json_tree
     from daq.report.log import info_report, log_lines
 
@@ -45,7 +44,7 @@ def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: Json
         report = info_report(log)
     except LogForeign as error:
         with suppress(DaqError):
-            load_calibration(log)
+            read_calibration(log)
             error.found = "a calibration"
             error.remedy = f"`drivegain certificate {log}` reads it"
         raise
@@ -53,9 +52,6 @@ def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: Json
         print_json(report)
     else:
         print_view(log_lines(json_tree(report), output_console().width))
-
-
-INFO = Verb("info", info, "drivegain info loaded.mcap")
 
 
 def import_files(
@@ -79,11 +75,6 @@ def import_files(
     typer.echo(f"{out}: {statistics.samples} samples of {len(statistics.missing)} axes")
     for line in (*(() if timing is None else (timing_text(timing),)), *imported.remarks):
         typer.echo(printable(line))
-
-
-IMPORT = Verb(
-    "import", import_files, "drivegain import press-4/imports/press-4.yaml --data csv-files --out imported.mcap"
-)
 
 
 def salvage_verb(
@@ -111,9 +102,6 @@ def salvage_verb(
         typer.echo(f"left out: {saved.left_out_bytes} bytes, from {printable(saved.damage)}")
     if not statistics.valid:
         typer.echo(f"INVALID: {printable(statistics.reason)}; a fit will refuse it")
-
-
-SALVAGE = Verb("salvage", salvage_verb, "drivegain salvage loaded.mcap.part --out loaded-partial.mcap")
 
 
 def export_verb() -> None:
@@ -165,11 +153,10 @@ def export_bag_verb(
 
     Joint states are at the full rate, with the names of the URDF's joints; effort only with --calibration.
     """
-    from daq.documents.calibration_file import load_calibration
     from daq.log.bag_writer import export_bag
     from daq.report.log import bag_report
 
-    known = None if calibration is None else load_calibration(calibration)
+    known = None if calibration is None else read_calibration(calibration)
     with status("writing the bag"):
         done = export_bag(log, out, known)
     _warn(log, done.partial, done.valid, done.reason)
@@ -197,7 +184,6 @@ def export_urdf_verb(
     """
     from daq.config.cell_file import URDF, bundle
     from daq.config.yaml_file import read_yaml_bytes
-    from daq.documents.calibration_file import load_calibration
     from daq.report.urdf_views import urdf_report, urdf_view
     from daq.workflow.fit import DOUBTFUL_PERCENT
     from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, update_urdf
@@ -213,7 +199,7 @@ def export_urdf_verb(
     given = urdf or cell
     calibration = calibration or cell
     check_output(out, (calibration, given), FORMAT)
-    known = load_calibration(calibration)
+    known = read_calibration(calibration)
     left = known.relative_error_percent.total
     if not left <= DOUBTFUL_PERCENT:  # it explains too little of the torque to derive bodies from it
         raise ModelContradicted(
@@ -274,10 +260,9 @@ def joint_updates(robot: PhysicalRobot) -> dict[str, JointUpdate]:
 
 
 def _declared(calibration: Calibration, path: Path) -> Cell:
-    from daq.config.cell_file import load_cell
     from daq.config.same_cell import mismatch_of_calibration
 
-    cell = load_cell(path)
+    cell = read_cell(path)
     found = mismatch_of_calibration(calibration, cell)
     if found is not None:
         raise ConfigurationInconsistent(
@@ -315,9 +300,3 @@ def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
 
     with write_output(out):
         replace_file(out, updated.content, check=check)
-
-
-EXPORT_LOG = Verb("log", export_log_verb, "drivegain export log loaded.mcap --csv --out loaded.csv")
-EXPORT_BAG = Verb("bag", export_bag_verb, "drivegain export bag loaded.mcap --out loaded-bag")
-EXPORT_URDF = Verb("urdf", export_urdf_verb, "drivegain export urdf CELL calibration.yaml --out robot.urdf")
-EXPORT = Verb("export", export_verb, EXPORT_URDF.example, (EXPORT_URDF, EXPORT_LOG, EXPORT_BAG))

@@ -11,7 +11,7 @@ import typer
 from daq.cli.record import mounted
 from daq.cli.scan import no_answer
 from daq.cli.terminal import interruptible
-from daq.cli.verb import CellArgument, JsonOption, Verb, print_json
+from daq.cli.verb import CellArgument, JsonOption, print_json, read_calibration, read_cell
 from daq.environment import require_packages
 from daq.errors import UsageError
 
@@ -35,8 +35,6 @@ def monitor_verb(
     from rich.live import Live
 
     from daq.config.cell_buses import cell_address, drive_axes
-    from daq.config.cell_file import load_cell
-    from daq.documents.calibration_file import load_calibration
     from daq.log.feed import Feed
     from daq.report.bus_views import monitor_report, monitor_view
     from daq.workflow.monitor import CellWatch
@@ -45,9 +43,9 @@ def monitor_verb(
     from drivers.canopen.sdo import SdoPolicy
     from drivers.stream.monitor import ABANDONED_S, QUIET_S
 
-    declared = load_cell(cell)
+    declared = read_cell(cell)
     carried = mounted(declared, payload)
-    known = None if calibration is None else load_calibration(calibration)
+    known = None if calibration is None else read_calibration(calibration)
     if known is not None:
         check_cell(known, cell, declared)
     console = Console(highlight=False)
@@ -80,9 +78,6 @@ def monitor_verb(
                 live.update(monitor_view(monitor_report(declared, watch.read(interval))), refresh=True)
 
 
-MONITOR = Verb("monitor", monitor_verb, "drivegain monitor CELL --calibration calibration.yaml")
-
-
 def console_verb(
     cell: CellArgument,
     calibration: Annotated[
@@ -107,13 +102,11 @@ def console_verb(
     require_packages("the console", "the web server", "console", "starlette", "uvicorn")
     if foxglove is not None:
         require_packages("the console", "the stream's server", "foxglove", "foxglove")
-    from daq.config.cell_file import load_cell
     from daq.console.live import Live
     from daq.console.results import Results
     from daq.console.server import Page, listen, new_token, server_of
-    from daq.documents.calibration_file import load_calibration
 
-    declared = load_cell(cell)
+    declared = read_cell(cell)
     if report is not None and not report.is_dir():
         raise UsageError(
             str(report),
@@ -122,7 +115,7 @@ def console_verb(
             remedy="check the name, or leave --report out",
         )
     results = Results(cell, declared, calibration, report)
-    known = results.calibration() if calibration is None else (calibration, load_calibration(calibration))
+    known = results.calibration() if calibration is None else (calibration, read_calibration(calibration))
     live = Live(cell, declared)
     live.calibration = None if known is None else known[1]
     beside = []
@@ -146,6 +139,3 @@ def console_verb(
         token = new_token()
         typer.echo(f"Open http://127.0.0.1:{port}/{token}/ in a browser on this computer; Ctrl-C ends the page.")
         server_of(Page(declared, live, results, *beside), token, port).run(sockets=[listener])
-
-
-CONSOLE = Verb("console", console_verb, "drivegain console CELL --calibration calibration.yaml")

@@ -17,11 +17,11 @@ from daq.cli.terminal import (
     check_page,
     check_replaceable,
     progress_bar,
+    write_file,
     write_output,
 )
-from daq.cli.verb import CellArgument, JsonOption, Verb, output_option, print_json, say_next
+from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, read_cell, say_next
 from daq.errors import UsageError
-from daq.files import replace_file
 from daq.workflow.choices import EXCHANGES, LARGEST_STD_PERCENT
 
 
@@ -49,7 +49,6 @@ def plan_verb(
     The moves keep the joint limits and the cell's workspace, and keep clear of the arm itself. The prediction is for
     these moves made once without load and once with the payload.
     """
-    from daq.config.cell_file import load_cell
     from daq.report.plan import plan_report, plan_text
     from daq.report.plan_preview import MARK, preview_page
     from daq.workflow.experiment import RUNS, experiment_of, extra_moves, paths_of
@@ -64,7 +63,7 @@ def plan_verb(
         check_page(preview, "--preview")
         check_folder(preview)
         check_replaceable(preview, MARK, "preview of a plan")
-    declared = load_cell(cell)
+    declared = read_cell(cell)
     check_controller(cell, declared)
     experiment = experiment_of(declared, payload)
     tried = [0]
@@ -89,9 +88,7 @@ def plan_verb(
         save_plan(made, out)
     if preview is not None:
         checked = load_plan(out, declared)
-        with write_output(preview):
-            page = preview_page(declared, checked.moves, experiment.scene.checker, out.read_bytes())
-            replace_file(preview, page.encode())
+        write_file(preview, preview_page(declared, checked.moves, experiment.scene.checker, out.read_bytes()))
     excitation, _ = experiment.excitation(paths_of(declared, made.moves))
     judged = verdicts(experiment.design, [(excitation, RUNS)], extra_moves(experiment))
     if json:
@@ -116,6 +113,3 @@ def say_how_to_resume(tried: list[int], exchanges: int) -> Iterator[None]:
         if done := tried[-1]:
             typer.echo(f"{done} of {exchanges} exchanges were tried; --exchanges {done} writes their plan", err=True)
         raise
-
-
-PLAN = Verb("plan", plan_verb, "drivegain plan CELL --out plan.yaml --seed 1 --duration 40")

@@ -16,7 +16,7 @@ import typer
 
 from daq.advice import for_command_line
 from daq.cli.terminal import interruptible
-from daq.cli.verb import JsonOption, Verb, output_option, print_json
+from daq.cli.verb import JsonOption, output_option, print_json, read_cell
 from daq.environment import login
 from daq.errors import DaqError, ExitCode, OutputFailed, UsageError, exit_code, writing
 from daq.files import replace_file
@@ -69,7 +69,6 @@ def recalibrate_verb(
 
 def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> None:
 
-    from daq.config.cell_file import load_cell
     from daq.documents.session_state import Outcome
     from daq.jobs.context import Tools
     from daq.jobs.job import preview, recalibrate
@@ -83,7 +82,7 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
     from daq.workflow.record import record
     from daq.writeback.request import Request
 
-    declared = load_cell(cell)
+    declared = read_cell(cell)
     if now and declared.recalibration is not None:
         declared = replace(declared, recalibration=replace(declared.recalibration, every_h=0.0))
     who = f"drivegain recalibrate, {login()}"
@@ -120,9 +119,6 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
         raise typer.Exit(ended.exit_code)
 
 
-RECALIBRATE = Verb("recalibrate", recalibrate_verb, "drivegain recalibrate press-4/cells/press-4.yaml --dry-run")
-
-
 _SYSTEM = Path("/etc/systemd/system")
 _OF_USER = Path(".config/systemd/user")
 
@@ -143,11 +139,10 @@ def schedule_verb(
     The timer does not catch up on a missed date, and the job checks the interlock before every motion. The earlier
     name of this verb, `install-units`, goes on working.
     """
-    from daq.config.cell_file import load_cell
     from daq.jobs.context import section_of, target_of
     from daq.jobs.units import Installation, cell_option, cron_line, next_commands, units_of
 
-    declared = load_cell(cell)
+    declared = read_cell(cell)
     section = section_of(declared)
     target_of(declared)  # refuses a cell without a controller file
     place = cell.resolve()
@@ -233,6 +228,3 @@ def require_own_unit(path: Path, option: str = "") -> None:
     if found:
         remedy = "name another folder with --to, or move it away; remove it if the cell file has moved"
         raise UsageError(str(path), found=found, expected=f"no such file, or {expected}", remedy=remedy)
-
-
-SCHEDULE = Verb("schedule", schedule_verb, "drivegain schedule press-4/cells/press-4.yaml --schedule weekly")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.terminal import interruptible, progress_bar, say_last
-from daq.cli.verb import CellArgument, JsonOption, Verb, output_option, print_json, say_next, taking
+from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, read_cell, say_next, taking
 from daq.environment import login
 from daq.errors import DaqError, DiskSpaceShort, ExitCode, OutputFailed, UsageError
 from daq.files import is_taken
@@ -56,7 +56,6 @@ def record_verb(options: RecordOptions) -> None:
     11 where it does not.
     A run with losses is kept, marked invalid, and ends with exit code 4; `fit` refuses it.
     """
-    from daq.config.cell_file import load_cell
     from daq.log.feed import Feed
     from daq.report.log import record_report
     from daq.workflow.bus_lock import bus_lock
@@ -64,7 +63,7 @@ def record_verb(options: RecordOptions) -> None:
     from daq.workflow.record import RecordingRequest, record
     from daq.workflow.safeguards import check_entered_mass
 
-    declared = load_cell(options.cell)
+    declared = read_cell(options.cell)
     moves = slowed(declared, load_plan(options.plan, declared), options.speed)
     who = options.operator or login()
     carried = mounted(declared, options.payload)
@@ -126,14 +125,13 @@ def record_verb(options: RecordOptions) -> None:
 def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:
     """Say in notes of an error what became of the samples, and what helps a cell that is too slow for its clock."""
     from daq.config.cell import PacingMode
-    from daq.config.cell_buses import SIMULATED_INTERFACES
 
     if part.exists():
         error.add_note(
             f"kept: the samples recorded until then are in {part}, which `fit` does not read; {_next_command(part)}"
         )
     if isinstance(error, SampleLost) and cell.sync is not None and cell.sync.pacing is PacingMode.TIMED:
-        real = any(bus.interface not in SIMULATED_INTERFACES for bus in cell.buses)
+        real = not all(bus.kind.is_simulated for bus in cell.buses)
         error.add_note(
             "hint: check the load of bus and computer, or use a longer `sync.period_us`"
             if real
@@ -234,10 +232,3 @@ def mounted(cell: Cell, name: str | None) -> Payload | None:
         expected=", ".join(known) or "none: the cell declares no payloads",
         remedy="weigh it and add it to `payloads` of the cell file",
     )
-
-
-RECORD = Verb(
-    "record",
-    record_verb,
-    "drivegain record CELL plan.yaml --out loaded.mcap --payload disc --mass 4.59 --enable-motion",
-)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.terminal import print_view
-from daq.cli.verb import CellArgument, JsonOption, Verb, print_json, say_next
+from daq.cli.verb import CellArgument, JsonOption, print_json, read_cell, say_next
 from daq.errors import ConfigurationInconsistent, UsageError, VirtualBusEmpty
 from drivers.errors import DriverError, NodeMissing
 
@@ -40,12 +40,11 @@ def scan_verb(
     another master uses the bus, nothing is sent: exit code 12 or 5.
     """
     from daq.config.cell_buses import bus_parts, drive_axes
-    from daq.config.cell_file import load_cell
     from daq.report.bus_views import scan_report, scan_view, scanned_nodes
     from daq.workflow.bus_lock import bus_lock
     from daq.workflow.nameplates import check_nameplates, nameplate_warnings
 
-    declared = load_cell(cell)
+    declared = read_cell(cell)
     found: dict[str, tuple[FoundNode, ...]] = {}
     misfits: dict[str, str] = {}
     scales: dict[str, ScaleReading | None] = {}
@@ -128,7 +127,7 @@ def no_answer(cell: Cell, missing: Sequence[Axis], answered: tuple[int, ...], wa
     """Error for axes that did not answer: amplifiers without power, or a simulated cell that was not started."""
     from daq.cli.simulate import SHIPPED
 
-    if answered or any(bus.interface != "virtual" for bus in cell.buses):
+    if answered or not all(bus.kind.is_of_process for bus in cell.buses):
         return NodeMissing(missing, answered, wait_s)
     name = cell.name if cell.name in SHIPPED else "FILE"
     return VirtualBusEmpty(
@@ -169,9 +168,6 @@ def _fault_of(network: CanopenNetwork, axis: Axis) -> str:
     return "the drive names no error code (603Fh)" if code == 0 else f"{explain(code).hex}: {explain(code).text}"
 
 
-SCAN = Verb("scan", scan_verb, "drivegain scan CELL")
-
-
 _HEX = re.compile(r"(?:0[xX])?([0-9a-fA-F]{1,4})[hH]?")
 
 
@@ -204,6 +200,3 @@ def read_code(text: str) -> int:
             remedy="take it from the event's text (`drivegain info LOG`) or from object 603Fh",
         )
     return int(found.group(1), 16)
-
-
-EXPLAIN_EMCY = Verb("explain-emcy", explain_emcy_verb, "drivegain explain-emcy 8611h")

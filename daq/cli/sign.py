@@ -10,7 +10,14 @@ from typing import Annotated
 import typer
 
 from daq.cli.terminal import print_view
-from daq.cli.verb import CalibrationArgument, JsonOption, Verb, output_option, print_json
+from daq.cli.verb import (
+    CalibrationArgument,
+    JsonOption,
+    output_option,
+    print_json,
+    read_calibration,
+    read_cell,
+)
 from daq.errors import UsageError
 
 
@@ -59,12 +66,11 @@ def sign_calibration_verb(
 ) -> None:
     """Show a calibration and write your signature beside it; changing the file makes the signature invalid."""
 
-    from daq.documents.calibration_file import load_calibration
     from daq.report.gains import gain_table
     from daq.report.job_schemas import SignatureReport
     from daq.writeback.signature import needs_password, sign
 
-    known = load_calibration(calibration)
+    known = read_calibration(calibration)
     password = _password() if needs_password(key) else ""
     if not json:
         print_view([gain_table(known.gains, title=f"{known.cell}, {known.created}")])
@@ -81,11 +87,10 @@ def sign_check_verb(
     json: JsonOption = False,
 ) -> None:
     """Show which of the cell's signers have signed a calibration; an invalid signature is exit code 3."""
-    from daq.config.cell_file import load_cell
     from daq.report.job_schemas import SignersReport
     from daq.writeback.signature import signers_of
 
-    policy = load_cell(cell).apply
+    policy = read_cell(cell).apply
     found = signers_of(calibration, policy.signers)
     if json:
         print_json(SignersReport(signers=list(found), signatures_needed=policy.signatures))
@@ -100,11 +105,3 @@ def _password() -> str:
     if not sys.stdin.isatty():
         return sys.stdin.readline().rstrip("\n")
     return str(typer.prompt("Password of the key", hide_input=True, err=True))
-
-
-SIGN_KEY = Verb("key", sign_key_verb, "drivegain sign key --name anna --folder keys")
-SIGN_CALIBRATION = Verb(
-    "calibration", sign_calibration_verb, "drivegain sign calibration calibration.yaml --key keys/anna.key --name anna"
-)
-SIGN_CHECK = Verb("check", sign_check_verb, "drivegain sign check CELL calibration.yaml")
-SIGN = Verb("sign", sign_verb, SIGN_CALIBRATION.example, (SIGN_KEY, SIGN_CALIBRATION, SIGN_CHECK))

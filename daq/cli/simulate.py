@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.terminal import at_most_one, interruptible, output_console, print_view, show_steps, write_output
-from daq.cli.verb import JsonOption, Verb, output_option, print_json
+from daq.cli.verb import JsonOption, output_option, print_json
 from daq.errors import ConfigurationInconsistent, UsageError
 from daq.files import read_regular, replace_file
 from daq.report.text import Sentence
+from drivers.canopen.interfaces import SOCKETCAND, interface_of
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -39,7 +40,7 @@ def simulate(
     ],
     payload: Annotated[str | None, typer.Option(help="Name of the mounted body in the simulation file.")] = None,
     faults: Annotated[Path | None, typer.Option(help="Scenario file, or the shipped faults-example.")] = None,
-    interface: Annotated[str, typer.Option(help="socketcand, a hub on 127.0.0.1, or socketcan.")] = "socketcand",
+    interface: Annotated[str, typer.Option(help="socketcand, a hub on 127.0.0.1, or socketcan.")] = SOCKETCAND.name,
     channel: Annotated[str, typer.Option(help="Channel of the bus.")] = "can0",
     bus: Annotated[
         list[str] | None,
@@ -85,7 +86,7 @@ def simulate(
     # SIGHUP is left alone, so that nohup works.
     with suppress(KeyboardInterrupt), interruptible(signals=(signal.SIGINT, signal.SIGTERM)), ExitStack() as stack:
         there = nodes_on_buses(bus, [axis.node_id for axis in spec.axes]) if bus else {channel: frozenset()}
-        hub = stack.enter_context(Hub(tuple(there), port)) if interface == "socketcand" else None
+        hub = stack.enter_context(Hub(tuple(there), port)) if interface_of(interface) is SOCKETCAND else None
         parts = tuple(
             BusPart(name, BusAddress(interface, name) if hub is None else hub.address(name), nodes)
             for name, nodes in there.items()
@@ -180,14 +181,14 @@ def nodes_on_buses(options: Sequence[str], node_ids: Sequence[int]) -> dict[str,
 def how_to_reach(parts: Sequence[BusPart], period_us: int) -> str:
     """Return the settings for the cell file, ready to paste, and a first command to try."""
     # A kernel's bus carries frames in their own time; over a hub the simulated cell sets the pace.
-    pacing = "timed" if parts[0].address.interface == "socketcan" else "lockstep"
+    pacing = "lockstep" if parts[0].address.kind.is_simulated else "timed"
     several = len(parts) > 1
     buses = ""
     for part in parts:
         address = part.address
         indent = "    " if several else "  "
         keys = {"interface": address.interface, "channel": address.channel}
-        if address.interface == "socketcand":
+        if address.kind.has_server:
             keys |= {"host": address.host, "port": str(address.port)}
         keys["bitrate_bit_s"] = str(address.bitrate_bit_s)
         buses += f"  - name: {part.name}\n" if several else ""
@@ -201,9 +202,6 @@ def how_to_reach(parts: Sequence[BusPart], period_us: int) -> str:
         + (f"{nodes}\n" if several else "")
         + "and try it in a second terminal: drivegain scan CELL"
     )
-
-
-SIMULATE = Verb("simulate", simulate, "drivegain simulate demo --payload disc --faults faults-example")
 
 
 def demo(
@@ -257,6 +255,3 @@ def demo_view(outcome: DemoOutcome) -> Iterator[RenderableType]:
         errors = (100.0 * (gain / truth[axis] - 1.0) for axis, gain in zip(truth, fitted.paper.gains, strict=True))
         yield "Errors of the paper's total least squares on the same rows: " + ", ".join(f"{e:+.2f} %" for e in errors)
     yield ""
-
-
-DEMO = Verb("demo", demo, "drivegain demo --out out/demo")

@@ -16,7 +16,7 @@ from rich.console import Console, RenderableType
 
 from daq.cli.verb import judged_output
 from daq.errors import OutputFailed, UsageError, writing
-from daq.files import is_taken
+from daq.files import is_taken, replace_file
 from daq.report.text import terminal_text
 
 if TYPE_CHECKING:
@@ -48,6 +48,12 @@ def write_output(path: Path) -> Iterator[None]:
             STARTED.append(path)
         raise
     WRITTEN.append(path)
+
+
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write a file whole or not at all, within `write_output`."""
+    with write_output(path):
+        replace_file(path, content.encode() if isinstance(content, str) else content)
 
 
 def make_folder(folder: Path) -> None:

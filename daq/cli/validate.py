@@ -15,11 +15,12 @@ from daq.cli.verb import (
     CalibrationArgument,
     CellOption,
     JsonOption,
-    Verb,
     cells_in,
     corrected_cell,
     output_option,
     print_json,
+    read_calibration,
+    read_cell,
     say_correct_first,
     say_next,
 )
@@ -89,14 +90,12 @@ def cell_of(calibration: Calibration, logs: list[Path]) -> Path:
     the logs of the fit carry is meant.
     """
 
-    from daq.config.cell_file import load_cell
-
     folders = dict.fromkeys([Path(), *(log.parent for log in logs)])
     found = {os.path.realpath(path): path for folder in folders for path in cells_in(folder, calibration.cell)}
     recorded = []
     for path in found.values():
         with suppress(DaqError):
-            if load_cell(path).recording_digest == calibration.recording_configuration_sha256:
+            if read_cell(path).recording_digest == calibration.recording_configuration_sha256:
                 recorded.append(path)
     # Without the fit's own one, the only one of that name may be it, edited since.
     likely = recorded or list(found.values())
@@ -105,8 +104,6 @@ def cell_of(calibration: Calibration, logs: list[Path]) -> Path:
 
 def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]:
     """Load calibrations by label, the one to validate first; a file that is named twice counts once."""
-
-    from daq.documents.calibration_file import load_calibration
 
     files = [calibration]
     for place in beside:
@@ -121,10 +118,7 @@ def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]
         known = {os.path.realpath(file) for file in files}
         files += [file for file in found if os.path.realpath(file) not in known]
     stems = Counter(file.stem for file in files)
-    return {file.stem if stems[file.stem] == 1 else str(file): load_calibration(file) for file in files}
-
-
-VALIDATE = Verb("validate", validate_verb, "drivegain validate calibration.yaml held-out.mcap --pictures pictures")
+    return {file.stem if stems[file.stem] == 1 else str(file): read_calibration(file) for file in files}
 
 
 def weigh_verb(
@@ -142,19 +136,15 @@ def weigh_verb(
     of its joints; with --bare it is found again together with the body, which takes more moves and trusts the
     calibration's gains alone. Says which of the ten parameters these moves identify, and which moves would help.
     """
-    from daq.documents.calibration_file import load_calibration
     from daq.report.weighing_views import weigh_report, weighed_view
     from daq.workflow.weigh import weigh_logs
 
     with status("weighing"):
-        found = weigh_logs(load_calibration(calibration), logs, bare=bare or (), cell=corrected_cell(cell))
+        found = weigh_logs(read_calibration(calibration), logs, bare=bare or (), cell=corrected_cell(cell))
     if json:
         print_json(weigh_report(found))
     else:
         print_view(weighed_view(found))
-
-
-WEIGH = Verb("weigh", weigh_verb, "drivegain weigh calibration.yaml held-out.mcap --bare unloaded.mcap")
 
 
 def contact_verb(
@@ -172,13 +162,12 @@ def contact_verb(
     The threshold gives less than one false alarm in an hour of motion, extrapolated from the quiet logs, or, without
     any, from the quiet part of the log itself. A payload must be one that the calibration knows.
     """
-    from daq.documents.calibration_file import load_calibration
     from daq.report.weighing_views import contact_report, contact_view, draw_contact
     from daq.workflow.weigh import contact_in
 
     picture = None
     with status("predicting"):
-        known = load_calibration(calibration)
+        known = read_calibration(calibration)
         found, described = contact_in(known, log, quiet=quiet or (), cell=corrected_cell(cell))
         if pictures is not None:
             with write_output(pictures):
@@ -188,6 +177,3 @@ def contact_verb(
         print_json(contact_report(found, described, log, picture))
     else:
         print_view(contact_view(found, described), picture)
-
-
-CONTACT = Verb("contact", contact_verb, "drivegain contact calibration.yaml loaded.mcap --quiet held-out.mcap")

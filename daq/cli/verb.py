@@ -28,6 +28,7 @@ from daq.files import judge_target
 if TYPE_CHECKING:
     from daq.config.cell import Cell
     from daq.report.document import Report
+    from ident.calibration import Calibration
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 CellArgument = Annotated[Path, typer.Argument(help="Cell file.")]
@@ -68,11 +69,31 @@ def output_option(name: str, about: str) -> Any:
     return typer.Option(name, help=about, callback=judged_output)
 
 
-def corrected_cell(path: Path | None) -> Cell | None:
-    """Load the cell file of `--cell`; None where the description in the logs is used."""
+def read_cell(path: Path) -> Cell:
+    """Read a cell file.
+
+    Raises:
+        ConfigurationError: as `load_cell`.
+    """
     from daq.config.cell_file import load_cell
 
-    return None if path is None else load_cell(path)
+    return load_cell(path)
+
+
+def corrected_cell(path: Path | None) -> Cell | None:
+    """Read the cell file of `--cell`; None where the description in the logs is used."""
+    return None if path is None else read_cell(path)
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Read a calibration.
+
+    Raises:
+        CalibrationMissing, CalibrationUnreadable, CalibrationRefused: as `load_calibration`.
+    """
+    from daq.documents.calibration_file import load_calibration
+
+    return load_calibration(path)
 
 
 def taking(request: type[RequestT]) -> Callable[[Callable[[RequestT], None]], Callable[..., None]]:
@@ -107,13 +128,21 @@ class Job(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """One verb."""
+    """One verb. The module of its function is imported when it is called or explained."""
 
     name: str  #: on the command line
-    function: Callable[..., None]  #: takes its arguments as typer parses them; its docstring is the help
+    #: Function, as module:name; it takes its arguments as typer parses them, and its docstring is the help.
+    place: str
     example: str  #: a command line that works, shown at the end of the help; CELL is the cell file of the user's folder
-    #: Verbs with arguments of their own, `drivegain export urdf …`; then `function` takes none and is the help alone.
+    summary: str = ""  #: one line for the list of verbs
+    #: Verbs with arguments of their own, `drivegain export urdf …`; then the function takes none and is the help alone.
     kinds: tuple[Verb, ...] = ()
+
+    def function(self) -> Callable[..., None]:
+        """Import the function."""
+        module, _, name = self.place.partition(":")
+        function: Callable[..., None] = getattr(importlib.import_module(module), name)
+        return function
 
     def command(self) -> Any:
         """Click command of this verb, or group of its kinds."""
@@ -127,25 +156,10 @@ class Verb:
             epilog=self.example,
         )
         if self.kinds:
-            app.callback()(self.function)
+            app.callback()(self.function())
         for verb in self.kinds or (self,):
-            app.command(verb.name, cls=_VerbCommand, epilog=verb.example)(verb.function)
+            app.command(verb.name, cls=_VerbCommand, epilog=verb.example)(verb.function())
         return typer.main.get_command(app)
-
-
-@dataclass(frozen=True, slots=True)
-class Listed:
-    """Entry of the list of verbs, before the verb is imported."""
-
-    name: str  #: on the command line
-    place: str  #: where its `Verb` is defined, as module:name
-    summary: str  #: one line for the list
-
-    def load(self) -> Verb:
-        """Import the verb."""
-        module, _, name = self.place.partition(":")
-        verb: Verb = getattr(importlib.import_module(module), name)
-        return verb
 
 
 _HYPHEN = "\u2011"  #: Non-breaking: a line is broken at spaces alone, so that --enable-motion stays whole

@@ -17,6 +17,7 @@ from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistoryPlace, P
 from daq.config.recalibration import Recalibration
 from daq.config.workspace import Clearance
 from daq.config.yaml_file import FileName, Name
+from drivers.canopen.interfaces import BusInterface, interface_of
 from drivers.profiles.profile import DriveProfile, Identity
 from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
@@ -64,6 +65,11 @@ class UnnamedBus:
     bitrate_bit_s: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
     host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
     port: Annotated[int, Field(ge=1, le=65535)] = 29536
+
+    @property
+    def kind(self) -> BusInterface:
+        """What its interface can do."""
+        return interface_of(self.interface)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

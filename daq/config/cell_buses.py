@@ -13,6 +13,7 @@ from daq.config.cell import KERNEL, RECORDER, Bus, Cell, PacingMode, Sync
 from daq.config.cell_schema import CellModel
 from daq.config.yaml_file import Fault, Location
 from daq.errors import ConfigurationInconsistent
+from drivers.canopen.interfaces import INTERFACES, SOCKETCAN
 from drivers.canopen.pdo import HEARTBEAT_MS, SETPOINT_PDOS, STATUSWORD, pack
 from drivers.profiles.profile import Axis, DriveProfile, ObjectEntry
 
@@ -136,7 +137,7 @@ def _steady_bits_s(profiles: Sequence[DriveProfile]) -> float:
     return heartbeats + MOVES_PER_S * len(profiles) * (SETPOINTS * first + sum(others))
 
 
-SIMULATED_INTERFACES = ("virtual", "socketcand")  #: Interfaces of simulated cells; any other may have a machine on it
+SIMULATED = " or ".join(one.name for one in INTERFACES.values() if one.is_simulated)
 
 
 def bus_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Iterator[Fault]:
@@ -161,12 +162,12 @@ def bus_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Iterat
     for index, bus in enumerate(model.buses):
         if model.sync.pacing is PacingMode.TIMED:
             yield from _load_faults(model, model.sync.period_us, bus, profiles)
-        elif bus.interface not in SIMULATED_INTERFACES:
+        elif not bus.kind.is_simulated:
             yield Fault(
                 ("sync", "pacing"),
                 f"lockstep on a bus of interface {bus.interface}",
-                f"timed: in lockstep the time of the samples is simulated, so only a simulated cell "
-                f"({' or '.join(SIMULATED_INTERFACES)}) may use it",
+                f"timed: in lockstep the time of the samples is simulated, so only a simulated cell ({SIMULATED}) may "
+                "use it",
             )
         for other in model.buses[:index]:
             if _where(bus) == _where(other):
@@ -229,15 +230,12 @@ def _load_faults(model: CellModel, period_us: int, bus: Bus, profiles: Mapping[s
 
 
 def _where(bus: Bus) -> tuple[str | int, ...]:
-    hub = (bus.host, bus.port) if bus.interface == "socketcand" else ()
+    hub = (bus.host, bus.port) if bus.kind.has_server else ()
     return (bus.interface, bus.channel, *hub)
 
 
 def _path(model: CellModel, index: int) -> Location:
     return ("bus", index) if isinstance(model.bus, tuple) else ("bus",)
-
-
-KERNEL_INTERFACE = "socketcan"  #: Only SocketCAN's broadcast manager sends SYNC from the kernel
 
 
 def producer_faults(model: CellModel) -> Iterator[Fault]:
@@ -254,8 +252,8 @@ def producer_faults(model: CellModel) -> Iterator[Fault]:
         expected = f"{RECORDER}, or pacing timed: in lockstep the next SYNC waits for the answers"
         yield Fault(path, f"{producer} with pacing lockstep", expected)
     if producer == KERNEL:
-        if set(interfaces) != {KERNEL_INTERFACE}:
-            expected = f"a bus of interface {KERNEL_INTERFACE}, whose broadcast manager sends it"
+        if set(interfaces) != {SOCKETCAN.name}:
+            expected = f"a bus of interface {SOCKETCAN.name}, whose broadcast manager sends it"
             yield Fault(path, f"{KERNEL} on {' + '.join(interfaces) or 'no bus'}", expected)
     elif producer not in model.axis_names:
         yield Fault(path, producer, f"{RECORDER}, {KERNEL}, or an axis ({', '.join(model.axis_names)})")

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, get_args, g
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
 
-from daq.errors import ConfigurationMissing, DaqError, SchemaMismatch, YamlInvalid
+from daq.errors import ConfigurationMissing, DaqError, SchemaMismatch, YamlInvalid, reason_of
 from daq.files import follow_links, read_regular
 
 Location = tuple[str | int, ...]
@@ -241,7 +241,7 @@ def read_file(path: Path, missing: type[DaqError], *, expected: str, remedy: str
     try:
         return read_regular(path, MAX_BYTES)
     except OSError as error:
-        found = (error.strerror or type(error).__name__).lower()
+        found = reason_of(error)
         raise missing(str(path), found=found, expected=expected, remedy=remedy) from error
 
 

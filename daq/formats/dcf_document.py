@@ -9,17 +9,14 @@ An object is named by index and subindex, both hexadecimal: `6076`, `2003:01`, `
 
 from __future__ import annotations
 
-import configparser
 import re
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from daq.errors import ControllerUnfit
-from daq.formats.scalar import CORRECT_KEY, DECIMAL, OCTAL, ControllerDocument, IntegerStyle, KeyPath, Leaves, Scalar
+from daq.formats.scalar import CORRECT_KEY, DECIMAL, OCTAL, ControllerDocument, IntegerStyle, KeyPath, Scalar, Values
+from daq.formats.sections import DcfEntry, DcfSection, parsed_values, sections_of
 
-_LINE = re.compile(r"([^\r\n]*)(?:\r\n|\r|\n|\Z)")
-_SECTION = re.compile(r"\s*\[([^\]]*)\]\s*")
-_ENTRY = re.compile(r"\s*([^=]*?)\s*=\s*(.*?)\s*")
 _KEY = re.compile(r"(?:0x)?([0-9a-f]{4})h?(?:(?:sub|:)(?:0x)?([0-9a-f]{1,2})h?)?", re.IGNORECASE)
 _TITLE = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]+))?")
 _CODE = re.compile(r"0|[1-9][0-9]{0,9}|0x[0-9a-f]{1,8}", re.IGNORECASE)
@@ -28,7 +25,6 @@ _VALUE = "parametervalue"
 _TYPE = "datatype"
 _OBJECT_TYPE = "objecttype"
 _VARIABLE = 7
-_BYTE_ORDER_MARK = "ï»¿"  #: That of UTF-8, each byte a character
 _INTEGERS = {
     0x02: (8, True),
     0x03: (16, True),
@@ -49,33 +45,28 @@ _REALS = (0x08, 0x11)
 class DcfDocument(ControllerDocument):
     """A DCF as it was read: each byte a character (ISO 8859-1), so that nothing is lost in whatever encoding it is."""
 
-    @property
-    def content(self) -> bytes:
-        """The text as bytes of the file."""
-        return self.text.encode("latin-1")
-
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
         """See `ControllerDocument.locate`."""
-        sections = _sections(self.text)
+        sections = sections_of(self.text)
         return tuple(self._locate(sections, key) for key in keys)
 
-    def readings(self) -> tuple[Leaves, Leaves]:
+    def readings(self) -> tuple[Values, Values]:
         """Read with our parser and with configparser."""
-        leaves: dict[KeyPath, str] = {}
+        values: dict[KeyPath, str] = {}
         seen = Counter[KeyPath]()
-        for section in _sections(self.text):
+        for section in sections_of(self.text):
             for entry in section.entries:
                 seen[section.title, entry.name] += 1
                 again = seen[section.title, entry.name]
                 name = entry.name if again == 1 else f"{entry.name} ({again})"
-                leaves[section.title, name] = entry.value
-        return leaves, _parsed(self)
+                values[section.title, name] = entry.value
+        return values, parsed_values(self.name, self.text)
 
-    def leaf(self, key: str) -> KeyPath:
+    def path_of(self, key: str) -> KeyPath:
         """Return section and entry of an object's value."""
-        return (self._section(_sections(self.text), key).title, _VALUE)
+        return (self._section(sections_of(self.text), key).title, _VALUE)
 
-    def _section(self, sections: list[_Section], key: str) -> _Section:
+    def _section(self, sections: list[DcfSection], key: str) -> DcfSection:
         match = _KEY.fullmatch(key)
         if match is None:
             raise self.unfit(key, "a key that names no object", f"{CORRECT_KEY}: 6076, 2003:01 or 2003sub1")
@@ -97,7 +88,7 @@ class DcfDocument(ControllerDocument):
             raise self.unfit(key, f"no section [{'] or ['.join(titles)}] ({has})", CORRECT_KEY)
         return found[0]
 
-    def _locate(self, sections: list[_Section], key: str) -> Scalar:
+    def _locate(self, sections: list[DcfSection], key: str) -> Scalar:
         section = self._section(sections, key)
         names = Counter(entry.name for entry in section.entries)
         doubled = sorted(name for name, count in names.items() if count > 1)
@@ -135,7 +126,7 @@ class DcfDocument(ControllerDocument):
             raise self.unfit(key, where, "write a plain integer, decimal or 0x", "an integer of its type") from error
         return Scalar(key, float(value), entry.value, entry.start, entry.line, style)
 
-    def _style(self, entries: dict[str, _Entry], key: str, kind: int) -> IntegerStyle:
+    def _style(self, entries: dict[str, DcfEntry], key: str, kind: int) -> IntegerStyle:
         """Return the integers of a type within the limits of the file."""
         bits, signed = _INTEGERS[kind]
         lowest, highest = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
@@ -150,7 +141,7 @@ class DcfDocument(ControllerDocument):
                 raise self.unfit(key, found, "correct the limit", "an integer, or nothing") from error
         return IntegerStyle(bits, max(lowest, bounds[0]), min(highest, bounds[1]))
 
-    def _number(self, entries: dict[str, _Entry], key: str, name: str, default: int) -> int:
+    def _number(self, entries: dict[str, DcfEntry], key: str, name: str, default: int) -> int:
         entry = entries.get(name)
         if entry is None or not entry.value:
             return default
@@ -158,25 +149,6 @@ class DcfDocument(ControllerDocument):
             expected = f"{name} in decimal digits without a leading zero, or in hexadecimal digits after 0x"
             raise self.unfit(key, f"line {entry.line}: {entry.value!r:.60}", "correct it", expected)
         return int(entry.value, 0)
-
-
-@dataclass(frozen=True, slots=True)
-class _Entry:
-    """`name = value`; the place is that of the value."""
-
-    name: str
-    value: str
-    start: int
-    line: int
-
-
-@dataclass(frozen=True, slots=True)
-class _Section:
-    """The entries under one `[title]`; keys and titles in lower case, as CiA 306 ignores the case."""
-
-    title: str
-    line: int
-    entries: list[_Entry] = field(default_factory=list)
 
 
 def dcf_document(content: bytes, name: str) -> DcfDocument:
@@ -192,50 +164,4 @@ def dcf_document(content: bytes, name: str) -> DcfDocument:
             expected="a DCF in ASCII, ISO 8859-1 or UTF-8",
             remedy="save it in one of these; nothing was written",
         )
-    return DcfDocument(name, content.decode("latin-1"))
-
-
-def _sections(text: str) -> list[_Section]:
-    """Split the text into sections; comments and lines other than `name=value` are skipped."""
-    sections: list[_Section] = []
-    for number, line in enumerate(_LINE.finditer(text), start=1):
-        written = line[1].removeprefix(_BYTE_ORDER_MARK) if number == 1 else line[1]
-        if written.lstrip().startswith(";"):
-            continue
-        title = _SECTION.fullmatch(written)
-        entry = _ENTRY.fullmatch(written)
-        if title is not None:
-            sections.append(_Section(title[1].strip().lower(), number))
-        elif entry is not None and sections:
-            start = line.end(1) - len(written) + entry.start(2)
-            sections[-1].entries.append(_Entry(entry[1].lower(), entry[2], start, number))
-    return sections
-
-
-def _parsed(document: DcfDocument) -> dict[KeyPath, str]:
-    """Read the leaves with configparser."""
-    parser = configparser.RawConfigParser(
-        strict=False,
-        allow_no_value=True,
-        delimiters=("=",),
-        comment_prefixes=(";",),
-        empty_lines_in_values=False,
-        default_section="\0",
-    )
-    try:
-        parser.read_string(document.text.removeprefix(_BYTE_ORDER_MARK))
-    except (configparser.Error, AttributeError) as error:
-        # An indented line goes on with the value above it; without a value, Python before 3.13 fails for want of one.
-        no_value = isinstance(error, AttributeError)
-        why = "an indented line below a name without `=`" if no_value else " ".join(str(error).split())[:200]
-        raise ControllerUnfit(
-            document.name,
-            found=f"no DCF ({why})",
-            expected="sections of name=value (CiA 306)",
-            remedy="correct the file; nothing was written",
-        ) from error
-    return {
-        (section.strip().lower(), name): value or ""
-        for section in parser.sections()
-        for name, value in parser.items(section)
-    }
+    return DcfDocument(name, content.decode("latin-1"), "latin-1")

@@ -6,11 +6,11 @@ Comments, order, quotes, spacing, line ends and encoding belong to the person wh
 To add a format:
 
 1. Write `formats/<name>_document.py` with a frozen dataclass that derives from `ControllerDocument`. It implements
-   `locate` (keys to places in the text) and `readings` (all values, once for each parser). It overrides `leaf` where
-   keys are no dotted paths, `number` where a parser's value contains blanks around the number, and `content` where the
-   file is not UTF-8.
+   `locate` (keys to places in the text) and `readings` (all values, once for each parser). It overrides
+   `path_of` where keys are no dotted paths, and `number` where a parser's value contains blanks around the number;
+   `encoding` is that of a file that is not UTF-8.
 2. Add one line to `FORMATS` below, and the name of the format to `ControllerFormat`: the word in the cell file.
-3. In `tests/daq/writeback/test_documents.py` add a strategy of files to `CASES`, an independent reader to
+3. In `tests/daq/formats/test_documents.py` add a strategy of files to `CASES`, an independent reader to
    `test_another_reader_sees_the_new_numbers_and_nothing_else_new`, and the suffixes to `test_the_name_gives_the_format`
    (`a.conf` is there for a suffix that no format has).
 """

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from daq.errors import ControllerUnfit
-from daq.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPath, Leaves, Scalar, utf8
+from daq.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPath, Scalar, Values, utf8
 
 MAX_DEPTH = 100
 _BYTE_ORDER_MARK = "\ufeff"
@@ -28,20 +28,20 @@ class JsonDocument(ControllerDocument):
 
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
         """See `ControllerDocument.locate`; a file with a key twice is refused."""
-        leaves = self._scanned()
-        return tuple(self._locate(leaves, key) for key in keys)
+        tokens = self._scanned()
+        return tuple(self._locate(tokens, key) for key in keys)
 
-    def readings(self) -> tuple[Leaves, Leaves]:
+    def readings(self) -> tuple[Values, Values]:
         """Read with our scanner, and with Python's parser."""
-        return {path: leaf.text for path, leaf in self._scanned().items()}, self._loaded()
+        return {path: token.text for path, token in self._scanned().items()}, self._loaded()
 
-    def _scanned(self) -> dict[KeyPath, _Leaf]:
+    def _scanned(self) -> dict[KeyPath, _Token]:
         """Return every value with its place, and `{}` or `[]` with the size of every object and list."""
         self._loaded()  # refuses all that is not JSON: the scanner need not
-        tokens = (_Leaf(token.lastgroup or "", token[0], token.start()) for token in _TOKEN.finditer(self.text))
+        tokens = (_Token(found.lastgroup or "", found[0], found.start()) for found in _TOKEN.finditer(self.text))
         return dict(self._scan(tokens, (), next(tokens)))
 
-    def _scan(self, tokens: Iterator[_Leaf], path: KeyPath, token: _Leaf) -> Iterator[tuple[KeyPath, _Leaf]]:
+    def _scan(self, tokens: Iterator[_Token], path: KeyPath, token: _Token) -> Iterator[tuple[KeyPath, _Token]]:
         if len(path) > MAX_DEPTH:
             raise self._no_json(f"more than {MAX_DEPTH} lists in lists")
         if token.text not in ("{", "["):
@@ -59,10 +59,10 @@ class JsonDocument(ControllerDocument):
             else:
                 yield from self._scan(tokens, (*path, str(size)), inner)
             size += 1
-        yield (*path, "{}" if token.text == "{" else "[]"), _Leaf("size", str(size), token.start)
+        yield (*path, "{}" if token.text == "{" else "[]"), _Token("size", str(size), token.start)
 
     def _loaded(self) -> dict[KeyPath, str]:
-        """Read the leaves with Python's parser; numbers stay text."""
+        """Read the values with Python's parser; numbers stay text."""
         try:
             tree = json.loads(
                 self.text.removeprefix(_BYTE_ORDER_MARK),
@@ -85,32 +85,32 @@ class JsonDocument(ControllerDocument):
             remedy="correct the file (JSON knows no comments, no NaN and no Infinity); nothing was written",
         )
 
-    def _locate(self, leaves: dict[KeyPath, _Leaf], key: str) -> Scalar:
-        path = tuple(key.split("."))
-        leaf = leaves.get(path)
-        if leaf is not None and leaf.kind == "number":
-            line = self.text.count("\n", 0, leaf.start) + 1
-            return Scalar(key, float(leaf.text), leaf.text, leaf.start, line)
-        if leaf is not None:
-            raise self.unfit(key, f"{leaf.text:.60}", "write a plain number, without quotes")
-        if (*path, "{}") in leaves or (*path, "[]") in leaves:
+    def _locate(self, tokens: dict[KeyPath, _Token], key: str) -> Scalar:
+        path = self.path_of(key)
+        token = tokens.get(path)
+        if token is not None and token.kind == "number":
+            line = self.text.count("\n", 0, token.start) + 1
+            return Scalar(key, float(token.text), token.text, token.start, line)
+        if token is not None:
+            raise self.unfit(key, f"{token.text:.60}", "write a plain number, without quotes")
+        if (*path, "{}") in tokens or (*path, "[]") in tokens:
             raise self.unfit(key, "a list or mapping", "name the key of a number")
         for length in range(len(path), 0, -1):
             parent = path[: length - 1]
-            if (*parent, "{}") in leaves or (*parent, "[]") in leaves:
+            if (*parent, "{}") in tokens or (*parent, "[]") in tokens:
                 place = ".".join(parent) or "the file"
                 inside = {
-                    other[length - 1] for other in leaves if len(other) >= length and other[: length - 1] == parent
+                    other[length - 1] for other in tokens if len(other) >= length and other[: length - 1] == parent
                 }
                 has = ", ".join(sorted(inside - {"{}", "[]"})[:12]) or "nothing"
                 raise self.unfit(key, f"no key {path[length - 1]!r} in {place} (it has {has})", CORRECT_KEY)
-            if parent in leaves:
+            if parent in tokens:
                 break
         raise self.unfit(key, f"no key {path[-1]!r} in {'.'.join(path[:-1]) or 'the file'}", CORRECT_KEY)
 
 
 @dataclass(frozen=True, slots=True)
-class _Leaf:
+class _Token:
     """A value in the text."""
 
     kind: str

@@ -82,7 +82,7 @@ def spell(value: float, std: float, like: str = "") -> str:
 
 
 KeyPath = tuple[str, ...]
-Leaves = Mapping[KeyPath, str]  #: Every value of a document by its path, as one parser sees it
+Values = Mapping[KeyPath, str]  #: Every value of a document by its path, as one parser sees it
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,11 +161,12 @@ class ControllerDocument(ABC):
 
     name: str  #: of the file, for messages
     text: str  #: all of it, a byte order mark and the line ends included
+    encoding: str = "utf-8"  #: of the file
 
     @property
     def content(self) -> bytes:
         """The text as bytes of the file."""
-        return self.text.encode()
+        return self.text.encode(self.encoding)
 
     @abstractmethod
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
@@ -176,8 +177,8 @@ class ControllerDocument(ABC):
         """
 
     @abstractmethod
-    def readings(self) -> tuple[Leaves, ...]:
-        """Return the leaves as each parser of the format reads them. Two parsers should share no code.
+    def readings(self) -> tuple[Values, ...]:
+        """Return the values as each parser of the format reads them. Two parsers should share no code.
 
         Raises:
             ControllerUnfit: a parser cannot read the text.
@@ -191,13 +192,13 @@ class ControllerDocument(ABC):
             f"{self.name}: {key}", found=found, expected=expected, remedy=f"{remedy}; nothing was written"
         )
 
-    def leaf(self, key: str) -> KeyPath:
-        """Return the path of a key's number among the leaves; here a dotted one (`drives.J1.gain`, `gains.0`)."""
+    def path_of(self, key: str) -> KeyPath:
+        """Return the path of a key's number among the values; here a dotted one (`drives.J1.gain`, `gains.0`)."""
         return tuple(key.split("."))
 
-    def number(self, leaf: str) -> str:
-        """Return the number in the text of a leaf, without what readers of the format ignore around it."""
-        return leaf
+    def number(self, value: str) -> str:
+        """Return the number in a value, without what readers of the format ignore around it."""
+        return value
 
     def with_values(self, spelling: Mapping[str, str]) -> Self:
         """Replace some numbers, each by the text for its key, and check the result with `check_against`.
@@ -215,7 +216,7 @@ class ControllerDocument(ABC):
         Raises:
             ControllerUnfit: it differs in more, or in less.
         """
-        targets = {before.leaf(key): number for key, number in spelling.items()}
+        targets = {before.path_of(key): number for key, number in spelling.items()}
         for old, new in zip(before.readings(), self.readings(), strict=True):
             paths = [path for path in old.keys() | new.keys() if path not in targets and old.get(path) != new.get(path)]
             paths += [path for path, number in targets.items() if self.number(new.get(path, "")) != number]

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from xml.parsers import expat
 
 from daq.errors import ControllerUnfit
-from daq.formats.scalar import CORRECT_KEY, DECIMAL, ControllerDocument, KeyPath, Leaves, Scalar
+from daq.formats.scalar import CORRECT_KEY, DECIMAL, ControllerDocument, KeyPath, Scalar, Values
 
 TEXT = "text()"
 
@@ -98,41 +98,34 @@ _ATTRIBUTE = re.compile(r"\s+([^\s=/>]+)\s*=\s*(['\"])(.*?)\2", re.DOTALL)
 class XmlDocument(ControllerDocument):
     """An XML file as it was read."""
 
-    encoding: str  #: of the file
-
-    @property
-    def content(self) -> bytes:
-        """The text as bytes of the file."""
-        return self.text.encode(self.encoding)
-
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
         """See `ControllerDocument.locate`; a file with a document type is refused."""
         content = self.content
         around, _ = parse(content, self.name)
         return tuple(self._locate(content, around, key) for key in keys)
 
-    def readings(self) -> tuple[Leaves]:
+    def readings(self) -> tuple[Values]:
         """Read every attribute, piece of text, comment and instruction, and the order of the elements."""
-        leaves: dict[KeyPath, str] = {}
+        values: dict[KeyPath, str] = {}
         around, _ = parse(self.content, self.name)
         waiting = [around]
         while waiting:
             element = waiting.pop()
-            leaves |= {(element.label, f"@{name}"): value for name, value in element.attributes.items()}
+            values |= {(element.label, f"@{name}"): value for name, value in element.attributes.items()}
             for position, (kind, text) in enumerate(element.pieces, start=1):
-                leaves[element.label, f"{kind}[{position}]"] = text
+                values[element.label, f"{kind}[{position}]"] = text
             waiting.extend(element.children)
-        return (leaves,)
+        return (values,)
 
-    def leaf(self, key: str) -> KeyPath:
+    def path_of(self, key: str) -> KeyPath:
         """Return the path of an element's text, or of an attribute."""
         around, _ = parse(self.content, self.name)
         element, attribute = self._find(around, key)
         return (element.label, f"{TEXT}[1]" if attribute is None else f"@{attribute}")
 
-    def number(self, leaf: str) -> str:
+    def number(self, value: str) -> str:
         """Return a number without the blanks around it."""
-        return leaf.strip(_SPACE)
+        return value.strip(_SPACE)
 
     def _locate(self, content: bytes, around: Element, key: str) -> Scalar:
         element, attribute = self._find(around, key)

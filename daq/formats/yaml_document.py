@@ -15,7 +15,7 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from daq.config.yaml_file import yaml_events
 from daq.errors import ControllerUnfit
-from daq.formats.scalar import CORRECT_KEY, DECIMAL, OCTAL, ControllerDocument, KeyPath, Leaves, Scalar, utf8
+from daq.formats.scalar import CORRECT_KEY, DECIMAL, OCTAL, ControllerDocument, KeyPath, Scalar, Values, utf8
 
 MAX_BYTES, MAX_VALUES, MAX_DEPTH = 2**19, 15_000, 100  #: Of a file: two parsers in Python read it before and after
 _MERGE = "<<"
@@ -36,9 +36,9 @@ class YamlDocument(ControllerDocument):
         _count_references(root, references)
         return tuple(self._locate(root, key, references) for key in keys)
 
-    def readings(self) -> tuple[Leaves, Leaves]:
+    def readings(self) -> tuple[Values, Values]:
         """Read as YAML 1.2 and as YAML 1.1."""
-        return _leaves(_composed(self.text, self.name, "1.2")), _leaves(_composed(self.text, self.name, "1.1"))
+        return _values(_composed(self.text, self.name, "1.2")), _values(_composed(self.text, self.name, "1.1"))
 
     def _locate(self, root: Node, key: str, references: Counter[int]) -> Scalar:
         node = root
@@ -156,28 +156,28 @@ def _count_references(node: Node, references: Counter[int]) -> None:
             _count_references(child, references)
 
 
-def _leaves(root: Any) -> dict[KeyPath, str]:
+def _values(root: Any) -> dict[KeyPath, str]:
     """Return every scalar of a tree by its path, and the size of every list and mapping.
 
     The two parsers have unrelated node classes whose parts have the same names. A node that an alias repeats is
     followed once: it is the same text.
     """
-    leaves: dict[KeyPath, str] = {}
+    values: dict[KeyPath, str] = {}
     seen: set[int] = set()
     waiting: list[tuple[KeyPath, Any]] = [((), root)]
     while waiting:
         path, node = waiting.pop()
         if id(node) in seen:
-            leaves[path] = "*"
+            values[path] = "*"
         elif isinstance(node.value, str):
-            leaves[path] = node.value
+            values[path] = node.value
         elif type(node).__name__ == "SequenceNode":
-            leaves[*path, "[]"] = str(len(node.value))
+            values[*path, "[]"] = str(len(node.value))
             waiting.extend(((*path, str(position)), child) for position, child in enumerate(node.value))
         else:
-            leaves[*path, "{}"] = str(len(node.value))
+            values[*path, "{}"] = str(len(node.value))
             for position, (name, value) in enumerate(node.value):
                 step = name.value if isinstance(name.value, str) else f"? {position}"
                 waiting.append(((*path, step), value))
         seen.add(id(node))
-    return leaves
+    return values

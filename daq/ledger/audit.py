@@ -23,7 +23,7 @@ from datetime import datetime
 from enum import Enum
 from pathlib import Path
 
-from daq.errors import AuditUnusable
+from daq.errors import AuditUnusable, reason_of
 from daq.files import follow_links, fsync_folder, read_regular, sha256, sha256_of
 
 MAX_BYTES = 2**30  #: Largest audit log; it is read whole
@@ -318,7 +318,7 @@ def _content_of(path: Path) -> bytes:
             remedy="check its owner and rights; nothing was written",
         ) from error
     except OSError as error:
-        raise _no_file(path, (error.strerror or type(error).__name__).lower()) from error
+        raise _no_file(path, reason_of(error)) from error
 
 
 def _require_target(path: Path) -> None:

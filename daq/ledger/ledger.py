@@ -15,7 +15,7 @@ from pathlib import Path
 
 from daq.config.cell import Cell
 from daq.documents.calibration_file import encode_calibration
-from daq.errors import DataError, HistoryInaccessible, HistoryUnreadable, OutputFailed, evidence, writing
+from daq.errors import DataError, HistoryInaccessible, HistoryUnreadable, OutputFailed, evidence, reason_of, writing
 from daq.files import fsync_folder
 from daq.ledger.audit import (
     AuditAction,
@@ -332,7 +332,7 @@ def _put_aside(ledger: Ledger, at: datetime) -> Path | None:
     except OSError as error:
         raise _NotPutAside(
             str(ledger.stored),
-            found=(error.strerror or type(error).__name__).lower(),
+            found=reason_of(error),
             expected="a new name for it, now that the audit log has its content",
             remedy="check the rights of its folder, and repeat the command; nothing is lost",
         ) from error

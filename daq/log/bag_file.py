@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 
 import zstandard
 
-from daq.errors import LogCorrupt, LogMissing, LogTruncated, OutputFailed
+from daq.errors import LogCorrupt, LogMissing, LogTruncated, OutputFailed, reason_of
 from daq.files import open_regular
 from daq.log.container import LARGEST_CHUNK, LARGEST_RATIO, LARGEST_RECORD
 from daq.log.mcap_bag import ZSTD_MAGIC, BagMessage, McapBag, Topic
@@ -50,12 +50,15 @@ class SqliteBag:
             self._refuse_unfinished()
             with closing(sqlite3.connect(uri, uri=True)) as database:
                 self._bound(database)
-                self._check(database)
+                # Without this, SQLite would leave out the rows of broken pages without a word.
+                (found,) = database.execute("PRAGMA quick_check(1)").fetchone()
+                if found != "ok":
+                    raise self._broken(str(self.path), str(found))
                 yield from self._messages(database)
         except OSError as error:
             raise LogMissing(
                 str(self.path),
-                found=(error.strerror or type(error).__name__).lower(),
+                found=reason_of(error),
                 expected="a ROS 2 bag",
                 remedy="check the name",
             ) from error
@@ -80,12 +83,6 @@ class SqliteBag:
         """Count; SQLite stops at True."""
         self._steps_left -= 1
         return self._steps_left < 0
-
-    def _check(self, database: sqlite3.Connection) -> None:
-        """Refuse a file with broken pages: SQLite would leave out their rows without a word."""
-        (found,) = database.execute("PRAGMA quick_check(1)").fetchone()
-        if found != "ok":
-            raise self._broken(str(self.path), str(found))
 
     def _messages(self, database: sqlite3.Connection) -> Iterator[BagMessage]:
         topics: dict[int, Topic] = {}
@@ -168,7 +165,7 @@ def _unpack_file(path: Path, target: Path) -> None:
         except OSError as error:
             raise OutputFailed(
                 str(target),
-                found=(error.strerror or type(error).__name__).lower(),
+                found=reason_of(error),
                 expected=f"room for what {path.name} unfolds to",
                 remedy="free space, or name another folder in the environment variable TMPDIR",
             ) from error

@@ -14,14 +14,12 @@ from pathlib import Path
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
-from numpy.typing import NDArray
 
 from daq.config.cell import Cell, joint_names
-from daq.config.cell_file import cell_from_bundle
 from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
 from daq.files import fsync_folder
-from daq.log.conversion import scaling, unwrapped
+from daq.log.conversion import continuous_counts, scaling
 from daq.log.message import (
     CURRENTS_TOPIC,
     DEFINITIONS,
@@ -37,9 +35,9 @@ from daq.log.message import (
     reading_bytes,
     text_bytes,
 )
-from daq.log.motion import MotionWatch, log_verdict
+from daq.log.motion import MotionWatch
 from daq.log.reader import Log, SampleChecks, read_log
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, IntArray
 from ident.calibration import Calibration
 from ident.model.model import DriveTrain
 
@@ -77,7 +75,7 @@ def export_bag(path: Path, out: Path, calibration: Calibration | None = None) ->
             str(out), found="a file or folder of that name", expected="none", remedy="choose another --out"
         )
     log = read_log(path)
-    cell = cell_from_bundle(log.head.files, names={"cell.yaml": f"{path}, cell.yaml"})
+    cell = log.head.cell(path)
     found = None if calibration is None else mismatch_of_calibration(calibration, cell)
     if found is not None:
         raise ConfigurationInconsistent(
@@ -104,16 +102,14 @@ def export_bag(path: Path, out: Path, calibration: Calibration | None = None) ->
     checks.take(log.samples)
     watch = MotionWatch(cell, log.head)
     watch.take(log.samples)
-    verdict = log_verdict(cell, log.head, checks, log.statistics, watch, lambda: (log.samples,))
+    verdict = watch.verdict(checks, log.statistics, lambda: (log.samples,))
     return BagWritten(dict(sorted(counts.items())), (last_ns - first_ns) * 1e-9, log.partial, *verdict)
 
 
 def _messages(log: Log, cell: Cell, gains: Sequence[float]) -> Iterator[tuple[int, str, bytes]]:
     """Yield stamp [ns], topic and CDR bytes of every message."""
     samples, scale = log.samples, scaling(cell, log.head.readback)
-    is_counter = np.array([axis.position_rad_per_count is None for axis in log.head.readback.axes])
-    counts = np.where(is_counter, unwrapped(samples.position_counts), samples.position_counts)
-    position = scale.joint_position(counts)
+    position = scale.joint_position(continuous_counts(samples.position_counts, log.head.readback))
     velocity = mean_velocity(position, samples.time_ns)
     current = samples.current_raw * scale.current_per_unit
     effort = joint_effort(cell, current, gains) if len(gains) else np.empty((len(current), 0))
@@ -130,7 +126,7 @@ def _messages(log: Log, cell: Cell, gains: Sequence[float]) -> Iterator[tuple[in
         yield reading.time_ns, READING_TOPICS[reading.quantity], reading_bytes(reading)
 
 
-def mean_velocity(position: FloatArray, time_ns: NDArray[np.int64]) -> FloatArray:
+def mean_velocity(position: FloatArray, time_ns: IntArray) -> FloatArray:
     """Mean velocity over VELOCITY_S about each sample, shorter at the ends [rad/s or m/s], shape (k, n).
 
     Args:
@@ -153,7 +149,7 @@ def joint_effort(cell: Cell, current: FloatArray, gains: Sequence[float]) -> Flo
         current: [unit of the gains' denominator], shape (k, n).
         gains: g of each axis, shape (n,).
     """
-    return np.asarray((np.asarray(gains) * current) @ DriveTrain(cell.ratio).direction)
+    return (np.asarray(gains) * current) @ DriveTrain(cell.ratio).direction
 
 
 def _write(writer: Writer, messages: Sequence[tuple[int, str, bytes]]) -> None:

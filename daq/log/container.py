@@ -25,7 +25,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, McapRecord, Metadata, Schema
 from numpy.typing import NDArray
 
-from daq.errors import LogCorrupt, LogForeign, LogMissing, LogTruncated
+from daq.errors import LogCorrupt, LogForeign, LogMissing, LogTruncated, reason_of
 from daq.files import open_regular
 from daq.log.message import (
     EVENTS_SCHEMA,
@@ -43,6 +43,7 @@ from drivers.messages import CellEvent, SlowReading
 
 MAGIC = b"\x89MCAP0\r\n"
 UNFINISHED = ".part"  #: Suffix of a log that is being written, or whose recorder has died
+HEAD_BYTES = 9  #: Kind and length before every record
 LARGEST_RECORD = 64 * 2**20  #: [bytes]; our chunks hold 200 ms
 LARGEST_CHUNK = 64 * 2**20
 LARGEST_RATIO = 200
@@ -53,15 +54,17 @@ RECORDS, BYTES_A_RECORD = 500_000, 4
 bytes each; without a bound, megabytes of equal events take gigabytes and minutes."""
 BYTES_A_UNIT = 64  #: An event of so many bytes counts as another record: its text is kept
 
+RecordArray = NDArray[np.void]  #: Records with samples, of `sample_dtype`
+PlacedRecord = tuple[int, McapRecord]  #: Offset in the file, and the record there
 Record = TypeVar("Record", bound=McapRecord)
-_PARSERS: tuple[tuple[Opcode, Callable[[ReadDataStream], McapRecord]], ...] = (
-    (Opcode.HEADER, Header.read),
-    (Opcode.SCHEMA, Schema.read),
-    (Opcode.CHANNEL, Channel.read),
-    (Opcode.ATTACHMENT, Attachment.read),
-    (Opcode.METADATA, Metadata.read),
-    (Opcode.CHUNK, Chunk.read),
-)
+_PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
+    Opcode.HEADER: Header.read,
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.ATTACHMENT: Attachment.read,
+    Opcode.METADATA: Metadata.read,
+    Opcode.CHUNK: Chunk.read,
+}
 
 
 class RecordFile:
@@ -82,7 +85,7 @@ class RecordFile:
         self._allowance = self._records_left = 0
         self._zstd = zstandard.ZstdDecompressor()
 
-    def __iter__(self) -> Generator[tuple[int, McapRecord], None, None]:
+    def __iter__(self) -> Generator[PlacedRecord, None, None]:
         """Yield offset and record, without the records that only index others.
 
         The file is open until the last record, or until the generator is closed: who may stop before the end, as at an
@@ -90,7 +93,7 @@ class RecordFile:
         """
         yield from self._opened(self._records)
 
-    def unfinished(self) -> Generator[tuple[int, McapRecord], None, None]:
+    def unfinished(self) -> Generator[PlacedRecord, None, None]:
         """Yield the records before the damage of a file without a valid end, then raise an error with its place.
 
         Such a file has only the checksums of chunks and attachments, so an unknown kind of record counts as damage. A
@@ -99,8 +102,8 @@ class RecordFile:
         yield from self._opened(self._unfinished_records)
 
     def _opened(
-        self, records: Callable[[BinaryIO, int], Iterator[tuple[int, McapRecord]]]
-    ) -> Generator[tuple[int, McapRecord], None, None]:
+        self, records: Callable[[BinaryIO, int], Iterator[PlacedRecord]]
+    ) -> Generator[PlacedRecord, None, None]:
         try:
             with open_regular(self._source) as stream:
                 size = os.fstat(stream.fileno()).st_size
@@ -110,24 +113,27 @@ class RecordFile:
         except OSError as error:
             raise LogMissing(
                 str(self.path),
-                found=(error.strerror or type(error).__name__).lower(),
+                found=reason_of(error),
                 expected="a log (.mcap)",
                 remedy="check the name",
             ) from error
 
-    def _unfinished_records(self, stream: BinaryIO, size: int) -> Iterator[tuple[int, McapRecord]]:
+    def _unfinished_records(self, stream: BinaryIO, size: int) -> Iterator[PlacedRecord]:
         self._check_start(stream, size)
         crc = zlib.crc32(MAGIC)
-        offset = stream.seek(len(MAGIC))
+        self.whole_bytes = stream.seek(len(MAGIC))
         while True:
-            self.whole_bytes = offset
-            head = stream.read(9)
-            opcode, length = struct.unpack("<BQ", head) if len(head) == 9 else (0, LARGEST_RECORD)
+            offset = self.whole_bytes
+            head = stream.read(HEAD_BYTES)
+            if len(head) < HEAD_BYTES:
+                raise self._truncated(offset + len(head), offset)
+            opcode = head[0]
+            length = _length(head)
             if length > LARGEST_RECORD:
                 raise self.corrupt(offset, f"a record of {length} bytes", f"at most {LARGEST_RECORD}")
-            body = stream.read(length) if len(head) == 9 else b""
+            body = stream.read(length)
             if len(body) < length:
-                raise self._truncated(offset + len(head) + len(body), offset)
+                raise self._truncated(offset + HEAD_BYTES + len(body), offset)
             if opcode == Opcode.DATA_END:
                 self._check_crc(offset, "data section", _parse(DataEnd.read, body, self, offset).data_section_crc, crc)
                 return
@@ -135,53 +141,55 @@ class RecordFile:
             if opcode == Opcode.MESSAGE_INDEX:
                 if length < 6 or length != 6 + int.from_bytes(body[2:6], "little"):
                     raise self.corrupt(offset, "a broken index", "one of the chunk before it")
-            elif all(opcode != known for known, _ in _PARSERS):
+            elif opcode not in _PARSERS:
                 raise self.corrupt(offset, f"a record of kind {opcode:#04x}", "one of a data section")
             yield from self._record(offset, opcode, body)
-            offset += 9 + length
+            self.whole_bytes += HEAD_BYTES + length
 
-    def _records(self, stream: BinaryIO, size: int) -> Iterator[tuple[int, McapRecord]]:
+    def _records(self, stream: BinaryIO, size: int) -> Iterator[PlacedRecord]:
         self._check_start(stream, size)
         self._check_end(stream, size)
         digest = hashlib.sha256(MAGIC)
         crc = zlib.crc32(MAGIC)
         offset = stream.seek(len(MAGIC))
+        end = size - len(MAGIC)
+        opcode = 0
         in_data = True
-        while offset < size - len(MAGIC):
-            head = stream.read(9)
-            opcode, length = struct.unpack("<BQ", head) if len(head) == 9 else (0, size)
-            if length > min(size - len(MAGIC) - offset - 9, LARGEST_RECORD):
+        while in_data or opcode != Opcode.FOOTER:
+            if offset == end:
+                raise self.corrupt(offset, "no footer", "one before the end")
+            head = stream.read(HEAD_BYTES)
+            length = _length(head)
+            if not head or length > min(end - offset - HEAD_BYTES, LARGEST_RECORD):
                 raise self.corrupt(offset, f"a record of {length} bytes", "one that fits the file")
+            opcode = head[0]
             body = stream.read(length)
             digest.update(head)
             digest.update(body)
-            if opcode == Opcode.DATA_END and in_data:
+            if in_data and opcode == Opcode.DATA_END:
                 self._check_crc(offset, "data section", _parse(DataEnd.read, body, self, offset).data_section_crc, crc)
-                crc, in_data = 0, False
-            elif opcode == Opcode.FOOTER and not in_data:
+                crc = 0
+                in_data = False
+            elif in_data:
+                crc = zlib.crc32(body, zlib.crc32(head, crc))
+                yield from self._record(offset, opcode, body)
+            elif opcode == Opcode.FOOTER:
                 crc = zlib.crc32(body[:16], zlib.crc32(head, crc))
                 self._check_crc(offset, "summary", _parse(Footer.read, body, self, offset).summary_crc, crc)
-                offset += 9 + length
-                break
             else:
                 crc = zlib.crc32(body, zlib.crc32(head, crc))
-                if in_data:
-                    yield from self._record(offset, opcode, body)
-            offset += 9 + length
-        else:
-            raise self.corrupt(offset, "no footer", "one before the end")
-        if offset != size - len(MAGIC):
-            raise self.corrupt(offset, f"{size - len(MAGIC) - offset} bytes behind the footer", "none")
+            offset += HEAD_BYTES + length
+        if offset != end:
+            raise self.corrupt(offset, f"{end - offset} bytes behind the footer", "none")
         digest.update(MAGIC)
         self.sha256 = digest.hexdigest()
 
-    def _record(self, offset: int, opcode: int, body: bytes) -> Iterator[tuple[int, McapRecord]]:
+    def _record(self, offset: int, opcode: int, body: bytes) -> Iterator[PlacedRecord]:
         if opcode == Opcode.ATTACHMENT:
             stored = int.from_bytes(body[-4:], "little")
             self._check_crc(offset, "attachment", stored, zlib.crc32(body[:-4]))
-        for known, read in _PARSERS:
-            if opcode == known:
-                yield offset, _parse(read, body, self, offset)
+        if opcode in _PARSERS:
+            yield offset, _parse(_PARSERS[opcode], body, self, offset)
 
     def _check_start(self, stream: BinaryIO, size: int) -> None:
         start = stream.read(len(MAGIC))
@@ -236,6 +244,21 @@ class RecordFile:
         if self._records_left < 0:
             raise self.corrupt(offset, "too many messages for a file of its size", "a recording")
 
+    def records_inside(self, offset: int, data: bytes) -> Iterator[tuple[int, int, int]]:
+        """Yield kind, start and end of each record of a chunk.
+
+        Raises:
+            LogCorrupt: one is longer than the chunk, or there are more than a recording of this size has.
+        """
+        start = 0
+        while start < len(data):
+            self.spend(offset)
+            end = start + HEAD_BYTES + _length(data[start : start + HEAD_BYTES])
+            if end > len(data):
+                raise self.corrupt(offset, "a record beyond the end of its chunk", "one inside")
+            yield data[start], start, end
+            start = end
+
     def unpack(self, offset: int, chunk: Chunk) -> bytes:
         """Decompress a chunk.
 
@@ -257,23 +280,25 @@ class RecordFile:
                 remedy="convert the file with a tool for MCAP",
             )
         data = chunk.data
-        if chunk.compression == "zstd":
-            try:
+        try:
+            if chunk.compression == "zstd":
                 claimed = zstandard.frame_content_size(data)
                 if claimed > size:
                     raise self.corrupt(offset, f"a chunk that unfolds to {claimed} bytes", f"{size}, as declared")
                 data = self._zstd.decompress(data, max_output_size=size)
-            except zstandard.ZstdError as error:
-                raise self.corrupt(offset, f"a broken chunk ({error})", "zstd") from error
-        elif chunk.compression == "lz4":
-            try:
+            elif chunk.compression == "lz4":
                 data = LZ4FrameDecompressor().decompress(data, max_length=size)
-            except (RuntimeError, EOFError) as error:
-                raise self.corrupt(offset, f"a broken chunk ({error})", "lz4") from error
+        except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+            raise self.corrupt(offset, f"a broken chunk ({error})", chunk.compression) from error
         if len(data) != size:
             raise self.corrupt(offset, f"a chunk of {len(data)} bytes", f"{size}, as declared")
         self._check_crc(offset, "chunk", chunk.uncompressed_crc, zlib.crc32(data))
         return data
+
+
+def _length(head: bytes) -> int:
+    """Return the length of the body of a record."""
+    return int.from_bytes(head[1:], "little")
 
 
 def _parse(read: Callable[[ReadDataStream], Record], body: bytes, file: RecordFile, offset: int) -> Record:
@@ -285,7 +310,7 @@ def _parse(read: Callable[[ReadDataStream], Record], body: bytes, file: RecordFi
         raise file.corrupt(offset, f"a broken record ({type(error).__name__})", "an MCAP record") from error
 
 
-_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+_MESSAGE_HEAD_BYTES = HEAD_BYTES + 22  #: Kind, length, channel, sequence and two times
 _QUANTITIES = {topic: quantity for quantity, topic in READING_TOPICS.items()}
 _READ = (SAMPLES_TOPIC, EVENTS_TOPIC, *_QUANTITIES)  #: Topics that a fit needs; the others are for viewers
 
@@ -298,9 +323,9 @@ class ChunkContents:
         self.readings: list[SlowReading] = []  #: likewise
         self._file = file
         self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
+        self._topics: dict[int, str] = {}
 
-    def samples(self, offset: int, data: bytes) -> Iterator[tuple[int, NDArray[np.void]]]:
+    def samples(self, offset: int, data: bytes) -> Iterator[tuple[int, RecordArray]]:
         """Yield the samples of a chunk, all at once if it holds nothing else; its events and readings are collected.
 
         Args:
@@ -311,65 +336,48 @@ class ChunkContents:
             LogCorrupt: a record is broken.
             LogForeign: a topic has another type than in a log of a cell.
         """
-        start = self._definitions(offset, data)
-        if start == len(data):
-            return
-        head = self._message_head(offset, data, start)
-        if self._topic(head[2]) == SAMPLES_TOPIC:
-            count, rest = divmod(len(data) - start, 9 + head[1])
-            axes = self._axes(offset, head[1])
-            if not rest:
-                records = np.frombuffer(data, dtype=sample_dtype(axes), count=count, offset=start)
-                words = zip((records[name] for name in ("opcode", "length", "channel")), head[:3], strict=True)
-                if all((column == word).all() for column, word in words):
-                    yield offset, records
-                    return
-        yield from self._mixed(offset, data, start)
-
-    def _mixed(self, offset: int, data: bytes, start: int) -> Iterator[tuple[int, NDArray[np.void]]]:
-        """Yield the samples of a chunk with events and viewers' topics, or repacked by another tool."""
         samples: list[bytes] = []
-        while start < len(data):
-            opcode, length, channel, _, _, _ = self._message_head(offset, data, start)
-            record = data[start : start + 9 + length]
-            start += 9 + length
-            self._file.spend(offset)
+        for opcode, start, end in self._file.records_inside(offset, data):
+            if opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
+                self.define(_parse(_PARSERS[opcode], data[start + HEAD_BYTES : end], self._file, offset))
             if opcode != Opcode.MESSAGE:
                 continue
-            topic = self._topic(channel)
+            channel = int.from_bytes(data[start + HEAD_BYTES : start + HEAD_BYTES + 2], "little")
+            topic = self._topics.get(channel)
+            body = data[start + _MESSAGE_HEAD_BYTES : end]
             if topic == SAMPLES_TOPIC:
-                samples.append(record)
+                if not samples:
+                    alike = self._samples_alike(offset, data, start, end)
+                    if alike is not None:
+                        yield offset, alike
+                        return
+                samples.append(data[start:end])
             elif topic == EVENTS_TOPIC:
-                self._file.spend(offset, length)
+                self._file.spend(offset, len(body))
                 try:
-                    self.events.append(event_from_bytes(record[_MESSAGE_HEAD.size :]))
+                    self.events.append(event_from_bytes(body))
                 except (ValueError, struct.error) as error:
                     raise self._file.corrupt(offset, f"a broken event ({error})", EVENTS_SCHEMA) from error
             elif topic in _QUANTITIES:
                 try:
-                    self.readings.append(reading_from_bytes(record[_MESSAGE_HEAD.size :], _QUANTITIES[topic]))
+                    self.readings.append(reading_from_bytes(body, _QUANTITIES[topic]))
                 except (ValueError, struct.error) as error:
                     raise self._file.corrupt(offset, f"a broken reading ({error})", READING_SCHEMA) from error
         if samples:
-            axes = self._axes(offset, len(samples[0]) - 9)
+            axes = self._axes(offset, len(samples[0]))
             dtype = sample_dtype(axes)
             if any(len(sample) != dtype.itemsize for sample in samples):
                 raise self._file.corrupt(offset, "samples of different sizes", "one number of axes")
             yield offset, np.frombuffer(b"".join(samples), dtype=dtype)
 
-    def _definitions(self, offset: int, data: bytes) -> int:
-        """Read the schemas and channels at the start of a chunk; return the position of the first message."""
-        start = 0
-        while start < len(data) and data[start] != Opcode.MESSAGE:
-            self._file.spend(offset)
-            end = start + 9 + int.from_bytes(data[start + 1 : start + 9], "little")
-            if end > len(data):
-                raise self._file.corrupt(offset, "a record beyond the end of its chunk", "one inside")
-            if data[start] in {Opcode.SCHEMA, Opcode.CHANNEL}:
-                read = Schema.read if data[start] == Opcode.SCHEMA else Channel.read
-                self.define(_parse(read, data[start + 9 : end], self._file, offset))
-            start = end
-        return start
+    def _samples_alike(self, offset: int, data: bytes, start: int, end: int) -> RecordArray | None:
+        """Return the rest of a chunk as one array, if it holds nothing but samples as the first one of them."""
+        dtype = sample_dtype(self._axes(offset, end - start))
+        if (len(data) - start) % dtype.itemsize:
+            return None
+        records = np.frombuffer(data, dtype=dtype, offset=start)
+        heads = records[["opcode", "length", "channel"]]
+        return records if (heads == heads[0]).all() else None
 
     def define(self, record: McapRecord) -> None:
         """Register a schema or channel.
@@ -387,23 +395,11 @@ class ChunkContents:
                 raise self._file.foreign(
                     f"{record.topic} as {name} in {record.message_encoding!r}", f"{expected} in 'cdr'"
                 )
-            self._channels[record.id] = record
+            self._topics[record.id] = record.topic
 
-    def _message_head(self, offset: int, data: bytes, start: int) -> tuple[int, int, int, int, int, int]:
-        if start + _MESSAGE_HEAD.size > len(data):
-            raise self._file.corrupt(offset, "a message beyond the end of its chunk", "one inside")
-        opcode, length, channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(data, start)
-        if start + 9 + length > len(data):
-            raise self._file.corrupt(offset, "a message beyond the end of its chunk", "one inside")
-        return opcode, length, channel, sequence, log_time, publish_time
-
-    def _topic(self, channel: int) -> str:
-        known = self._channels.get(channel)
-        return known.topic if known else ""
-
-    def _axes(self, offset: int, length: int) -> int:
-        """Return the number of axes of samples of this length."""
+    def _axes(self, offset: int, size: int) -> int:
+        """Return the number of axes of samples of this size, as records."""
         for axes in range(1, LARGEST_AXES + 1):
-            if sample_dtype(axes).itemsize == 9 + length:
+            if sample_dtype(axes).itemsize == size:
                 return axes
-        raise self._file.corrupt(offset, f"a sample of {length} bytes", f"1 to {LARGEST_AXES} axes")
+        raise self._file.corrupt(offset, f"a sample of {size - HEAD_BYTES} bytes", f"1 to {LARGEST_AXES} axes")

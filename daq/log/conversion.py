@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from math import pi
 from pathlib import Path
@@ -13,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.cell import DEGREE, Cell, model_of
-from daq.config.cell_file import cell_from_bundle
 from daq.config.same_cell import Correction, correction_of
 from daq.errors import CurrentSaturated, LogIncomplete, LogsDiffer, PositionImplausible, RunInvalid
 from daq.log.impossible import motion_fault
+from daq.log.message import RawArray
 from daq.log.metadata import Readback, reports_only_losses
 from daq.log.reader import Log, LossyLogs, SampleChecks, read_log
-from drivers.messages import CellEvent, EventKind, Quantity
-from ident.arrays import BoolArray, FloatArray
+from drivers.messages import CellEvent, EventKind, Quantity, SlowReading
+from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.run import Recording, Run
 from ident.data.torque_channel import TorqueChannel
 from ident.data.unsigned_current import unsigned_currents
@@ -45,17 +46,18 @@ class SiScaling:
     def joint_position(self, counts: NDArray[np.integer]) -> FloatArray:
         """Return joint positions [rad or m] of motor counts, shape (..., n): q = R⁻¹ q_motor + offset (paper eq. 24)"""
         motor_rad = counts * self.rad_per_count
-        return np.asarray(motor_rad @ self.to_joint.T + self.offset_rad, dtype=np.float64)
+        return motor_rad @ self.to_joint.T + self.offset_rad
 
     def joints_known(self, answered: BoolArray) -> BoolArray:
-        """Return whether every motor that moves a joint answered, shape (k, n), from the answers of the motors."""
+        """Return whether every motor that moves a joint answered, shape (..., n), from the answers of the motors."""
         size = np.abs(self.to_joint)
         moves = size > 1e-12 * size.max()
         return np.asarray(~(~answered @ moves.T), dtype=np.bool_)
 
     def joint_position_of(self, counts: tuple[int, ...]) -> list[float]:
         """Convert one sample, for /joint_states."""
-        return [float(value) for value in self.joint_position(np.array(counts, dtype=np.int64))]
+        position: list[float] = self.joint_position(np.array(counts, dtype=np.int64)).tolist()
+        return position
 
 
 def scaling(cell: Cell, readback: Readback) -> SiScaling:
@@ -119,7 +121,7 @@ def load_run(path: Path | str, cell: Cell | None = None, lossy: LossyLogs = Loss
             100.0 * speed,
         )
     if cell is None:
-        own = cell_from_bundle(log.head.files, names={"cell.yaml": f"{path}, cell.yaml"})
+        own = log.head.cell(path)
         return run_from_log(log, own, lossy), own
     serials = [_serial(axis.drive) for axis in log.head.readback.axes]
     correction = correction_of(str(path), log.head.files, cell, serials)
@@ -247,7 +249,7 @@ def answers(missing: NDArray[np.uint32], axes: int) -> BoolArray:
     return np.asarray(missing[:, None] >> np.arange(axes, dtype=np.uint32) & 1 == 0, dtype=np.bool_)
 
 
-def continuous_counts(position_counts: NDArray[np.int32], readback: Readback) -> NDArray[np.int64]:
+def continuous_counts(position_counts: RawArray, readback: Readback) -> IntArray:
     """Return positions without the wraps of an encoder's counter, shape (k, n)."""
     is_counter = [axis.position_rad_per_count is None for axis in readback.axes]
     return np.where(is_counter, unwrapped(position_counts), position_counts)
@@ -259,7 +261,7 @@ def _serial(drive: Mapping[str, Any]) -> int | None:
     return serial if type(serial) is int and 0 <= serial < 2**32 else None
 
 
-def moves(events: tuple[CellEvent, ...], time_ns: NDArray[np.int64]) -> NDArray[np.int64] | None:
+def moves(events: tuple[CellEvent, ...], time_ns: IntArray) -> IntArray | None:
     """Return the number of the move of each sample, shape (k,); None in a log without moves.
 
     A move lasts until the next one starts, so the standstill between two moves belongs to the first. Samples before
@@ -268,9 +270,22 @@ def moves(events: tuple[CellEvent, ...], time_ns: NDArray[np.int64]) -> NDArray[
     starts = sorted((event.time_ns, event.code) for event in events if event.kind is EventKind.MOVE_START)
     if not starts:
         return None
-    begin_ns = np.array([start[0] for start in starts], dtype=np.int64)
-    number = np.array([start[1] for start in starts], dtype=np.int64)
+    number: IntArray
+    begin_ns, number = np.array(starts, dtype=np.int64).T
     return number[np.maximum(np.searchsorted(begin_ns, time_ns, side="right") - 1, 0)]
+
+
+def readings_by_axis(readings: Iterable[SlowReading], quantity: Quantity) -> dict[int, tuple[IntArray, FloatArray]]:
+    """Return times [ns] and values of the readings of a quantity, in the order of time, by the index of their axis."""
+    found = defaultdict(list)
+    for reading in readings:
+        if reading.quantity is quantity:
+            found[reading.axis].append((reading.time_ns, reading.value))
+    series = {}
+    for axis, own in found.items():
+        stamps, values = zip(*sorted(own), strict=True)
+        series[axis] = np.array(stamps, dtype=np.int64), np.array(values, dtype=np.float64)
+    return series
 
 
 def temperatures(log: Log) -> FloatArray | None:
@@ -278,15 +293,13 @@ def temperatures(log: Log) -> FloatArray | None:
 
     It is interpolated between readings, and constant before the first and after the last; NaN for an axis without.
     """
-    readings = [reading for reading in log.readings if reading.quantity is Quantity.TEMPERATURE]
+    readings = readings_by_axis(log.readings, Quantity.TEMPERATURE)
     if not readings:
         return None
     time_ns = log.samples.time_ns
     found = np.full(log.samples.position_counts.shape, np.nan)
-    for axis in {reading.axis for reading in readings}:
-        own = sorted((one.time_ns - int(time_ns[0]), one.value) for one in readings if one.axis == axis)
-        at_ns, values = np.array(own).T
-        found[:, axis] = np.interp(time_ns - time_ns[0], at_ns, values)
+    for axis, (at_ns, values) in readings.items():
+        found[:, axis] = np.interp(time_ns - time_ns[0], at_ns - time_ns[0], values)
     return found
 
 
@@ -302,7 +315,7 @@ def torque_channels(log: Log, cell: Cell, current: FloatArray, valid: BoolArray)
         current: recorded currents in the gains' unit, shape (k, n).
         valid: samples that may be used, shape (k, n).
     """
-    readings = [reading for reading in log.readings if reading.quantity is Quantity.TORQUE]
+    readings = readings_by_axis(log.readings, Quantity.TORQUE)
     if not readings:
         return ()
     time_ns, rate_hz = log.samples.time_ns, log.head.run.rate_hz
@@ -311,9 +324,9 @@ def torque_channels(log: Log, cell: Cell, current: FloatArray, valid: BoolArray)
     sums = np.zeros((2, len(current) + 1, len(cell.axes)))
     np.cumsum((current, valid), axis=1, out=sums[:, 1:])
     channels = []
+    none = np.empty(0, dtype=np.int64), np.empty(0)
     for axis, reduction in enumerate(DriveTrain(cell.ratio).reduction):
-        own = sorted((one.time_ns, one.value) for one in readings if one.axis == axis)
-        at_ns = np.array([stamp for stamp, _ in own], dtype=np.int64)
+        at_ns, values = readings.get(axis, none)
         row = np.searchsorted(time_ns, at_ns - round(0.5e9 / rate_hz))
         inside = (row >= far) & (row + far < len(time_ns))
         row, at_ns = row[inside], at_ns[inside]
@@ -327,7 +340,7 @@ def torque_channels(log: Log, cell: Cell, current: FloatArray, valid: BoolArray)
                 time_s=(at_ns[whole] - time_ns[0]) * 1e-9,
                 current_a=beside[0, whole],
                 nearby_a=0.5 * (before[0] + after[0])[whole],
-                torque_nm=float(reduction) * np.array([value for _, value in own])[inside][whole],
+                torque_nm=float(reduction) * values[inside][whole],
             )
         )
     return tuple(channels)
@@ -361,9 +374,7 @@ def check_limits(name: str, position_rad: FloatArray, cell: Cell, valid: BoolArr
             )
 
 
-def unwrapped(
-    counts: NDArray[np.int32], before: tuple[NDArray[np.int32], NDArray[np.int64]] | None = None
-) -> NDArray[np.int64]:
+def unwrapped(counts: RawArray, before: tuple[RawArray, IntArray] | None = None) -> IntArray:
     """Unwrap the positions of a 32 bit encoder counter, shape (k, n).
 
     A jump of more than half the range between two samples is a wrap: no motor makes 2³¹ counts in one period.

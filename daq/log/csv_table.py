@@ -6,6 +6,7 @@ import csv
 import hashlib
 import math
 import re
+from array import array
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,13 +20,12 @@ import numpy as np
 from daq.config.import_description import Column, CsvLayout, ImportDescription, TimeColumn, TimeUnit
 from daq.errors import TableUnfit
 from daq.files import read_regular
-from daq.log.table import Stamps, Table, check_reach, stamps_of_ns, stamps_of_numbers
+from daq.log.table import Stamps, Table, check_reach, repeated, stamps_of_ns, stamps_of_numbers, unreadable
 from ident.arrays import FloatArray
 
 ABSOLUTE_S = 1e8  #: Stamps above this are since 1970, and floats are too coarse for them: 0.2 µs
 LARGEST_BYTES = 2**30  #: Largest file; an hour of six axes at 1 kHz has half of it
 LARGEST_JUMP = 3.0  #: Largest step to a last number that may be cut off, in multiples of the largest step before it
-_UNUSED = "\x1e"  #: Delimiter of fields that are split already; it ends a line, so no field has it
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d{1,9})\d*)?(Z|[+-]\d\d:?\d\d)")
 
 
@@ -75,6 +75,8 @@ class _Lines:
 
     def number(self, text: str) -> float:
         """Read a field; NaN if it is no number."""
+        if "_" in text:  # Python reads 1_000, no other program does
+            return math.nan
         try:
             return float(text.replace(",", ".") if self.table.decimal == "," else text)
         except ValueError:
@@ -90,12 +92,7 @@ def _read_lines(path: Path, table: CsvLayout) -> tuple[_Lines, tuple[str, ...]]:
     try:
         data = read_regular(path, LARGEST_BYTES)
     except OSError as error:
-        raise TableUnfit(
-            str(path),
-            found=(error.strerror or type(error).__name__).lower(),
-            expected="a CSV file",
-            remedy="check --data and the file name in the import description",
-        ) from error
+        raise unreadable(path, error, "a CSV file") from error
     text, *remarks = _decoded(path, data)
     lines = text.splitlines()
     whole = text.endswith(("\n", "\r"))
@@ -235,31 +232,24 @@ def _numbers(file: _Lines, columns: Sequence[str | int]) -> FloatArray:
         TableUnfit: a column is missing, or a field is not a finite number.
     """
     indices = [_index(file, column) for column in columns]
-    table = file.table
     if twice := [column for number, column in enumerate(columns) if indices[number] in indices[:number]]:
-        raise TableUnfit(
-            str(file.path),
-            found=f"column {twice[0]} a second time, once by name and once by number",
-            expected="a column of its own for each quantity of each axis",
-            remedy="correct `columns` in the import description",
-        )
-    rows, usecols, delimiter = file.rows, indices, None if table.delimiter == " " else table.delimiter
-    if any('"' in row for row in rows):  # as `fields` has it, for quotes are read in one place alone
-        split = (file.fields(row) for row in rows)
-        rows = tuple(_UNUSED.join(fields[index] for index in indices) for fields in split)
-        usecols, delimiter = [*range(len(indices))], _UNUSED
-    if table.decimal == ",":
-        rows = tuple(row.replace(",", ".") for row in rows)
-    try:
-        values = np.loadtxt(rows, delimiter=delimiter, usecols=usecols, ndmin=2, comments=None, quotechar=None)
-    except ValueError as error:
-        raise _not_numeric(file, indices) from error
-    if len(values) != len(rows) or not np.isfinite(values).all():  # loadtxt leaves empty lines out
-        raise _not_numeric(file, indices)
+        raise repeated(file.path, twice[0], "once by name and once by number")
+    numbers = array("d")
+    for row in file.rows:
+        fields = file.fields(row)
+        numbers.extend([file.number(fields[index]) for index in indices])
+    values = np.asarray(numbers).reshape(len(file.rows), len(indices))
+    wrong = np.argwhere(~np.isfinite(values))
+    if wrong.size:
+        number, column = wrong[0].tolist()
+        index = indices[column]
+        text = file.fields(file.rows[number])[index]
+        remedy = _remedy(file, number, text)
+        raise TableUnfit(file.place(number, index), found=repr(text), expected="a finite number", remedy=remedy)
     _check_points(file, indices)
-    for index, column in zip(indices, values.T, strict=True):
-        _check_thousands(file, index, column)
-    return np.asarray(values, dtype=np.float64)
+    for index, own in zip(indices, values.T, strict=True):
+        _check_thousands(file, index, own)
+    return values
 
 
 def _check_points(file: _Lines, indices: list[int]) -> None:
@@ -340,23 +330,6 @@ def _index(file: _Lines, column: str | int) -> int:
         found=f"columns {', '.join(file.names)}",
         expected=f"one column {column!r}",
         remedy="correct `columns` in the import description",
-    )
-
-
-def _not_numeric(file: _Lines, indices: list[int]) -> TableUnfit:
-    """Make the error for the first field that is not a finite number."""
-    for number, row in enumerate(file.rows):
-        fields = file.fields(row)
-        for index in indices:
-            if not math.isfinite(file.number(fields[index])):
-                return TableUnfit(
-                    file.place(number, index),
-                    found=repr(fields[index]),
-                    expected="a finite number",
-                    remedy=_remedy(file, number, fields[index]),
-                )
-    return TableUnfit(
-        str(file.path), found="fields that are no numbers", expected="numbers", remedy="check the decimal sign"
     )
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import importlib
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from importlib.util import find_spec
-from math import isnan
+from itertools import chain, pairwise
+from math import inf, isnan
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.cell import Cell
-from daq.config.cell_file import cell_from_bundle
 from daq.errors import ConfigurationMissing, OutputFailed, UsageError
-from daq.log.conversion import moves, scaling, unwrapped
-from daq.log.motion import MotionWatch, log_verdict
+from daq.log.conversion import answers, moves, readings_by_axis, scaling, unwrapped
+from daq.log.message import RawArray
+from daq.log.motion import judge_log
 from daq.log.reader import LogReader, SampleBlock
 from drivers.messages import CellEvent, Quantity, SlowReading
+from ident.arrays import FloatArray, IntArray
 
 Columns = dict[str, NDArray[Any]]  #: Columns of equal length by name, in order
 Write = Callable[[Columns], None]
@@ -47,21 +49,6 @@ class Exported:
     reason: str  #: why not
 
 
-def require_format(kind: TableFormat) -> None:
-    """Check that the package for a format is installed.
-
-    Raises:
-        ConfigurationMissing: it is not; the message names the extra to install.
-    """
-    if kind is TableFormat.PARQUET and find_spec("pyarrow") is None:
-        raise ConfigurationMissing(
-            "Parquet",
-            found="no package pyarrow",
-            expected="that of the optional extra `parquet`",
-            remedy="pip install 'drivegain[parquet]', or export --csv",
-        )
-
-
 def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
     """Write all samples of a log to a table; the file appears when it is whole.
 
@@ -73,23 +60,22 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
     Raises:
         UsageError: a file of that name exists.
         OutputFailed: the file system refuses.
-        ConfigurationMissing: the package for the format is missing.
+        ConfigurationMissing: the package for the format is missing; the message names the extra to install.
         LogUnreadable: the log is damaged or contradicts itself; nothing is written.
     """
-    require_format(kind)
+    if kind is TableFormat.PARQUET and find_spec("pyarrow") is None:
+        raise ConfigurationMissing(
+            "Parquet",
+            found="no package pyarrow",
+            expected="that of the optional extra `parquet`",
+            remedy="pip install 'drivegain[parquet]', or export --csv",
+        )
     if out.exists():
         raise UsageError(
             str(out), found="a file of that name", expected="none", remedy="choose another --out, or move it away"
         )
-    reader = LogReader(log)
     # The first pass finds all damage and all moves; the second writes, a block at a time.
-    watch: MotionWatch | None = None
-    for block in reader:
-        if watch is None:
-            cell = cell_from_bundle(reader.head.files, names={"cell.yaml": f"{log}, cell.yaml"})
-            watch = MotionWatch(cell, reader.head)
-        watch.take(block)
-    assert watch is not None  # the reader refuses a log without samples
+    reader, cell, verdict = judge_log(log)
     names: tuple[str, ...] = ()
     rows = 0
     unfinished = out.with_name(out.name + ".part")
@@ -108,7 +94,6 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
             unfinished.replace(out)
     except OSError as error:
         raise OutputFailed.of(out, error) from error
-    verdict = log_verdict(cell, reader.head, reader.checks, reader.statistics, watch, lambda: LogReader(log))
     return Exported(names, rows, reader.partial, *verdict)
 
 
@@ -126,18 +111,20 @@ def tables(
     Raises:
         LogUnreadable: the log is damaged, or cell and log do not belong together.
     """
-    last: tuple[NDArray[np.int32], NDArray[np.int64]] | None = None
+    last: tuple[RawArray, IntArray] | None = None
     first_ns = 0
+    end_ns = -inf
     names = column_names(cell)
-    every = {
-        f"{names[axis]}.{_SLOW_COLUMNS[quantity]}": sorted(
-            (one.time_ns, one.value) for one in readings if (one.axis, one.quantity) == (axis, quantity)
-        )
-        for axis in range(len(names))
-        for quantity in Quantity
-    }
-    slow = {name: found for name, found in every.items() if found}
-    for block, is_last in _with_last(reader):
+    by_quantity = {quantity: readings_by_axis(readings, quantity) for quantity in Quantity}
+    slow = {}
+    for axis, name in enumerate(names):
+        for quantity, by_axis in by_quantity.items():
+            if axis in by_axis:
+                slow[f"{name}.{_SLOW_COLUMNS[quantity]}"] = by_axis[axis]
+    for block, following in pairwise(chain(reader, (None,))):
+        assert block is not None  # None follows the last one
+        begin_ns = end_ns
+        end_ns = inf if following is None else int(following.time_ns[0])
         scale = scaling(cell, reader.head.readback)
         is_counter = np.array([axis.position_rad_per_count is None for axis in reader.head.readback.axes])
         if last is None:
@@ -148,17 +135,17 @@ def tables(
         joints = scale.joint_position(counts)
         yield {
             **_columns(cell, block, counts, joints, scale.current_per_unit, moves(events, block.time_ns), first_ns),
-            **{name: _in_rows(block.time_ns, found, to_end=is_last) for name, found in slow.items()},
+            **{name: _in_rows(block.time_ns, *found, begin_ns, end_ns) for name, found in slow.items()},
         }
 
 
 def _columns(
     cell: Cell,
     block: SampleBlock,
-    counts: NDArray[np.int64],
-    joints: NDArray[np.float64],
-    per_unit: NDArray[np.float64],
-    move: NDArray[np.int64] | None,
+    counts: IntArray,
+    joints: FloatArray,
+    per_unit: FloatArray,
+    move: IntArray | None,
     first_ns: int,
 ) -> Columns:
     columns: Columns = {
@@ -167,6 +154,7 @@ def _columns(
         "time_s": (block.time_ns - first_ns) * 1e-9,
         "move": np.full(len(block.cycle), -1, dtype=np.int64) if move is None else move,
     }
+    answered = answers(block.missing, len(cell.axes)).astype(np.uint8)
     for index, (axis, name) in enumerate(zip(cell.axes, column_names(cell), strict=True)):
         current = axis.gain_unit.partition("/")[2].strip() or "A"
         columns |= {
@@ -175,7 +163,7 @@ def _columns(
             f"{name}.motor_counts": counts[:, index],
             f"{name}.current_raw": block.current_raw[:, index],
             f"{name}.statusword": block.statusword[:, index],
-            f"{name}.answered": ((block.missing >> np.uint32(index)) & 1 == 0).astype(np.uint8),
+            f"{name}.answered": answered[:, index],
         }
     return columns
 
@@ -196,31 +184,23 @@ def column_names(cell: Cell) -> list[str]:
 _SLOW_COLUMNS = {Quantity.TORQUE: "motor_torque_Nm", Quantity.TEMPERATURE: "temperature_degC"}
 
 
-def _in_rows(time_ns: NDArray[np.int64], found: list[tuple[int, float]], *, to_end: bool) -> NDArray[np.float64]:
-    """Take the readings of a block's rows from the front of a list; rows without one are NaN.
+def _in_rows(
+    time_ns: IntArray, reading_ns: IntArray, readings: FloatArray, begin_ns: float, end_ns: float
+) -> FloatArray:
+    """Put the readings from one time to another into the rows of a block, shape (k,); rows without one are NaN.
 
     Args:
         time_ns: of the rows, shape (k,).
-        found: time and value of the readings that are left, in their order; those of these rows are taken out.
-        to_end: the rows are the last, and take all that is left.
+        reading_ns: increasing times of all readings of the log, shape (r,).
+        readings: their values, shape (r,).
+        begin_ns: time of the first row; before all readings if it is the first of the log.
+        end_ns: time of the row after the last; infinite behind the last of the log.
     """
     values = np.full(len(time_ns), np.nan)
-    step = int(time_ns[-1] - time_ns[-2]) if len(time_ns) > 1 else 1
-    while found and (to_end or found[0][0] < time_ns[-1] + step):
-        stamp, value = found.pop(0)
-        values[max(0, int(np.searchsorted(time_ns, stamp, side="right")) - 1)] = value
+    inside = (reading_ns >= begin_ns) & (reading_ns < end_ns)
+    row = np.searchsorted(time_ns, reading_ns[inside], side="right") - 1
+    values[np.maximum(row, 0)] = readings[inside]
     return values
-
-
-def _with_last(blocks: Iterable[SampleBlock]) -> Iterator[tuple[SampleBlock, bool]]:
-    """Yield each block, and whether it is the last."""
-    held: SampleBlock | None = None
-    for block in blocks:
-        if held is not None:
-            yield held, False
-        held = block
-    if held is not None:
-        yield held, True
 
 
 @contextmanager

@@ -323,8 +323,7 @@ class Feed:
 
     def event(self, event: CellEvent) -> None:
         """Publish an event, in its place between the samples."""
-        shown = {"time_ns": event.time_ns, "axis": event.axis, "kind": event.kind.value, "code": event.code}
-        shown["text"] = event.text
+        shown = {**asdict(event), "kind": event.kind.value}
         self._flush()
         self._events.append(shown)
         self._send({"events": [shown]})
@@ -381,16 +380,12 @@ class Feed:
 
     def _wait(self, selector: selectors.BaseSelector) -> None:
         """Accept consoles and stops until the listeners are shut down."""
+        # Clients of the stop that have not asked yet are waited for all at once: a silent one delays no other.
+        asking: deque[socket.socket] = deque()
         with ExitStack() as closing:
+            closing.enter_context(selector)
             for listener in self._listening:
                 closing.enter_context(listener)
-            self._accept_all(selector)
-
-    def _accept_all(self, selector: selectors.BaseSelector) -> None:
-        """Accept consoles, and wait for all clients of the stop at once: a silent one delays no other."""
-        asking: deque[socket.socket] = deque()
-        with selector:
-            for listener in self._listening:
                 selector.register(listener, selectors.EVENT_READ)
             while True:
                 for key, _ in selector.select():

@@ -38,11 +38,12 @@ from daq.log.plausibility import (
     check_speed,
     check_steps,
     check_velocity,
+    in_si,
     warn_of_unsigned,
 )
 from daq.log.resampling import Clock, clock_of, on_clock
 from daq.log.table import Table
-from daq.log.writer import NOTHING_KEPT, LogContent, LogWriter
+from daq.log.writer import LogContent, LogWriter
 from drivers.messages import Quantity, Sample, SlowReading
 from ident.arrays import FloatArray, IntArray
 from ident.model.bodies import Payload
@@ -92,11 +93,14 @@ def import_recording(
     check_current(current, wanted, files[wanted.current.file])
     if wanted.position.unit is PositionUnit.COUNTS:
         check_counts(position, wanted, table)
-    clock = _clock(wanted, files)
-    rate_hz = wanted.rate_hz if clock is None else clock.timing.rate_hz
-    assert rate_hz is not None  # load_import requires one of the two
-    if clock is not None:
+    clock = None
+    rate_hz = wanted.rate_hz
+    if wanted.time is not None:
+        numbers = np.hstack([file.values for file in files.values()])
+        clock = clock_of(files[wanted.time.file], wanted.time, numbers)
+        rate_hz = clock.timing.rate_hz
         position = position[clock.row]
+    assert rate_hz is not None  # load_import requires one of the two
     counts, count_rad = _counts(wanted, cell, position, clock)
     factors = wanted.current.factors(cell.axis_names)
     raw, unit = quantise(on_clock(current, clock) * np.array(factors))
@@ -116,7 +120,7 @@ def import_recording(
     check_velocity(wanted, cell, files, clock, joint_rad, rate_hz)
     warn_of_unsigned(wanted.name, joint_rad, raw * unit, rate_hz, cell)
     digests = {name: file.digest for name, file in files.items()}
-    slow = _slow(wanted, cell, files, clock)
+    slow = _slow(wanted, cell, files, clock, rate_hz)
     started_ns, started_wall_ns, timing = _start(wanted, files, clock)
     run = RunInfo(
         run_id=f"import-{hashlib.sha256(repr(sorted(digests.items())).encode()).hexdigest()[:16]}",
@@ -130,21 +134,15 @@ def import_recording(
         timing=timing,
     )
     content = LogContent.of(cell, run, bundle(path), readback)
-    opened = False
-    try:
-        # A crash of an import loses no sample, so no clock is needed to flush in time.
-        with LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0, remedy=NOTHING_KEPT) as log:
-            opened = True
-            time_ns = (started_ns + np.rint(np.arange(len(counts)) * (1e9 / rate_hz)).astype(np.int64)).tolist()
-            silent = (0,) * len(cell.axes)
-            for cycle, row in enumerate(zip(time_ns, counts.tolist(), raw.tolist(), strict=True)):
-                log.readings(_readings(slow, cycle, row[0]))
-                log.write(Sample(cycle, row[0], tuple(row[1]), tuple(row[2]), silent))
-            log.conclude(valid=True)
-    except BaseException:
-        if opened:
-            log.part.unlink(missing_ok=True)
-        raise
+    # A crash of an import loses no sample, so no clock is needed to flush in time.
+    with LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False) as log:
+        stamp_ns = (started_ns + np.rint(np.arange(len(counts)) * (1e9 / rate_hz)).astype(np.int64)).tolist()
+        silent = (0,) * len(cell.axes)
+        rows = zip(stamp_ns, counts.tolist(), raw.tolist(), strict=True)
+        for cycle, (time_ns, position_counts, current_raw) in enumerate(rows):
+            log.readings(_readings(slow, cycle, time_ns))
+            log.write(Sample(cycle, time_ns, tuple(position_counts), tuple(current_raw), silent))
+        log.conclude(valid=True)
     return Imported(log.statistics, timing, tuple(remark for file in files.values() for remark in file.remarks))
 
 
@@ -172,19 +170,10 @@ def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
     return tables
 
 
-def _clock(wanted: ImportDescription, files: dict[str, Table]) -> Clock | None:
-    """Return the clock of the time column, None without one."""
-    if wanted.time is None:
-        return None
-    return clock_of(files[wanted.time.file], wanted.time, np.hstack([file.values for file in files.values()]))
-
-
 def _slow(
-    wanted: ImportDescription, cell: Cell, files: dict[str, Table], clock: Clock | None
+    wanted: ImportDescription, cell: Cell, files: dict[str, Table], clock: Clock | None, rate_hz: float
 ) -> list[tuple[Quantity, int, FloatArray]]:
     """Return torques of the motors [Nm] and temperatures [°C] at every sample, each with its period in samples."""
-    rate_hz = wanted.rate_hz if clock is None else clock.timing.rate_hz
-    assert rate_hz is not None
     found = []
     if (torque := wanted.torque) is not None:
         factors = np.array(torque.factors(cell.axis_names))
@@ -248,10 +237,8 @@ def _counts(
             return position.astype(np.int64), None
         turn = np.array([axis.counts_per_revolution for axis in cell.axes], dtype=np.float64)
         position = unwrapped(position.astype(np.int32)) * (2.0 * pi / turn)
-    elif wanted.position.unit in {PositionUnit.DEG, PositionUnit.MM}:
-        # On the joint side a prismatic axis is in mm; on the motor side everything is an angle.
-        units = [axis.unit.si if wanted.position.side is Side.JOINT else pi / 180.0 for axis in cell.axes]
-        position = position * np.array(units)
+    else:
+        position = in_si(position, wanted.position, cell)
     if wanted.position.side is Side.JOINT:
         # Zero is that of the controller; `zero_offset_deg` leads from there to the URDF's.
         position = position @ cell.ratio.T

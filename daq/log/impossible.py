@@ -6,7 +6,7 @@ damaged current is an outlier. Each function returns what it found, with the axi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,6 +39,10 @@ class Impossible:
     row: int  #: index of the sample
     found: str
     expected: str
+
+    def error(self, kind: type[DataError], subject: str, remedy: str) -> DataError:
+        """Make the error for it."""
+        return kind(subject, found=self.found, expected=self.expected, remedy=remedy)
 
 
 def impossible_current(current: FloatArray) -> Impossible | None:
@@ -137,7 +141,7 @@ def fastest_speeds(joint_rad: FloatArray, rate_hz: float) -> FloatArray:
     speeds = np.abs(joint_rad[step:] - joint_rad[:-step]) * rate_hz / step
     if not len(speeds):
         return np.zeros(joint_rad.shape[1])
-    return np.asarray(np.percentile(speeds, SPEED_PERCENTILE, axis=0), dtype=np.float64)
+    return np.percentile(speeds, SPEED_PERCENTILE, axis=0)
 
 
 def between_answers(joint_rad: FloatArray, answered: BoolArray) -> FloatArray:
@@ -180,28 +184,21 @@ def motion_fault(
         answered: whether every motor that moves the joint answered, shape (k, n).
     """
     known_rad = between_answers(position_rad, answered)
-    found = impossible_step(known_rad, rate_hz, cell)
-    if found is not None:
-        return PositionImplausible(
-            f"{name}, axis {cell.axes[found.axis].name}",
-            found=f"{found.found}, at {found.row / rate_hz:.6g} s",
-            expected=found.expected,
-            remedy=_GLITCH,
-        )
-    found = impossible_speed(known_rad, rate_hz, cell)
-    if found is not None:
-        return PositionImplausible(
-            f"{name}, axis {cell.axes[found.axis].name}",
-            found=found.found,
-            expected=found.expected,
-            remedy="check `drive_train.ratio`, `counts_per_revolution` and the velocity limit in the cell file",
-        )
-    found = impossible_current(current)
-    if found is not None:
-        return CurrentImplausible(
-            f"{name}, axis {cell.axes[found.axis].name}",
-            found=f"a current of {found.found}, at {found.row / rate_hz:.6g} s",
-            expected=found.expected,
-            remedy="record again, and check the object that the drive sends as its current",
-        )
+    step = impossible_step(known_rad, rate_hz, cell)
+    if step is not None:
+        found = replace(step, found=f"{step.found}, at {step.row / rate_hz:.6g} s")
+        return found.error(PositionImplausible, _axis_of(step, name, cell), _GLITCH)
+    speed = impossible_speed(known_rad, rate_hz, cell)
+    if speed is not None:
+        remedy = "check `drive_train.ratio`, `counts_per_revolution` and the velocity limit in the cell file"
+        return speed.error(PositionImplausible, _axis_of(speed, name, cell), remedy)
+    outlier = impossible_current(current)
+    if outlier is not None:
+        found = replace(outlier, found=f"a current of {outlier.found}, at {outlier.row / rate_hz:.6g} s")
+        remedy = "record again, and check the object that the drive sends as its current"
+        return found.error(CurrentImplausible, _axis_of(outlier, name, cell), remedy)
     return None
+
+
+def _axis_of(found: Impossible, name: str, cell: Cell) -> str:
+    return f"{name}, axis {cell.axes[found.axis].name}"

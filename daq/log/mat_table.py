@@ -24,7 +24,17 @@ from numpy.typing import NDArray
 from daq.config.import_description import Column, ImportDescription, TimeColumn, TimeUnit
 from daq.errors import TableUnfit
 from daq.files import read_regular
-from daq.log.table import Stamps, Table, check_reach, digest_of, require_finite, stamps_of_ns, stamps_of_numbers
+from daq.log.table import (
+    Stamps,
+    Table,
+    check_reach,
+    digest_of,
+    repeated,
+    require_finite,
+    stamps_of_ns,
+    stamps_of_numbers,
+    unreadable,
+)
 
 MAGIC = b"MATLAB 5.0 MAT-file"
 LARGEST_BYTES = 2**31 - 1  #: Largest file and variable; the format has no larger ones
@@ -70,14 +80,10 @@ def read_mat(path: Path, _wanted: ImportDescription, columns: tuple[Column, ...]
         )
     begun = [numbers.ctypes.data for numbers in found]  # they are views of what was read
     if twice := [name for index, name in enumerate(names) if begun[index] in begun[:index]]:
-        raise TableUnfit(
-            str(path),
-            found=f"column {twice[0]} a second time, under another name",
-            expected="a column of its own for each quantity of each axis",
-            remedy="correct `columns` in the import description",
-        )
+        raise repeated(path, twice[0], "under another name")
     values = require_finite(Table(path, names, np.column_stack([one.astype(np.float64) for one in found]), "")).values
-    values, clock = values[:, : len(columns)], None if time is None else _stamps(path, found[-1], time)
+    values = values[:, : len(columns)]
+    clock = None if time is None else _stamps(path, found[-1], time)
     return Table(path, columns, values, digest_of(values, clock), clock)
 
 
@@ -99,12 +105,7 @@ def _content(path: Path) -> memoryview:
     try:
         content = read_regular(path, LARGEST_BYTES)
     except OSError as error:
-        raise TableUnfit(
-            str(path),
-            found=(error.strerror or type(error).__name__).lower(),
-            expected="a MATLAB file (.mat) of at most 2 GB",
-            remedy="check --data and the file name in the import description",
-        ) from error
+        raise unreadable(path, error, "a MATLAB file (.mat) of at most 2 GB") from error
     if content.startswith(MAGIC) and content[126:128] in (b"IM", b"MI"):
         return memoryview(content)
     newer = b"\x89HDF\r\n" in content[: 512 + 8]

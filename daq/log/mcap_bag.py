@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Header, McapRecord, Message, Schema
 
 from daq.errors import LogForeign, LogTruncated, LogUnreadable
-from daq.log.container import LARGEST_RATIO, RecordFile
+from daq.log.container import HEAD_BYTES, LARGEST_RATIO, PlacedRecord, RecordFile
 from daq.log.message import JOINTS_SCHEMA, SAMPLES_TOPIC
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -63,7 +63,7 @@ class McapBag(RecordFile):
         with closing(self.unfinished()) as records:
             yield from self._messages(records)
 
-    def _messages(self, records: Iterable[tuple[int, McapRecord]]) -> Iterator[BagMessage]:
+    def _messages(self, records: Iterable[PlacedRecord]) -> Iterator[BagMessage]:
         for offset, outer in records:
             inside = self._inside(offset, outer) if isinstance(outer, Chunk) else (outer,)
             for record in inside:
@@ -83,17 +83,11 @@ class McapBag(RecordFile):
 
     def _inside(self, offset: int, chunk: Chunk) -> Iterator[McapRecord]:
         data = self.unpack(offset, chunk)
-        at = 0
-        while at < len(data):
-            self.spend(offset)
-            opcode, length = struct.unpack_from("<BQ", data, at) if len(data) - at >= 9 else (0, len(data))
-            at += 9 + length
-            if at > len(data):
-                raise self.corrupt(offset, "a record beyond the end of its chunk", "one inside")
-            for _, record in self._record(offset, opcode, data[at - length : at]):
+        for opcode, start, end in self.records_inside(offset, data):
+            for _, record in self._record(offset, opcode, data[start + HEAD_BYTES : end]):
                 yield record
 
-    def _record(self, offset: int, opcode: int, body: bytes) -> Iterator[tuple[int, McapRecord]]:
+    def _record(self, offset: int, opcode: int, body: bytes) -> Iterator[PlacedRecord]:
         if opcode != Opcode.MESSAGE:
             yield from super()._record(offset, opcode, body)
         elif len(body) < 22:

@@ -13,6 +13,7 @@ import struct
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.messages import CellEvent, EventKind, Quantity, Sample, SlowReading
 
@@ -24,6 +25,7 @@ URDF_TOPIC, URDF_SCHEMA = "/robot_description", "std_msgs/msg/String"
 READING_TOPICS = {Quantity.TORQUE: "/cell/torque", Quantity.TEMPERATURE: "/cell/temperature"}
 """Topics of the slow readings; a log without such readings has no such topic."""
 READING_SCHEMA = "drivegain_msgs/msg/AxisReading"
+RawArray = NDArray[np.int32]  #: Counts and currents as amplifiers send them
 LARGEST_AXES = 32  #: Number of bits in `missing`
 
 _SEPARATOR = "=" * 80 + "\n"
@@ -103,12 +105,10 @@ def sample_bytes(layout: struct.Struct, sample: Sample) -> bytes:
         struct.error: a value does not fit its type, or the number of axes the layout.
     """
     axes = len(sample.position_counts)
-    seconds, nanoseconds = divmod(sample.time_ns, 1_000_000_000)
     return layout.pack(
         _ENCAPSULATION,
         sample.cycle,
-        seconds,
-        nanoseconds,
+        *divmod(sample.time_ns, 1_000_000_000),
         axes,
         *sample.position_counts,
         axes,
@@ -151,9 +151,8 @@ ENCAPSULATION_WORD = int.from_bytes(_ENCAPSULATION, "little")
 
 def event_bytes(event: CellEvent) -> bytes:
     """Encode one event."""
-    seconds, nanoseconds = divmod(event.time_ns, 1_000_000_000)
     axis = WHOLE_CELL if event.axis is None else event.axis
-    head = _EVENT.pack(_ENCAPSULATION, seconds, nanoseconds, axis)
+    head = _EVENT.pack(_ENCAPSULATION, *divmod(event.time_ns, 1_000_000_000), axis)
     kind = _string(event.kind.value)
     return head + kind + b"\0" * (-len(kind) % 4) + struct.pack("<I", event.code) + _string(event.text)
 
@@ -171,16 +170,13 @@ def event_from_bytes(data: bytes) -> CellEvent:
     end += -end % 4
     (code,) = struct.unpack_from("<I", data, end)
     text, _ = _string_from(data, end + 4)
-    if seconds < 0 or nanoseconds >= 1_000_000_000:
-        raise ValueError(f"time {seconds} s, {nanoseconds} ns")
-    time_ns = seconds * 1_000_000_000 + nanoseconds
+    time_ns = _time_ns(seconds, nanoseconds)
     return CellEvent(time_ns, None if axis == WHOLE_CELL else axis, EventKind(kind), code, text)
 
 
 def reading_bytes(reading: SlowReading) -> bytes:
     """Encode one slow reading; the topic names its quantity."""
-    seconds, nanoseconds = divmod(reading.time_ns, 1_000_000_000)
-    return _READING.pack(_ENCAPSULATION, seconds, nanoseconds, reading.axis, reading.value)
+    return _READING.pack(_ENCAPSULATION, *divmod(reading.time_ns, 1_000_000_000), reading.axis, reading.value)
 
 
 def reading_from_bytes(data: bytes, quantity: Quantity) -> SlowReading:
@@ -192,11 +188,16 @@ def reading_from_bytes(data: bytes, quantity: Quantity) -> SlowReading:
     head, seconds, nanoseconds, axis, value = _READING.unpack(data)
     if head != _ENCAPSULATION:
         raise ValueError(f"encapsulation {head!r}, expected little-endian CDR")
-    if seconds < 0 or nanoseconds >= 1_000_000_000:
-        raise ValueError(f"time {seconds} s, {nanoseconds} ns")
+    time_ns = _time_ns(seconds, nanoseconds)
     if not 0 <= axis < LARGEST_AXES or not math.isfinite(value):
         raise ValueError(f"a value of {value} for axis {axis}")
-    return SlowReading(seconds * 1_000_000_000 + nanoseconds, axis, quantity, value)
+    return SlowReading(time_ns, axis, quantity, value)
+
+
+def _time_ns(seconds: int, nanoseconds: int) -> int:
+    if seconds < 0 or nanoseconds >= 1_000_000_000:
+        raise ValueError(f"time {seconds} s, {nanoseconds} ns")
+    return seconds * 1_000_000_000 + nanoseconds
 
 
 def _string(text: str) -> bytes:
@@ -217,10 +218,11 @@ def _string_from(data: bytes, start: int) -> tuple[str, int]:
 
 def joint_state_prefix(names: Sequence[str]) -> bytes:
     """Encode the fields of a JointState between its stamp and its positions: they are the same for every message."""
-    data = bytearray(struct.pack("<I", 1) + b"\0")  # empty frame_id
-    for word in (None, *(name.encode() + b"\0" for name in names)):
-        data += b"\0" * (-len(data) % 4)  # the stamp before it is 8 bytes long, so alignment counts from here too
-        data += struct.pack("<I", len(names) if word is None else len(word)) + (word or b"")
+    # The stamp before them is 8 bytes long, so alignment counts from here too.
+    data = bytearray(_string(""))  # frame_id
+    data += b"\0" * (-len(data) % 4) + struct.pack("<I", len(names))
+    for name in names:
+        data += b"\0" * (-len(data) % 4) + _string(name)
     return bytes(data)
 
 
@@ -236,18 +238,12 @@ def joint_state_bytes(
         velocity: per second, shape (n,).
         effort: [Nm; N of a prismatic joint], shape (n,) or empty.
     """
-    seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
-    data = bytearray(struct.pack("<iI", seconds, nanoseconds) + prefix)
-    for values in (position, velocity, effort):
-        _append_doubles(data, values)
-    return _ENCAPSULATION + bytes(data)
+    return _doubles_bytes(time_ns, prefix, position, velocity, effort)
 
 
 def currents_bytes(time_ns: int, current_a: Sequence[float]) -> bytes:
     """Encode the currents of all axes [A], shape (n,)."""
-    data = bytearray(struct.pack("<iI", *divmod(time_ns, 1_000_000_000)))
-    _append_doubles(data, current_a)
-    return _ENCAPSULATION + bytes(data)
+    return _doubles_bytes(time_ns, b"", current_a)
 
 
 def text_bytes(text: str) -> bytes:
@@ -255,8 +251,11 @@ def text_bytes(text: str) -> bytes:
     return _ENCAPSULATION + _string(text)
 
 
-def _append_doubles(data: bytearray, values: Sequence[float]) -> None:
-    """Append a sequence of float64, aligned; an empty one has no element to be aligned."""
-    data += b"\0" * (-len(data) % 4) + struct.pack("<I", len(values))
-    if len(values):
-        data += b"\0" * (-len(data) % 8) + struct.pack(f"<{len(values)}d", *values)
+def _doubles_bytes(time_ns: int, prefix: bytes, *sequences: Sequence[float]) -> bytes:
+    """Encode a stamp, other fields and sequences of float64, aligned; an empty one has no element to be aligned."""
+    data = bytearray(struct.pack("<iI", *divmod(time_ns, 1_000_000_000)) + prefix)
+    for values in sequences:
+        data += b"\0" * (-len(data) % 4) + struct.pack("<I", len(values))
+        if len(values):
+            data += b"\0" * (-len(data) % 8) + struct.pack(f"<{len(values)}d", *values)
+    return _ENCAPSULATION + bytes(data)

@@ -136,15 +136,15 @@ def reports_only_losses(reason: str) -> bool:
 
 def run_record(info: RunInfo) -> dict[str, str]:
     """Encode the metadata `drivegain.run`."""
-    payload = info.payload
+    payload = info.payload or Payload("", "")
     return {
         "version": VERSION,
         "run_id": info.run_id,
         "rate_hz": repr(info.rate_hz),
         "role": info.role.value,
-        "payload": "" if payload is None else payload.name,
-        "mounting": "" if payload is None else payload.mounting,
-        "payload_known": "{}" if payload is None else json.dumps(payload.known, sort_keys=True),
+        "payload": payload.name,
+        "mounting": payload.mounting,
+        "payload_known": json.dumps(payload.known, sort_keys=True),
         "operator": info.operator,
         "software": info.software,
         "started_wall_ns": str(info.started_wall_ns),

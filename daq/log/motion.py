@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.cell import Cell
-from daq.errors import DataError
 from daq.log.conversion import answers, continuous_counts, scaling
 from daq.log.impossible import LARGEST_OUTLIER, SPEED_MARGIN, motion_fault
+from daq.log.message import RawArray
 from daq.log.metadata import Readback, RunStatistics
-from daq.log.reader import LogHead, SampleBlock, SampleChecks, joined
+from daq.log.reader import LogHead, LogReader, SampleBlock, SampleChecks, joined
 from drivers.messages import Sample
 
 
@@ -24,8 +25,8 @@ def motion_reason(
     cell: Cell,
     readback: Readback,
     rate_hz: float,
-    position_counts: NDArray[np.int32],
-    current_raw: NDArray[np.int32],
+    position_counts: RawArray,
+    current_raw: RawArray,
     missing: NDArray[np.uint32],
 ) -> str:
     """Return why no robot moves by the samples of a log, with the axis; empty where one may.
@@ -45,10 +46,8 @@ def motion_reason(
     position_rad = scale.joint_position(continuous_counts(position_counts, readback))
     known = scale.joints_known(answers(missing, len(cell.axes)))
     fault = motion_fault("", cell, rate_hz, position_rad, current_raw * scale.current_per_unit, known)
-    return "" if fault is None else _reason(fault)
-
-
-def _reason(fault: DataError) -> str:
+    if fault is None:
+        return ""
     axis = fault.subject.removeprefix(", ")
     return f"{axis}: {fault.found}"
 
@@ -61,12 +60,13 @@ class MotionWatch:
     """
 
     def __init__(self, cell: Cell, head: LogHead) -> None:
-        """Store what turns counts to positions."""
+        """Store the cell of a log, and what is before its samples."""
+        self._cell = cell
         self._rate_hz = head.run.rate_hz
         self._readback = head.readback
         self._scale = scaling(cell, head.readback)
         self._limits = np.array([axis.limits.velocity for axis in cell.axes])
-        self._last: NDArray[np.int32] | None = None
+        self._last: RawArray | None = None
         self._fastest = 0.0  # in multiples of the velocity limit
         self._peak = np.zeros(len(cell.axes))
         self._usual = np.full(len(cell.axes), np.inf)
@@ -87,39 +87,46 @@ class MotionWatch:
         self._peak = np.maximum(self._peak, size.max(axis=0))
         self._usual = np.minimum(self._usual, np.percentile(size, 99.0, axis=0))
 
-    @property
-    def suspects(self) -> bool:
-        """Whether all samples have to be judged together."""
+    def verdict(
+        self, checks: SampleChecks, statistics: RunStatistics, again: Callable[[], Iterable[SampleBlock]]
+    ) -> tuple[bool, str]:
+        """Return whether the log is valid by its recorder, its cycles and its motion, and why not.
+
+        Args:
+            checks: that took every block.
+            statistics: of its recorder.
+            again: reads the blocks once more, where all samples have to be judged together.
+        """
+        valid, reason = checks.verdict(self._rate_hz, statistics)
         outlier = self._peak > LARGEST_OUTLIER * self._usual
-        return self._fastest > SPEED_MARGIN or bool(outlier.any())
+        if not valid or not (self._fastest > SPEED_MARGIN or outlier.any()):
+            return valid, reason
+        samples = joined(again())
+        found = motion_reason(
+            self._cell, self._readback, self._rate_hz, samples.position_counts, samples.current_raw, samples.missing
+        )
+        return not found, found or reason
 
 
-def log_verdict(
-    cell: Cell,
-    head: LogHead,
-    checks: SampleChecks,
-    statistics: RunStatistics,
-    watch: MotionWatch,
-    again: Callable[[], Iterable[SampleBlock]],
-) -> tuple[bool, str]:
-    """Return whether a log is valid by its recorder, its cycles and its motion, and why not.
+def judge_log(path: Path) -> tuple[LogReader, Cell, tuple[bool, str]]:
+    """Read a whole log in bounded memory.
 
-    Args:
-        cell: of the log.
-        head: of the log.
-        checks: that took every block.
-        statistics: of its recorder.
-        watch: that took every block.
-        again: reads the blocks once more, where the motion is suspect.
+    Returns:
+        its reader, which has read all; the cell in it; whether it is valid, and why not.
+
+    Raises:
+        LogUnreadable: the log cannot be read, or its parts contradict each other.
+        ConfigurationError: the cell in it is inconsistent.
     """
-    valid, reason = checks.verdict(head.run.rate_hz, statistics)
-    if not valid or not watch.suspects:
-        return valid, reason
-    samples = joined(again())
-    found = motion_reason(
-        cell, head.readback, head.run.rate_hz, samples.position_counts, samples.current_raw, samples.missing
-    )
-    return not found, found or reason
+    reader = LogReader(path)
+    watch: MotionWatch | None = None
+    for block in reader:
+        if watch is None:
+            cell = reader.head.cell(path)
+            watch = MotionWatch(cell, reader.head)
+        watch.take(block)
+    assert watch is not None  # the reader refuses a log without samples
+    return reader, cell, watch.verdict(reader.checks, reader.statistics, lambda: LogReader(path))
 
 
 class RecordedMotion:

@@ -12,7 +12,16 @@ from math import pi
 import numpy as np
 
 from daq.config.cell import Cell
-from daq.config.import_description import ImportDescription, ScaledColumns, Side, TemperatureColumns, VelocityUnit
+from daq.config.import_description import (
+    ImportDescription,
+    PositionColumns,
+    PositionUnit,
+    ScaledColumns,
+    Side,
+    TemperatureColumns,
+    VelocityColumns,
+    VelocityUnit,
+)
 from daq.errors import PositionImplausible, TableUnfit
 from daq.log.impossible import fastest_speeds, impossible_current, impossible_speed, impossible_step
 from daq.log.resampling import Clock, on_clock
@@ -93,6 +102,17 @@ def _bits_of_counter(least: float, largest: float, step: float) -> int | None:
     return None
 
 
+def in_si(values: FloatArray, columns: PositionColumns | VelocityColumns, cell: Cell) -> FloatArray:
+    """Convert positions or velocities to rad or m, shape (k, n).
+
+    On the joint side a prismatic axis is in mm where others are in degrees; on the motor side everything is an angle.
+    """
+    if columns.unit not in {PositionUnit.DEG, PositionUnit.MM, VelocityUnit.DEG, VelocityUnit.MM}:
+        return values
+    units = [axis.unit.si if columns.side is Side.JOINT else pi / 180.0 for axis in cell.axes]
+    return values * np.array(units, dtype=np.float64)
+
+
 def check_velocity(
     wanted: ImportDescription,
     cell: Cell,
@@ -104,10 +124,7 @@ def check_velocity(
     """Compare velocity columns with the positions, by the way moved in VELOCITY_WINDOW_S: it needs no derivative."""
     if (velocity := wanted.velocity) is None:
         return
-    stated = on_clock(files[velocity.file].take(velocity.columns), clock)
-    if velocity.unit in {VelocityUnit.DEG, VelocityUnit.MM}:
-        units = [axis.unit.si if velocity.side is Side.JOINT else pi / 180.0 for axis in cell.axes]
-        stated = stated * np.array(units)
+    stated = in_si(on_clock(files[velocity.file].take(velocity.columns), clock), velocity, cell)
     if velocity.side is Side.MOTOR:
         stated = stated @ np.linalg.inv(cell.ratio).T
     step = min(max(1, round(VELOCITY_WINDOW_S * rate_hz)), len(stated) - 1)
@@ -141,24 +158,16 @@ def check_current(current: FloatArray, wanted: ImportDescription, file: Table) -
             )
     found = impossible_current(current)
     if found is not None:
-        raise TableUnfit(
-            file.place(found.row, wanted.current.columns[found.axis]),
-            found=found.found,
-            expected=found.expected,
-            remedy="samples are never invented: cut the recording there, or export it again",
-        )
+        place = file.place(found.row, wanted.current.columns[found.axis])
+        raise found.error(TableUnfit, place, "samples are never invented: cut the recording there, or export it again")
 
 
 def check_speed(name: str, joint_rad: FloatArray, rate_hz: float, cell: Cell) -> None:
     """Refuse implausible speeds. A wrong rate scales them all; over many samples they are far above the noise."""
     found = impossible_speed(joint_rad, rate_hz, cell)
     if found is not None:
-        raise TableUnfit(
-            f"{name}, axis {cell.axes[found.axis].name}",
-            found=found.found,
-            expected=found.expected,
-            remedy="most likely rate_hz is too high, or the unit of the time column or of the positions is another",
-        )
+        remedy = "most likely rate_hz is too high, or the unit of the time column or of the positions is another"
+        raise found.error(TableUnfit, f"{name}, axis {cell.axes[found.axis].name}", remedy)
     limits = np.array([axis.limits.velocity for axis in cell.axes])
     share = float((fastest_speeds(joint_rad, rate_hz) / limits).max())
     if share < SLOW_SHARE:
@@ -191,11 +200,10 @@ def check_steps(
     row = found.row
     if clock is not None:
         row = int(clock.row[min(np.searchsorted(clock.time_s, clock.tick_s[row]), len(clock.row) - 1)])
-    raise TableUnfit(
+    raise found.error(
+        TableUnfit,
         f"{file.place(row, wanted.position.columns[found.axis])}, axis {cell.axes[found.axis].name}",
-        found=found.found,
-        expected=found.expected,
-        remedy="cut the recording there, or export it again; a column that wraps (at 360 degrees, at a turn of "
+        "cut the recording there, or export it again; a column that wraps (at 360 degrees, at a turn of "
         "the motor, as a counter) has to be made continuous",
     )
 

@@ -9,14 +9,16 @@ from enum import Enum
 from pathlib import Path
 
 import numpy as np
-from mcap.records import Attachment, Chunk, Header, McapRecord, Metadata
+from mcap.records import Attachment, Chunk, Header, Metadata
 from numpy.typing import NDArray
 
+from daq.config.cell import Cell
+from daq.config.cell_file import cell_from_bundle
 from daq.config.yaml_file import MAX_BYTES
 from daq.errors import ClockImplausible, CyclesLost, DataError, LogIncomplete, LogMissing, LogUnreadable
-from daq.log.container import UNFINISHED, ChunkContents, RecordFile
+from daq.log.container import UNFINISHED, ChunkContents, PlacedRecord, RecordArray, RecordFile
 from daq.log.mcap_bag import foreign_recording
-from daq.log.message import ENCAPSULATION_WORD, LARGEST_AXES, SAMPLES_TOPIC
+from daq.log.message import ENCAPSULATION_WORD, LARGEST_AXES, SAMPLES_TOPIC, RawArray
 from daq.log.metadata import (
     READBACK,
     RUN,
@@ -31,6 +33,7 @@ from daq.log.metadata import (
     unsealed,
 )
 from drivers.messages import CellEvent, SlowReading
+from ident.arrays import IntArray
 
 BLOCK_SAMPLES = 4096  #: Samples of a block; at most these and one chunk are in memory
 LARGEST_ENTRIES = 1000  #: Attachments and metadata of a log; those of the shipped cells are a dozen
@@ -45,9 +48,9 @@ class SampleBlock:
     """Samples of k cycles, in the order of the log."""
 
     cycle: NDArray[np.uint64]  #: number of the sampling period, shape (k,), uint64
-    time_ns: NDArray[np.int64]  #: time of the SYNC [ns], shape (k,), int64
-    position_counts: NDArray[np.int32]  #: shape (k, n), int32
-    current_raw: NDArray[np.int32]  #: shape (k, n), int32
+    time_ns: IntArray  #: time of the SYNC [ns], shape (k,), int64
+    position_counts: RawArray  #: shape (k, n), int32
+    current_raw: RawArray  #: shape (k, n), int32
     statusword: NDArray[np.uint16]  #: shape (k, n), uint16
     missing: NDArray[np.uint32]  #: bit i for axis i, shape (k,), uint32
 
@@ -59,6 +62,14 @@ class LogHead:
     run: RunInfo  #: facts about the recording
     readback: Readback  #: answers of the amplifiers
     files: Mapping[str, bytes]  #: all attachments by name, with the cell's bundle
+
+    def cell(self, log: Path) -> Cell:
+        """Return the cell of the log, which is named in messages.
+
+        Raises:
+            ConfigurationError: its configuration is inconsistent.
+        """
+        return cell_from_bundle(self.files, names={"cell.yaml": f"{log}, cell.yaml"})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,6 +128,11 @@ class SampleChecks:
         for place in (int(np.argmin(step_ns)), int(np.argmax(step_ns))):
             self._steps.setdefault(int(step_ns[place]), f"cycle {cycle[place + 1]} {{}} after cycle {cycle[place]}")
         self._steps = {step: self._steps[step] for step in (min(self._steps), max(self._steps))}
+
+    @property
+    def span_ns(self) -> int:
+        """Time from the first sample to the last [ns]."""
+        return int(self._last[1][0]) - self._first_ns
 
     def contradiction(
         self, head: LogHead, statistics: RunStatistics, readings: Iterable[SlowReading]
@@ -210,6 +226,8 @@ class LogReader:
         self.damage: LogUnreadable | None = None
         self._file = RecordFile(path)
         self._chunks = ChunkContents(self._file)
+        self.events = self._chunks.events  #: read so far
+        self.readings = self._chunks.readings  #: slow ones, read so far
         self._attachments: dict[str, bytes] = {}
         self._metadata: dict[str, dict[str, str]] = {}
         self.checks = SampleChecks(path)  #: of the samples read so far
@@ -252,16 +270,6 @@ class LogReader:
         return self.checks.contradiction(self.head, self.statistics, self.readings)
 
     @property
-    def events(self) -> list[CellEvent]:
-        """Events read so far."""
-        return self._chunks.events
-
-    @property
-    def readings(self) -> list[SlowReading]:
-        """Slow readings read so far."""
-        return self._chunks.readings
-
-    @property
     def whole_bytes(self) -> int:
         """Size of the undamaged part of the file, after `until_damage`."""
         return self._file.whole_bytes
@@ -271,16 +279,16 @@ class LogReader:
         """Whether the recorder's summary has been read."""
         return STATISTICS in self._metadata
 
-    def _checked(self, records: Iterator[tuple[int, McapRecord]]) -> Iterator[tuple[int, McapRecord]]:
+    def _checked(self, records: Iterator[PlacedRecord]) -> Iterator[PlacedRecord]:
         """Refuse metadata without a seal: only the end of the file would cover them."""
         for offset, record in records:
             if isinstance(record, Metadata) and SEAL not in record.metadata:
                 raise self._file.corrupt(offset, f"metadata {record.name!r} without a seal", f"an entry {SEAL!r}")
             yield offset, record
 
-    def _blocks(self, records: Iterable[tuple[int, McapRecord]]) -> Iterator[SampleBlock]:
+    def _blocks(self, records: Iterable[PlacedRecord]) -> Iterator[SampleBlock]:
         """Join several chunks to a block: numpy's calls cost more than the 150 samples of one chunk."""
-        waiting: list[NDArray[np.void]] = []
+        waiting: list[RecordArray] = []
         start = 0
         try:
             for offset, chunk in self._sample_chunks(records):
@@ -296,7 +304,7 @@ class LogReader:
         if waiting:
             yield self._block(start, waiting)
 
-    def _sample_chunks(self, records: Iterable[tuple[int, McapRecord]]) -> Iterator[tuple[int, NDArray[np.void]]]:
+    def _sample_chunks(self, records: Iterable[PlacedRecord]) -> Iterator[tuple[int, RecordArray]]:
         for offset, record in records:
             if isinstance(record, Attachment | Metadata):
                 self._check_entry(offset, record)
@@ -368,14 +376,12 @@ class LogReader:
         """See `Log.partial`; after the iteration."""
         return self.statistics.partial or self.path.name.endswith(UNFINISHED)
 
-    def _block(self, offset: int, chunks: list[NDArray[np.void]]) -> SampleBlock:
+    def _block(self, offset: int, chunks: list[RecordArray]) -> SampleBlock:
         # Joined as bytes: numpy would convert the fields chunk by chunk.
         records = np.frombuffer(b"".join(chunk.tobytes() for chunk in chunks), dtype=chunks[0].dtype)
         axes = records["position_counts"].shape[1]
-        fixed = [records[name] for name in ("positions", "currents", "statuswords", "encapsulation")]
-        if any(
-            (column != word).any() for column, word in zip(fixed, (axes, axes, axes, ENCAPSULATION_WORD), strict=True)
-        ):
+        lengths = np.stack([records[name] for name in ("positions", "currents", "statuswords")])
+        if (lengths != axes).any() or (records["encapsulation"] != ENCAPSULATION_WORD).any():
             raise self._file.corrupt(offset, "samples of another layout", f"little-endian CDR of {axes} axes")
         if (records["seconds"] < 0).any() or (records["nanoseconds"] >= 1_000_000_000).any():
             raise self._file.corrupt(offset, "samples from before 1970 or of a second that is too long", "Unix time")
@@ -406,9 +412,16 @@ def read_log(path: Path | str) -> Log:
     path = Path(path)
     reader = LogReader(path)
     samples = joined(reader)
-    head, statistics = reader.head, reader.statistics
-    events, readings = tuple(reader.events), tuple(reader.readings)
-    return Log(path, reader.digest, head, samples, events, readings, statistics, reader.partial)
+    return Log(
+        path,
+        reader.digest,
+        reader.head,
+        samples,
+        tuple(reader.events),
+        tuple(reader.readings),
+        reader.statistics,
+        reader.partial,
+    )
 
 
 def joined(blocks: Iterable[SampleBlock]) -> SampleBlock:

@@ -43,7 +43,7 @@ class Clock:
         """Return positions at the ticks, shape (m, n), by a cubic spline through those of the rows, shape (k, n)."""
         if not self.timing.resampled:
             return values
-        return np.asarray(scipy.interpolate.CubicSpline(self.time_s, values)(self.tick_s), dtype=np.float64)
+        return scipy.interpolate.CubicSpline(self.time_s, values)(self.tick_s)
 
     def currents(self, values: FloatArray) -> FloatArray:
         """Return currents at the ticks, shape (m, n), by straight lines between those of the rows, shape (k, n)."""

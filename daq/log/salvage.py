@@ -10,15 +10,14 @@ from itertools import chain
 from pathlib import Path
 
 from daq.config.cell import Cell
-from daq.config.cell_file import cell_from_bundle
 from daq.errors import LogIncomplete, LogUnreadable, UsageError
 from daq.files import open_regular
 from daq.log.container import UNFINISHED
 from daq.log.conversion import scaling
 from daq.log.metadata import RunStatistics
-from daq.log.motion import MotionWatch, log_verdict
+from daq.log.motion import MotionWatch
 from daq.log.reader import LogReader, SampleBlock
-from daq.log.writer import NOTHING_KEPT, LogContent, LogWriter
+from daq.log.writer import LogContent, LogWriter
 from drivers.messages import EventKind, Sample
 
 _HARMLESS = (
@@ -81,18 +80,13 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
             str(damaged), found="no samples", expected="at least one", remedy="record the run again"
         )
     head = reader.head
-    cell = cell_from_bundle(head.files, names={"cell.yaml": f"{damaged}, cell.yaml"})
+    cell = head.cell(damaged)
     scale = scaling(cell, head.readback)
     run = replace(head.run, origin=f"{head.run.origin}; salvaged from {damaged.name}")
     content = LogContent.of(cell, run, head.files, head.readback)
     # A crash loses only this new file, so no clock is needed to flush in time.
-    log = LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0, remedy=NOTHING_KEPT)
-    with log:
-        try:
-            _copy(reader, chain((first,), blocks), log, cell, progress)
-        except BaseException:
-            log.part.unlink(missing_ok=True)  # half of what was saved is of no use
-            raise
+    with LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False) as log:
+        _copy(reader, chain((first,), blocks), log, cell, progress)
     size = damaged.stat().st_size
     damage = "" if reader.damage is None else f"{reader.damage.subject}: {reader.damage.found}"
     left_out = 0 if reader.damage is None else size - reader.whole_bytes
@@ -105,36 +99,26 @@ def _copy(
     known_events = known_readings = 0
     axes = len(cell.axes)
     watch = MotionWatch(cell, reader.head)
-    for block in blocks:
-        width = block.position_counts.shape[1]
-        if width != axes:
-            raise LogIncomplete(
-                str(reader.path),
-                found=f"samples of {width} axes",
-                expected=f"{axes}, as in its cell configuration",
-                remedy="it is not a recording of this software",
-            )
-        watch.take(block)
+    for block in chain(blocks, (None,)):  # events and readings may follow the last samples
         for event in reader.events[known_events:]:
             log.event(event)
         known_events = len(reader.events)
         fresh = reader.readings[known_readings:]
         if foreign := {reading.axis for reading in fresh if reading.axis >= axes}:
-            raise LogIncomplete(
-                str(reader.path),
-                found=f"a torque or temperature of axis {max(foreign)}, counted from 0",
-                expected=f"those of {axes} axes, as in its cell configuration",
-                remedy="it is not a recording of this software",
-            )
+            surplus = f"a torque or temperature of axis {max(foreign)}, counted from 0"
+            raise _foreign(reader.path, surplus, f"those of {axes} axes")
         log.readings(fresh)
         known_readings = len(reader.readings)
+        if block is None:
+            break
+        width = block.position_counts.shape[1]
+        if width != axes:
+            raise _foreign(reader.path, f"samples of {width} axes", f"{axes}")
+        watch.take(block)
         columns = (getattr(block, name).tolist() for name in SampleBlock.__slots__)
         for cycle, time_ns, position, current, statusword, missing in zip(*columns, strict=True):
             log.write(Sample(cycle, time_ns, tuple(position), tuple(current), tuple(statusword), missing))
         progress(log.statistics.samples)
-    for event in reader.events[known_events:]:
-        log.event(event)
-    log.readings(reader.readings[known_readings:])
     if reader.concluded:
         contradiction = reader.contradiction
         found = [] if contradiction is None else [f"{contradiction.found}; expected {contradiction.expected}"]
@@ -145,10 +129,17 @@ def _copy(
         found += [f"{sum(counted.missing)} missing answers"] if any(counted.missing) else []
         found += [f"{event.kind.value} ({event.text})" for event in reader.events if event.kind not in _HARMLESS][:3]
     judged = RunStatistics(0, 0, (), valid=not found, reason=", ".join(found))
-    verdict = log_verdict(
-        cell, reader.head, reader.checks, judged, watch, lambda: LogReader(reader.path).until_damage()
-    )
+    verdict = watch.verdict(reader.checks, judged, lambda: LogReader(reader.path).until_damage())
     log.conclude(*verdict, partial=True)
+
+
+def _foreign(path: Path, found: str, expected: str) -> LogIncomplete:
+    return LogIncomplete(
+        str(path),
+        found=found,
+        expected=f"{expected}, as in its cell configuration",
+        remedy="it is not a recording of this software",
+    )
 
 
 def _refuse_running(damaged: Path) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from daq.config.import_description import Column, ImportDescription, TimeColumn, TimeUnit
-from daq.errors import TableUnfit
+from daq.errors import TableUnfit, reason_of
 from ident.arrays import FloatArray
 
 LATEST_NS = 9 * 10**18  #: The latest stamp that a log holds, roughly
@@ -84,6 +84,26 @@ def stamps_of_ns(stamp_ns: Sequence[int]) -> Stamps:
     """Make stamps of whole nanoseconds, exactly."""
     first = stamp_ns[0]
     return Stamps(np.array([stamp - first for stamp in stamp_ns], dtype=np.float64) * 1e-9, first)
+
+
+def unreadable(path: Path, error: OSError, expected: str) -> TableUnfit:
+    """Make the error for a file that the file system refuses."""
+    return TableUnfit(
+        str(path),
+        found=reason_of(error),
+        expected=expected,
+        remedy="check --data and the file name in the import description",
+    )
+
+
+def repeated(path: Path, column: Column, names: str) -> TableUnfit:
+    """Make the error for a column that is named twice."""
+    return TableUnfit(
+        str(path),
+        found=f"column {column} a second time, {names}",
+        expected="a column of its own for each quantity of each axis",
+        remedy="correct `columns` in the import description",
+    )
 
 
 def require_finite(table: Table) -> Table:

@@ -15,7 +15,7 @@ from types import TracebackType
 from mcap.writer import CompressionType, Writer
 
 from daq.config.cell import Cell, joint_names
-from daq.errors import OutputFailed, UsageError
+from daq.errors import OutputFailed, UsageError, reason_of
 from daq.files import fsync_folder, is_taken
 from daq.log.container import UNFINISHED
 from daq.log.message import (
@@ -48,14 +48,13 @@ from daq.log.metadata import (
     sealed,
     statistics_record,
 )
-from drivers.messages import CellEvent, Quantity, Sample, SlowReading
+from drivers.messages import CellEvent, Sample, SlowReading
 
 FLUSH_NS = 150_000_000
 """Time between two flushes, recorded or wall time, whichever ends first [ns]. A kill may cost 200 ms: the rest is
 for the cycle on the bus and the chunk that is being packed."""
 JOINT_STATE_NS = 20_000_000  #: Time between two joint states, over which their velocity is the mean
 CHUNK_BYTES = 4 * 2**20  #: Never reached between two flushes; a chunk ends with one
-NOTHING_KEPT = "nothing was written; free space or rights, or choose another folder"
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +77,7 @@ class LogWriter:
     """Context manager that writes one log.
 
     The log is `PATH.part` until the block ends without an error; then it is finished, synced and renamed. After an
-    error the `.part` keeps everything up to that moment.
+    error the `.part` keeps everything up to that moment, or is removed if the log can be made again.
 
     Raises (on entry and later):
         UsageError: the log, or a `.part` of the same name, already exists. At the end: a file of that name has
@@ -92,7 +91,8 @@ class LogWriter:
         content: LogContent,
         joint_position: Callable[[tuple[int, ...]], Sequence[float]],
         clock_ns: Callable[[], int],
-        remedy: str = "",
+        *,
+        keeps_part: bool = True,
     ) -> None:
         """Store the arguments.
 
@@ -101,19 +101,19 @@ class LogWriter:
             content: start of the log.
             joint_position: converts motor counts to joint positions [rad or m], for /joint_states.
             clock_ns: monotonic clock, for the flush by wall time.
-            remedy: advice if the file system refuses, instead of that of a recording.
+            keeps_part: whether an error leaves the `.part`.
         """
         self.path = path
         self.part = path.with_name(path.name + UNFINISHED)
         self._content = content
         self._joint_position = joint_position
         self._clock_ns = clock_ns
-        self._remedy = remedy
+        self._keeps_part = keeps_part
         self._axes = len(content.readback.axes)
         self._layout = sample_struct(self._axes)
         self._prefix = joint_state_prefix(content.joint_names)
         self._held: list[tuple[int, int, bytes]] = []
-        self._reading_channels: dict[Quantity, int] = {}
+        self._channels: dict[str, int] = {}  # by topic
         self._samples = 0
         self._lost = 0
         self._missing = [0] * self._axes
@@ -179,9 +179,8 @@ class LogWriter:
             self.flush()
             self._flushed_recorded_ns, self._flushed_wall_ns = sample.time_ns, wall_ns
         try:
-            self._mcap.add_message(
-                self._samples_channel, sample.time_ns, data, sample.time_ns, sample.cycle & 0xFFFFFFFF
-            )
+            channel = self._channel(SAMPLES_TOPIC)
+            self._mcap.add_message(channel, sample.time_ns, data, sample.time_ns, sample.cycle & 0xFFFFFFFF)
         except OSError as error:
             raise self._failed(error) from error
         if sample.time_ns >= self._joint_state_due_ns:
@@ -196,20 +195,16 @@ class LogWriter:
         velocity = [(now - then) / elapsed_s for now, then in zip(position, before, strict=True)]
         self._joint_state_before = time_ns, position
         current = [raw * unit for raw, unit in zip(sample.current_raw, self._ampere_per_unit, strict=True)]
-        self._held.append((self._joints_channel, time_ns, joint_state_bytes(self._prefix, time_ns, position, velocity)))
-        self._held.append((self._currents_channel, time_ns, currents_bytes(time_ns, current)))
+        self._hold(JOINTS_TOPIC, time_ns, joint_state_bytes(self._prefix, time_ns, position, velocity))
+        self._hold(CURRENTS_TOPIC, time_ns, currents_bytes(time_ns, current))
 
     def event(self, event: CellEvent) -> None:
         """Append one event."""
-        self._held.append((self._events_channel, event.time_ns, event_bytes(event)))
+        self._hold(EVENTS_TOPIC, event.time_ns, event_bytes(event))
 
     def reading(self, reading: SlowReading) -> None:
         """Append one slow reading."""
-        channel = self._reading_channels.get(reading.quantity)
-        if channel is None:
-            channel = self._channel(READING_TOPICS[reading.quantity])
-            self._reading_channels[reading.quantity] = channel
-        self._held.append((channel, reading.time_ns, reading_bytes(reading)))
+        self._hold(READING_TOPICS[reading.quantity], reading.time_ns, reading_bytes(reading))
 
     def readings(self, readings: Iterable[SlowReading]) -> None:
         """Append several slow readings."""
@@ -267,6 +262,9 @@ class LogWriter:
                 error.add_note(f"the log keeps less than it could: {failure}")
                 return
             raise (failure if isinstance(failure, OutputFailed) else self._failed(failure)) from failure
+        finally:
+            if not self._keeps_part:
+                self.part.unlink(missing_ok=True)  # after a success it has the name of the log
 
     def _take_name(self) -> None:
         """Rename the finished log without replacing a file that has appeared meanwhile."""
@@ -275,6 +273,7 @@ class LogWriter:
         except OSError as error:
             # Without an existing file it is a file system without hard links.
             if isinstance(error, FileExistsError) or self.path.exists():
+                self._keeps_part = True
                 raise UsageError(
                     str(self.path),
                     found="a file of that name, which was not there when the recording began",
@@ -300,19 +299,23 @@ class LogWriter:
         for name, data in {**self._content.files, READBACK: readback_bytes(self._content.readback)}.items():
             self._mcap.add_attachment(started_ns, started_ns, name, "application/octet-stream", data)
         self._mcap.add_metadata(RUN, sealed(run_record(self._content.run)))
-        self._samples_channel = self._channel(SAMPLES_TOPIC)
-        self._events_channel = self._channel(EVENTS_TOPIC)
-        self._joints_channel = self._channel(JOINTS_TOPIC)
-        self._currents_channel = self._channel(CURRENTS_TOPIC)
+        for topic in (SAMPLES_TOPIC, EVENTS_TOPIC, JOINTS_TOPIC, CURRENTS_TOPIC):  # also those without a message
+            self._channel(topic)
         if self._content.urdf:
-            urdf = self._channel(URDF_TOPIC)
-            self._held.append((urdf, started_ns, text_bytes(self._content.urdf)))
+            self._hold(URDF_TOPIC, started_ns, text_bytes(self._content.urdf))
         self._mcap.flush()
 
     def _channel(self, topic: str) -> int:
-        schema = SCHEMA_OF[topic]
-        identifier = self._mcap.register_schema(schema, "ros2msg", DEFINITIONS[schema].encode())
-        return self._mcap.register_channel(topic, "cdr", identifier)
+        """Return the channel of a topic, which is new at its first message."""
+        if topic not in self._channels:
+            schema = SCHEMA_OF[topic]
+            identifier = self._mcap.register_schema(schema, "ros2msg", DEFINITIONS[schema].encode())
+            self._channels[topic] = self._mcap.register_channel(topic, "cdr", identifier)
+        return self._channels[topic]
+
+    def _hold(self, topic: str, time_ns: int, data: bytes) -> None:
+        """Keep a message for the chunk behind the samples."""
+        self._held.append((self._channel(topic), time_ns, data))
 
     def _count(self, sample: Sample) -> None:
         self._samples += 1
@@ -324,11 +327,12 @@ class LogWriter:
                 self._missing[axis] += sample.missing >> axis & 1
 
     def _failed(self, error: OSError) -> OutputFailed:
+        remedy = "nothing was written; free space or rights, or choose another folder"
+        if self._keeps_part:
+            remedy = (
+                "what was recorded until then stays in that file, which no fit reads (`drivegain salvage` saves it); "
+                "free space and record again"
+            )
         return OutputFailed(
-            str(self.part),
-            found=(error.strerror or type(error).__name__).lower(),
-            expected="a folder that can be written, with room",
-            remedy=self._remedy
-            or "what was recorded until then stays in that file, which no fit reads (`drivegain salvage` saves "
-            "it); free space and record again",
+            str(self.part), found=reason_of(error), expected="a folder that can be written, with room", remedy=remedy
         )

@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Any
 from rich.text import Text
 
 from daq.config.cell_buses import bus_loads
-from daq.config.cell_file import cell_from_bundle
-from daq.log.motion import MotionWatch, log_verdict
-from daq.log.reader import LogReader
+from daq.log.motion import judge_log
 from daq.report.bus_views import current_signals
 from daq.report.document import Figure, Report
 from daq.report.text import entry_lines, printable
@@ -222,20 +220,11 @@ def info_report(path: Path) -> InfoReport:
         LogUnreadable: the log cannot be read, or its parts contradict each other.
         ConfigurationError: the cell in it is inconsistent.
     """
-    reader = LogReader(path)
-    first_ns = last_ns = 0
-    watch: MotionWatch | None = None
-    for block in reader:
-        if watch is None:
-            first_ns = int(block.time_ns[0])
-            cell = cell_from_bundle(reader.head.files, names={"cell.yaml": f"{path}, cell.yaml"})
-            watch = MotionWatch(cell, reader.head)
-        watch.take(block)
-        last_ns = int(block.time_ns[-1])
-    assert watch is not None  # the reader refuses a log without samples
-    head, statistics = reader.head, reader.statistics
-    run, samples = head.run, reader.checks.samples
-    valid, reason = log_verdict(cell, head, reader.checks, statistics, watch, lambda: LogReader(path))
+    reader, cell, (valid, reason) = judge_log(path)
+    head = reader.head
+    statistics = reader.statistics
+    run = head.run
+    samples = reader.checks.samples
     clock_step_s = None  # how far the wall clock was set during the run; it may not have been read at the end
     if statistics.wall_minus_monotonic_ns is not None:
         clock_step_s = (statistics.wall_minus_monotonic_ns - run.wall_minus_monotonic_ns) * 1e-9
@@ -250,7 +239,7 @@ def info_report(path: Path) -> InfoReport:
         current=current_signals(cell),
         samples=samples,
         duration_s=samples / run.rate_hz,
-        stamped_duration_s=(last_ns - first_ns) * 1e-9,
+        stamped_duration_s=reader.checks.span_ns * 1e-9,
         moves=sum(event.kind is EventKind.MOVE_START for event in reader.events),
         slow_readings=Counter(reading.quantity.value for reading in reader.readings),
         missing=dict(zip(cell.axis_names, statistics.missing, strict=True)),

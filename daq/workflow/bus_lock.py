@@ -25,7 +25,6 @@ from drivers.canopen.bus import BusAddress
 AnyBus = Bus | BusAddress  #: A bus of a cell file, or by its address
 SHARED_FOLDERS = (Path("/run/lock"), Path("/var/lock"), Path("/tmp"))
 """Tried in this order; all users of a computer must come to the same one, so TMPDIR is not asked."""
-VIRTUAL = "virtual"  #: python-can's bus within one process: a bus of that name in another process is another bus
 
 
 @contextmanager
@@ -72,14 +71,10 @@ def taken_of(
         lines = [line for line in locks.read_text().splitlines() if " FLOCK " in line]
         held = {int(line.split()[-3].rpartition(":")[2]) for line in lines}
         where = folder or _shared_folder()
-        return tuple(bus for bus in buses if _inode(where / lock_name(bus)) in held)
+        files = {bus: where / lock_name(bus) for bus in buses}
+        return tuple(bus for bus, file in files.items() if file.exists() and file.stat().st_ino in held)
     except (OSError, ValueError, IndexError):
         return ()
-
-
-def _inode(file: Path) -> int | None:
-    """Return the inode of a lock file; None where there is none."""
-    return file.stat().st_ino if file.exists() else None
 
 
 def require_untaken(buses: Iterable[AnyBus], folder: Path | None = None) -> None:
@@ -100,9 +95,9 @@ def require_untaken(buses: Iterable[AnyBus], folder: Path | None = None) -> None
 def lock_name(bus: AnyBus) -> str:
     """Name of a bus's lock file: by interface and channel, for a hub by its host's address and port."""
     parts = [bus.interface, bus.channel]
-    if bus.interface == "socketcand":
+    if bus.kind.has_server:
         parts += [_address(bus), str(bus.port)]
-    elif bus.interface == VIRTUAL:
+    elif bus.kind.is_of_process:
         parts.append(str(os.getpid()))
     return "drivegain-" + "-".join(re.sub(r"[^A-Za-z0-9.]", "_", part) for part in parts) + ".lock"
 

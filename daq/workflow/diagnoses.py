@@ -39,8 +39,8 @@ from ident.arrays import FloatArray
 from ident.data.run import Run
 from ident.discovery.evidence import Evidence, coefficients_of
 from ident.discovery.geometry_check import GeometryCheck, check_geometry
-from ident.effects.effect import PlacedEffect
-from ident.effects.geometry_corrections import LatePosition, ZeroOffset, is_correction, turned_gravity
+from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.geometry_corrections import GravityDirection, LatePosition, ZeroOffset, is_correction, turned_gravity
 from ident.equations.instants import Instants, read_instants
 from ident.equations.system import System
 from ident.errors import (
@@ -322,37 +322,40 @@ def drift_diagnosis(drift: GeometryDrift, model: Model, axes: Sequence[str], run
     """
     placed = drift.placed
     name = axes[placed.axis]
-    share = f"it explains {100.0 * drift.share:.0f} % of what the error is larger than in the fit"
     match placed.effect:
         case ZeroOffset():
             offset = _offset_text(placed.axis, drift.values, drift.deviations, model)
-            return Diagnosis(
-                name="zero-off",
-                runs=tuple(runs),
-                axes=(name,),
-                found=f"the zero of {name} off by {offset} since the calibration; {share}",
-                expected="the zero of the calibration",
-                remedy="reference the axis again, or calibrate anew",
-            )
+            found = f"the zero of {name} off by {offset} since the calibration"
+            expected = "the zero of the calibration"
+            remedy = "reference the axis again, or calibrate anew"
         case LatePosition():
             size = f"{1e3 * drift.values[0]:+.2f} ± {1e3 * drift.deviations[0]:.2f} ms"
-            return Diagnosis(
-                name="position-late",
-                runs=tuple(runs),
-                axes=(name,),
-                found=f"the position of {name} late by {size} more than in the calibration; {share}",
-                expected="positions and currents of one moment",
-                remedy="look for what delays this encoder alone",
-            )
+            found = f"the position of {name} late by {size} more than in the calibration"
+            expected = ONE_MOMENT
+            remedy = "look for what delays this encoder alone"
         case _:
-            return Diagnosis(
-                name="gravity-tilted",
-                runs=tuple(runs),
-                axes=(),
-                found=f"gravity turned by {_turn_text(drift.values, drift.deviations)} since the calibration; {share}",
-                expected="the mounting of the calibration",
-                remedy="level the base as it was, or correct `gravity_m_s2` in the cell file and calibrate anew",
-            )
+            found = f"gravity turned by {_turn_text(drift.values, drift.deviations)} since the calibration"
+            expected = "the mounting of the calibration"
+            remedy = "level the base as it was, or correct `gravity_m_s2` in the cell file and calibrate anew"
+    found += f"; it explains {100.0 * drift.share:.0f} % of what the error is larger than in the fit"
+    return _diagnosis_of(placed, name, runs, found, expected, remedy)
+
+
+ONE_MOMENT = "positions and currents of one moment"  #: Expected of the positions of every axis
+CORRECTED_BY: dict[type[Effect], str] = {
+    ZeroOffset: "zero-off",
+    LatePosition: "position-late",
+    GravityDirection: "gravity-tilted",
+}
+"""Diagnosis of a wrong description, by the effect that corrects it."""
+
+
+def _diagnosis_of(
+    placed: PlacedEffect, name: str, runs: Sequence[str], found: str, expected: str, remedy: str
+) -> Diagnosis:
+    """Diagnosis of a wrong description, by the correction that it needs."""
+    axes = (name,) if placed.effect.has_axis else ()
+    return Diagnosis(CORRECTED_BY[type(placed.effect)], tuple(runs), axes, found, expected, remedy)
 
 
 def _correction_diagnosis(
@@ -364,39 +367,30 @@ def _correction_diagnosis(
         case ZeroOffset():
             _, scale, key = _zero_unit(model, placed.axis)
             entered = scale * (cell.axes[placed.axis].zero_offset_rad + values[0])
-            return Diagnosis(
-                name="zero-off",
-                runs=(),
-                axes=(name,),
-                found=f"the zero of {name} off by {_offset_text(placed.axis, values, deviations, model)}",
-                expected="positions whose zero is that of the URDF",
-                remedy=f"correct `{key}` of {name} in the cell file to {entered:.2f}, or the zero in the "
-                "controller, and fit again",
+            found = f"the zero of {name} off by {_offset_text(placed.axis, values, deviations, model)}"
+            expected = "positions whose zero is that of the URDF"
+            remedy = (
+                f"correct `{key}` of {name} in the cell file to {entered:.2f}, or the zero in the controller, and fit "
+                "again"
             )
         case LatePosition():
             delay = f"{1e3 * abs(values[0]):.2f} ± {1e3 * deviations[0]:.2f} ms"
             late = "late" if values[0] > 0.0 else "early"
-            return Diagnosis(
-                name="position-late",
-                runs=(),
-                axes=(name,),
-                found=f"the position of {name} {late} by {delay}",
-                expected="positions and currents of one moment",
-                remedy="look for what delays this encoder alone: a filter, a slower channel, another time stamp "
-                "than that of the other axes",
+            found = f"the position of {name} {late} by {delay}"
+            expected = ONE_MOMENT
+            remedy = (
+                "look for what delays this encoder alone: a filter, a slower channel, another time stamp than that of "
+                "the other axes"
             )
         case _:
             declared = model.robot.gravity_m_s2
             turned = vector_text(turned_gravity(declared, values.tolist()))
-            return Diagnosis(
-                name="gravity-tilted",
-                runs=(),
-                axes=(),
-                found=f"gravity along {turned}, turned by {_turn_text(values, deviations)}",
-                expected=f"{vector_text(declared)}, as the cell file says",
-                remedy=f"write `gravity_m_s2: {turned}` in the cell file, or level the base and record again; then "
-                "fit again",
+            found = f"gravity along {turned}, turned by {_turn_text(values, deviations)}"
+            expected = f"{vector_text(declared)}, as the cell file says"
+            remedy = (
+                f"write `gravity_m_s2: {turned}` in the cell file, or level the base and record again; then fit again"
             )
+    return _diagnosis_of(placed, name, (), found, expected, remedy)
 
 
 def _zero_unit(model: Model, axis: int) -> tuple[str, float, str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from daq.config.cell import Cell, model_of
+from daq.config.cell import Cell, CellAxis, model_of
 from ident.calibration import Calibration, EncoderMisfit, GeometryCorrection
 from ident.errors import Diagnosis, ModelError
 from ident.model.geometry import GeometryChange, GeometryKind, GeometryParameter, described_length
@@ -85,22 +85,22 @@ def _axes_of(corrections: Sequence[GeometryEstimate], cell: Cell) -> Iterator[st
     """Axes of the zeros among corrections."""
     for one in corrections:
         if one.parameter.kind is GeometryKind.ZERO:
-            yield cell.axes[_axis_of(one.parameter, model_of(cell))].name
+            yield _axis_of(one.parameter, cell).name
 
 
-def _axis_of(parameter: GeometryParameter, model: Model) -> int:
+def _axis_of(parameter: GeometryParameter, cell: Cell) -> CellAxis:
     """Axis of a zero.
 
     Raises:
         ModelError: no axis has a joint of this name.
     """
-    names = [joint.name for joint in model.robot.axes]
+    names = [joint.name for joint in model_of(cell).robot.axes]
     if parameter.joint not in names:
         raise ModelError(
             f"a zero of joint {parameter.joint!r} was corrected, and no axis of the robot has it: "
             f"{', '.join(names)}; give the cell file of the fit, or calibrate anew"
         )
-    return names.index(parameter.joint)
+    return cell.axes[names.index(parameter.joint)]
 
 
 def _explanation_text(corrections: Sequence[GeometryEstimate], cell: Cell) -> str:
@@ -110,7 +110,7 @@ def _explanation_text(corrections: Sequence[GeometryEstimate], cell: Cell) -> st
 def _correction_text(one: GeometryEstimate, cell: Cell) -> str:
     """Say how far a number is off: `a zero of M2 that is off by -0.102 ± 0.003 deg`."""
     if one.parameter.kind is GeometryKind.ZERO:
-        axis = cell.axes[_axis_of(one.parameter, model_of(cell))]
+        axis = _axis_of(one.parameter, cell)
         size = _size_text(-one.change, one.std, axis.unit.si)
         return f"a zero of {axis.name} that is off by {size} {axis.unit.name}"
     longer = "longer" if one.change > 0.0 else "shorter"
@@ -126,7 +126,7 @@ def _size_text(value: float, std: float, unit_si: float, sign: str = "+") -> str
 
 def _remedy(one: GeometryEstimate, cell: Cell) -> str:
     if one.parameter.kind is GeometryKind.ZERO:
-        axis = cell.axes[_axis_of(one.parameter, model_of(cell))]
+        axis = _axis_of(one.parameter, cell)
         amount = f"{one.change / axis.unit.si:+.4f}"
         return (
             f"add {amount} {axis.unit.name} to `zero_offset_{axis.unit.name}` of {axis.name} in the cell file, or "
@@ -144,27 +144,26 @@ def encoder_misfit_of(finding: GeometryFinding | None, cell: Cell, *, applied: b
     """Make what a calibration keeps of a finding; arguments as for `geometry_diagnoses`."""
     if finding is None:
         return None
-    model = model_of(cell)
     return EncoderMisfit(
         described=_rounded(finding.misfit),
         left=_rounded(finding.misfit_left),
-        unit=_misfit_unit(model),
+        unit=_misfit_unit(model_of(cell)),
         significant=finding.is_significant,
-        corrections=tuple(_kept(one, cell, model) for one in finding.corrections),
+        corrections=tuple(_kept(one, cell) for one in finding.corrections),
         applied=applied,
         alternatives=tuple(_explanation_text(other, cell) for other in finding.alternatives),
         unobservable=finding.unobservable,
     )
 
 
-def _kept(one: GeometryEstimate, cell: Cell, model: Model) -> GeometryCorrection:
+def _kept(one: GeometryEstimate, cell: Cell) -> GeometryCorrection:
     parameter = one.parameter
     if parameter.kind is GeometryKind.ZERO:
-        axis = _axis_of(parameter, model)
-        described = float(cell.axes[axis].zero_offset_rad)
-        unit = "rad" if model.robot.axes[axis].kind is JointKind.REVOLUTE else "m"
+        axis = _axis_of(parameter, cell)
+        described = float(axis.zero_offset_rad)
+        unit = axis.unit.si_name
     else:
-        described = described_length(model.robot, parameter)
+        described = described_length(model_of(cell).robot, parameter)
         unit = "m"
     return GeometryCorrection(
         kind=parameter.kind.value,
@@ -197,7 +196,7 @@ def calibrated_model(calibration: Calibration, cell: Cell) -> Model:
     for one in kept.corrections:
         parameter = GeometryParameter(GeometryKind(one.kind), one.joint, one.end)
         if parameter.kind is GeometryKind.ZERO:
-            now = cell.axes[_axis_of(parameter, model)].zero_offset_rad
+            now = _axis_of(parameter, cell).zero_offset_rad
         else:
             now = described_length(model.robot, parameter)
         changes.append(GeometryChange(parameter, one.described + one.change - now))

@@ -308,9 +308,8 @@ def joint_positions(cell: Cell, reading: CellReading) -> list[float | None]:
     offset = np.array([axis.zero_offset_rad for axis in cell.axes])
     scale = SiScaling(rad_per_count, to_joint, offset, current_per_unit=np.full(len(offset), nan))
     joint = scale.joint_position(np.array([axis.position_counts or 0 for axis in reading.axes]))
-    # A joint's position depends on the motors that move it, and on no others.
-    blind = (np.abs(to_joint) > 1e-12 * np.abs(to_joint).max()) @ unknown
-    return [None if hidden else float(value) for hidden, value in zip(blind, joint, strict=True)]
+    known = scale.joints_known(~unknown)
+    return [float(value) if shown else None for shown, value in zip(known, joint, strict=True)]
 
 
 def _in_fault(axis: AxisReading) -> bool:

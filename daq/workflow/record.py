@@ -603,8 +603,8 @@ def _sync_producer(cell: Cell, network: CanopenNetwork) -> AbstractContextManage
     if sync is None:
         return nullcontext()
     timed = sync.pacing is declared.PacingMode.TIMED
-    socketcan = isinstance(address, BusAddress) and address.interface == "socketcan"
-    if sync.producer == declared.KERNEL or (sync.producer == declared.RECORDER and timed and socketcan):
+    by_kernel = isinstance(address, BusAddress) and address.kind.has_kernel_sync
+    if sync.producer == declared.KERNEL or (sync.producer == declared.RECORDER and timed and by_kernel):
         return KernelProducer(network, sync.period_us)
     if sync.producer == declared.RECORDER:
         return nullcontext()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from daq.config.signers import SIGNER_NAME, UNTRUSTED, PublicKey, public_keys
 from daq.config.yaml_file import read_file
-from daq.errors import CalibrationMissing, OutputFailed, SignatureInvalid, UsageError
+from daq.errors import CalibrationMissing, OutputFailed, SignatureInvalid, UsageError, reason_of
 from daq.files import read_regular, replace_file
 from daq.writeback.minisign import SecretKey, check_signature, is_encrypted, parse_secret_key, parse_signature
 
@@ -178,7 +178,7 @@ def _reading_key(path: Path) -> Iterator[None]:
 
 
 def _spelled(error: Exception) -> str:
-    return (error.strerror or type(error).__name__).lower() if isinstance(error, OSError) else str(error)
+    return reason_of(error) if isinstance(error, OSError) else str(error)
 
 
 def _text_of(path: Path) -> str:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
 from daq.config.cell import Cell
-from daq.errors import AuditUnusable, CalibrationRefused, OutputFailed, evidence
+from daq.errors import AuditUnusable, CalibrationRefused, OutputFailed, evidence, reason_of
 from daq.files import sha256
 from daq.ledger.audit import GONE, AuditAction, AuditEntry, digest_now
 from daq.ledger.fold import WriteAction
@@ -269,7 +269,7 @@ def _disturbed(edit: Edit, error: OSError, *, made: bool) -> OutputFailed:
     asking = f"whether {edit.subject} has the new content is not known: compare it with the newest backup beside it"
     return OutputFailed(
         edit.subject,
-        found=f"{(error.strerror or type(error).__name__).lower()}, {'after' if made else 'during'} the replacement",
+        found=f"{reason_of(error)}, {'after' if made else 'during'} the replacement",
         expected="a file system that completes what it began",
         remedy=f"check the disk; {_IN_PLACE.format(edit.subject) + ': ' + entering if made else asking}",
     )
@@ -293,7 +293,7 @@ class _Recorder:
         except OSError as error:
             raise OutputFailed(
                 str(self.audit),
-                found=(error.strerror or type(error).__name__).lower(),
+                found=reason_of(error),
                 expected="an audit log that takes an entry",
                 remedy="nothing was written to the controller; free space or rights",
             ) from error

@@ -23,6 +23,7 @@ import can
 from can.interfaces.virtual import VirtualBus
 from can.typechecking import CanFilter
 
+from drivers.canopen.interfaces import SOCKETCAN, SOCKETCAND, VIRTUAL, BusInterface, interface_of
 from drivers.canopen.socketcan import BurstBus, open_socketcan
 from drivers.errors import BusError
 
@@ -47,16 +48,19 @@ _FRAME = re.compile(rb"< (?:frame ([0-9A-Fa-f]++) ([0-9]++\.?+[0-9]*+) ([0-9A-Fa
 class BusAddress:
     """Address of a bus."""
 
-    #: ``virtual`` (one process), ``socketcand`` (a hub, across processes), ``socketcan`` (kernel), or the name of any
-    #: other python-can interface.
-    interface: str
+    interface: str  #: one of `INTERFACES` (drivers/canopen/interfaces.py), or the name of any other of python-can
     channel: str  #: of the interface, such as ``can0``
     bitrate_bit_s: int = 1_000_000  #: of the wire; buses of the kernel and of a hub have theirs already
     host: str = "127.0.0.1"  #: of the hub (socketcand only)
     port: int = 29536  #: of the hub (socketcand only)
 
+    @property
+    def kind(self) -> BusInterface:
+        """What its interface can do."""
+        return interface_of(self.interface)
+
     def __str__(self) -> str:
-        where = f"@{self.host}:{self.port}" if self.interface == "socketcand" else ""
+        where = f"@{self.host}:{self.port}" if self.kind.has_server else ""
         return f"{self.interface}:{self.channel}{where}"
 
     @classmethod
@@ -97,13 +101,13 @@ def open_bus(address: BusAddress, *, answering: bool = False) -> can.BusABC:
         BusError: the interface is unknown, the device is absent, or the hub does not answer.
     """
     with bus_errors(address):
-        if address.interface == "socketcand":
+        if address.kind is SOCKETCAND:
             # python-can's own client mistakes a closed hub for silence.
             return SocketcandBus(address.channel, address.host, address.port)
-        if address.interface == "socketcan" and not answering:
+        if address.kind is SOCKETCAN and not answering:
             # python-can's own loses frames while this interpreter is busy, and cannot count them.
             return open_socketcan(address.channel)
-        if address.interface == "virtual":
+        if address.kind is VIRTUAL:
             return VirtualEnd(address.channel)
         try:
             # A user's python-can configuration file must not change the cell's configuration.

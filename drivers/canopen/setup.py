@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 
 from drivers.canopen.link import Link
@@ -82,31 +82,26 @@ Profiles = Callable[[], Sequence[DriveProfile]]
 """Returns the profiles from which one that fits a drive is suggested."""
 
 
-@dataclass(frozen=True, slots=True)
-class Need:
-    """One object without which a drive cannot be recorded."""
+def needs_of(profile: DriveProfile) -> dict[ObjectEntry, str]:
+    """Return the objects without which a drive cannot be recorded with a profile, and what each is for, in messages.
 
-    entry: ObjectEntry
-    purpose: str  #: in a message
-
-
-def needs_of(profile: DriveProfile) -> tuple[Need, ...]:
-    """Return the objects that a recording with a profile needs; 1016h, 6007h and 6084h may be missing."""
+    1016h, 6007h and 6084h may be missing.
+    """
     scale = profile.current_scale
     switch = () if scale.switch is None else (scale.switch,)
-    return (
-        Need(profile.position, "position"),
-        Need(profile.current, "current"),
-        Need(STATUSWORD, "statusword"),
-        Need(CONTROLWORD, "controlword"),
-        Need(TARGET_POSITION, "target position"),
-        Need(PROFILE_VELOCITY, "profile velocity"),
-        Need(PROFILE_ACCELERATION, "profile acceleration"),
-        Need(MODE_OF_OPERATION, "mode of operation"),
-        Need(MODE_DISPLAY, "mode display"),
-        Need(HEARTBEAT_TIME, "heartbeat period"),
-        *(Need(entry, "scale of the current") for entry in (*scale.objects, *switch)),
-    )
+    return {
+        profile.position: "position",
+        profile.current: "current",
+        STATUSWORD: "statusword",
+        CONTROLWORD: "controlword",
+        TARGET_POSITION: "target position",
+        PROFILE_VELOCITY: "profile velocity",
+        PROFILE_ACCELERATION: "profile acceleration",
+        MODE_OF_OPERATION: "mode of operation",
+        MODE_DISPLAY: "mode display",
+        HEARTBEAT_TIME: "heartbeat period",
+        **dict.fromkeys((*scale.objects, *switch), "scale of the current"),
+    }
 
 
 def misfit(access: ObjectAccess, profile: DriveProfile, others: Profiles = tuple) -> str:
@@ -129,24 +124,24 @@ def misfit(access: ObjectAccess, profile: DriveProfile, others: Profiles = tuple
 
 def _lacking(access: ObjectAccess, profile: DriveProfile) -> tuple[str, ...]:
     found = []
-    for need in needs_of(profile):
+    for entry, purpose in needs_of(profile).items():
         try:
-            bits = 8 * len(access.read_bytes(need.entry.index, need.entry.subindex))
+            bits = 8 * len(access.read_bytes(entry.index, entry.subindex))
         except ObjectAccessError as error:
             if error.abort_code is None:
                 raise
             if error.abort_code in NO_SUCH_OBJECT:
-                found.append(f"no object {need.entry} ({need.purpose})")
+                found.append(f"no object {entry} ({purpose})")
             continue  # an object that cannot be read now exists
-        if bits < need.entry.bits:
-            found.append(f"object {need.entry} ({need.purpose}) of {bits} bits instead of {need.entry.bits}")
+        if bits < entry.bits:
+            found.append(f"object {entry} ({purpose}) of {bits} bits instead of {entry.bits}")
     return tuple(found)
 
 
 def _difference(other: DriveProfile, profile: DriveProfile) -> str:
     """Describe the objects by which another profile differs."""
     same = needs_of(profile)
-    parts = [f"{need.purpose} from {need.entry}" for need in needs_of(other) if need not in same]
+    parts = [f"{purpose} from {entry}" for entry, purpose in needs_of(other).items() if same.get(entry) != purpose]
     if other.rated is not None and (profile.rated is None or other.rated.current != profile.rated.current):
         parts.append(f"rated current from {other.rated.current}")
     return ", ".join(parts) or "the same objects in other units"

@@ -364,7 +364,7 @@ def _wires(bus: can.BusABC, node_ids: Sequence[int]) -> tuple[tuple[str, ...], t
 def _refuse_error_frames(faults: Sequence[FaultSpec], bus: can.BusABC) -> None:
     """Refuse error frames that the bus cannot carry: they would end the cell in the middle of a run."""
     hub = (
-        any(part.address.interface == "socketcand" for part in bus.address.parts)
+        any(part.address.kind.has_server for part in bus.address.parts)
         if isinstance(bus, SplitBus)
         else isinstance(bus, SocketcandBus)
     )

@@ -314,7 +314,6 @@ class Mechanism:
         joints: names of the n joints, in the order of the plant.
         order: place of each of them among the velocities of the Pinocchio model, shape (n,).
         constants: the Tree as a plain tuple.
-        rows: number c of closed directions.
         start_rad: closed position of all joints at power-on, shape (n,).
         mobility: d, degrees of freedom at power-on.
     """
@@ -335,7 +334,6 @@ class Mechanism:
         tree = _tree(model, ids, spec)
         self.constants: tuple[Any, ...] = tuple(tree)
         self._closed_directions = tree.closed
-        self.rows = len(tree.closed)
         motors = len(spec.motors)
         assembled = self.closed(np.array([spec.assembly_rad[name] for name in self.joints]), (motors, 0))
         self.mobility = len(ids) - _rank(self.at(assembled)[1])
@@ -343,7 +341,7 @@ class Mechanism:
         jacobian = self.at(self.start_rad)[1]
         if self.mobility < 1 or motors < self.mobility:
             raise SpecInvalid(
-                f"closures: {len(ids)} joints and {self.rows} closed directions of rank {_rank(jacobian)} leave "
+                f"closures: {len(ids)} joints and {len(tree.closed)} closed directions of rank {_rank(jacobian)} leave "
                 f"{self.mobility} degrees of freedom; expected at least 1 and at most the {motors} motors; correct "
                 "closures or motors"
             )
@@ -356,8 +354,8 @@ class Mechanism:
 
     def at(self, position_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return φ, shape (c,), and J_c, shape (c, n)."""
-        error = np.zeros(self.rows)
-        jacobian = np.zeros((self.rows, len(self.joints)))
+        error = np.zeros(len(self._closed_directions))
+        jacobian = np.zeros((len(error), len(self.joints)))
         evaluate(self.constants, np.ascontiguousarray(position_rad, dtype=np.float64), error, jacobian)
         return error, jacobian
 

@@ -12,10 +12,10 @@ import errno
 import re
 import threading
 import time
-from collections.abc import Callable
 from typing import Self, cast
 
 from drivers.canopen.bus import BusAddress
+from drivers.canopen.interfaces import SOCKETCAND
 from drivers.errors import BusError
 
 HOST = "127.0.0.1"
@@ -38,12 +38,10 @@ class Hub:
         channels: names that clients may open; each is a bus of its own. Another name is refused, so that a typing
             error does not open an empty bus.
         port: to listen on; 0 chooses a free one, see ``address``.
-        clock: wall clock [s] for the frames' time stamps.
     """
 
-    def __init__(self, channels: tuple[str, ...], port: int = 0, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, channels: tuple[str, ...], port: int = 0) -> None:
         self.channels = channels
-        self.clock = clock
         self.clients: set[_Client] = set()
         self._port = port
         self._server: asyncio.Server | None = None
@@ -53,7 +51,7 @@ class Hub:
         if self._server is None:
             raise BusError(f"hub {HOST}:{self._port}", "is not running")
         port = self._server.sockets[0].getsockname()[1]
-        return BusAddress("socketcand", channel or self.channels[0], host=HOST, port=port)
+        return BusAddress(SOCKETCAND.name, channel or self.channels[0], host=HOST, port=port)
 
     def __enter__(self) -> Self:
         self._loop = asyncio.new_event_loop()
@@ -111,7 +109,7 @@ class _Client(asyncio.Protocol):
         buffer = self._incoming + data
         end = 0
         frames = []
-        stamp = b"%.6f" % self._hub.clock()
+        stamp = b"%.6f" % time.time()
         for match in _COMMAND.finditer(buffer):
             end = match.end()
             identifier, length, payload, command = match.groups()

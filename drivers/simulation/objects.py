@@ -98,9 +98,6 @@ class Entry:
 
 Dictionary = dict[tuple[int, int], Entry]
 
-_REAL32 = struct.Struct("<f")
-_REAL32_BITS = struct.Struct("<I")
-
 SAVE = int.from_bytes(b"save", "little")
 LOAD = int.from_bytes(b"load", "little")
 
@@ -136,7 +133,7 @@ def _cia402(axis: AxisSpec) -> tuple[Entry, ...]:
         # Manufacturer specific: the entered joint drive gain, for masters only.
         Entry(0x2003, 0, u8, ro, 2),
         Entry(0x2003, 1, i32, rw, round(1000 * axis.entered_gain_nm_per_a)),
-        Entry(0x2003, 2, u32, rw, _REAL32_BITS.unpack(_REAL32.pack(axis.entered_gain_nm_per_a))[0]),
+        Entry(0x2003, 2, u32, rw, int.from_bytes(struct.pack("<f", axis.entered_gain_nm_per_a), "little")),
         Entry(0x2005, 0, i16),  # manufacturer specific: temperature of the motor [0.1 °C]
         Entry(0x6007, 0, i16, rw, 1, lowest=0, highest=3),
         Entry(0x603F, 0, u16, tpdo),

@@ -144,20 +144,20 @@ class Plant:
             )
         start_rad = spec.start_rad
         mobility = n
-        self._passive_joints: tuple[str, ...] = ()
+        passive_joints: tuple[str, ...] = ()
         self._order: slice | IntArray = slice(None)  # of the joints in Pinocchio's model
         if self.mechanism is not None:
             start_rad = self.mechanism.start_rad
             mobility = self.mechanism.mobility
-            self._passive_joints = self.mechanism.joints[n:]
+            passive_joints = self.mechanism.joints[n:]
             self._order = self.mechanism.order
-        effects = [build_effect(effect, n, self._passive_joints) for effect in spec.effects]
-        self._joints = n + len(self._passive_joints)
+        effects = [build_effect(effect, n, passive_joints) for effect in spec.effects]
+        self._joints = n + len(passive_joints)
         self._mechanics, flexible = lay_out(spec, effects, self._joints)
         self._constants = tuple(self._mechanics)
         m, total = self._mechanics.directions.shape
         with_friction: list[AxisSpec | PassiveFriction] = [*spec.axes]
-        with_friction += [spec.passive.get(name, PassiveFriction()) for name in self._passive_joints]
+        with_friction += [spec.passive.get(name, PassiveFriction()) for name in passive_joints]
         self.time_s = 0.0
         self.position_rad = np.concatenate([start_rad, [drive.row @ start_rad[:n] for drive in flexible]])
         self.velocity_rad_s = np.zeros(total)

@@ -90,7 +90,7 @@ class KernelProducer(Producer, AbstractContextManager["KernelProducer"]):
             BusError: the kernel has no broadcast manager, or the bus is not SocketCAN.
         """
         address = self._link.address
-        if not isinstance(address, BusAddress) or address.interface != "socketcan":
+        if not isinstance(address, BusAddress) or not address.kind.has_kernel_sync:
             raise BusError(str(address), "SYNC by the kernel needs one bus of interface socketcan")
         try:
             if self._socket is None:

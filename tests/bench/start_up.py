@@ -28,7 +28,7 @@ def start_up(out: Path, log: Path, repeats: int, environment: dict[str, str]) ->
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree("configs", folder, ignore=shutil.ignore_patterns("*.jsonl*", "*.sqlite*"))
     cell = str(folder / "cells" / CELL.name)
-    commands = {f"{listed.name} --help": [listed.name, "--help"] for listed in VERBS}
+    commands = {f"{verb.name} --help": [verb.name, "--help"] for verb in VERBS}
     commands |= {"scan": ["scan", cell, "--wait", "0.05"], "info": ["info", str(log)], "history": ["history", cell]}
     return {
         name: statistics.median(_seconds(command, environment) for _ in range(repeats))

@@ -24,8 +24,8 @@ def next_step(output: str) -> str | None:
     (line,) = lines
     program, verb, *words = shlex.split(line.removeprefix("Next: "))
     assert program == "drivegain", line
-    (listed,) = [one for one in VERBS if one.name == verb]
-    context = listed.load().command().make_context(verb, [_FILLED_IN.get(word, word) for word in words])
+    (called,) = [one for one in VERBS if one.name == verb]
+    context = called.command().make_context(verb, [_FILLED_IN.get(word, word) for word in words])
     for name, value in context.params.items():
         for path in value if isinstance(value, list | tuple) else [value]:
             assert not isinstance(path, Path) or name in _WRITTEN or path.exists(), f"{line}: {name} {path}"

@@ -18,10 +18,9 @@ from rich.console import Console
 
 from daq.cli import main
 from daq.cli.app import ALIASES, BY_JOB, VERBS
-from daq.cli.init import INIT
 from daq.cli.plan import free_name
 from daq.cli.terminal import say_written, show_steps
-from daq.cli.verb import Job, Listed, cell_here, cells_in, continued
+from daq.cli.verb import Job, Verb, cell_here, cells_in, continued
 from daq.config.cell import PacingMode
 from daq.config.cell_file import load_cell
 from daq.config.import_description import load_import
@@ -33,13 +32,11 @@ from tests.daq.logs import DISC, START_NS, demo_content, samples, write
 from tests.pipeline.next_step import next_step
 
 
-@pytest.mark.parametrize("listed", VERBS, ids=[verb.name for verb in VERBS])
+@pytest.mark.parametrize("verb", VERBS, ids=[verb.name for verb in VERBS])
 def test_every_help_is_whole_and_ends_with_an_example_to_copy(
-    listed: Listed, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    verb: Verb, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    verb = listed.load()
-    assert verb.name == listed.name
     kinds = verb.kinds
     for command in ([verb.name], *([verb.name, kind.name] for kind in kinds)):
         assert main([*command, "--help"]) == 0
@@ -51,7 +48,7 @@ def test_every_help_is_whole_and_ends_with_an_example_to_copy(
         # Nothing of a help text is taken for markup: units are in brackets.
         reported = _squeezed(output)
         assert max(map(len, output.splitlines())) <= 80
-        for parameter in inspect.signature(shown.function, eval_str=True).parameters.values():
+        for parameter in inspect.signature(shown.function(), eval_str=True).parameters.values():
             (option,) = parameter.annotation.__metadata__
             assert _squeezed(option.help) in reported
             assert set(option.help.split()) <= set(output.split())  # no word is cut
@@ -60,8 +57,8 @@ def test_every_help_is_whole_and_ends_with_an_example_to_copy(
 def test_the_list_shows_every_verb_with_its_whole_summary(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    for listed in VERBS:
-        assert f"{listed.name} {listed.summary}" in lines
+    for verb in VERBS:
+        assert f"{verb.name} {verb.summary}" in lines
 
 
 @pytest.mark.parametrize(("earlier", "name"), ALIASES.items())
@@ -90,7 +87,7 @@ def test_every_job_of_the_help_has_its_verbs(capsys: pytest.CaptureFixture[str])
     for job in Job:
         (section,) = (one for one in sections if one.startswith(f"{job.value}:"))
         named = [line.split()[0] for line in section.splitlines()[1:]]
-        assert named == [listed.name for listed in BY_JOB[job]]
+        assert named == [verb.name for verb in BY_JOB[job]]
 
 
 def test_an_example_chooses_none_of_several_cell_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,7 +104,7 @@ def test_an_example_uses_the_cell_file_of_the_folder(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert cell_here() == Path("press-4/cells/press-4.yaml")
-    (example,) = re.findall(r"init (\S+)", INIT.example)
+    (example,) = [re.findall(r"init (\S+)", verb.example)[0] for verb in VERBS if verb.name == "init"]
     assert main(["init", "other-cells/lathe"]) == 0
     assert main(["init", example]) == 0
     assert cell_here().is_file()
@@ -168,7 +165,7 @@ def test_progress_in_a_pipe_is_a_whole_line_a_step(capsys: pytest.CaptureFixture
 
 
 def test_examples_name_files_that_other_examples_make() -> None:
-    examples = [kind.example for listed in VERBS for kind in (listed.load(), *listed.load().kinds)]
+    examples = [kind.example for verb in VERBS for kind in (verb, *verb.kinds)]
     made = {value for one in examples for value in re.findall(r"--(?:out|report) (\S+)", one)}
     used = {word for one in examples for word in one.split() if re.search(r"\.(mcap|yaml)$", word)}
     # Made by `record` with other options, as in the guide, and by `init`.

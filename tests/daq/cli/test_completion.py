@@ -96,5 +96,5 @@ def test_each_shell_has_its_script_and_every_verb(shell_name: str, checkout: Pat
     }
     found = subprocess.run(run, capture_output=True, text=True, env=asked, check=True).stdout
     assert set(re.findall(r"^\W*([a-z-]+)", found.replace("_arguments '*: :((", ""), re.MULTILINE)) >= {
-        listed.name for listed in VERBS
+        verb.name for verb in VERBS
     }

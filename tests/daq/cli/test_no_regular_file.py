@@ -40,8 +40,7 @@ LONGEST_S = 20.0
 
 def _command_lines() -> Iterator[tuple[str, list[str]]]:
     """Yield a name and the words of each command line, with PIPE for one file that it reads."""
-    for listed in VERBS:
-        verb = listed.load()
+    for verb in VERBS:
         for kind in verb.kinds or (verb,):
             words = [verb.name, kind.name] if verb.kinds else [verb.name]
             params = kind.command().params

@@ -140,7 +140,7 @@ def test_every_verb_can_be_imported_without_the_simulated_cell() -> None:
         "sys.modules.update(dict.fromkeys(('numba', 'pinocchio', 'llvmlite'), None))\n"
         "import ident.planning.clearance, ident.planning.excitation, ident.physical.physical\n"
         "from daq.cli.app import VERBS\n"
-        "print(len([listed.load() for listed in VERBS]))\n"
+        "print(len([verb.function() for verb in VERBS]))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

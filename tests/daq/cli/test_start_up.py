@@ -36,8 +36,7 @@ UNUSED = {
 HELP = """
 import contextlib, io
 from daq.cli.app import VERBS, main
-for listed in VERBS:
-    verb = listed.load()
+for verb in VERBS:
     for kind in ((), *((kind.name,) for kind in verb.kinds)):
         with contextlib.redirect_stdout(io.StringIO()) as shown:
             assert main([verb.name, *kind, "--help"]) == 0, verb.name

@@ -47,8 +47,8 @@ def data_sheet(text: bytes, name: str) -> ObjectDictionary:
 
 def disagreements(profile: DriveProfile, sheet: ObjectDictionary) -> tuple[str, ...]:
     """List the statements of a profile that the drive's data sheet contradicts; empty if the two agree."""
-    needs, rated = needs_of(profile), profile.rated
-    read = [need.entry for need in needs]
+    rated = profile.rated
+    read = list(needs_of(profile))
     if rated is not None:
         read += [rated.current, *(() if rated.torque is None else (rated.torque,))]
     if profile.torque is not None:

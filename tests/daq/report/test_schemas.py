@@ -47,7 +47,7 @@ def test_every_verb_with_json_has_a_schema() -> None:
         kinds = getattr(command, "commands", {}).values()
         return any(param.name == "json" for param in command.params) or any(map(takes_json, kinds))
 
-    with_json = {listed.name for listed in VERBS if takes_json(listed.load().command())}
+    with_json = {verb.name for verb in VERBS if takes_json(verb.command())}
     assert with_json == REPORTS.keys()
 
 
@@ -109,11 +109,11 @@ def _made_by(module: ModuleType, tree: ast.Module, value: ast.expr) -> set[Any]:
     return _kinds(get_type_hints(alone, called.__globals__)["return"])
 
 
-@pytest.mark.parametrize("place", sorted({listed.place.partition(":")[0] for listed in VERBS}))
+@pytest.mark.parametrize("place", sorted({verb.place.partition(":")[0] for verb in VERBS}))
 def test_a_verb_prints_the_types_that_are_published_for_it(place: str) -> None:
     module = importlib.import_module(place)
     tree = ast.parse(inspect.getsource(module))
     calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and ast.unparse(node.func) == "print_json"]
     printed = set[Any]().union(*(_made_by(module, tree, call.args[0]) for call in calls))
-    names = [listed.name for listed in VERBS if listed.place.startswith(f"{place}:")]
+    names = [verb.name for verb in VERBS if verb.place.startswith(f"{place}:")]
     assert printed == set[Any]().union(*(_kinds(REPORTS[name]) for name in names if name in REPORTS))
