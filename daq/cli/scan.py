@@ -38,6 +38,8 @@ def scan_verb(
     with the motors' data in the drives and with the controller's file. Nothing is changed without
     --reset-faults; find out why an axis is in fault before you reset it. While a recording or
     another master uses the bus, nothing is sent: exit code 12 or 5.
+    Exit code 5 also where an axis does not answer; what else is wrong is in the table, as another
+    serial number is, and `record` refuses it.
     """
     from daq.config.cell_buses import bus_parts, drive_axes
     from daq.config.cell_file import load_cell

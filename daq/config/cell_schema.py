@@ -55,10 +55,10 @@ Buses = Annotated[
 
 
 class IdentityModel(StrictModel):
-    """Object 1018h."""
+    """Object 1018h; what is left out is not compared."""
 
     vendor_id: U32
-    product_code: U32
+    product_code: U32 | None = None
     serial: U32 | None = None
 
 

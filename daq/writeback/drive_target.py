@@ -43,7 +43,7 @@ class DriveNote(StrictModel):
     axis: str  #: name of the axis
     node_id: Annotated[int, Field(ge=1, le=127)]  #: its node id
     vendor_id: _U32  #: vendor that the drive reported (1018h:1)
-    product_code: _U32  #: product (1018h:2)
+    product_code: _U32 | None  #: product (1018h:2)
     serial: _U32 | None  #: serial number (1018h:4)
     index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]  #: index of the object that was to be written
     subindex: Annotated[int, Field(ge=0, le=0xFF)]  #: its subindex
