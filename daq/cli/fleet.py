@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.terminal import check_replaceable, print_view, progress_bar, write_output
+from daq.cli.terminal import check_replaceable, print_view, progress_bar, replace_output
 from daq.cli.verb import JsonOption, Verb, output_option, print_json
 from daq.errors import ExitCode, OutputFailed
 from daq.files import replace_file
@@ -60,7 +60,7 @@ def fleet_verb(
     with progress_bar("fitting the fleet") as report_progress, wanted as pool:
         rows = fit_fleet(found, pool, loop, cache, lambda: datetime.now(UTC), report_progress)
     if csv is not None:
-        with write_output(csv):
+        with replace_output(csv):
             replace_file(csv, fleet_csv(rows).encode())
     if json:
         print_json(fleet_report(rows))

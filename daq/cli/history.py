@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.apply import applier
-from daq.cli.terminal import check_replaceable, output_console, say_written, write_output
+from daq.cli.terminal import check_replaceable, output_console, replace_output, say_written
 from daq.cli.verb import JsonOption, Verb, output_option, print_json
 from daq.errors import (
     AuditUnusable,
@@ -308,10 +308,10 @@ def _write_files(chosen: tuple[Series, ...], cell: Cell, picture: Path | None, c
                 remedy="fit and apply one first",
             )
         kind = picture.suffix.lower().removeprefix(".")
-        with write_output(picture):
+        with replace_output(picture):
             replace_file(picture, plot_history(drawn, kind, title=f"Drive gains of {cell.name}"))
     if csv is not None:
-        with write_output(csv):
+        with replace_output(csv):
             replace_file(csv, csv_text(chosen).encode())
 
 

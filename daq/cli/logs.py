@@ -15,8 +15,8 @@ from daq.cli.terminal import (
     output_console,
     print_view,
     progress_bar,
+    replace_output,
     status,
-    write_output,
 )
 from daq.cli.verb import JsonOption, Verb, output_option, print_json
 from daq.environment import require_packages, software
@@ -313,7 +313,7 @@ def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
                 remedy="nothing was written; please report this URDF",
             )
 
-    with write_output(out):
+    with replace_output(out):
         replace_file(out, updated.content, check=check)
 
 

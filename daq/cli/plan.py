@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import chain, count
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from daq.cli.terminal import check_folder, check_output, check_replaceable, progress_bar, write_output
-from daq.cli.verb import CellArgument, JsonOption, Verb, output_option, print_json, say_next
+from daq.cli.next_step import say_after_plan
+from daq.cli.terminal import check_folder, check_output, check_replaceable, progress_bar, replace_output
+from daq.cli.verb import CellArgument, JsonOption, Verb, output_option, print_json
 from daq.errors import UsageError
 from daq.files import replace_file
 from daq.workflow.choices import EXCHANGES, LARGEST_STD_PERCENT
@@ -77,11 +77,11 @@ def plan_verb(
             experiment=experiment,
             progress=report,
         )
-    with write_output(out):
+    with replace_output(out):
         save_plan(made, out)
     if preview is not None:
         checked = load_plan(out, declared)
-        with write_output(preview):
+        with replace_output(preview):
             page = preview_page(declared, checked.moves, experiment.scene.checker, out.read_bytes())
             replace_file(preview, page.encode())
     excitation, _ = experiment.excitation(paths_of(declared, made.moves))
@@ -90,13 +90,7 @@ def plan_verb(
         print_json(plan_report(out, declared, experiment, made, judged))
     else:
         typer.echo(plan_text(out, preview, declared, experiment, made, judged))
-        say_next("drivegain", "record", cell, out, "--out", free_name(), "--enable-motion")
-
-
-def free_name() -> str:
-    """Name of a log that is not there yet; the first two are those of the help's examples."""
-    names = chain(("unloaded.mcap", "held-out.mcap"), (f"run-{number}.mcap" for number in count(3)))
-    return next(name for name in names if not Path(name).exists())
+        say_after_plan(cell, declared, out, made)
 
 
 @contextmanager

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from daq.cli.next_step import say_after_record
 from daq.cli.terminal import interruptible, progress_bar, say_last
-from daq.cli.verb import CellArgument, JsonOption, Verb, output_option, print_json, say_next, taking
+from daq.cli.verb import CellArgument, JsonOption, Verb, output_option, print_json, taking
 from daq.environment import login
-from daq.errors import DaqError, DiskSpaceShort, ExitCode, OutputFailed, UsageError
+from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError
 from daq.files import is_taken
 from drivers.errors import POWERED, DriverError, SampleLost, all_notes, error_chain
 
@@ -120,7 +121,7 @@ def record_verb(options: RecordOptions) -> None:
         # The log is kept; the exit code keeps a script from using it.
         raise typer.Exit(ExitCode.DATA_UNFIT)
     if not options.json:
-        _say_next(options.cell, declared, options.plan, out, carried)
+        say_after_record(options.cell, declared, options.plan, out)
 
 
 def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:
@@ -140,30 +141,6 @@ def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:
             else "hint: a cell of `drivegain simulate` answers as fast as its computer can and needs `sync.pacing: "
             "lockstep` in the cell file"
         )
-
-
-def _say_next(cell: Path, declared: Cell, plan: Path, out: Path, carried: Payload | None) -> None:
-    """Name the run with the payload after one without, and the fit of both where it is plain which these are."""
-    if carried is None:
-        if declared.payloads:
-            weighed = ("--payload", declared.payloads[0].payload.name, "--mass", "KG")
-            say_next("drivegain", "record", cell, plan, "--out", "loaded.mcap", *weighed, "--enable-motion")
-        return
-    others = [path for path in out.parent.glob("*.mcap") if path != out]
-    calibration = out.with_name("calibration.yaml")
-    if len(others) == 1 and not calibration.exists() and _is_unloaded(others[0], declared):
-        say_next("drivegain", "fit", *others, out, "--out", calibration)
-
-
-def _is_unloaded(log: Path, declared: Cell) -> bool:
-    """Whether a log is a valid run of this cell without load."""
-    from daq.report.log import info_report
-
-    try:
-        found = info_report(log)
-    except DaqError:
-        return False
-    return (found.cell, found.payload, found.valid) == (declared.name, None, True)
 
 
 def _before_motion(cell: Cell, plan: Path, not_weighed: bool) -> Iterator[str]:

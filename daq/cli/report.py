@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.terminal import check_folder, check_replaceable, print_view, write_output
+from daq.cli.terminal import check_folder, check_replaceable, print_view, replace_output
 from daq.cli.verb import CalibrationArgument, JsonOption, Verb, output_option, print_json
 from daq.files import replace_file
 
@@ -53,7 +53,7 @@ def report_verb(
         command = f"drivegain apply {shlex.quote(str(cell))} {shlex.quote(str(calibration))}"
         comparison = compare(load_cell(cell), request, command)
     certificate = certify(fitted, comparison, earlier)
-    with write_output(page):
+    with replace_output(page):
         replace_file(page, certificate_page(certificate).encode())
     if json:
         print_json(certificate_report(certificate))

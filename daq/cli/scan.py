@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from daq.cli.next_step import say_next
 from daq.cli.terminal import print_view
-from daq.cli.verb import CellArgument, JsonOption, Verb, print_json, say_next
+from daq.cli.verb import CellArgument, JsonOption, Verb, print_json
 from daq.errors import ConfigurationInconsistent, UsageError, VirtualBusEmpty
 from drivers.errors import DriverError, NodeMissing
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.terminal import at_most_one, interruptible, output_console, print_view, show_steps, write_output
+from daq.cli.terminal import at_most_one, interruptible, output_console, print_view, replace_output, show_steps
 from daq.cli.verb import JsonOption, Verb, output_option, print_json
 from daq.errors import ConfigurationInconsistent, UsageError
 from daq.files import read_regular, replace_file
@@ -222,7 +222,7 @@ def demo(
 
     began = time.monotonic()
     settings = Settings(out, simulation or shipped_simulation(), seed, duration)
-    with write_output(out):
+    with replace_output(out):
         with show_steps() as stepper:
             outcome = demonstrate(settings, lambda: datetime.now(UTC), ProgressReporter(stepper.step, stepper.progress))
         report = demo_report(outcome, seconds=round(time.monotonic() - began, 1))

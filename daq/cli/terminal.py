@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import signal
+import stat
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -48,6 +51,51 @@ def write_output(path: Path) -> Iterator[None]:
             STARTED.append(path)
         raise
     WRITTEN.append(path)
+
+
+@contextmanager
+def replace_output(path: Path) -> Iterator[None]:
+    """Write a file or folder within the block, as `write_output`, and say on stderr which files were there before.
+
+    What can be made again, such as a plan or a calibration, may replace an earlier file of its kind
+    (`check_replaceable`); a log replaces nothing.
+    """
+    before = _files_of(path)
+    with write_output(path):
+        yield
+    after = _files_of(path)
+    replaced = [file for file, state in before.items() if file in after and after[file] != state]
+    if not replaced:
+        return
+    oldest_ns = min(before[file].modified_ns for file in replaced)
+    since = datetime.fromtimestamp(oldest_ns / 1e9, UTC)
+    names = [str(file) for file in replaced[:NAMED_FILES]]
+    if len(replaced) > NAMED_FILES:
+        names.append(f"{len(replaced) - NAMED_FILES} more")
+    typer.echo(terminal_text(f"Replaced: {', '.join(names)} (of {since:%Y-%m-%d %H:%M} UTC)"), err=True)
+
+
+NAMED_FILES = 4  #: Replaced files that are named; of more, their number is said
+
+
+@dataclass(frozen=True, slots=True)
+class _FileState:
+    """What differs after a file was replaced."""
+
+    inode: int
+    modified_ns: int
+
+
+def _files_of(path: Path) -> dict[Path, _FileState]:
+    """Return a file, or each file in a folder, by name; empty where there is none."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    found = {}
+    for file in files:
+        with suppress(OSError):  # it is not there
+            status = file.stat()
+            if stat.S_ISREG(status.st_mode):
+                found[file] = _FileState(status.st_ino, status.st_mtime_ns)
+    return found
 
 
 def make_folder(folder: Path) -> None:

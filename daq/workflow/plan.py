@@ -417,6 +417,25 @@ class _Plan(StrictModel):
     moves: Annotated[tuple[_Move, ...], Field(min_length=1, max_length=10_000)]
 
 
+@dataclass(frozen=True, slots=True)
+class PlanHead:
+    """What a plan file says of itself, its moves unread."""
+
+    cell: str  #: name of the cell it was made for
+    seed: int  #: it was made from
+    predicted_std_percent: tuple[float, ...]  #: of each gain [% of it]; empty in plans of earlier versions
+
+
+def plan_head(path: Path) -> PlanHead:
+    """Read what a plan file says of itself, whatever cell it is for.
+
+    Raises:
+        ConfigurationError: the file is missing, or is no plan.
+    """
+    model = read_model(parse_yaml(read_yaml_bytes(path), str(path)), _Plan)
+    return PlanHead(model.cell, model.seed, model.predicted_std_percent)
+
+
 def save_plan(plan: Plan, path: Path) -> None:
     """Write a plan; a file of that name is replaced whole.
 

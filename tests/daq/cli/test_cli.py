@@ -19,7 +19,6 @@ from rich.console import Console
 from daq.cli import main
 from daq.cli.app import BY_JOB, VERBS
 from daq.cli.init import INIT
-from daq.cli.plan import free_name
 from daq.cli.terminal import say_written, show_steps
 from daq.cli.verb import Job, Listed, cell_here, cells_in, continued
 from daq.config.cell import PacingMode
@@ -106,13 +105,6 @@ def test_no_verb_waits_for_a_pipe_that_is_named_like_a_cell_file(
         assert main(words) == ExitCode.OK
         assert "Example:" in capsys.readouterr().out
     assert main(["scan", "missing.yaml"]) == ExitCode.CONFIGURATION
-
-
-def test_a_plan_names_a_log_that_is_not_there_yet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name in ("unloaded.mcap", "held-out.mcap", "run-3.mcap", "run-4.mcap"):
-        assert free_name() == name
-        Path(name).touch()
 
 
 def test_a_value_of_the_wrong_type_is_shown(capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from daq.cli.fit import say_after_fit
+from daq.cli.next_step import say_after_fit
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import decode_calibration, encode_calibration
