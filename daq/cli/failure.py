@@ -88,7 +88,7 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
     identification.DataUnfit: ("runs that can be used", "leave the run out, or record it again"),
     identification.TooFewMoves: (
         "enough moves to judge the scatter",
-        "record a longer plan (`plan --duration 60`), or give more logs",
+        "record a plan with more moves (`plan --duration`), or give more logs",
     ),
     identification.RankDeficient: (
         "moves that identify every unknown",

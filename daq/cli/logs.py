@@ -24,6 +24,7 @@ from daq.errors import ConfigurationInconsistent, DaqError, LogForeign, OutputFa
 from daq.files import replace_file
 from daq.report.text import printable
 from ident.errors import ModelContradicted
+from ident.plausible import format_at_limit
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
@@ -218,7 +219,7 @@ def export_urdf_verb(
     if not left <= DOUBTFUL_PERCENT:  # it explains too little of the torque to derive bodies from it
         raise ModelContradicted(
             str(calibration),
-            found=f"a relative error of {left:.3g} %",
+            found=f"a relative error of {format_at_limit(left, DOUBTFUL_PERCENT, 3, 'g')} %",
             expected=f"at most {DOUBTFUL_PERCENT:g} %",
             remedy="fit again; `drivegain fit` lists what to check",
         )

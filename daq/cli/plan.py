@@ -89,7 +89,7 @@ def plan_verb(
     if json:
         print_json(plan_report(out, declared, experiment, made, judged))
     else:
-        typer.echo(plan_text(out, preview, declared, experiment, made, judged))
+        typer.echo(plan_text(out, preview, declared, experiment, made, judged, duration))
         say_after_plan(cell, declared, out, made)
 
 
