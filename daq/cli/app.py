@@ -67,6 +67,7 @@ BY_JOB = {
 }
 """Verbs by job, in the order of the help; each is imported when it is called."""
 VERBS = tuple(listed for verbs in BY_JOB.values() for listed in verbs)
+VERB_NAMES = frozenset(listed.name for listed in VERBS)
 
 
 class _Verbs(TyperGroup):
@@ -158,7 +159,8 @@ def _run(words: list[str], json_wanted: bool) -> int:
     except (DaqError, DriverError, IdentificationError) as error:
         if isinstance(error, OutputFailed) and _kept():
             error.add_note(f"kept: {_kept()}")
-        failure = ErrorParts.of(error)
+        verb = next((word for word in words if word in VERB_NAMES), "")
+        failure = ErrorParts.of(error, verb)
         show_failure(failure, json_wanted=json_wanted)
         return failure.exit_code
     except OSError as error:

@@ -14,12 +14,13 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from daq.config.cell import DEGREE, Cell, JointUnit, model_of
+from daq.config.document_kind import DocumentKind
 from daq.config.yaml_file import StrictModel, parse_yaml, read_model, read_yaml_bytes
 from daq.errors import ConfigurationInconsistent, UsageError
 from daq.files import replace_file
@@ -516,6 +517,8 @@ class _Move(StrictModel):
 
 
 class _Plan(StrictModel):
+    document_kind: ClassVar[DocumentKind | None] = DocumentKind.PLAN
+
     format: Literal["drivegain-plan"]
     cell: str
     seed: int

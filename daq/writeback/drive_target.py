@@ -14,12 +14,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
 from daq.config.cell import Cell
 from daq.config.controller import GainObject
+from daq.config.document_kind import DocumentKind
 from daq.config.yaml_file import StrictModel
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
 from daq.files import read_regular, replace_file, sha256
@@ -59,6 +60,8 @@ class DriveNote(StrictModel):
 
 class DriveRecord(StrictModel):
     """One write to the drives of a cell."""
+
+    document_kind: ClassVar[DocumentKind | None] = DocumentKind.DRIVE_RECORD
 
     format: Literal["drivegain drive record 1"]
     cell: str  #: name of the cell

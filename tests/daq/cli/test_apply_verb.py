@@ -87,9 +87,10 @@ def bench(tmp_path: Path) -> Bench:
     ("order", "words"),
     [
         (("cell", "controller"), ("controllers/demo.yaml", "no calibration", "`drivegain fit` wrote")),
+        (("cell", "cell"), ("cell.yaml", "found:    a cell file", "expected: a calibration of version")),
         (
             ("calibration", "cell"),
-            ("calibration.yaml", "file of another kind, with format, version", "CELL comes first"),
+            ("calibration.yaml", "found:    a calibration", "expected: a cell file", "CELL comes first"),
         ),
         (("controller", "calibration"), ("demo.yaml", "file of another kind, with controller", "CELL comes first")),
         (

@@ -101,6 +101,20 @@ def test_a_virtual_bus_without_a_cell_names_the_simulation(checkout: Path, capsy
     assert "wiring" not in said
 
 
+def test_a_scan_without_answers_does_not_advise_a_scan(
+    checkout: Path, cell: Cell, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
+    file = configs / "cells/demo.yaml"
+    file.write_text(file.read_text().replace("node_id: 6", "node_id: 66"))
+    with open_bus(bus_address(cell)) as bus, SimulatedCell(load_simulation(shipped_simulation("clean")), bus):
+        assert main(["scan", str(file), "--json"]) == ExitCode.DEVICE_FAULT
+    failure = json.loads(capsys.readouterr().err)
+    assert failure["kind"] == "NodeMissing"
+    assert "wiring and termination" in failure["do"]
+    assert "drivegain scan" not in failure["do"]
+
+
 def test_a_real_bus_without_a_node_names_the_wiring(cell: Cell) -> None:
     real = replace(cell, buses=(replace(cell.buses[0], interface="socketcan"),))
     axes = drive_axes(real)

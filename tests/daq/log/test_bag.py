@@ -302,6 +302,19 @@ def _of_text(path: Path) -> Path:
     return path
 
 
+@pytest.mark.parametrize("size", [100, 300, 1000])
+def test_a_bag_that_ends_before_its_first_message_is_not_salvaged(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], size: int
+) -> None:
+    bag = write_bag(tmp_path / "run.mcap", whole())
+    bag.write_bytes(bag.read_bytes()[:size])
+    for words in (["info", bag], ["fit", bag], ["salvage", bag, "--out", tmp_path / "saved.mcap"]):
+        assert main([str(word) for word in words]) == 4
+        failure = capfd.readouterr().err
+        assert "the begin of a bag of" in failure
+        assert "`drivegain salvage`" not in failure
+
+
 def test_a_bag_of_a_killed_recorder_is_called_unfinished(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "run.mcap", whole(), chunk_size=4000)
     bag.write_bytes(bag.read_bytes()[:-2000])
