@@ -19,7 +19,7 @@ from rich.text import Text
 
 from daq.advice import for_command_line
 from daq.errors import DaqError, ExitCode, exit_code
-from daq.report.text import printable, spelled_bytes
+from daq.report.text import break_lines, printable, spelled_bytes
 from drivers import errors as driver
 from ident import errors as identification
 
@@ -289,6 +289,9 @@ def _number(error: BaseException | None) -> int | None:
     return None
 
 
+INDENT = 10  #: Columns of the labels of an error
+
+
 def show_failure(failure: ErrorParts, *, json_wanted: bool) -> None:
     """Print an error on stderr; where that takes nothing, the exit code alone says it."""
     console = Console(stderr=True, soft_wrap=True)
@@ -302,5 +305,8 @@ def show_failure(failure: ErrorParts, *, json_wanted: bool) -> None:
             return
         for label, text, style in failure.lines():
             # Indented, a line end in the name of a file cannot make another line of an error.
-            indented = printable(text).replace("\n", "\n" + 10 * " ")
-            console.print(Text(f"{label + ':':<10}", style=style) + Text(indented))
+            shown = printable(text)
+            if console.is_terminal:
+                shown = break_lines(shown, max(console.width - INDENT, 1))
+            indented = shown.replace("\n", "\n" + INDENT * " ")
+            console.print(Text(f"{label + ':':<{INDENT}}", style=style) + Text(indented))

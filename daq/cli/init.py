@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from daq.cli.next_step import say_next
-from daq.cli.terminal import write_output
+from daq.cli.terminal import say, write_output
 from daq.cli.verb import Verb, judged_output
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
@@ -71,9 +71,7 @@ def init(
         typer.echo(path)
     cell = folder / "cells" / f"{folder.resolve().name}.yaml"
     if not simulated:
-        typer.echo(
-            f"Edit {cell} first: its numbers are an example's, and its comments say what replaces them.", err=True
-        )
+        say(f"Edit {cell} first: its numbers are an example's, and its comments say what replaces them.", err=True)
     say_next("drivegain", "scan", cell)
 
 

@@ -16,11 +16,12 @@ from daq.cli.terminal import (
     print_view,
     progress_bar,
     replace_output,
+    say,
     status,
 )
 from daq.cli.verb import JsonOption, Verb, output_option, print_json
 from daq.environment import require_packages, software
-from daq.errors import ConfigurationInconsistent, DaqError, LogForeign, OutputFailed, UsageError
+from daq.errors import ConfigurationInconsistent, DaqError, LogForeign, OutputFailed, UsageError, counted
 from daq.files import replace_file
 from daq.report.text import printable
 from ident.errors import ModelContradicted
@@ -77,9 +78,9 @@ def import_files(
     if json:
         print_json(import_report(out, imported))
         return
-    typer.echo(f"{out}: {statistics.samples} samples of {len(statistics.missing)} axes")
+    say(f"{out}: {counted(statistics.samples, 'sample')} of {len(statistics.missing)} axes")
     for line in (*(() if timing is None else (timing_text(timing),)), *imported.remarks):
-        typer.echo(printable(line))
+        say(printable(line))
 
 
 IMPORT = Verb(
@@ -107,11 +108,11 @@ def salvage_verb(
         print_json(salvage_report(out, saved))
         return
     use = ": `fit` accepts it and says so; `apply` refuses the result" if statistics.valid else ""
-    typer.echo(f"{printable(str(out))}: {statistics.samples} samples, {saved.duration_s:g} s, PARTIAL{use}")
+    say(f"{printable(str(out))}: {statistics.samples} samples, {saved.duration_s:g} s, PARTIAL{use}")
     if saved.left_out_bytes:
-        typer.echo(f"left out: {saved.left_out_bytes} bytes, from {printable(saved.damage)}")
+        say(f"left out: {saved.left_out_bytes} bytes, from {printable(saved.damage)}")
     if not statistics.valid:
-        typer.echo(f"INVALID: {printable(statistics.reason)}; a fit will refuse it")
+        say(f"INVALID: {printable(statistics.reason)}; a fit will refuse it")
 
 
 SALVAGE = Verb("salvage", salvage_verb, "drivegain salvage loaded.mcap.part --out loaded-partial.mcap")
@@ -143,15 +144,16 @@ def export_log_verb(
     if json:
         print_json(table_report(log, out, kind, done))
     else:
-        print_view([f"{done.rows} rows of {len(done.columns)} columns"], out)
+        rows = counted(done.rows, "row")
+        print_view([f"{rows} of {counted(len(done.columns), 'column')}"], out)
 
 
 def _warn(log: Path, partial: bool, valid: bool, reason: str) -> None:
     """Say on stderr what a log lacks."""
     if partial:
-        typer.echo(f"{log} is PARTIAL: saved from an unfinished recording", err=True)
+        say(f"{log} is PARTIAL: saved from an unfinished recording", err=True)
     if not valid:
-        typer.echo(f"{log} is INVALID: {reason or 'no reason given'}; a fit refuses it", err=True)
+        say(f"{log} is INVALID: {reason or 'no reason given'}; a fit refuses it", err=True)
 
 
 def export_bag_verb(
@@ -177,7 +179,7 @@ def export_bag_verb(
     if json:
         print_json(bag_report(log, out, done, effort=known is not None))
     else:
-        print_view([f"{topic}: {count} messages" for topic, count in done.messages.items()], out)
+        print_view([f"{topic}: {counted(count, 'message')}" for topic, count in done.messages.items()], out)
 
 
 def export_urdf_verb(

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from daq.cli.next_step import say_after_plan
-from daq.cli.terminal import check_folder, check_output, check_replaceable, progress_bar, replace_output
+from daq.cli.terminal import check_folder, check_output, check_replaceable, progress_bar, replace_output, say
 from daq.cli.verb import CellArgument, JsonOption, Verb, output_option, print_json
 from daq.errors import UsageError
 from daq.files import replace_file
@@ -89,7 +89,7 @@ def plan_verb(
     if json:
         print_json(plan_report(out, declared, experiment, made, judged))
     else:
-        typer.echo(plan_text(out, preview, declared, experiment, made, judged, duration))
+        say(plan_text(out, preview, declared, experiment, made, judged, duration))
         say_after_plan(cell, declared, out, made)
 
 
@@ -100,7 +100,7 @@ def say_how_to_resume(tried: list[int], exchanges: int) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         if done := tried[-1]:
-            typer.echo(f"{done} of {exchanges} exchanges were tried; --exchanges {done} writes their plan", err=True)
+            say(f"{done} of {exchanges} exchanges were tried; --exchanges {done} writes their plan", err=True)
         raise
 
 

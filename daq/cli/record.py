@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.next_step import say_after_record
-from daq.cli.terminal import interruptible, progress_bar, say_last
+from daq.cli.terminal import interruptible, progress_bar, say, say_last
 from daq.cli.verb import CellArgument, JsonOption, Verb, output_option, print_json, taking
 from daq.environment import login
-from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError
+from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError, counted
 from daq.files import is_taken
 from drivers.errors import POWERED, DriverError, SampleLost, all_notes, error_chain
 
@@ -74,7 +74,7 @@ def record_verb(options: RecordOptions) -> None:
     part = _free(out)
     not_weighed = carried is not None and options.mass is None
     for line in _before_motion(declared, options.plan, not_weighed):
-        typer.echo(line, err=True)
+        say(line, err=True)
     request = RecordingRequest(
         options.cell,
         declared,
@@ -96,7 +96,7 @@ def record_verb(options: RecordOptions) -> None:
             progress_bar("recording") as report_progress,
         ):
             if feed.remark:
-                typer.echo(feed.remark, err=True)
+                say(feed.remark, err=True)
             done = record(
                 request,
                 block_signals=block_signals,
@@ -111,12 +111,12 @@ def record_verb(options: RecordOptions) -> None:
         _add_what_is_kept(error, declared, part)
         raise
     for warning in done.warnings:
-        typer.echo(warning, err=True)
+        say(warning, err=True)
     if options.json:
         print_json(record_report(out, done, declared))
     else:
         verdict = "complete" if done.log.valid else f"INVALID: {done.log.reason}; a fit will refuse it"
-        typer.echo(f"{out}: {done.log.samples} samples, {done.log.lost_cycles} cycles lost, {verdict}")
+        say(f"{out}: {done.log.samples} samples, {counted(done.log.lost_cycles, 'cycle')} lost, {verdict}")
     if not done.log.valid:
         # The log is kept; the exit code keeps a script from using it.
         raise typer.Exit(ExitCode.DATA_UNFIT)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.next_step import say_next
-from daq.cli.terminal import print_view
+from daq.cli.terminal import print_view, say
 from daq.cli.verb import CellArgument, JsonOption, Verb, print_json
 from daq.errors import ConfigurationInconsistent, UsageError, VirtualBusEmpty
 from drivers.errors import DriverError, NodeMissing
@@ -193,7 +193,7 @@ def explain_emcy_verb(
     if json:
         print_json(error_code_report(found))
     else:
-        typer.echo(f"{found.hex}: {found.text}\nWhat to do: {found.remedy}.")
+        say(f"{found.hex}: {found.text}\nWhat to do: {found.remedy}.")
 
 
 def read_code(text: str) -> int:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import stat
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -12,15 +14,16 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.console import Console, RenderableType
+from rich.text import Text
 
 from daq.cli.verb import judged_output
 from daq.errors import OutputFailed, UsageError, writing
 from daq.files import is_taken
-from daq.report.text import terminal_text
+from daq.report.text import break_lines, terminal_text
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -72,7 +75,8 @@ def replace_output(path: Path) -> Iterator[None]:
     names = [str(file) for file in replaced[:NAMED_FILES]]
     if len(replaced) > NAMED_FILES:
         names.append(f"{len(replaced) - NAMED_FILES} more")
-    typer.echo(terminal_text(f"Replaced: {', '.join(names)} (of {since:%Y-%m-%d %H:%M} UTC)"), err=True)
+    replaced_text = terminal_text(f"Replaced: {', '.join(names)} (of {since:%Y-%m-%d %H:%M} UTC)")
+    say(replaced_text.plain, err=True)
 
 
 NAMED_FILES = 4  #: Replaced files that are named; of more, their number is said
@@ -181,9 +185,36 @@ def at_most_one(**options: object) -> None:
         )
 
 
+class _WholeWords(Console):
+    """Console that breaks long lines of text at spaces, where a terminal would break them within a word."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print as rich does, with lines of text that fit a terminal."""
+        shown = objects
+        if self.is_terminal:
+            shown = tuple(self._fitting(one) for one in objects)
+        super().print(*shown, **options)
+
+    def _fitting(self, one: Any) -> Any:
+        if isinstance(one, str):
+            return break_lines(one, self.width)
+        if isinstance(one, Text) and not one.spans:
+            return Text(break_lines(one.plain, self.width), style=one.style)
+        return one
+
+
+def say(text: str, *, err: bool = False) -> None:
+    """Print text for a person; a terminal gets lines broken at spaces, a pipe or file gets them as they are."""
+    stream = sys.stderr if err else sys.stdout
+    shown = text
+    if stream is not None and stream.isatty():
+        shown = break_lines(text, shutil.get_terminal_size().columns)
+    typer.echo(shown, err=err)
+
+
 def output_console() -> Console:
     """Console of stdout; a pipe has no width, so nothing in it is broken into lines."""
-    console = Console(soft_wrap=True, highlight=False, markup=False)
+    console = _WholeWords(soft_wrap=True, highlight=False, markup=False)
     if not console.is_terminal:
         console.width = PIPE_COLUMNS
     return console
@@ -193,7 +224,7 @@ PIPE_COLUMNS = 1_000  #: Wider than any table
 
 
 def print_view(parts: Iterable[RenderableType], *written: Path | None) -> None:
-    """Print tables and lines on stdout, then the files written; lines are not broken, so that they can be copied."""
+    """Print tables and lines on stdout, then the files written; a terminal breaks lines between words alone."""
     console = output_console()
     for part in parts:
         console.print(part)
@@ -213,7 +244,7 @@ def say_written(console: Console, *paths: Path | None) -> None:
 def say_last(text: str) -> None:
     """Print the last line of a command on stderr; the exit code says it where that takes nothing."""
     with suppress(OSError, ValueError):  # a full disk, a reader that has gone, a closed stream
-        typer.echo(text, err=True)
+        say(text, err=True)
 
 
 class Stepper:

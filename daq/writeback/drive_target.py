@@ -22,7 +22,7 @@ from daq.config.cell import Cell
 from daq.config.controller import GainObject
 from daq.config.document_kind import DocumentKind
 from daq.config.yaml_file import StrictModel
-from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
+from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit, counted
 from daq.files import read_regular, replace_file, sha256
 from daq.ledger.fold import drives_of
 from daq.writeback.file_access import exclusive_writer, next_order
@@ -257,7 +257,7 @@ class DriveTarget:
             )
         raise CalibrationRefused(
             self.subject,
-            found=f"{len(paths)} records of the present values" if paths else f"no record in {folder}",
+            found=f"{counted(len(paths), 'record')} of the present values" if paths else f"no record in {folder}",
             expected="the record of a write that changed them",
             remedy="nothing was written",
         )

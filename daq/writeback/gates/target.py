@@ -7,7 +7,7 @@ import unicodedata
 from collections.abc import Iterator
 
 from daq.config.cell import CellAxis
-from daq.errors import SignatureInvalid
+from daq.errors import SignatureInvalid, counted
 from daq.writeback.gates.gate import GateContext
 from daq.writeback.request import GainChange, GateFinding, parse_base, short_digest
 from daq.writeback.signature import signers_of
@@ -187,7 +187,7 @@ def signature(context: GateContext) -> Iterator[GateFinding]:
         may = ", ".join(_others(tuple(policy.signers), applying)) or "no one else"
         yield (
             subject,
-            f"{len(others)} signatures ({', '.join(others) or 'none'}), not counting the operator's",
+            f"{counted(len(others), 'signature')} ({', '.join(others) or 'none'}), not counting the operator's",
             f"{policy.signatures} of: {may}",
             "have them review the calibration and sign it with `drivegain sign`",
         )
