@@ -107,6 +107,33 @@ def test_no_verb_waits_for_a_pipe_that_is_named_like_a_cell_file(
     assert main(["scan", "missing.yaml"]) == ExitCode.CONFIGURATION
 
 
+@pytest.mark.parametrize("listed", VERBS, ids=[verb.name for verb in VERBS])
+def test_an_option_without_its_value_is_an_error_of_the_usual_form(
+    listed: Listed, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """For every option that takes one, as a person and as a program see it."""
+    verb = listed.load()
+    for one in verb.kinds or (verb,):
+        names = [verb.name]
+        parsed = verb.command()
+        if verb.kinds:
+            names.append(one.name)
+            parsed = parsed.commands[one.name]
+        options = [param for param in parsed.params if param.param_type_name == "option" and not param.is_flag]
+        takes_json = any("--json" in param.opts for param in parsed.params)
+        for option in (max(param.opts, key=len) for param in options):
+            assert main([*names, option]) == ExitCode.USAGE
+            said = capsys.readouterr().err
+            assert all(f"{label}:" in said for label in ("error", "found", "expected", "do"))
+            assert option in said
+            if takes_json:
+                assert main([*names, "--json", option]) == ExitCode.USAGE
+                failure = json.loads(capsys.readouterr().err)
+                assert (failure["kind"], failure["exit_code"]) == ("UsageError", ExitCode.USAGE)
+                assert option in failure["found"]
+                assert failure["do"] == f"`drivegain {verb.name} --help` explains it"
+
+
 def test_a_value_of_the_wrong_type_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
     record = ["record", "cell.yaml", "plan.yaml", "--out", "a.mcap", "--mass"]
     assert main([*record, "4,59"]) == ExitCode.USAGE
